@@ -1,0 +1,164 @@
+"""The symmetric five-link robot in the sagittal plane, computed from the full robot (Sec. II-C of the paper).
+
+Left and right limbs are merged: masses and inertias add, and so do the torque limits. Nothing here is typed in by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+SAGITTAL_LINKS = ("foot", "shank", "thigh", "trunk", "arm")
+SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
+# hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)
+JOINT_OF_ANGLES = np.array(
+    [
+        [0.0, 0.0, 1.0, -1.0, 0.0],
+        [0.0, 1.0, -1.0, 0.0, 0.0],
+        [1.0, -1.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, -1.0, 1.0],
+    ]
+)
+
+
+@dataclass(frozen=True)
+class SagittalModel:
+    """Five links in the x-z plane; angles are absolute, positive about +y, zero in the robot's neutral pose.
+
+    All vectors are (x, z) in metres, written in the neutral pose, so a link at angle a has its vectors turned by a.
+
+    Attributes
+    ----------
+    mass, inertia : (5,) kg and kg m^2 about each link's own CoM, both sides summed; order :data:`SAGITTAL_LINKS`.
+    com : (5, 2) CoM from the link's lower joint: toe, ankle, knee, hip; for the arm from the shoulder.
+    span : (5, 2) from that joint to the next: toe to ankle, ankle to knee, knee to hip, hip to shoulder, shoulder to hand.
+    heel, sole_center : (2,) from the toe.
+    base : (2,) from the hip to the origin of the robot's base link, fixed in the trunk.
+    sign : (4,) +1 or -1, robot joint angle = sign * sagittal joint angle; order :data:`SAGITTAL_JOINTS`.
+    lower, upper, speed, effort, corner_speed : (4,) limits in sagittal signs; effort of both sides summed.
+    points : named points on the links for clearance, name -> (link index, (x, z) from the link's lower joint).
+    """
+
+    mass: np.ndarray
+    inertia: np.ndarray
+    com: np.ndarray
+    span: np.ndarray
+    heel: np.ndarray
+    sole_center: np.ndarray
+    base: np.ndarray
+    sign: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    speed: np.ndarray
+    effort: np.ndarray
+    corner_speed: np.ndarray
+    points: dict
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the whole robot [kg]."""
+        return float(self.mass.sum())
+
+    def com_arms(self) -> np.ndarray:
+        """(5, 5, 2) array d: CoM of link i from the toe is sum over j of R(a_j) d[i, j]."""
+        arms = np.zeros((5, 5, 2))
+        for i in range(4):
+            arms[i, :i] = self.span[:i]
+            arms[i, i] = self.com[i]
+        arms[4, :4] = self.span[:4]
+        arms[4, 4] = self.com[4]
+        return arms  # (link, angle, xz)
+
+    def point_arms(self, link: int, point) -> np.ndarray:
+        """(5, 2) array d: a point fixed in ``link`` sits at sum over j of R(a_j) d[j] from the toe."""
+        arms = np.zeros((5, 2))
+        arms[: min(link, 4)] = self.span[: min(link, 4)]
+        arms[link] = point
+        return arms  # (angle, xz)
+
+    def joint_angles(self, angles: np.ndarray) -> np.ndarray:
+        """Joint angles (..., 4) hip, knee, ankle, shoulder from absolute link angles (..., 5); also for their rates."""
+        return np.asarray(angles) @ JOINT_OF_ANGLES.T
+
+    def link_angles(self, joints: np.ndarray, trunk_pitch) -> np.ndarray:
+        """Absolute link angles (..., 5) from joint angles (..., 4) and trunk pitch; also for their rates."""
+        hip, knee, ankle, shoulder = np.moveaxis(np.asarray(joints, float), -1, 0)
+        thigh = trunk_pitch + hip
+        shank = thigh + knee
+        return np.stack([shank + ankle, shank, thigh, trunk_pitch + np.zeros_like(hip), trunk_pitch + shoulder], -1)
+
+
+def _members(model: pin.Model, joints: dict) -> list[list[int]]:
+    """Pinocchio joint indices whose bodies belong to foot, shank, thigh, trunk and arm."""
+    pitch = {joint: role for role, pair in joints.items() for joint in pair}
+    part_below = {"hip_pitch": "thigh", "knee": "shank", "ankle_pitch": "foot", "shoulder_pitch": "arm"}
+    part = {1: "trunk"}
+    for j in range(2, model.njoints):
+        role = pitch.get(model.names[j])
+        part[j] = part_below[role] if role else part[model.parents[j]]
+    return [[j for j in part if part[j] == name] for name in SAGITTAL_LINKS]
+
+
+def _axis_sign(model: pin.Model, data: pin.Data, name: str) -> float:
+    """+1 if the joint turns its limb about +y in the neutral pose, -1 if about -y: found by motion, not by name."""
+    joint = model.getJointId(name)
+    jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)  # (6, nv)
+    return float(np.sign(jacobian[4, model.idx_vs[joint]]))
+
+
+def reduce(model: pin.Model, joints: dict, foot, actuators: dict) -> SagittalModel:
+    """Merge the full robot into its sagittal five-link model.
+
+    Parameters
+    ----------
+    model : Pinocchio model with a free-flyer base.
+    joints : role -> (left, right) joint names for hip_pitch, knee, ankle_pitch, shoulder_pitch.
+    foot : object with ``frames`` (left, right), ``heel``, ``toe``, ``sole_z`` in the foot frame [m].
+    actuators : name -> dict(lower, upper, speed, effort, corner_speed) for every joint.
+    """
+    data = model.createData()
+    q = pin.neutral(model)
+    pin.computeJointJacobians(model, data, q)
+    pin.framesForwardKinematics(model, data, q)
+    parts = _members(model, joints)
+    mass, com, inertia = np.zeros(5), np.zeros((5, 2)), np.zeros(5)
+    for i, members in enumerate(parts):
+        total = pin.Inertia.Zero()
+        for j in members:
+            total += data.oMi[j].act(model.inertias[j])
+        mass[i], com[i] = total.mass, total.lever[[0, 2]]
+        # products along y drop out of the pitch axis, so the two sides may simply be added
+        inertia[i] = sum(
+            world.inertia[1, 1] + world.mass * np.sum((world.lever[[0, 2]] - com[i]) ** 2)
+            for world in (data.oMi[j].act(model.inertias[j]) for j in members)
+        )
+
+    def place(role):
+        return np.mean([data.oMi[model.getJointId(n)].translation[[0, 2]] for n in joints[role]], axis=0)
+
+    ankle, knee, hip, shoulder = (place(r) for r in ("ankle_pitch", "knee", "hip_pitch", "shoulder_pitch"))
+    frame = data.oMf[model.getFrameId(foot.frames[0])]
+    toe = frame.act(np.array([foot.toe, 0.0, foot.sole_z]))[[0, 2]]
+    heel = frame.act(np.array([foot.heel, 0.0, foot.sole_z]))[[0, 2]]
+    hand = 2 * (com[4] - shoulder)  # a limb of even thickness ends at twice its CoM distance
+    lower_joint = np.array([toe, ankle, knee, hip, shoulder])
+    span = np.array([ankle - toe, knee - ankle, hip - knee, shoulder - hip, hand])
+    sign, limits = [], {key: [] for key in ("lower", "upper", "speed", "effort", "corner_speed")}
+    for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
+        s = _axis_sign(model, data, joints[role][0])
+        sign.append(s)
+        left = actuators[joints[role][0]]
+        both = sorted((s * left["lower"], s * left["upper"]))
+        limits["lower"].append(both[0])
+        limits["upper"].append(both[1])
+        limits["speed"].append(left["speed"])
+        limits["corner_speed"].append(left["corner_speed"])
+        limits["effort"].append(sum(actuators[n]["effort"] for n in joints[role]))
+    base = data.oMi[1].translation[[0, 2]] - hip
+    points = {"toe": (0, np.zeros(2)), "heel": (0, heel - toe), "knee": (2, np.zeros(2)), "hip": (3, np.zeros(2)),
+              "shoulder": (4, np.zeros(2)), "hand": (4, hand), "mid-arm": (4, hand / 2)}  # fmt: skip
+    return SagittalModel(
+        mass, inertia, com - lower_joint, span, heel - toe, (heel - toe) / 2, base, np.array(sign),
+        **{k: np.array(x) for k, x in limits.items()}, points=points)  # fmt: skip

@@ -1,0 +1,81 @@
+"""What the jump shall achieve, and what ballistics alone says about it (Sec. III of the paper)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from jumplab.errors import InputError
+
+GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
+MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
+MAX_HEIGHT_M = 1.5  # beyond any human's CoM rise: surely a typo
+MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump
+
+
+def _number(name: str, value, low: float, high: float, unit: str) -> float:
+    try:
+        x = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be a number in {unit}, got {value!r}") from None
+    if not math.isfinite(x):
+        raise InputError(f"{name} must be finite, got {x}")
+    if not low <= x <= high:
+        raise InputError(f"{name} = {x:g} {unit} is outside {low:g} ... {high:g} {unit}")
+    return x
+
+
+@dataclass(frozen=True)
+class JumpTask:
+    """Target of one jump.
+
+    Attributes
+    ----------
+    distance_m : travel of the feet, toe to toe [m] (l in the paper; negative is backward).
+    height_m : rise of the CoM from the instant the feet leave the ground to the apex [m] (h in the paper).
+    platform_m : height of the landing surface above the launching surface [m].
+    rotation_rad : rotation about +y in flight, 0 or a multiple of 2 pi (theta_tar; -2 pi is a backflip).
+    gravity : [m/s^2].
+    """
+
+    distance_m: float
+    height_m: float
+    platform_m: float = 0.0
+    rotation_rad: float = 0.0
+    gravity: float = GRAVITY
+
+    def __post_init__(self):
+        clean = {
+            "distance_m": _number("distance", self.distance_m, -MAX_DISTANCE_M, MAX_DISTANCE_M, "m"),
+            "height_m": _number("height", self.height_m, 0.02, MAX_HEIGHT_M, "m"),
+            "platform_m": _number("platform", self.platform_m, -MAX_PLATFORM_M, MAX_PLATFORM_M, "m"),
+            "rotation_rad": _number("rotation", self.rotation_rad, -4 * math.pi, 4 * math.pi, "rad"),
+            "gravity": _number("gravity", self.gravity, 0.5, 30.0, "m/s^2"),
+        }
+        for name, x in clean.items():
+            object.__setattr__(self, name, x)
+        turns = self.rotation_rad / (2 * math.pi)
+        if abs(turns - round(turns)) > 1e-6:
+            raise InputError(
+                f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet only after a multiple "
+                f"of 360 deg; nearest is {360 * round(turns):g} deg"
+            )
+
+    @property
+    def takeoff_speed(self) -> float:
+        """Vertical CoM speed at take-off, sqrt(2 g h) [m/s] (v_z^exp, Sec. III)."""
+        return math.sqrt(2 * self.gravity * self.height_m)
+
+    def flight_time(self, com_rise_at_touchdown_m: float = 0.0) -> float:
+        """Time in the air [s] when the CoM touches down ``com_rise_at_touchdown_m`` above its take-off height.
+
+        Zero gives the paper's 2 v / g. Raises :class:`InputError` if the apex is lower than that.
+        """
+        v, g = self.takeoff_speed, self.gravity
+        rest = v * v - 2 * g * com_rise_at_touchdown_m
+        if rest < 0:
+            raise InputError(
+                f"a CoM rise of {self.height_m:g} m cannot reach a touchdown {com_rise_at_touchdown_m:.3f} m above "
+                f"take-off; ask for at least that height"
+            )
+        return (v + math.sqrt(rest)) / g

@@ -1,0 +1,94 @@
+"""The public tape: one planned jump of the full robot, sampled at 1 kHz, and nothing that needs the planner to read."""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from jumplab.errors import InputError
+
+SCHEMA = "jumplab-plan-1"
+RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
+
+
+@dataclass(frozen=True)
+class Tape:
+    """Launch and flight of the full robot at 1 kHz.
+
+    Attributes
+    ----------
+    t : (N,) time from the start of the launch [s]; the instant of take-off appears twice, once per phase.
+    q : (N, nq) Pinocchio free-flyer order: x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
+    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
+    a : (N, nv) time derivative of ``v`` [m/s^2, rad/s^2].
+    tau : (N, nv - 6) joint torques [N m].
+    phase : (N,) "launch" or "flight".
+    contact_frames : (K,) names of the foot links; where wrenches act.
+    f : (N, K, 6) force then moment on the robot, world axes, at the origin of each contact frame [N, N m].
+    joint_names : (nv - 6,) in the order of ``q[7:]``.
+    extra : further arrays under their own names (SRMP and planar solutions), for study; not needed to play the tape.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    tau: np.ndarray
+    phase: np.ndarray
+    contact_frames: np.ndarray
+    f: np.ndarray
+    joint_names: np.ndarray
+    extra: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        n = len(self.t)
+        for name in ("q", "v", "a", "tau", "phase", "f"):
+            if len(getattr(self, name)) != n:
+                raise InputError(f"tape: {name} has {len(getattr(self, name))} rows, t has {n}")
+        for x in (self.t, self.q, self.v, self.a, self.tau, self.f, self.phase, *self.extra.values()):
+            if isinstance(x, np.ndarray):
+                x.setflags(write=False)
+
+    @property
+    def takeoff_index(self) -> int:
+        """Row of the first flight sample."""
+        return int(np.argmax(self.phase == "flight"))
+
+    @property
+    def takeoff_time(self) -> float:
+        """Time of take-off [s]."""
+        return float(self.t[self.takeoff_index])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays under the names of ``plan.npz``."""
+        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "extra"}
+        return {"schema": np.array(SCHEMA), **own, **self.extra}
+
+    def save(self, path: str | Path) -> None:
+        """Write ``plan.npz`` (compressed, no pickle)."""
+        np.savez_compressed(path, **self.arrays())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Tape:
+        """Read ``plan.npz``; raises :class:`InputError` in one sentence if it is missing, damaged or of another schema."""
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                data = {k: file[k] for k in file.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as e:
+            raise InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated") from e
+        schema = str(data.pop("schema", "none"))
+        if schema != SCHEMA:
+            raise InputError(f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again")
+        names = [f.name for f in dataclasses.fields(cls) if f.name != "extra"]
+        missing = [n for n in names if n not in data]
+        if missing:
+            raise InputError(f"{path}: the array {missing[0]!r} is missing")
+        own = {n: data.pop(n) for n in names}
+        return cls(**own, extra=data)
