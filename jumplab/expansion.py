@@ -1,0 +1,142 @@
+"""From the symmetric plan to the full robot: the 1 kHz tape (last step of Sec. V: "symmetrically on each leg")."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.models.planar import evaluator
+from jumplab.robot import Robot
+from jumplab.robot.stance import configuration
+from jumplab.solver import PhaseSolution
+from jumplab.trajectory import RATE_HZ, Tape
+
+_EVALUATORS: dict = {}
+
+
+def planar_quantities(robot: Robot, angles, rates, accels, toe_acceleration, gravity: float) -> dict[str, np.ndarray]:
+    """Every planar quantity at n instants: name -> (n, size) or (n,); inputs are (n, 5), (n, 5), (n, 5), (n, 2)."""
+    key = (robot.hash, gravity)
+    if key not in _EVALUATORS:
+        _EVALUATORS[key] = evaluator(robot.sagittal, gravity)
+    out = _EVALUATORS[key].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
+    return {k: v.full().T.squeeze() for k, v in out.items()}
+
+
+def _joint_columns(robot: Robot):
+    model = robot.model
+    columns, rows = [], []
+    for i, role in enumerate(("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")):
+        for name in robot.joints[role]:
+            columns.append(model.idx_vs[model.getJointId(name)])
+            rows.append(i)
+    return np.array(columns), np.array(rows)
+
+
+def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:
+    """Sample the planner's own interpolant at 1 kHz: t, angles, rates, accels (n, 5), toe and derivatives (n, 2), flying.
+
+    The grid is laid so that take-off falls on a sample (which appears twice): the robot stands still for up to 1 ms more
+    at the start. The last sample is the touchdown itself.
+    """
+    flat, toe, flight = phases["flat"], phases["toe"], phases["flight"]
+    launch_s = flat.duration + toe.duration
+    steps = int(np.ceil(launch_s * RATE_HZ - 1e-9))
+    t_launch = launch_s - np.arange(steps, -1, -1) / RATE_HZ
+    parts = [_launch_sample(flat, toe, max(t, 0.0)) for t in t_launch]
+    q, v, a = (np.array([p[i] for p in parts]) for i in range(3))
+    t_flight = np.append(np.arange(0, flight.duration - 0.25 / RATE_HZ, 1 / RATE_HZ), flight.duration)
+    qf, vf, af = flight.sample(t_flight)
+    c = flight.constants
+    com = np.stack([c["com_x"] + c["vel_x"] * t_flight,
+                    c["com_z"] + c["vel_z"] * t_flight - gravity * t_flight**2 / 2], -1)  # fmt: skip
+    com_v = np.stack([np.full_like(t_flight, c["vel_x"]), c["vel_z"] - gravity * t_flight], -1)
+    rel = planar_quantities(robot, qf, vf, af, np.zeros((len(qf), 2)), gravity)
+    toe_f = com - rel["com"], com_v - rel["com_velocity"], np.array([0.0, -gravity]) - rel["com_acceleration"]
+    start = t_launch[0]
+    zeros = np.zeros((len(t_launch), 2))
+    return dict(
+        t=np.concatenate([t_launch - start, launch_s - start + t_flight]),
+        angles=np.concatenate([q, qf]), rates=np.concatenate([v, vf]), accels=np.concatenate([a, af]),
+        toe=np.concatenate([zeros, toe_f[0]]), toe_velocity=np.concatenate([zeros, toe_f[1]]),
+        toe_acceleration=np.concatenate([zeros, toe_f[2]]),
+        flying=np.concatenate([np.zeros(len(t_launch), bool), np.ones(len(t_flight), bool)]),
+        toe_phase_start=np.array(flat.duration - start))  # fmt: skip
+
+
+def _launch_sample(flat, toe, t):
+    if t < flat.duration:
+        return [np.concatenate([[0.0], x[0]]) for x in flat.sample(t)]
+    return [x[0] for x in toe.sample(min(t - flat.duration, toe.duration))]
+
+
+def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: dict | None = None) -> Tape:
+    """Full-robot tape from a sampled planar motion (see :func:`planar_motion`); the world's x is zero mid-sole at start.
+
+    Foot wrenches are half of the planar ground wrench each; joint torques follow from inverse dynamics of the full
+    robot, whose base rows are left for the audit to judge.
+    """
+    model, n = robot.model, len(motion["t"])
+    columns, role = _joint_columns(robot)
+    signs = robot.sagittal.sign[role]
+    origin = -robot.sagittal.sole_center
+    angles, rates, accels = motion["angles"], motion["rates"], motion["accels"]
+    q = np.array([configuration(robot, x, p + origin) for x, p in zip(angles, motion["toe"], strict=True)])
+    v, a = np.zeros((n, model.nv)), np.zeros((n, model.nv))
+    v[:, columns] = robot.sagittal.joint_angles(rates)[:, role] * signs
+    a[:, columns] = robot.sagittal.joint_angles(accels)[:, role] * signs
+    base_v, base_a = _base_motion(robot, motion)
+    pitch, w, alpha = angles[:, 3], rates[:, 3], accels[:, 3]
+    v[:, [0, 2]], v[:, 4] = _into_body(pitch, base_v), w
+    # derivative of the body-frame velocity: R' (a - w x v)
+    cross = np.stack([w * base_v[:, 1], -w * base_v[:, 0]], -1)
+    a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), alpha
+    wrench = planar_quantities(robot, angles, rates, accels, motion["toe_acceleration"], gravity)["ground_wrench"]
+    wrench = np.where(motion["flying"][:, None], 0.0, wrench)
+    f, tau = _forces(robot, q, v, a, wrench, motion["toe"] + origin)
+    phase = np.where(motion["flying"], "flight", "launch")
+    planar = {f"planar_{k}": x for k, x in motion.items() if k not in ("t", "flying")}
+    return Tape(motion["t"], q, v, a, tau, phase, np.array(robot.foot.frames), f, np.array(robot.joint_names),
+                {**planar, **(extra or {})})  # fmt: skip
+
+
+def _into_body(pitch, vectors):
+    c, s = np.cos(pitch), np.sin(pitch)
+    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], -1)
+
+
+def _base_motion(robot, motion):
+    """World velocity and acceleration (n, 2) of the base link's origin."""
+    model = robot.sagittal
+    arms = [*model.span[:3], model.base]
+    v, a = motion["toe_velocity"].copy(), motion["toe_acceleration"].copy()
+    for j, arm in enumerate(arms):
+        angle, w, b = motion["angles"][:, j], motion["rates"][:, j], motion["accels"][:, j]
+        c, s = np.cos(angle), np.sin(angle)
+        place = np.stack([c * arm[0] + s * arm[1], -s * arm[0] + c * arm[1]], -1)
+        across = np.stack([place[:, 1], -place[:, 0]], -1)
+        v += across * w[:, None]
+        a += across * b[:, None] - place * w[:, None] ** 2
+    return v, a
+
+
+def _forces(robot, q, v, a, wrench, toe):
+    model = robot.model
+    data = model.createData()
+    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    joints = [model.frames[i].parentJoint for i in frames]
+    f, tau = np.zeros((len(q), len(frames), 6)), np.zeros((len(q), model.nv - 6))
+    external = pin.StdVec_Force()
+    external.extend([pin.Force.Zero() for _ in range(model.njoints)])
+    for k in range(len(q)):
+        pin.forwardKinematics(model, data, q[k])
+        for i, (frame, joint) in enumerate(zip(frames, joints, strict=True)):
+            place = pin.updateFramePlacement(model, data, frame)
+            force = np.array([wrench[k, 0], 0.0, wrench[k, 1]]) / 2
+            lever = np.array([toe[k, 0] - place.translation[0], 0.0, toe[k, 1] - place.translation[2]])
+            moment = np.array([0.0, wrench[k, 2] / 2, 0.0]) + np.cross(lever, force)
+            f[k, i] = np.concatenate([force, moment])
+            world = pin.SE3(np.eye(3), place.translation)
+            external[joint] = data.oMi[joint].actInv(world.act(pin.Force(force, moment)))
+        tau[k] = pin.rnea(model, data, q[k], v[k], a[k], external)[6:]
+    return f, tau

@@ -1,0 +1,65 @@
+"""Standing posture: soles flat on the ground, CoM above their middle, at rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from scipy.optimize import brentq
+
+from jumplab.errors import RobotError
+from jumplab.robot.description import Robot
+
+
+def _rotate(angle, vector):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]])
+
+
+def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
+    """CoM (x, z) from the toe [m] at absolute link angles (5,)."""
+    model = robot.sagittal
+    arms = np.einsum("i,ijk->jk", model.mass, model.com_arms()) / model.total_mass
+    return np.sum([_rotate(a, d) for a, d in zip(angles, arms, strict=True)], axis=0)
+
+
+def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
+    """Absolute link angles (5,) of the standing posture, order foot, shank, thigh, trunk, arm [rad].
+
+    Knee, trunk pitch and shoulder come from the robot's configuration (``knee_rad`` overrides the first); the shank's
+    lean follows from the CoM above the middle of the sole. Raises :class:`RobotError` if no lean does that.
+    """
+    knee = robot.stance["knee_rad"] if knee_rad is None else knee_rad
+    pitch, shoulder = robot.stance["trunk_pitch_rad"], robot.stance["shoulder_rad"]
+
+    def angles(shank):
+        return np.array([0.0, shank, shank - knee, pitch, pitch + shoulder])
+
+    def offset(shank):
+        return com_from_toe(robot, angles(shank))[0] - robot.sagittal.sole_center[0]
+
+    try:
+        return angles(brentq(offset, -0.6, 1.4))  # our choice: generous lean of the shank, both ways
+    except ValueError:
+        raise RobotError(
+            f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank brings "
+            f"the CoM above the middle of the sole; change [stance] in its configuration"
+        ) from None
+
+
+def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:
+    """Pinocchio configuration (nq,) of the full robot for absolute link angles (5,) and the toe's (x, z) [m]."""
+    model = robot.sagittal
+    toe_to_hip = np.sum([_rotate(angles[j], model.span[j]) for j in range(3)], axis=0)
+    base = np.asarray(toe) + toe_to_hip + _rotate(angles[3], model.base)
+    q = pin.neutral(robot.model)
+    q[:7] = [base[0], 0.0, base[1], 0.0, np.sin(angles[3] / 2), 0.0, np.cos(angles[3] / 2)]
+    joints = model.joint_angles(angles) * model.sign
+    for role, angle in zip(("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"), joints, strict=True):
+        for name in robot.joints[role]:
+            q[robot.model.idx_qs[robot.model.getJointId(name)]] = angle
+    return q
+
+
+def stance_configuration(robot: Robot) -> np.ndarray:
+    """Pinocchio configuration (nq,) of the standing robot, middle of the soles at the origin."""
+    return configuration(robot, stance_angles(robot), toe=-robot.sagittal.sole_center)

@@ -1,0 +1,310 @@
+"""Solving an assembled problem with ipopt, and saying what came out: statistics, cost shares, tightest rows, or why not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from jumplab.errors import InputError, SolverError
+from jumplab.terms import Bound, Problem
+from jumplab.transcription import Assembled, PhaseLayout, chain
+
+GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+RESIDUAL_LIMIT = 1e-4  # our choice: scaled row error above which a "solved" status is not believed
+IPOPT = {
+    "tol": 1e-6,  # our choice: scaled; the tape's own audit is the judge of physics
+    "constr_viol_tol": 1e-6,
+    "acceptable_tol": 1e-4,
+    "acceptable_constr_viol_tol": 1e-5,
+    "max_iter": 300,
+    "mu_strategy": "adaptive",
+    "nlp_scaling_method": "none",  # the terms carry their scales
+    "print_level": 0,
+    "sb": "yes",
+}
+
+
+@dataclass(frozen=True)
+class PhaseGuess:
+    """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
+
+    duration: float
+    q: np.ndarray  # (N + 1, nq)
+    v: np.ndarray | None = None
+    a: np.ndarray | None = None
+    z: np.ndarray | None = None
+    constants: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PhaseSolution:
+    """One phase at its nodes, and between them.
+
+    Attributes
+    ----------
+    t : (N + 1,) from the start of the phase [s];  q, v, a : (N + 1, nq);  j : (N, nq);  z : (N + 1, nz).
+    duration : [s];  constants : the phase's further constants.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    j: np.ndarray
+    z: np.ndarray
+    duration: float
+    constants: dict
+
+    def sample(self, t) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
+        t = np.atleast_1d(np.asarray(t, float))
+        n = len(self.j)
+        k = np.clip((t / self.duration * n).astype(int), 0, n - 1)
+        h = (t - self.t[k])[:, None]
+        return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
+
+    def guess(self, intervals: int | None = None) -> PhaseGuess:
+        """This solution as the start of another solve, on another mesh if asked."""
+        t = np.linspace(0, self.duration, (intervals or len(self.j)) + 1)
+        q, v, a = self.sample(t)
+        z = np.stack([np.interp(t, self.t, col) for col in self.z.T], -1) if self.z.shape[1] else None
+        return PhaseGuess(self.duration, q, v, a, z, dict(self.constants))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a solve cost."""
+
+    iterations: int
+    status: str
+    build_s: float
+    solve_s: float
+    variables: int
+    rows: int
+    objective: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of one solve; ``phases`` by name, tables for people."""
+
+    problem: Problem
+    phases: dict[str, PhaseSolution]
+    statistics: Statistics
+    cost_shares: tuple[dict, ...]
+    constraint_report: tuple[dict, ...]
+
+    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
+        """All phases as a warm start, on another mesh if asked."""
+        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
+
+
+def _resolve(value, parameters, size):
+    value = value(parameters) if callable(value) else value
+    return np.broadcast_to(np.asarray(value, float).ravel(), (size,))
+
+
+class Nlp:
+    """A problem ready to be solved for any target.
+
+    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches.
+    """
+
+    def __init__(self, problem: Problem, options: Mapping | None = None):
+        began = time.perf_counter()
+        self.problem = problem
+        self.assembled = a = Assembled(problem)
+        ipopt = {**IPOPT, **(options or {})}
+        nlp = {"ipopt": ipopt, "print_time": False, "error_on_fail": False, "grad_f": a.grad_f, "jac_g": a.jac_g,
+               "hess_lag": a.hess_lag}  # fmt: skip
+        self._solver = ca.nlpsol("solver", "ipopt", a.nlp, nlp)
+        self.build_s = time.perf_counter() - began
+
+    # building blocks of one solve -------------------------------------------------------------------------------
+    def _is_off(self, owner, name, off):
+        return name in off or f"{owner}/{name}" in off
+
+    def _parameter_vector(self, parameters, references, weights, off):
+        a, problem = self.assembled, self.problem
+        unknown = set(parameters) ^ set(problem.parameters)
+        if unknown:
+            raise InputError(f"{problem.name}: parameters {sorted(unknown)} do not fit; it takes {list(problem.parameters)}")
+        values = [np.broadcast_to(np.asarray(parameters[n], float).ravel(), (s,)) for n, s in problem.parameters.items()]
+        weight = []
+        for owner, term in a.cost_terms:
+            w = weights.get(f"{owner}/{term.name}", weights.get(term.name, term.weight))
+            weight.append(0.0 if self._is_off(owner, term.name, off) else w)
+        columns = []
+        for name, layout in a.layouts.items():
+            n = layout.phase.intervals
+            rows = [np.linspace(0, 1, n + 1)[None]]
+            for ref, size in layout.phase.references.items():
+                given = np.asarray(references.get(name, {}).get(ref, np.zeros((size, n + 1))), float)
+                if given.shape != (size, n + 1) or not np.all(np.isfinite(given)):
+                    raise InputError(f"{problem.name}: reference {ref!r} of phase {name!r} must be finite, {(size, n + 1)}")
+                rows.append(given)
+            columns.append(np.concatenate(rows).ravel(order="F"))
+        vector = np.concatenate([np.concatenate([*values, [0.0]])[:-1], weight, *columns])
+        if not np.all(np.isfinite(vector)):
+            raise InputError(f"{problem.name}: a parameter or weight is not finite")
+        return vector
+
+    def _variable_bounds(self, parameters, off):
+        a = self.assembled
+        low, high = np.full(a.size, -np.inf), np.full(a.size, np.inf)
+        for layout in a.layouts.values():
+            phase = layout.phase
+            ends = [phase.duration, *(c[:2] for c in phase.constants.values())]
+            for i, (lo, hi), s in zip(layout.constants(), ends, layout.constant_scales(), strict=True):
+                low[i], high[i] = _resolve(lo, parameters, 1)[0] / s, _resolve(hi, parameters, 1)[0] / s
+            for bound in phase.bounds:
+                if not self._is_off(phase.name, bound.name, off):
+                    self._apply(layout, bound, parameters, low, high)
+        return low, high
+
+    @staticmethod
+    def _apply(layout: PhaseLayout, bound: Bound, parameters, low, high):
+        n, nq = layout.phase.intervals, layout.nq
+        first = {"q": 0, "v": nq, "a": 2 * nq, "z": 3 * nq, "j": 0}[bound.on]
+        size = layout.nz if bound.on == "z" else nq
+        nodes = {"all": range(n + 1), "start": (0,), "end": (n,), "inner": range(1, n + 1)}[bound.where]
+        lo = _resolve(bound.lower, parameters, size) / layout.phase.scale(bound.on, size)
+        hi = _resolve(bound.upper, parameters, size) / layout.phase.scale(bound.on, size)
+        for k in nodes:
+            if bound.on == "j" and k == n:
+                continue
+            i = layout.jerk(k) if bound.on == "j" else layout.node(k)[first : first + size]
+            low[i], high[i] = np.maximum(low[i], lo), np.minimum(high[i], hi)
+
+    def _row_bounds(self, parameters, off):
+        rows, cache, sizes = self.assembled.rows, {}, {}
+        low, high = np.empty(len(rows)), np.empty(len(rows))
+        for row in rows:
+            key = (row.owner, row.term.name)
+            sizes[key] = max(sizes.get(key, 0), row.component + 1)
+        for i, row in enumerate(rows):
+            key = (row.owner, row.term.name)
+            if key not in cache:
+                count = sizes[key]
+                lo = _resolve(row.term.lower, parameters, count) / row.term.scale
+                hi = _resolve(row.term.upper, parameters, count) / row.term.scale
+                switched = self._is_off(row.owner, row.term.name, off)
+                cache[key] = (lo * 0 - np.inf, hi * 0 + np.inf) if switched else (lo, hi)
+            low[i], high[i] = cache[key][0][row.component], cache[key][1][row.component]
+        return low, high
+
+    def _pack(self, guess: Mapping[str, PhaseGuess]):
+        x = np.zeros(self.assembled.size)
+        for name, layout in self.assembled.layouts.items():
+            phase, g, n = layout.phase, guess[name], layout.phase.intervals
+            t = np.linspace(0, g.duration, n + 1)
+            v = np.gradient(g.q, t, axis=0) if g.v is None else g.v
+            a = np.gradient(v, t, axis=0) if g.a is None else g.a
+            z = np.zeros((n + 1, layout.nz)) if g.z is None else g.z
+            j = np.diff(a, axis=0) / (g.duration / n) / phase.scale("j", layout.nq)
+            nodes = np.concatenate([g.q, v, a, z], axis=1) / layout.node_scales()
+            constants = [g.duration, *(g.constants.get(c, 0.0) for c in phase.constants)]
+            x[layout.constants()] = np.array(constants) / layout.constant_scales()
+            for k in range(n + 1):
+                x[layout.node(k)] = nodes[k]
+            for k in range(n):
+                x[layout.jerk(k)] = j[k]
+        return x
+
+    def _unpack(self, x) -> dict[str, PhaseSolution]:
+        out = {}
+        for name, layout in self.assembled.layouts.items():
+            n, nq, phase = layout.phase.intervals, layout.nq, layout.phase
+            nodes = np.array([x[layout.node(k)] for k in range(n + 1)]) * layout.node_scales()
+            jerk = np.array([x[layout.jerk(k)] for k in range(n)]) * phase.scale("j", nq)
+            constants = x[layout.constants()] * layout.constant_scales()
+            q, v, a, z = np.split(nodes, [nq, 2 * nq, 3 * nq], axis=1)
+            duration = float(constants[0])
+            named = {c: float(value) for c, value in zip(phase.constants, constants[1:], strict=True)}
+            out[name] = PhaseSolution(np.linspace(0, duration, n + 1), q, v, a, jerk, z, duration, named)
+        return out
+
+    # solving ----------------------------------------------------------------------------------------------------
+    def solve(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], *, references: Mapping | None = None,
+              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> Solution:  # fmt: skip
+        """Solve for one target.
+
+        Parameters
+        ----------
+        parameters : name -> number or column, exactly those of the problem.
+        guess : phase name -> initial values.
+        references : phase name -> reference name -> (size, N + 1).
+        weights : term name (or "phase/name") -> weight, instead of the term's own.
+        off : names of terms and bounds to leave out.
+
+        Raises
+        ------
+        SolverError
+            If ipopt stops without an acceptable point or the re-evaluated rows contradict it; says which terms are
+            violated, where and by how much.
+        """
+        weights, references = dict(weights or {}), references or {}
+        self.problem.check_names([*weights, *off], "weight or switch")
+        p = self._parameter_vector(parameters, references, weights, off)
+        low, high = self._variable_bounds(parameters, off)
+        row_low, row_high = self._row_bounds(parameters, off)
+        x0 = np.clip(self._pack(guess), low, high)
+        began = time.perf_counter()
+        answer = self._solver(x0=x0, p=p, lbx=low, ubx=high, lbg=row_low, ubg=row_high)
+        solve_s = time.perf_counter() - began
+        stats = self._solver.stats()
+        x, g = answer["x"].full().ravel(), answer["g"].full().ravel()
+        beyond = np.maximum(np.maximum(row_low - g, g - row_high), 0.0)
+        residual = float(np.max(beyond, initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
+        status = stats["return_status"]
+        if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
+            self._fail(status, stats["iter_count"], beyond, x)
+        statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
+                                float(answer["f"]), residual)  # fmt: skip
+        return Solution(self.problem, self._unpack(x), statistics, self._cost_shares(x, p),
+                        self._constraint_report(g, row_low, row_high))  # fmt: skip
+
+    def _cost_shares(self, x, p):
+        a = self.assembled
+        parts = a.cost_parts(x, p).full().ravel()
+        weighted = parts * p[a.n_par : a.n_par + a.n_weight]
+        total = weighted.sum() or 1.0
+        return tuple(
+            dict(phase=owner, name=t.name, equation=t.equation, weight=float(w), cost=float(c), share=float(c / total))
+            for (owner, t), w, c in zip(a.cost_terms, p[a.n_par : a.n_par + a.n_weight], weighted, strict=True)
+        )
+
+    def _constraint_report(self, g, low, high):
+        best: dict[tuple, dict] = {}
+        for row, value, lo, hi in zip(self.assembled.rows, g, low, high, strict=True):
+            if row.term.name == "jerk chain" or not (np.isfinite(lo) or np.isfinite(hi)):
+                continue
+            slack, scale = min(value - lo, hi - value), row.term.scale
+            key = (row.owner, row.term.name)
+            if key not in best or slack * scale < best[key]["slack"]:
+                best[key] = dict(phase=row.owner, name=row.term.name, equation=row.term.equation, unit=row.term.unit,
+                                 kind="equality" if lo == hi else "inequality", node=row.node,
+                                 value=float(value * scale), slack=float(slack * scale))  # fmt: skip
+        return tuple(best.values())
+
+    def _fail(self, status, iterations, beyond, x):
+        worst: dict[tuple, tuple] = {}
+        phases = self._unpack(x)
+        for row, amount in zip(self.assembled.rows, np.nan_to_num(beyond, nan=np.inf), strict=True):
+            key = (row.owner, row.term.name)
+            if amount > RESIDUAL_LIMIT and amount > worst.get(key, (0,))[0]:
+                when = phases[row.owner].t[row.node] if row.owner in phases else None
+                worst[key] = (amount, amount * row.term.scale, row.term.unit, row.node, when)
+        ranked = sorted(worst.items(), key=lambda kv: -kv[1][0])
+        lines = tuple(
+            f"{owner}/{name}: off by {amount:.3g} {unit} at node {node}" + (f" (t = {when:.3f} s)" if when is not None else "")
+            for (owner, name), (_, amount, unit, node, when) in ranked[:5]
+        )
+        reason = "; ".join(lines) or "all constraints are met but the cost did not converge"
+        raise SolverError(f"{self.problem.name}: ipopt stopped with {status} after {iterations} iterations; {reason}",
+                          stage=self.problem.name, status=status, violations=lines)  # fmt: skip

@@ -1,0 +1,190 @@
+"""Words for optimisation problems: named terms, phases, problems. Pure data; nothing here solves.
+
+A problem is a sequence of phases. In each phase every coordinate is a chain position, rate, acceleration, driven by a
+piecewise constant jerk (the paper's states and controls, Sec. III-A and V-A), so the motion between nodes is known
+exactly. Costs and constraints are :class:`Term` objects that a notebook can list, reweight and switch off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+
+from jumplab.errors import InputError
+
+PLACES = ("node", "mid", "interval", "start", "end", "problem")
+
+
+@dataclass
+class Point:
+    """What a term sees: one instant of one phase, in physical units.
+
+    Attributes
+    ----------
+    q, v, a, j : (nq,) coordinate, rate, acceleration and jerk (jerk only at "mid" and "interval" points).
+    z : (nz,) further states of the phase.
+    duration : of the phase [s];  s : elapsed share of the phase, 0 to 1;  c : the phase's further constants by name.
+    p : the problem's parameters by name;  ref : this node's references by name.
+    memo : scratch space, so that several terms can share one model evaluation.
+    """
+
+    q: ca.SX
+    v: ca.SX
+    a: ca.SX
+    j: ca.SX
+    z: ca.SX
+    duration: ca.SX
+    s: ca.SX
+    c: SimpleNamespace
+    p: SimpleNamespace
+    ref: SimpleNamespace
+    memo: dict = field(default_factory=dict)
+
+    @property
+    def time(self):
+        """Time since the phase began [s]."""
+        return self.s * self.duration
+
+
+@dataclass(frozen=True)
+class Term:
+    """One named cost or constraint.
+
+    Attributes
+    ----------
+    name : unique in its phase.
+    equation : where it comes from: an id of the paper's equations, or "ours" with the reason.
+    unit : of the expression.
+    at : "node" (all nodes), "mid" (middle of every interval), "interval" (called with left, right, step), "start",
+        "end", or "problem" (called with a dict of phase name -> namespace(start, end)).
+    expression : function of a :class:`Point` that returns a column.
+    weight : cost if set, [1/unit^2] ("node", "mid": integrated over time, so also [1/s]); constraint if None.
+    lower, upper : bounds of a constraint; numbers, columns, or functions of the parameter dict, read when solving.
+    scale : nominal size of a constraint's expression, for conditioning only.
+    skip : how many nodes to leave out at the start and at the end of the phase.
+    """
+
+    name: str
+    equation: str
+    unit: str
+    at: str
+    expression: Callable
+    weight: float | None = None
+    lower: object = 0.0
+    upper: object = 0.0
+    scale: float = 1.0
+    skip: tuple[int, int] = (0, 0)
+
+    def __post_init__(self):
+        if self.at not in PLACES:
+            raise InputError(f"term {self.name!r}: at = {self.at!r}, must be one of {', '.join(PLACES)}")
+
+    @property
+    def is_cost(self) -> bool:
+        """True for a cost, False for a constraint."""
+        return self.weight is not None
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Box bound on the variables of a phase: ``on`` is "q", "v", "a", "j" or "z"; values as in :class:`Term`.
+
+    ``where`` is "all", "start", "end" or "inner" (all but the first node).
+    """
+
+    name: str
+    equation: str
+    unit: str
+    on: str
+    lower: object
+    upper: object
+    where: str = "all"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One phase: coordinates with jerk chains, a duration, further states and constants, terms and bounds.
+
+    Attributes
+    ----------
+    coordinates : names of the chain coordinates.
+    intervals : number of equal steps.
+    duration : (lower, upper) [s]; numbers or functions of the parameter dict.
+    states : names of further node variables, tied by "interval" terms.
+    constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration.
+    references : name -> size, data given per node when solving.
+    scales : nominal sizes of q, v, a, j and z, for conditioning.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    intervals: int
+    duration: tuple
+    terms: tuple[Term, ...]
+    bounds: tuple[Bound, ...] = ()
+    states: tuple[str, ...] = ()
+    constants: dict = field(default_factory=dict)
+    references: dict = field(default_factory=dict)
+    scales: dict = field(default_factory=dict)
+
+    def scale(self, key: str, size: int) -> np.ndarray:
+        """(size,) nominal sizes of the variables ``key``."""
+        return np.broadcast_to(np.asarray(self.scales.get(key, 1.0), float), (size,))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Phases, the terms that join them, and the names and sizes of the parameters."""
+
+    name: str
+    phases: tuple[Phase, ...]
+    joints: tuple[Term, ...] = ()
+    parameters: dict = field(default_factory=dict)
+
+    def terms(self) -> list[tuple[str, Term]]:
+        """(phase name, term) of every term, in order; joining terms carry the problem's name."""
+        return [(p.name, t) for p in self.phases for t in p.terms] + [(self.name, t) for t in self.joints]
+
+    def term_names(self) -> set[str]:
+        """Names by which terms and bounds can be switched or reweighted: "name" or "phase/name"."""
+        pairs = [(owner, t.name) for owner, t in self.terms()]
+        pairs += [(p.name, b.name) for p in self.phases for b in p.bounds]
+        return {name for _, name in pairs} | {f"{owner}/{name}" for owner, name in pairs}
+
+    def check_names(self, names, what: str) -> None:
+        """Raise :class:`InputError` if a name is not a term or bound of this problem."""
+        known = self.term_names()
+        for name in names:
+            if name not in known:
+                listed = ", ".join(sorted(n for n in known if "/" not in n))
+                raise InputError(f"{what} {name!r}: the problem {self.name!r} has no such term; it has {listed}")
+
+    def with_terms(self, phase: str, *extra: Term) -> Problem:
+        """A copy with further terms in one phase (for experiments in a notebook)."""
+        phases = tuple(replace(p, terms=p.terms + extra) if p.name == phase else p for p in self.phases)
+        return replace(self, phases=phases)
+
+    def table(self) -> list[dict]:
+        """One row per term and bound: phase, name, kind, at, unit, equation, weight or bounds."""
+        rows = []
+        for owner, t in self.terms():
+            kind = "cost" if t.is_cost else "constraint"
+            size = f"weight {t.weight:g}" if t.is_cost else f"{_text(t.lower)} ... {_text(t.upper)}"
+            rows.append(dict(phase=owner, name=t.name, kind=kind, at=t.at, unit=t.unit, equation=t.equation, value=size))
+        for p in self.phases:
+            for b in p.bounds:
+                size = f"{_text(b.lower)} ... {_text(b.upper)}"
+                rows.append(dict(phase=p.name, name=b.name, kind="bound", at=f"{b.on} {b.where}", unit=b.unit,
+                                 equation=b.equation, value=size))  # fmt: skip
+        return rows
+
+
+def _text(bound) -> str:
+    if callable(bound):
+        return "from the target"
+    values = np.atleast_1d(np.asarray(bound, float))
+    return f"{values[0]:g}" if np.all(values == values[0]) else "[" + " ".join(f"{x:g}" for x in values) + "]"

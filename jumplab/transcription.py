@@ -1,0 +1,320 @@
+"""From a :class:`~jumplab.terms.Problem` to a sparse NLP with exact derivatives.
+
+Every term depends on few variables: one node, one interval, or the ends of phases. The NLP is therefore assembled from
+small CasADi functions, differentiated once and evaluated for all nodes at a time; the sparse gradient, Jacobian and
+Hessian are gathered from theirs. Building takes a fraction of a second, needs no compiler, and the functions can be
+shared by all targets, weights and switches, which are parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+
+from jumplab.terms import Phase, Point, Problem, Term
+
+
+def chain(q, v, a, j, h):
+    """Exact triple-integrator step of length ``h`` under constant jerk: new (q, v, a)."""
+    return q + h * v + h * h / 2 * a + h**3 / 6 * j, v + h * a + h * h / 2 * j, a + h * j
+
+
+@dataclass(frozen=True)
+class PhaseLayout:
+    """Where the variables of one phase stand in the decision vector."""
+
+    phase: Phase
+    first: int  # index of the duration
+
+    @property
+    def nq(self) -> int:
+        return len(self.phase.coordinates)
+
+    @property
+    def nz(self) -> int:
+        return len(self.phase.states)
+
+    @property
+    def n_const(self) -> int:
+        return 1 + len(self.phase.constants)
+
+    @property
+    def stride(self) -> int:
+        return 4 * self.nq + self.nz  # state, further states, jerk
+
+    @property
+    def size(self) -> int:
+        return self.n_const + self.phase.intervals * self.stride + 3 * self.nq + self.nz
+
+    def constants(self) -> np.ndarray:
+        return self.first + np.arange(self.n_const)
+
+    def node(self, k: int) -> np.ndarray:
+        return self.first + self.n_const + k * self.stride + np.arange(3 * self.nq + self.nz)
+
+    def jerk(self, k: int) -> np.ndarray:
+        return self.first + self.n_const + k * self.stride + 3 * self.nq + self.nz + np.arange(self.nq)
+
+    def node_scales(self) -> np.ndarray:
+        p = self.phase
+        return np.concatenate([p.scale(k, self.nq) for k in "qva"] + [p.scale("z", self.nz)])
+
+    def constant_scales(self) -> np.ndarray:
+        return np.array([1.0, *(c[2] for c in self.phase.constants.values())])
+
+
+@dataclass(frozen=True)
+class Row:
+    """Which term, phase, node and component a constraint row belongs to."""
+
+    owner: str
+    term: Term
+    node: int
+    component: int
+
+
+class Element:
+    """One small function, repeated: its terms, its variables in each repetition, its data columns."""
+
+    def __init__(self, local, data, outputs, terms, index, data_columns, owner, nodes):
+        self.local, self.data, self.index, self.data_columns = local, data, index, data_columns  # index (n, ny)
+        self.owner, self.nodes = owner, nodes
+        self.costs = [(t, e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]
+        self.constraints = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
+
+
+def _columns(expression):
+    return ca.vertcat(*expression) if isinstance(expression, (list, tuple)) else ca.SX(expression)
+
+
+class ElementBuilder:
+    """Makes the symbolic points of each phase and evaluates the terms on them."""
+
+    def __init__(self, problem: Problem, layouts: dict[str, PhaseLayout]):
+        self.problem, self.layouts = problem, layouts
+        self.parameters = SimpleNamespace()
+        symbols = []
+        for name, size in problem.parameters.items():
+            symbol = ca.SX.sym(name, size)
+            setattr(self.parameters, name, symbol)
+            symbols.append(symbol)
+        self.parameter_vector = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+        self.elements = [e for layout in layouts.values() for e in self._phase(layout)]
+        if problem.joints:
+            self.elements.append(self._joints())
+
+    def _point(self, layout, state, jerk, constants, s, refs):
+        nq, phase = layout.nq, layout.phase
+        x = ca.DM(layout.node_scales()) * state
+        const = ca.DM(layout.constant_scales()) * constants
+        names = SimpleNamespace(**{n: const[1 + i] for i, n in enumerate(phase.constants)})
+        ref, at = SimpleNamespace(), 0
+        for name, size in phase.references.items():
+            setattr(ref, name, refs[at : at + size])
+            at += size
+        j = jerk * ca.DM(phase.scale("j", nq)) if jerk is not None else None
+        return Point(x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], j, x[3 * nq :], const[0], s, names, self.parameters, ref)
+
+    def _phase(self, layout):
+        phase, n = layout.phase, layout.phase.intervals
+        nx, nref = 3 * layout.nq + layout.nz, sum(layout.phase.references.values())
+        constants, refs, s = ca.SX.sym("const", layout.n_const), ca.SX.sym("ref", nref), ca.SX.sym("s")
+        state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
+        step = constants[0] / n
+        node_index = [np.concatenate([layout.constants(), layout.node(k)]) for k in range(n + 1)]
+        data = ca.vertcat(s, refs)
+        at_node = self._point(layout, state, None, constants, s, refs)
+        for place, nodes in (("node", range(n + 1)), ("start", (0,)), ("end", (n,))):
+            terms = [t for t in phase.terms if t.at == place]
+            if terms:
+                out = [self._weighted(t, _columns(t.expression(at_node)), step if place == "node" else 1.0) for t in terms]
+                index = np.array([node_index[k] for k in nodes])
+                yield Element(ca.vertcat(constants, state), data, out, terms, index, list(nodes), phase.name, list(nodes))
+        left = self._point(layout, state, jerk, constants, s, refs)
+        after = self._point(layout, right, None, constants, s + 1 / n, refs)
+        q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
+        mid = Point(q, v, a, left.j, left.z, left.duration, s + 0.5 / n, left.c, left.p, left.ref)
+        terms, out = [_defect_term()], [_defect(layout, left, after, step)]
+        for t in phase.terms:
+            if t.at == "mid":
+                terms.append(t)
+                out.append(self._weighted(t, _columns(t.expression(mid)), step))
+            elif t.at == "interval":
+                terms.append(t)
+                out.append(self._weighted(t, _columns(t.expression(left, after, step)), 1.0))
+        index = np.array([np.concatenate([node_index[k], layout.jerk(k), layout.node(k + 1)]) for k in range(n)])
+        local = ca.vertcat(constants, state, jerk, right)
+        yield Element(local, data, out, terms, index, list(range(n)), phase.name, list(range(n)))
+
+    def _joints(self):
+        ends, symbols, index = {}, [], []
+        for name, layout in self.layouts.items():
+            nx = 3 * layout.nq + layout.nz
+            constants, first, last = ca.SX.sym("const", layout.n_const), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
+            refs = ca.SX.zeros(sum(layout.phase.references.values()))
+            ends[name] = SimpleNamespace(
+                start=self._point(layout, first, None, constants, 0.0, refs),
+                end=self._point(layout, last, None, constants, 1.0, refs),
+            )
+            symbols += [constants, first, last]
+            index += [layout.constants(), layout.node(0), layout.node(layout.phase.intervals)]
+        terms = list(self.problem.joints)
+        out = [self._weighted(t, _columns(t.expression(ends)), 1.0) for t in terms]
+        return Element(ca.vertcat(*symbols), ca.SX(0, 1), out, terms, np.concatenate(index)[None], None,
+                       self.problem.name, [0])  # fmt: skip
+
+    @staticmethod
+    def _weighted(term, expression, step):
+        return step * ca.sumsqr(expression) if term.is_cost else expression / term.scale
+
+
+def _defect_term() -> Term:
+    return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None)
+
+
+def _defect(layout, left, right, step):
+    q, v, a = chain(left.q, left.v, left.a, left.j, step)
+    p, nq = layout.phase, layout.nq
+    return ca.vertcat((right.q - q) / p.scale("q", nq), (right.v - v) / p.scale("v", nq), (right.a - a) / p.scale("a", nq))
+
+
+class Assembled:
+    """The NLP's sparse functions of (x, p), gathered from the elements."""
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.layouts, at = {}, 0
+        for phase in problem.phases:
+            self.layouts[phase.name] = PhaseLayout(phase, at)
+            at += self.layouts[phase.name].size
+        self.size = at
+        builder = ElementBuilder(problem, self.layouts)
+        self.n_par = builder.parameter_vector.numel()
+        self.cost_terms: list[tuple[str, Term]] = []
+        for e in builder.elements:
+            for term, _ in e.costs:
+                self.cost_terms.append((e.owner, term))
+        self.n_weight = len(self.cost_terms)
+        # p = [parameters; weights; per phase: references (rows) x nodes, column major, preceded by s]
+        self.data_first, at = {}, self.n_par + self.n_weight
+        for name, layout in self.layouts.items():
+            rows = 1 + sum(layout.phase.references.values())
+            self.data_first[name] = (at, rows)
+            at += rows * (layout.phase.intervals + 1)
+        self.p_size = at
+        self.rows: list[Row] = []
+        self._assemble(builder)
+
+    def _assemble(self, builder):
+        x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", self.p_size)
+        lam_f, n_rows = ca.MX.sym("lam_f"), 0
+        cost, values, grad, jac, hess = 0, [], 0, [], []
+        cost_parts, jac_ij, hess_ij, lam_users, weight_at = [], [], [], [], 0
+        for e in builder.elements:
+            n, ny = e.index.shape
+            w = ca.SX.sym("w", len(e.costs))
+            y, d, par = e.local, e.data, builder.parameter_vector
+            total = ca.dot(w, ca.vertcat(*(c for _, c in e.costs))) if e.costs else ca.SX(0)
+            g = ca.vertcat(*(c for _, c in e.constraints)) if e.constraints else ca.SX(0, 1)
+            keep = self._add_rows(e)
+            inputs = [x[e.index.ravel().tolist()].reshape((ny, n)), self._data(p, e), self._repeat(p[: self.n_par], n)]
+            weights = p[self.n_par + weight_at : self.n_par + weight_at + len(e.costs)]
+            weight_at += len(e.costs)
+            one = {"cse": True}
+            parts = ca.vertcat(*(c for _, c in e.costs)) if e.costs else ca.SX(0, 1)
+            f_val = ca.Function("value", [y, d, par], [parts, g], one)
+            part_val, g_val = f_val.map(n)(*inputs)
+            if e.costs:
+                cost += ca.dot(weights, ca.sum2(part_val))
+                cost_parts.append(ca.sum2(part_val))
+                f_grad = ca.Function("gradient", [y, d, par, w], [ca.gradient(total, y)], one)
+                local = ca.vec(f_grad.map(n)(*inputs, self._repeat(weights, n)))
+                grad += _scatter(e.index.ravel(), self.size) @ local
+            lam = None
+            if e.constraints:
+                values.append(ca.vec(g_val)[keep.tolist()])
+                j = ca.jacobian(g, y)
+                rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
+                f_jac = ca.Function("jacobian", [y, d, par], [ca.vertcat(*j.nonzeros())], one)
+                row_of = np.full(g.numel() * n, -1)
+                row_of[keep] = n_rows + np.arange(len(keep))
+                i = row_of[(np.arange(n)[:, None] * g.numel() + rows[None]).ravel()]
+                used = i >= 0
+                jac.append(ca.vec(f_jac.map(n)(*inputs))[np.flatnonzero(used).tolist()])
+                jac_ij.append((i[used], e.index[:, cols].ravel()[used]))
+                lam_users.append((e, g, keep, n_rows))
+                n_rows += len(keep)
+                lam = ca.SX.sym("lam", g.numel())
+            lagrangian = ca.SX.sym("lam_f") if e.costs else None
+            scalar = (lagrangian * total if e.costs else 0) + (ca.dot(lam, g) if lam is not None else 0)
+            h = ca.triu(ca.hessian(scalar, y)[0])
+            rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
+            if len(rows):
+                args = [y, d, par, w, lam if lam is not None else ca.SX(0, 1), lagrangian if e.costs else ca.SX.sym("unused")]
+                f_hess = ca.Function("hessian", args, [ca.vertcat(*h.nonzeros())], one)
+                hess.append((f_hess, inputs, weights, e, g, keep, n_rows - len(keep), n))
+                gi, gj = e.index[:, rows].ravel(), e.index[:, cols].ravel()
+                hess_ij.append((np.minimum(gi, gj), np.maximum(gi, gj)))
+        g_all = ca.vertcat(*values)
+        lam_g = ca.MX.sym("lam_g", n_rows)
+        self.n_rows = n_rows
+        jac_m = _gather(jac, jac_ij, (n_rows, self.size))
+        locals_ = []
+        for f_hess, inputs, weights, _, g, keep, first, n in hess:
+            lam = _scatter(keep, g.numel() * n) @ lam_g[first : first + len(keep)] if len(keep) else ca.MX(0, 1)
+            lam = ca.reshape(lam, g.numel(), n) if len(keep) else ca.MX(0, n)
+            locals_.append(ca.vec(f_hess.map(n)(*inputs, self._repeat(weights, n), lam, self._repeat(lam_f, n))))
+        hess_m = _gather(locals_, hess_ij, (self.size, self.size))
+        self.nlp = ca.Function("nlp", [x, p], [cost, g_all], ["x", "p"], ["f", "g"])
+        self.grad_f = ca.Function("nlp_grad_f", [x, p], [cost, grad], ["x", "p"], ["f", "grad_f_x"])
+        self.jac_g = ca.Function("nlp_jac_g", [x, p], [g_all, jac_m], ["x", "p"], ["g", "jac_g_x"])
+        self.hess_lag = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess_m], ["x", "p", "lam_f", "lam_g"],
+                                    ["triu_hess_gamma_x_x"])  # fmt: skip
+        self.cost_parts = ca.Function("cost_parts", [x, p], [ca.vertcat(*cost_parts)])
+
+    def _add_rows(self, e) -> np.ndarray:
+        """Record the constraint rows of an element; return which of its local rows are kept."""
+        keep, size = [], sum(c.numel() for _, c in e.constraints)
+        for r, k in enumerate(e.nodes):
+            at = 0
+            for term, expression in e.constraints:
+                inside = len(e.nodes) == 1 or term.skip[0] <= r < len(e.nodes) - term.skip[1]
+                for i in range(expression.numel()):
+                    if inside:
+                        keep.append(r * size + at)
+                        self.rows.append(Row(e.owner, term, k, i))
+                    at += 1
+        return np.array(keep, int)
+
+    def _data(self, p, e):
+        if e.data_columns is None:
+            return ca.MX(0, len(e.nodes))
+        first, rows = self.data_first[e.owner]
+        index = np.concatenate([first + k * rows + np.arange(rows) for k in e.data_columns])
+        return ca.reshape(p[index.tolist()], rows, len(e.data_columns))
+
+    @staticmethod
+    def _repeat(column, n):
+        return ca.repmat(column, 1, n)
+
+
+def _scatter(index, size) -> ca.DM:
+    """0/1 matrix that adds entry i of a vector to position index[i]."""
+    index = np.asarray(index, int)
+    return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
+
+
+def _gather(pieces, ij, shape):
+    """Sparse MX matrix whose entries are sums of the local nonzeros at the given rows and columns."""
+    rows, cols = (np.concatenate([pair[k] for pair in ij]) for k in (0, 1))
+    key = cols.astype(np.int64) * shape[0] + rows
+    unique, inverse = np.unique(key, return_inverse=True)
+    pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
+    values = ca.vertcat(*pieces)
+    if len(unique) == len(key):
+        order = np.argsort(key)
+        return ca.MX(pattern, values[order.tolist()])
+    return ca.MX(pattern, _scatter(inverse, len(unique)) @ values)
