@@ -21,6 +21,7 @@ IPOPT = {
     "acceptable_tol": 1e-4,
     "acceptable_constr_viol_tol": 1e-5,
     "max_iter": 300,
+    "max_wall_time": 60.0,  # [s]; a solve that needs longer is lost, not slow
     "mu_strategy": "adaptive",
     "nlp_scaling_method": "none",  # the terms carry their scales
     "print_level": 0,

@@ -1,82 +1,23 @@
-"""Stage 3: whole-body launch and flight of the five-link robot (Sec. V of the paper), and the direct planner.
-
-One nonlinear program over three phases: flat foot, toe (heel up), flight. Coordinates are the absolute angles of foot,
-shank, thigh, trunk and arm, rooted at the toe: in launch the toe is the origin, so contact needs no equation; in flight
-the CoM is the parabola and the toe follows from it, so only dL/dt = 0 remains. Term names carry the paper's equations;
-what the paper leaves out is marked "ours".
-"""
+"""The named costs and constraints of stage 3, as functions of one instant; pure, nothing here solves."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from jumplab.models.planar import PlanarState
 from jumplab.robot import Robot
-from jumplab.terms import Bound, Phase, Point, Problem, Term
-
-LINKS = ("foot", "shank", "thigh", "trunk", "arm")
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a plan may use of the robot and the ground; all our choice, since the paper prints no bound."""
-
-    torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
-    speed_share: float = 0.90  # of the speed limit
-    friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
-    cop_margin_m: float = 0.01  # inside the sole's edges while the foot is flat
-    range_margin_rad: float = 0.03  # to the joint stops
-    hand_clearance_m: float = 0.05  # above the ground in launch
-    clearance_m: float = 0.03  # of toe and heel over the ground in mid-flight
-    heel_up_rad: float = 0.9  # foot pitch at most during toe-off
-    flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
-    toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
-    touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
-    touchdown_trunk_rate: float = 1.0  # [rad/s]
-    touchdown_knee: tuple[float, float] = (0.7, 1.4)  # [rad]: stroke left to absorb the fall
-    touchdown_trunk: tuple[float, float] = (0.0, 0.30)  # [rad]
-    capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
-    capture_slope_s: float = 0.13
-    capture_window_m: tuple[float, float] = (-0.02, 0.02)
+from jumplab.task import GRAVITY
+from jumplab.terms import Point, Term
+from jumplab.whole_body.settings import Limits, Weights
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Cost weights, integrated over time; all our choice. Units: [1] / [unit of the term]^2 / [s]."""
-
-    joint_acceleration: float = 4e-3  # [1] / [rad/s^2]^2 / [s]
-    jerk: float = 4e-7  # [1] / [rad/s^3]^2 / [s]
-    torque: float = 1e-4  # [1] / [N m]^2 / [s]
-    track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
-    track_inertia: float = 2.0  # [1] / [kg m^2]^2 / [s]
-    track_inertia_rate: float = 0.02  # [1] / [kg m^2/s]^2 / [s]
-    track_momentum: float = 2.0  # [1] / [kg m^2/s]^2 / [s]
-    heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
-    ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
-    track_duration: float = 50.0  # [1] / [s]^2
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Intervals per phase."""
-
-    flat: int = 25
-    toe: int = 20
-    flight: int = 30
-
-
-SCALES = {"q": 1.0, "v": 10.0, "a": 100.0, "j": 2000.0}
-
-
-class _Builder:
+class WholeBodyTerms:
     """Expressions shared by the terms; pure, no numbers but the robot's and the limits'."""
 
     def __init__(self, robot: Robot, limits: Limits, weights: Weights):
         self.model, self.limits, self.weights = robot.sagittal, limits, weights
-        self.mg = self.model.total_mass * 9.8
+        self.mg = self.model.total_mass * GRAVITY
 
     # model on a point -------------------------------------------------------------------------------------------
     def state(self, p: Point) -> PlanarState:
@@ -113,8 +54,8 @@ class _Builder:
         return self.ballistic_com(p) - self.state(p).com
 
     def ground(self, p: Point, x):
-        """Height of the surface below x: a step of the platform's height at the edge, smoothed over 3 cm."""
-        return p.p.platform * (1 + ca.tanh((x - p.p.edge) / 0.015)) / 2
+        """Height of the surface below x: a step of the platform's height at the edge, smoothed."""
+        return p.p.platform * (1 + ca.tanh((x - p.p.edge) / self.limits.edge_smoothing_m)) / 2
 
     # terms ------------------------------------------------------------------------------------------------------
     def limits_of_joints(self, flying: bool) -> list[Term]:
@@ -173,10 +114,18 @@ class _Builder:
                      scale=mg, skip=last),
                 Term(f"friction{suffix}", "ours", "N", at, cone, lower=0.0, upper=np.inf, scale=mg, skip=last),
             ]  # fmt: skip
-        hand = self.limits.hand_clearance_m
-        rows.append(Term("hand clearance", "ours", "m", "node", lambda p: self.state(p).point("hand")[1], lower=hand,
-                         upper=np.inf, scale=0.1))  # fmt: skip
-        return rows
+        return [*rows, self.body_clearance(False)]
+
+    def body_clearance(self, flying: bool) -> Term:
+        """Hand, mid-arm and knee stay away from the ground and from the platform's edge."""
+        lim = self.limits
+
+        def heights(p):
+            toe = self.toe(p) if flying else ca.SX.zeros(2)
+            points = [toe + self.state(p).point(name) for name in ("hand", "mid-arm", "knee")]
+            return ca.vertcat(*(x[1] - self.ground(p, x[0] + lim.edge_clearance_m) for x in points))
+
+        return Term("body clearance", "ours", "m", "node", heights, lower=lim.hand_clearance_m, upper=np.inf, scale=0.1)
 
     def flat_rows(self) -> list[Term]:
         heel, margin, mg = self.model.heel[0], self.limits.cop_margin_m, self.mg
@@ -204,6 +153,41 @@ class _Builder:
                  lambda p: self.state(p).com_velocity[1] - p.p.takeoff_speed),
         ]  # fmt: skip
 
+    def tracking(self, flying: bool) -> list[Term]:
+        """Stage 1's trajectories as references, at the same share of each phase (WL-J1, WL-J3, WF-J1, WF-J2)."""
+        w = self.weights
+        rows = [
+            Term("track inertia", "WF-J1" if flying else "WL-J1", "kg m^2", "node",
+                 lambda p: self.state(p).inertia - p.ref.rho, weight=w.track_inertia),
+            Term("track inertia rate", "WF-J1" if flying else "WL-J1", "kg m^2/s", "node",
+                 lambda p: self.state(p).inertia_rate - p.ref.rho_rate, weight=w.track_inertia_rate),
+        ]  # fmt: skip
+        if flying:
+            rows.append(Term("ankle rate", "WF-J2", "rad/s", "node", lambda p: self.state(p).joint_rates[2],
+                             weight=w.ankle_rate))  # fmt: skip
+        else:
+            rows += [
+                Term("track velocity", "WL-J1", "m/s", "node", lambda p: self.state(p).com_velocity - p.ref.velocity,
+                     weight=w.track_velocity),
+                Term("track momentum", "WL-D1, as a cost on L", "kg m^2/s", "node",
+                     lambda p: self.state(p).angular_momentum - p.ref.L, weight=w.track_momentum),
+            ]  # fmt: skip
+        return rows
+
+    def toe_tracking(self) -> list[Term]:
+        w, lim = self.weights, self.limits
+
+        def momentum(p):
+            slack = ca.fmax(lim.momentum_share * ca.fabs(p.p.momentum), lim.momentum_slack)
+            difference = self.state(p).angular_momentum - p.p.momentum
+            return ca.vertcat(slack - difference, slack + difference)
+
+        return self.tracking(False) + [
+            Term("heel velocity", "WL-J3", "m/s", "node", lambda p: self.state(p).point("heel", 1)[1],
+                 weight=w.heel_velocity),
+            Term("L at take-off", "WL-D1", "kg m^2/s", "end", momentum, lower=0.0, upper=np.inf),
+        ]  # fmt: skip
+
     def flight_rows(self) -> list[Term]:
         lim, model = self.limits, self.model
 
@@ -213,7 +197,7 @@ class _Builder:
         def clearance(p):
             toe, shape = self.toe(p), (4 * p.s * (1 - p.s)) ** 3
             rows = []
-            for share in (0.0, 0.5, 1.0):
+            for share in (0.0, 0.25, 0.5, 0.75, 1.0):
                 point = toe + self.state(p).point(model.point_arms(0, share * model.heel))
                 rows.append(point[1] - self.ground(p, point[0]) - lim.clearance_m * shape)
             return ca.vertcat(*rows)
@@ -223,7 +207,7 @@ class _Builder:
             Term("angular momentum (mid)", "WF-D1", "N m", "mid", l_rate, scale=20.0),
             Term("sole clearance", "ours", "m", "node", clearance, lower=0.0, upper=np.inf, scale=0.1, skip=(1, 1)),
         ]
-        return rows + self.touchdown_rows()
+        return [*rows, self.body_clearance(True), *self.touchdown_rows()]
 
     def touchdown_rows(self) -> list[Term]:
         lim, model = self.limits, self.model
@@ -249,46 +233,3 @@ class _Builder:
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
                  upper=lim.capture_window_m[1], scale=0.1),
         ]  # fmt: skip
-
-
-def _continuity(left: str, right: str) -> Term:
-    def jump(ends):
-        a, b = ends[left].end, ends[right].start
-        rows = []
-        for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 10.0), (a.a, b.a, 100.0)):
-            if x.numel() == 4:
-                x = ca.vertcat(0, x)
-            rows.append((x - y) / scale)
-        return ca.vertcat(*rows)
-
-    return Term(f"{left} to {right}", "WF-L1..L3", "scaled", "problem", jump)
-
-
-def build_problem(robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights()) -> Problem:
-    """The direct whole-body problem: flat foot, toe, flight, in one NLP."""
-    b = _Builder(robot, limits, weights)
-
-    def takeoff(ends):
-        end, c = ends["toe"].end, ends["flight"].start.c
-        s = b.state(end)
-        return ca.vertcat(s.com[0] - c.com_x, s.com[1] - c.com_z, s.com_velocity[0] - c.vel_x, s.com_velocity[1] - c.vel_z)
-
-    stance = lambda p: p["stance"][1:]  # noqa: E731
-    angle_box = Bound("link angles", "ours: box", "rad", "q", -8.0, 8.0)
-    flat = Phase("flat", LINKS[1:], mesh.flat, limits.flat_s,
-                 tuple(b.smoothness(False) + b.limits_of_joints(False) + b.ground_contact() + b.flat_rows()),
-                 (Bound("stance", "ours: reading of the start", "rad", "q", stance, stance, "start"),
-                  Bound("at rest", "ours", "rad/s", "v", 0.0, 0.0, "start"),
-                  Bound("at rest (acceleration)", "ours", "rad/s^2", "a", 0.0, 0.0, "start")), scales=SCALES)  # fmt: skip
-    heel_up = Bound("heel not below ground", "WL-K2", "rad", "q", [0.0, -8, -8, -8, -8], [limits.heel_up_rad, 8, 8, 8, 8])
-    toe = Phase("toe", LINKS, mesh.toe, limits.toe_s,
-                tuple(b.smoothness(False) + b.limits_of_joints(False) + b.ground_contact() + b.toe_rows()),
-                (heel_up,), scales=SCALES)  # fmt: skip
-    constants = {"com_x": (-1.0, 1.0, 1.0), "com_z": (0.0, 2.0, 1.0), "vel_x": (-5.0, 5.0, 1.0), "vel_z": (0.0, 6.0, 1.0)}
-    flight = Phase("flight", LINKS, mesh.flight, (0.05, 1.5),
-                   tuple(b.smoothness(True) + b.limits_of_joints(True) + b.flight_rows()), (angle_box,),
-                   constants=constants, scales=SCALES)  # fmt: skip
-    joints = (_continuity("flat", "toe"), _continuity("toe", "flight"),
-              Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff))  # fmt: skip
-    parameters = dict(stance=5, distance=1, platform=1, edge=1, takeoff_speed=1, rotation=1, gravity=1)
-    return Problem("whole body", (flat, toe, flight), joints, parameters)

@@ -1,0 +1,113 @@
+"""Stage 1's model: the static reaction mass pendulum (Sec. II-A of the paper).
+
+A massless rod of length phi leans by theta_l from a pivot fixed on the ground and carries a barbell of two masses m/2 at
+distance varphi from the CoM, turned by theta_pl against the rod. Words here: ``lean`` (theta_l), ``length`` (phi),
+``turn`` (theta_pl), ``radius`` (varphi). Angles positive about +y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+
+from jumplab.task import GRAVITY
+
+COORDINATES = ("lean", "length", "turn", "radius")  # theta_l [rad], phi [m], theta_pl [rad], varphi [m]
+
+
+@dataclass(frozen=True)
+class SrmpState:
+    """SRMP quantities at one instant as CasADi expressions; q, v, a are (4,) in the order of :data:`COORDINATES`."""
+
+    mass: float
+    q: ca.SX
+    v: ca.SX
+    a: ca.SX
+    gravity: float = GRAVITY
+
+    @property
+    def com(self):
+        """CoM from the pivot [m] (2,)."""
+        return self.q[1] * ca.vertcat(ca.sin(self.q[0]), ca.cos(self.q[0]))
+
+    @cached_property
+    def _polar(self):
+        sin, cos = ca.sin(self.q[0]), ca.cos(self.q[0])
+        return ca.vertcat(sin, cos), ca.vertcat(cos, -sin)  # along the rod, across it
+
+    @property
+    def com_velocity(self):
+        """CoM velocity [m/s] (2,)."""
+        along, across = self._polar
+        return self.v[1] * along + self.q[1] * self.v[0] * across
+
+    @property
+    def com_acceleration(self):
+        """CoM acceleration [m/s^2] (2,)."""
+        along, across = self._polar
+        w = self.v[0]
+        return (self.a[1] - self.q[1] * w**2) * along + (self.q[1] * self.a[0] + 2 * self.v[1] * w) * across
+
+    @property
+    def inertia(self):
+        """rho = 2 m_p varphi^2 [kg m^2] (Eq. 4)."""
+        return self.mass * self.q[3] ** 2
+
+    @property
+    def inertia_rate(self):
+        """d rho / dt [kg m^2/s]."""
+        return 2 * self.mass * self.q[3] * self.v[3]
+
+    @property
+    def inertia_accel(self):
+        """d^2 rho / dt^2 [kg m^2/s^2]."""
+        return 2 * self.mass * (self.v[3] ** 2 + self.q[3] * self.a[3])
+
+    @property
+    def angular_momentum(self):
+        """L = 2 m_p varphi^2 (omega_l + omega_pl) [kg m^2/s]."""
+        return self.inertia * (self.v[0] + self.v[2])
+
+    @property
+    def angular_momentum_rate(self):
+        """dL/dt, which is also the torque tau_pl on the barbell [N m]."""
+        return self.inertia * (self.a[0] + self.a[2]) + self.inertia_rate * (self.v[0] + self.v[2])
+
+    @property
+    def ground_force(self):
+        """F_x, F_z on the robot [N] (2,)."""
+        acc = self.com_acceleration
+        return self.mass * ca.vertcat(acc[0], acc[1] + self.gravity)
+
+    @property
+    def pivot_torque(self):
+        """tau_l, the ground's moment about the pivot [N m]; equals -X_CoP F_z."""
+        f, c = self.ground_force, self.com
+        return self.angular_momentum_rate + c[1] * f[0] - c[0] * f[1]
+
+    @property
+    def rod_force(self):
+        """F_phi = m (phi'' - phi omega^2 + g cos theta) [N]; the paper's undefined F_l."""
+        return self.mass * (self.a[1] - self.q[1] * self.v[0] ** 2 + self.gravity * ca.cos(self.q[0]))
+
+    @property
+    def barbell_force(self):
+        """F_varphi = m (varphi'' - varphi (omega_l + omega_pl)^2) [N]."""
+        return self.mass * (self.a[3] - self.q[3] * (self.v[0] + self.v[2]) ** 2)
+
+
+def lagrangian(mass: float, gravity: float = GRAVITY) -> ca.Function:
+    """Independent derivation of (tau_l, F_phi, tau_pl, F_varphi) by Lagrange's equation (Eq. 2): (q, v, a) -> (4,)."""
+    q, v, a = (ca.SX.sym(n, 4) for n in "qva")
+    centre = q[1] * ca.vertcat(ca.sin(q[0]), ca.cos(q[0]))
+    offset = q[3] * ca.vertcat(ca.sin(q[0] + q[2]), ca.cos(q[0] + q[2]))
+    kinetic, potential = 0, 0
+    for end in (centre + offset, centre - offset):
+        speed = ca.jacobian(end, q) @ v
+        kinetic += mass / 2 * ca.dot(speed, speed) / 2
+        potential += mass / 2 * gravity * end[1]
+    momentum = ca.gradient(kinetic, v)
+    force = ca.jacobian(momentum, v) @ a + ca.jacobian(momentum, q) @ v + ca.gradient(potential - kinetic, q)
+    return ca.Function("srmp_lagrangian", [q, v, a], [force])

@@ -1,0 +1,135 @@
+"""What the robot can do, as stage 1 needs to know it: leg length, inertia and leg force within reach.
+
+Postures of the sagittal model are sampled (a fixed low-discrepancy sequence, so the result is the same every time),
+those outside the joint ranges are dropped, and the extremes over each CoM distance give smooth envelopes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from jumplab.robot.description import Robot
+from jumplab.robot.stance import stance_angles
+
+SAMPLES = 2**16  # our choice: envelopes move by less than 1 % when doubled
+BINS = 24  # our choice: about 2 cm of CoM distance each
+EDGE = 0.02  # our choice: share of extreme samples cut off on either side, so that the envelope is not a singular posture
+HEEL_UP_RAD = 0.5  # our choice: foot pitch considered as still pushing off
+TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; forward lean of a deep bow
+COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
+FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
+MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
+SPEED_QUANTILE = 0.90  # our choice: a good posture for extending the leg fast, not the single best one
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Envelopes over the CoM's distance from the middle of the sole (phi).
+
+    Attributes
+    ----------
+    length : (lower, upper) of phi [m].
+    length_grid, inertia_low, inertia_high, force_high, speed_high : sampled envelopes over phi [m]: pitch inertia
+        [kg m^2], vertical force at which a leg joint saturates [N], rate of phi at which a leg joint reaches its speed
+        limit while the trunk does not turn [m/s].
+    inertia_low_fit, inertia_high_fit, force_fit, speed_fit : polynomial coefficients over phi, highest power first.
+    inertia : overall (lower, upper) of the pitch inertia, in any reachable posture [kg m^2].
+    internal_inertia : constant part rho_I [kg m^2].
+    cop : (heel, toe) from the middle of the sole [m].
+    posture : (lower, upper) trunk pitch [rad].
+    start : lean, length, turn, radius of the stance (theta_l, phi, theta_pl, varphi).
+    mass : of the whole robot [kg].
+    """
+
+    length: tuple[float, float]
+    length_grid: np.ndarray
+    inertia_low: np.ndarray
+    inertia_high: np.ndarray
+    force_high: np.ndarray
+    speed_high: np.ndarray
+    inertia_low_fit: np.ndarray
+    inertia_high_fit: np.ndarray
+    force_fit: np.ndarray
+    speed_fit: np.ndarray
+    inertia: tuple[float, float]
+    internal_inertia: float
+    cop: tuple[float, float]
+    posture: tuple[float, float]
+    start: np.ndarray
+    mass: float
+
+
+def _turned(angle, vector):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
+
+
+def postures(robot: Robot, count: int = SAMPLES) -> dict[str, np.ndarray]:
+    """Sampled postures within joint ranges, toe on the ground: angles (n, 5), com (n, 2) from mid-sole, rho, force."""
+    m = robot.sagittal
+    unit = qmc.Sobol(5, scramble=False).random(count)
+    foot, trunk = unit[:, 0] * HEEL_UP_RAD, TRUNK_RAD[0] + unit[:, 1] * (TRUNK_RAD[1] - TRUNK_RAD[0])
+    joints = m.lower + unit[:, 2:][:, [0, 1, 1, 2]] * (m.upper - m.lower)
+    hip, knee, shoulder = joints[:, 0], joints[:, 1], joints[:, 3]
+    angles = np.stack([foot, trunk + hip + knee, trunk + hip, trunk, trunk + shoulder], -1)  # (n, 5)
+    ankle = angles[:, 0] - angles[:, 1]
+    com_arms, mass = m.com_arms(), m.mass
+    links = np.stack([sum(_turned(angles[:, j], com_arms[i, j]) for j in range(5)) for i in range(5)], 1)  # (n, 5, 2)
+    com = np.einsum("i,nik->nk", mass, links) / mass.sum()
+    rho = m.inertia.sum() + np.einsum("i,nik->n", mass, (links - com[:, None]) ** 2)
+    from_sole = com - m.sole_center
+    ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > COM_X_M[0]) & (from_sole[:, 0] < COM_X_M[1])
+    ok &= from_sole[:, 1] > 0.15  # our choice: lower than this the robot sits
+    force = _static_force(m, angles, com)
+    speed = _extension_speed(m, angles, from_sole)
+    return {"angles": angles[ok], "com": from_sole[ok], "rho": rho[ok], "force": force[ok], "speed": speed[ok]}
+
+
+def _static_force(m, angles, com):
+    """Vertical force [N] at which the first leg joint saturates, CoP below the CoM but inside the sole."""
+    at = np.cumsum([_turned(angles[:, j], m.span[j]) for j in range(3)], axis=0)[..., 0]  # ankle, knee, hip x (3, n)
+    cop = np.clip(com[:, 0], m.heel[0], 0.0)
+    levers = np.maximum(np.abs(at - cop), MIN_FORCE_LEVER_M)
+    return FORCE_SHARE * np.min(m.effort[[2, 1, 0]][:, None] / levers, axis=0)
+
+
+def _extension_speed(m, angles, com):
+    """Rate of phi [m/s] at which ankle, knee or hip reaches its speed limit: foot and trunk still, CoM along phi."""
+    arms = np.einsum("i,ijk->jk", m.mass, m.com_arms()) / m.total_mass
+    along = com / np.linalg.norm(com, axis=1, keepdims=True)
+    turned = [_turned(angles[:, j], arms[j]) for j in (1, 2)]  # shank, thigh
+    (a, c), (b, d) = ((x[:, 1], -x[:, 0]) for x in turned)
+    det = a * d - b * c
+    det = np.where(np.abs(det) < 1e-6, 1e-6, det)  # straight leg: no speed at all
+    shank, thigh = (d * along[:, 0] - b * along[:, 1]) / det, (a * along[:, 1] - c * along[:, 0]) / det
+    used = np.abs([shank / m.speed[2], (shank - thigh) / m.speed[1], thigh / m.speed[0]])
+    return 1.0 / np.max(used, axis=0)
+
+
+def reach(robot: Robot, count: int = SAMPLES) -> Reach:
+    """Sample the robot and fit its envelopes (Sec. III: "proper range respecting to the actual robot")."""
+    m, p = robot.sagittal, postures(robot, count)
+    phi, rho, force, speed = np.linalg.norm(p["com"], axis=1), p["rho"], p["force"], p["speed"]
+    low, high = np.quantile(phi, [EDGE / 10, 1 - EDGE / 10])
+    edges = np.linspace(low, high, BINS + 1)
+    grid = (edges[1:] + edges[:-1]) / 2
+    rows = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        inside = (phi >= a) & (phi < b)
+        rows.append([*np.quantile(rho[inside], [EDGE, 1 - EDGE]), np.quantile(force[inside], 1 - EDGE),
+                     np.quantile(speed[inside], SPEED_QUANTILE)])  # fmt: skip
+    lower, upper, strongest, fastest = np.array(rows).T
+    stance = stance_angles(robot)
+    arms, mass = m.com_arms(), m.mass
+    links = np.array([sum(_turned(stance[j], arms[i, j]) for j in range(5)) for i in range(5)])
+    com = mass @ links / mass.sum()
+    from_sole = com - m.sole_center
+    stance_rho = m.inertia.sum() + mass @ np.sum((links - com) ** 2, axis=1)
+    start = np.array([np.arctan2(*from_sole), np.hypot(*from_sole), stance[3], np.sqrt(stance_rho / mass.sum())])
+    half = -m.heel[0] / 2
+    return Reach((float(low), float(high)), grid, lower, upper, strongest, fastest, np.polyfit(grid, lower, 2),
+                 np.polyfit(grid, upper, 2), np.polyfit(grid, np.minimum(strongest, 1.5 * strongest[0]), 3), np.polyfit(grid, fastest, 3), (float(lower.min()), float(upper.max())),
+                 float(m.inertia.sum()), (-half, half), TRUNK_RAD, start, float(mass.sum()))  # fmt: skip

@@ -1,0 +1,144 @@
+"""Solving stage 3 for a target: guesses, references, the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_angles
+from jumplab.solver import Nlp, PhaseGuess, Solution
+from jumplab.srmp import SrmpPlan
+from jumplab.task import JumpTask
+from jumplab.whole_body.problem import build_problem
+from jumplab.whole_body.settings import Limits, Mesh, Weights
+
+TOE_PHASE_S = 0.12  # our choice: heel-up time expected at the end of stage 1's launch; stage 3 may change it
+# naive guess, our choice: a squat, a stretched take-off, a tuck and a landing crouch (knee, trunk, heel-up, arm in rad)
+POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0), "tuck": (1.4, 0.3, 0.0, -0.2),
+            "touchdown": (0.9, 0.15, 0.0, 0.2)}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WholeBodyPlan:
+    """Result of stage 3 or of the direct planner: the target and the solution (phases "flat", "toe", "flight")."""
+
+    task: JumpTask
+    solution: Solution
+
+    @property
+    def launch_s(self) -> float:
+        """Duration of the launch [s]."""
+        return self.solution.phases["flat"].duration + self.solution.phases["toe"].duration
+
+    @property
+    def flight_s(self) -> float:
+        """Duration of the flight [s]."""
+        return self.solution.phases["flight"].duration
+
+
+def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> float:
+    """Where the ground steps up or down, ahead of the toe's first place [m].
+
+    A platform begins a little before the landing heel; when the robot jumps down, the launching surface ends a little
+    ahead of its toe.
+    """
+    if task.platform_m < 0:
+        return limits.edge_before_heel_m
+    return task.distance_m + robot.sagittal.heel[0] - limits.edge_before_heel_m
+
+
+class WholeBodyPlanner:
+    """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target."""
+
+    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
+                 tracking: bool = True, options: Mapping | None = None):  # fmt: skip
+        self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
+        self.stance = stance_angles(robot)
+        self.nlp = Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), options)
+
+    def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
+             weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
+        """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it. Raises :class:`SolverError`."""
+        references = self.references(srmp) if self.tracking else None
+        guess = guess or self.naive_guess(task)
+        parameters = self.parameters(task, srmp)
+        return WholeBodyPlan(task, self.nlp.solve(parameters, guess, references=references, weights=weights, off=off))
+
+    def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
+        """Parameter values of the problem for a target."""
+        edge = platform_edge_m(task, self.robot, self.limits) - np.sign(task.platform_m) * self.limits.edge_step_m
+        values = dict(stance=self.stance, distance=task.distance_m, platform=task.platform_m, edge=edge,
+                      takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
+        if self.tracking:
+            flat_s = srmp.launch_s - TOE_PHASE_S
+            values |= dict(momentum=srmp.launch.L[-1], launch_s=[flat_s, TOE_PHASE_S])
+        return values
+
+    def references(self, srmp: SrmpPlan) -> dict[str, dict[str, np.ndarray]]:
+        """Stage 1's trajectories at this mesh's nodes, by share of each phase."""
+        launch, flight, split = srmp.launch, srmp.flight, srmp.launch_s - TOE_PHASE_S
+        out = {}
+        for name, first, last, n in (("flat", 0.0, split, self.mesh.flat), ("toe", split, srmp.launch_s, self.mesh.toe)):
+            t = np.linspace(first, last, n + 1)
+            columns = {k: np.interp(t, launch.t, getattr(launch, k))[None] for k in ("rho", "rho_rate", "L")}
+            velocity = [np.interp(t, launch.t, launch.com_velocity[:, i]) for i in range(2)]
+            out[name] = columns | {"velocity": np.array(velocity)}
+        t = np.linspace(0, srmp.flight_s, self.mesh.flight + 1)
+        out["flight"] = {k: np.interp(t, flight.t, getattr(flight, k))[None] for k in ("rho", "rho_rate")}
+        return out
+
+    # guesses ----------------------------------------------------------------------------------------------------
+    def _posture(self, name: str) -> np.ndarray:
+        """Absolute link angles (5,) of a named posture of :data:`POSTURES`, CoM roughly above the sole."""
+        knee, trunk, heel, arm = POSTURES[name]
+        angles = stance_angles(self.robot, knee) if knee < 1.8 else self.stance.copy()
+        return angles + np.array([heel, heel * 0.5, 0.0, trunk - angles[3], trunk + arm - angles[4]])
+
+    def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
+        """Start values that know only the target: straight lines through four postures, at rest at every node."""
+        p = {name: self._posture(name) for name in POSTURES}
+        push = (p["crouch"] + p["take-off"]) / 2
+        push[0] = 0.0
+        turn = np.full(5, task.rotation_rad)
+        flight_s = task.flight_time(min(task.platform_m, 0.9 * task.height_m))
+        n, zero = self.mesh, np.zeros
+        flat = _through([self.stance, p["crouch"], push], [0, 0.6, 1], n.flat)[:, 1:]
+        toe = _through([push, p["take-off"]], [0, 1], n.toe)
+        fly = _through([p["take-off"], p["tuck"] + turn / 2, p["touchdown"] + turn], [0, 0.5, 1], n.flight)
+        lean = 0.3 * np.tanh(task.distance_m)
+        constants = dict(com_x=lean - 0.12, com_z=0.65, vel_x=(task.distance_m - lean) / flight_s, vel_z=task.takeoff_speed)
+        return {
+            "flat": PhaseGuess(0.7, flat, zero(flat.shape), zero(flat.shape)),
+            "toe": PhaseGuess(TOE_PHASE_S, toe, zero(toe.shape), zero(toe.shape)),
+            "flight": PhaseGuess(flight_s, fly, zero(fly.shape), zero(fly.shape), None, constants),
+        }
+
+    def guess_from_motion(self, t, angles, rates, accels, takeoff_s: float, com, com_velocity) -> dict[str, PhaseGuess]:
+        """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time [s].
+
+        ``com`` and ``com_velocity`` (2,) are the CoM from the toe and its velocity at take-off.
+        """
+        split, end = takeoff_s - TOE_PHASE_S, t[-1]
+        out = {}
+        spans = (("flat", 0.0, split, self.mesh.flat), ("toe", split, takeoff_s, self.mesh.toe),
+                 ("flight", takeoff_s, end, self.mesh.flight))  # fmt: skip
+        for name, first, last, n in spans:
+            at = np.linspace(first, last, n + 1)
+            q, v, a = (np.stack([np.interp(at, t, x) for x in y.T], -1) for y in (angles, rates, accels))
+            if name == "flat":
+                q, v, a = q[:, 1:], v[:, 1:], a[:, 1:]
+            if name == "toe":
+                q[:, 0] = np.maximum(q[:, 0], 0.0)
+            out[name] = PhaseGuess(last - first, q, v, a)
+        constants = dict(com_x=com[0], com_z=com[1], vel_x=com_velocity[0], vel_z=com_velocity[1])
+        flight = out["flight"]
+        out["flight"] = PhaseGuess(flight.duration, flight.q, flight.v, flight.a, None, constants)
+        return out
+
+
+def _through(knots, shares, intervals) -> np.ndarray:
+    s = np.linspace(0, 1, intervals + 1)
+    return np.stack([np.interp(s, shares, column) for column in np.array(knots).T], -1)

@@ -1,0 +1,59 @@
+"""Limits, weights and mesh of stage 3. The paper prints none of them: every number is our choice, with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a plan may use of the robot and the ground; all our choice, since the paper prints no bound."""
+
+    torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
+    speed_share: float = 0.90  # of the speed limit
+    friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
+    cop_margin_m: float = 0.01  # inside the sole's edges while the foot is flat
+    range_margin_rad: float = 0.03  # to the joint stops
+    hand_clearance_m: float = 0.05  # above the ground in launch
+    edge_clearance_m: float = 0.07  # of hand, mid-arm and knee before a platform's edge
+    edge_smoothing_m: float = 0.015  # a platform's edge is a step smoothed over about twice this
+    edge_before_heel_m: float = 0.05  # a platform begins this far before the landing heel
+    edge_step_m: float = 0.08  # and for clearance it counts as beginning this much earlier still
+    clearance_m: float = 0.03  # of the sole over the ground in mid-flight
+    heel_up_rad: float = 0.9  # foot pitch at most during toe-off
+    flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
+    toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
+    touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
+    touchdown_trunk_rate: float = 1.0  # [rad/s]
+    touchdown_knee: tuple[float, float] = (0.7, 1.4)  # [rad]: stroke left to absorb the fall
+    touchdown_trunk: tuple[float, float] = (0.0, 0.30)  # [rad]
+    capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
+    capture_slope_s: float = 0.13
+    capture_window_m: tuple[float, float] = (-0.02, 0.02)
+    momentum_share: float = 0.01  # L at take-off within this share of stage 1's
+    momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Cost weights, integrated over time; all our choice. Units: [1] / [unit of the term]^2 / [s]."""
+
+    joint_acceleration: float = 4e-3  # [1] / [rad/s^2]^2 / [s]
+    jerk: float = 4e-7  # [1] / [rad/s^3]^2 / [s]
+    torque: float = 1e-4  # [1] / [N m]^2 / [s]
+    track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
+    track_inertia: float = 2.0  # [1] / [kg m^2]^2 / [s]
+    track_inertia_rate: float = 0.02  # [1] / [kg m^2/s]^2 / [s]
+    track_momentum: float = 2.0  # [1] / [kg m^2/s]^2 / [s]
+    heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
+    ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
+    track_duration: float = 50.0  # [1] / [s]^2
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Intervals per phase."""
+
+    flat: int = 25
+    toe: int = 20
+    flight: int = 30
