@@ -17,7 +17,7 @@ from jumplab.models.srmp import COORDINATES, SrmpState
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.solver import Nlp, PhaseGuess, Solution
-from jumplab.task import JumpTask
+from jumplab.task import GRAVITY, JumpTask
 from jumplab.terms import Bound, Phase, Point, Problem, Term
 
 GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
@@ -27,10 +27,11 @@ GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 1
 class SrmpSettings:
     """Weights and bounds of stage 1. The paper prints none; all are our choice, integrated over time where they run."""
 
-    intervals: int = 40  # per phase
+    intervals: tuple[int, int, int] = (28, 12, 40)  # flat foot, toe, flight
     friction: float = 0.45  # as in stage 3
     cop_margin_m: float = 0.015  # inside the sole's edges
-    launch_s: tuple[float, float] = (0.4, 1.2)
+    flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot part of the launch, as in stage 3
+    toe_s: tuple[float, float] = (0.08, 0.15)  # duration of its toe part (heel up, CoP at the toe), as in stage 3
     posture_end: tuple[float, float] = (0.2, 0.8)  # trunk at take-off [rad]: leaning into the jump, so it bends first
     speed_share: float = 0.90  # of the extension speed, as in stage 3
     corner_speed: float = 0.5  # share of the extension speed up to which the full leg force is there
@@ -55,6 +56,7 @@ class SrmpSettings:
     w_inertia_jerk: float = 1e-7  # SF-J1
 
 
+TOE_BAND_M = 0.005  # our choice: the toe part's CoP lies within this distance of the toe edge
 SCALES = {"q": 1.0, "v": [5.0, 3.0, 5.0, 2.0], "a": [50.0, 30.0, 50.0, 20.0], "j": [1000.0, 500.0, 1000.0, 500.0]}
 FLIGHT_SCALES = {"q": 1.0, "v": 20.0, "a": 200.0, "j": 5000.0}
 
@@ -123,6 +125,11 @@ class SrmpPlan:
         return float(self.launch.t[-1])
 
     @property
+    def toe_s(self) -> float:
+        """Duration of the launch's last part, heel up and CoP at the toe [s]."""
+        return self.solution.phases["toe"].duration
+
+    @property
     def flight_s(self) -> float:
         """Duration of the flight [s]."""
         return float(self.flight.t[-1])
@@ -136,7 +143,7 @@ def _state(p: Point, mass: float) -> SrmpState:
 
 
 def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
-    """Costs and constraints of the launch, SL-* (Sec. III-A)."""
+    """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
 
     def at(p):
         return _state(p, mass)
@@ -145,11 +152,6 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         low, high = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.inertia_low_fit, reach.inertia_high_fit))
         margin = s.inertia_margin * (high - low)
         return ca.vertcat(at(p).inertia - low - margin, high - margin - at(p).inertia)
-
-    def cop(p):
-        f, torque = at(p).ground_force, at(p).pivot_torque
-        low, high = reach.cop[0] + s.cop_margin_m, reach.cop[1] - s.cop_margin_m
-        return ca.vertcat(-torque - low * f[1], high * f[1] + torque)
 
     def cone(p):
         f = at(p).ground_force
@@ -164,24 +166,14 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     def extension(p):
         return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
 
-    mg, inf = mass * 9.8, np.inf
-    posture = s.posture_end
+    mg, inf = mass * GRAVITY, np.inf
     return [
         Term("jerk", "SL-J1", "weighted", "mid", lambda p: ca.DM(np.sqrt(s.w_jerk)) * p.j, weight=1.0),
-        Term("posture at take-off", "SL-J2", "rad", "end", lambda p: p.q[0] + p.q[2], weight=s.w_posture_end),
         Term("CoM velocity", "SL-J2", "m/s", "node", lambda p: at(p).com_velocity, weight=s.w_velocity),
-        Term("L at take-off", "SL-J3", "kg m^2/s", "end", lambda p: at(p).angular_momentum, weight=s.w_momentum_end),
         Term("L rate", "SL-J3", "N m", "node", lambda p: at(p).angular_momentum_rate, weight=s.w_momentum_rate),
         Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], weight=s.w_turn),
-        Term("launch time", "SL-J5", "s", "end", lambda p: p.duration, weight=s.w_time),
-        Term("take-off speed", "SL-E2", "m/s", "end", lambda p: at(p).com_velocity[1] - p.p.takeoff_speed),
-        Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
-        Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
-        Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
-        Term("posture range", "SL-P1", "rad", "end", lambda p: p.q[0] + p.q[2], lower=posture[0], upper=posture[1]),
         Term("trunk range", "SL-P1, as path", "rad", "node", lambda p: p.q[0] + p.q[2], lower=reach.posture[0],
              upper=reach.posture[1]),
-        Term("CoP", "SL-P2 (times F_z)", "N m", "node", cop, lower=0.0, upper=inf, scale=0.1 * mg, skip=(0, 1)),
         Term("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_box, lower=0.0, upper=inf),
         Term("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, lower=s.momentum[0],
              upper=s.momentum[1], scale=10.0),
@@ -192,17 +184,55 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     ]  # fmt: skip
 
 
-def _launch_phase(mass, reach, s) -> Phase:
+def _cop(mass: float, low: float, high: float) -> Term:
+    """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0."""
+
+    def room(p):
+        f, torque = _state(p, mass).ground_force, _state(p, mass).pivot_torque
+        return ca.vertcat(-torque - low * f[1], high * f[1] + torque)
+
+    return Term("CoP", "SL-P2, times F_z", "N m", "node", room, lower=0.0, upper=np.inf, scale=0.1 * mass * GRAVITY,
+                skip=(0, 1))  # fmt: skip
+
+
+def takeoff_terms(mass: float, s: SrmpSettings) -> list[Term]:
+    """Costs and constraints at the end of the launch, SL-J2, J3 and SL-E* (Sec. III-A)."""
+
+    def at(p):
+        return _state(p, mass)
+
+    mg, posture = mass * GRAVITY, s.posture_end
+    return [
+        Term("posture at take-off", "SL-J2", "rad", "end", lambda p: p.q[0] + p.q[2], weight=s.w_posture_end),
+        Term("L at take-off", "SL-J3", "kg m^2/s", "end", lambda p: at(p).angular_momentum, weight=s.w_momentum_end),
+        Term("take-off speed", "SL-E2", "m/s", "end", lambda p: at(p).com_velocity[1] - p.p.takeoff_speed),
+        Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
+        Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
+        Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
+        Term("posture range", "SL-P1", "rad", "end", lambda p: p.q[0] + p.q[2], lower=posture[0], upper=posture[1]),
+    ]
+
+
+def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, Phase]:
+    def start(parameters):
+        return parameters["start"]
+
     low, high = reach.length
-    start = lambda P: P["start"]  # noqa: E731
+    box = Bound("state box", "SL-B1", "rad, m", "q", [s.takeoff_lean[0], low, -2.5, 0.1],
+                [s.takeoff_lean[1], high, 2.5, 1.0], "inner")  # fmt: skip
     bounds = (
         Bound("start posture", "SL-P3; ours: the stance", "rad, m", "q", start, start, "start"),
         Bound("at rest", "ours", "1/s", "v", 0.0, 0.0, "start"),
         Bound("at rest (acceleration)", "ours", "1/s^2", "a", 0.0, 0.0, "start"),
-        Bound("state box", "SL-B1", "rad, m", "q", [s.takeoff_lean[0], low, -2.5, 0.1],
-              [s.takeoff_lean[1], high, 2.5, 1.0], "inner"),
-    )  # fmt: skip
-    return Phase("launch", COORDINATES, s.intervals, s.launch_s, tuple(launch_terms(mass, reach, s)), bounds, scales=SCALES)
+        box,
+    )
+    heel, toe, margin = *reach.cop, s.cop_margin_m
+    along = launch_terms(mass, reach, s)
+    flat = Phase("flat", COORDINATES, s.intervals[0], s.flat_s, (*along, _cop(mass, heel + margin, toe - margin)), bounds,
+                 scales=SCALES)  # fmt: skip
+    tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s,
+                (*along, _cop(mass, toe - TOE_BAND_M, toe), *takeoff_terms(mass, s)), (box,), scales=SCALES)  # fmt: skip
+    return flat, tip
 
 
 def flight_terms(s: SrmpSettings) -> list[Term]:
@@ -249,19 +279,23 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
     leg = (s.touchdown_length[0] * stance, s.touchdown_length[1] * stance, 1.0)
     constants = {"L": (*s.momentum, 10.0), "com_x": (-1.0, 1.0, 1.0), "com_z": (0.0, 2.0, 1.0), "vel_x": (-5.0, 5.0, 1.0),
                  "vel_z": (0.0, 6.0, 1.0), "leg": leg}  # fmt: skip
-    return Phase("flight", ("inertia",), s.intervals, (0.05, 2.0), tuple(flight_terms(s)), bounds, states=("theta",),
+    return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), tuple(flight_terms(s)), bounds, states=("theta",),
                  constants=constants, scales=FLIGHT_SCALES)  # fmt: skip
 
 
 def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
     """Links at take-off (SF-L1..4), jump length and landing condition over both phases."""
 
+    def continuity(e):
+        a, b = e["flat"].end, e["toe"].start
+        return ca.vertcat(*((x - y) / ca.DM(scale) for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0))))
+
     def inertia_link(e):
-        a, b = _state(e["launch"].end, mass), e["flight"].start
+        a, b = _state(e["toe"].end, mass), e["flight"].start
         return ca.vertcat(a.inertia - b.q[0], (a.inertia_rate - b.v[0]) / 20, (a.inertia_accel - b.a[0]) / 200)
 
     def ballistic(e):
-        a, c = _state(e["launch"].end, mass), e["flight"].start.c
+        a, c = _state(e["toe"].end, mass), e["flight"].start.c
         position, velocity = a.com, a.com_velocity
         return ca.vertcat(position - ca.vertcat(c.com_x, c.com_z), velocity - ca.vertcat(c.vel_x, c.vel_z))
 
@@ -274,16 +308,19 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
         return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
 
     return [
-        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["launch"].end.q[0] - e["flight"].start.z[0]),
+        Term("launch time", "SL-J5", "s", "problem", lambda e: e["flat"].end.duration + e["toe"].end.duration,
+             weight=s.w_time),
+        Term("flat to toe", "ours: heel up", "scaled", "problem", continuity),
+        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["toe"].end.q[0] - e["flight"].start.z[0]),
         Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link),
         Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem",
-             lambda e: _state(e["launch"].end, mass).angular_momentum - e["flight"].start.c.L, scale=10.0),
+             lambda e: _state(e["toe"].end, mass).angular_momentum - e["flight"].start.c.L, scale=10.0),
         Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic),
         Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
         Term("capture window", "ours; replaces SF-E1", "m", "problem", capture, lower=s.capture_window_m[0],
              upper=s.capture_window_m[1], scale=0.1),
         Term("symmetric landing", "SF-E1 (about the pivot)", "rad", "problem",
-             lambda e: e["flight"].end.z[0] + e["launch"].end.q[0] - e["flight"].end.p.rotation),
+             lambda e: e["flight"].end.z[0] + e["toe"].end.q[0] - e["flight"].end.p.rotation),
     ]  # fmt: skip
 
 
@@ -294,7 +331,7 @@ PARAMETERS = dict(start=4, distance=1, platform=1, takeoff_speed=1, rotation=1, 
 def build_problem(robot: Robot, settings: SrmpSettings = SrmpSettings(), envelope: Reach | None = None) -> Problem:
     """Stage 1 as one problem over launch and flight."""
     envelope, mass = envelope or reach(robot), robot.sagittal.total_mass
-    phases = (_launch_phase(mass, envelope, settings), _flight_phase(envelope, settings))
+    phases = (*_launch_phases(mass, envelope, settings), _flight_phase(envelope, settings))
     return Problem("SRMP", phases, tuple(joining_terms(mass, settings)), dict(PARAMETERS))
 
 
@@ -307,9 +344,11 @@ def parameters(task: JumpTask, envelope: Reach) -> dict:
 
 def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict[str, PhaseGuess]:
     """Start values that know only the target: crouch and rise on a straight line, constant inertia, steady turning."""
-    n, launch_s = settings.intervals, 0.8
-    phi0, t_f = envelope.start[1], task.flight_time()
-    s = np.linspace(0, 1, n + 1)
+    n_flat, n_toe, n = settings.intervals
+    phi0, t_f = envelope.start[1], task.flight_time(min(task.platform_m, 0.9 * task.height_m))
+    flat_s, toe_s = 0.6, 0.12  # our choice
+    share = flat_s / (flat_s + toe_s)
+    s = np.concatenate([np.linspace(0, share, n_flat + 1), np.linspace(share, 1, n_toe + 1)])
     crouch = 0.62 * phi0  # our choice: a knee bend of about a right angle
     length = np.interp(s, [0, 0.65, 1], [phi0, crouch, 0.9 * phi0])
     vel_x = 0.8 * task.distance_m / t_f
@@ -319,10 +358,12 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
     rho = envelope.mass * radius[-1] ** 2
     spin = (task.rotation_rad - 2 * lean[-1]) / t_f
     flight = PhaseGuess(t_f, np.full((n + 1, 1), rho), np.zeros((n + 1, 1)), np.zeros((n + 1, 1)),
-                        (lean[-1] + spin * t_f * s)[:, None],
+                        (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None],
                         dict(L=rho * spin, com_x=length[-1] * np.sin(lean[-1]), com_z=length[-1] * np.cos(lean[-1]),
                              vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.88 * phi0))  # fmt: skip
-    return {"launch": PhaseGuess(launch_s, q, q * 0, q * 0), "flight": flight}
+    flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
+    return {"flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0), "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
+            "flight": flight}  # fmt: skip
 
 
 class SrmpPlanner:
@@ -342,10 +383,13 @@ class SrmpPlanner:
 # sampling --------------------------------------------------------------------------------------------------------
 def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float, step_s: float = 0.005) -> SrmpPlan:
     """Sample a stage-1 solution on grids of about ``step_s`` that include both ends of both phases."""
-    launch, flight = solution.phases["launch"], solution.phases["flight"]
-    t = np.linspace(0, launch.duration, int(np.ceil(launch.duration / step_s)) + 1)
+    flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
+    launch_s = flat.duration + toe.duration
+    t = np.linspace(0, launch_s, int(np.ceil(launch_s / step_s)) + 1)
     quantities = _launch_function(mass, task.gravity).map(len(t))
-    q, v, a = launch.sample(t)
+    first = t < flat.duration
+    later = np.minimum(t[~first] - flat.duration, toe.duration)
+    q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
     out = [x.full().T.squeeze() for x in quantities(q.T, v.T, a.T)]
     com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = out
     up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
@@ -353,7 +397,7 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
     cop[~up] = cop[up][-1]
     launched = SrmpLaunch(t, com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force[:, 0], force[:, 1], cop,
                           q[:, 0], q[:, 0] + q[:, 2], q)  # fmt: skip
-    return SrmpPlan(task, launched, _sample_flight(task, flight, launch.q[-1, 1], step_s), solution, envelope,
+    return SrmpPlan(task, launched, _sample_flight(task, flight, toe.q[-1, 1], step_s), solution, envelope,
                     flight.constants["leg"])  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from jumplab.task import JumpTask
 from jumplab.whole_body.problem import build_problem
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 
-TOE_PHASE_S = 0.12  # our choice: heel-up time expected at the end of stage 1's launch; stage 3 may change it
+TOE_PHASE_S = 0.12  # our choice: heel-up time of the naive guess
 # naive guess, our choice: a squat, a stretched take-off, a tuck and a landing crouch (knee, trunk, heel-up, arm in rad)
 POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0), "tuck": (1.4, 0.3, 0.0, -0.2),
             "touchdown": (0.9, 0.15, 0.0, 0.2)}  # fmt: skip
@@ -73,13 +73,12 @@ class WholeBodyPlanner:
         values = dict(stance=self.stance, distance=task.distance_m, platform=task.platform_m, edge=edge,
                       takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
         if self.tracking:
-            flat_s = srmp.launch_s - TOE_PHASE_S
-            values |= dict(momentum=srmp.launch.L[-1], launch_s=[flat_s, TOE_PHASE_S])
+            values |= dict(momentum=srmp.launch.L[-1], launch_s=[srmp.launch_s - srmp.toe_s, srmp.toe_s])
         return values
 
     def references(self, srmp: SrmpPlan) -> dict[str, dict[str, np.ndarray]]:
         """Stage 1's trajectories at this mesh's nodes, by share of each phase."""
-        launch, flight, split = srmp.launch, srmp.flight, srmp.launch_s - TOE_PHASE_S
+        launch, flight, split = srmp.launch, srmp.flight, srmp.launch_s - srmp.toe_s
         out = {}
         for name, first, last, n in (("flat", 0.0, split, self.mesh.flat), ("toe", split, srmp.launch_s, self.mesh.toe)):
             t = np.linspace(first, last, n + 1)
@@ -116,12 +115,13 @@ class WholeBodyPlanner:
             "flight": PhaseGuess(flight_s, fly, zero(fly.shape), zero(fly.shape), None, constants),
         }
 
-    def guess_from_motion(self, t, angles, rates, accels, takeoff_s: float, com, com_velocity) -> dict[str, PhaseGuess]:
-        """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time [s].
+    def guess_from_motion(self, t, angles, rates, accels, takeoff_s: float, toe_s: float, com, com_velocity) -> dict[str, PhaseGuess]:
+        """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time and length of
+        the toe phase [s].
 
         ``com`` and ``com_velocity`` (2,) are the CoM from the toe and its velocity at take-off.
         """
-        split, end = takeoff_s - TOE_PHASE_S, t[-1]
+        split, end = takeoff_s - toe_s, t[-1]
         out = {}
         spans = (("flat", 0.0, split, self.mesh.flat), ("toe", split, takeoff_s, self.mesh.toe),
                  ("flight", takeoff_s, end, self.mesh.flight))  # fmt: skip

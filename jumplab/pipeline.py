@@ -1,0 +1,185 @@
+"""From a target to a finished plan: the paper's three steps in order (or the direct planner), then the 1 kHz tape."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumplab.errors import InputError
+from jumplab.expansion import expand, planar_motion, planar_quantities
+from jumplab.joint_map import JointPlan, map_to_joints
+from jumplab.robot import Robot
+from jumplab.solver import PhaseGuess, Statistics
+from jumplab.srmp import SrmpPlan, SrmpPlanner
+from jumplab.task import JumpTask
+from jumplab.trajectory import Tape
+from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body.planner import platform_edge_m
+
+METHODS = ("three-step", "direct")
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """One line of the table of stages: what it cost. Times in seconds, wall clock."""
+
+    stage: str
+    iterations: int
+    build_s: float
+    solve_s: float
+
+
+@dataclass(frozen=True)
+class JumpPlan:
+    """A finished plan.
+
+    Attributes
+    ----------
+    task, robot, method : what was asked, of whom, and how it was planned.
+    tape : the 1 kHz tape of the full robot.
+    srmp, joints : results of stages 1 and 2 (None for the direct planner).
+    whole_body : result of stage 3 or of the direct planner.
+    statistics : one row per stage.
+    """
+
+    task: JumpTask
+    robot: Robot
+    method: str
+    tape: Tape
+    srmp: SrmpPlan | None
+    joints: JointPlan | None
+    whole_body: WholeBodyPlan
+    statistics: tuple[StageRow, ...]
+
+    @property
+    def planned_distance_m(self) -> float:
+        """Travel of the toe over the whole tape [m]."""
+        toe = self.tape.extra["planar_toe"]
+        return float(toe[-1, 0] - toe[0, 0])
+
+    @property
+    def planned_rise_m(self) -> float:
+        """CoM apex minus CoM at take-off [m], on the tape."""
+        com = self.tape.extra["planar_com"][self.tape.takeoff_index :, 1]
+        return float(com.max() - com[0])
+
+    @property
+    def summary(self) -> dict:
+        """What ``summary.json`` says: target, method, results, cost of the stages; plain types."""
+        task = {f: getattr(self.task, f) for f in ("distance_m", "height_m", "platform_m", "rotation_rad", "gravity")}
+        return {
+            "target": task,
+            "method": self.method,
+            "robot": {"name": self.robot.name, "hash": self.robot.hash, "mass_kg": self.robot.total_mass},
+            "planned_distance_m": self.planned_distance_m,
+            "planned_rise_m": self.planned_rise_m,
+            "launch_s": self.whole_body.launch_s,
+            "flight_s": self.whole_body.flight_s,
+            "platform_edge_m": platform_edge_m(self.task, self.robot),
+            "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
+            "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
+            "stages": [vars(row) for row in self.statistics],
+        }
+
+
+def _peaks(names, values) -> dict[str, float]:
+    return {str(n): float(x) for n, x in zip(names, np.abs(values).max(axis=0), strict=True)}
+
+
+class Planner:
+    """All three stages for one robot, built once and reused for any target (and the direct planner, built on demand)."""
+
+    def __init__(self, robot: Robot):
+        self.robot = robot
+        self._stages: dict = {}
+
+    def _stage(self, name: str):
+        if name not in self._stages:
+            build = {
+                "srmp": lambda: SrmpPlanner(self.robot),
+                "whole body": lambda: WholeBodyPlanner(self.robot),
+                "direct": lambda: WholeBodyPlanner(self.robot, tracking=False),
+            }
+            self._stages[name] = build[name]()
+        return self._stages[name]
+
+    def plan(self, task: JumpTask, method: str = "three-step") -> JumpPlan:
+        """Plan one jump.
+
+        Parameters
+        ----------
+        task : the target.
+        method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
+
+        Raises
+        ------
+        InputError, InfeasibleError, SolverError
+            If a stage refuses or fails; no later stage is run.
+        """
+        if method not in METHODS:
+            raise InputError(f"method {method!r}: choose one of {', '.join(METHODS)}")
+        if method == "direct":
+            planner = self._stage("direct")
+            body = planner.plan(task)
+            rows = (_row("direct", body.solution.statistics),)
+            return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
+        first, last = self._stage("srmp"), self._stage("whole body")
+        srmp = first.plan(task)
+        began = time.perf_counter()
+        joints = map_to_joints(srmp, self.robot, method="direct")
+        mapped_s = time.perf_counter() - began
+        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
+        rows = (_row("1 SRMP", srmp.solution.statistics), StageRow("2 joint map", len(joints.t), 0.0, mapped_s),
+                _row("3 whole body", body.solution.statistics))  # fmt: skip
+        return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+
+
+def _row(stage: str, s: Statistics) -> StageRow:
+    return StageRow(stage, s.iterations, s.build_s, s.solve_s)
+
+
+def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> JumpPlan:
+    """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
+    return Planner(robot).plan(task, method)
+
+
+def guess_from_joints(joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float) -> Mapping[str, PhaseGuess]:
+    """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles."""
+    robot = planner.robot
+    angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)
+    takeoff = int(np.argmax(joints.phase == "flight"))
+    rel = planar_quantities(robot, angles, rates, accels, np.zeros((len(angles), 2)), task.gravity)
+    return planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s,
+                                     rel["com"][takeoff], rel["com_velocity"][takeoff])  # fmt: skip
+
+
+def to_link_angles(robot: Robot, q, v, a) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Absolute link angles (n, 5) with rates and accelerations from full-robot q, v, a; the mean of left and right."""
+    model, sagittal = robot.model, robot.sagittal
+    ids = [[model.getJointId(n) for n in robot.joints[r]] for r in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")]
+    iq = [[model.idx_qs[j] for j in pair] for pair in ids]
+    iv = [[model.idx_vs[j] for j in pair] for pair in ids]
+    pitch = np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
+    out = []
+    for values, index, trunk in ((q, iq, pitch), (v, iv, v[:, 4]), (a, iv, a[:, 4])):
+        joints = np.stack([values[:, pair].mean(axis=1) for pair in index], -1) * sagittal.sign
+        out.append(sagittal.link_angles(joints, trunk))
+    return tuple(out)
+
+
+def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -> Tape:
+    """The 1 kHz tape of a whole-body plan, with planar and stage-1 trajectories under their own names."""
+    gravity = body.task.gravity
+    motion = planar_motion(body.solution.phases, gravity, robot)
+    values = planar_quantities(robot, motion["angles"], motion["rates"], motion["accels"], motion["toe_acceleration"],
+                               gravity)  # fmt: skip
+    extra = {"planar_com": motion["toe"] + values["com"], "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"]}
+    extra |= {f"planar_{k}": values[k] for k in ("L", "rho", "rho_rate", "joints", "joint_rates", "torques")}
+    if srmp is not None:
+        for name in ("launch", "flight"):
+            part = getattr(srmp, name)
+            extra |= {f"srmp_{name}_{k}": np.array(v) for k, v in vars(part).items()}
+    return expand(motion, robot, gravity, extra)
