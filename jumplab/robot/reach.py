@@ -22,7 +22,7 @@ TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; 
 COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
 FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
 MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
-SPEED_QUANTILE = 0.90  # our choice: a good posture for extending the leg fast, not the single best one
+SPEED_QUANTILE = 0.98  # our choice: as for the force; a good posture for extending the leg fast
 
 
 @dataclass(frozen=True)

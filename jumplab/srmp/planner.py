@@ -1,0 +1,113 @@
+"""Solving stage 1 for a target, and sampling the solution."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from jumplab.models.srmp import SrmpState
+from jumplab.robot import Robot
+from jumplab.robot.reach import Reach, reach
+from jumplab.solver import Nlp, PhaseGuess, Solution
+from jumplab.srmp.plan import SrmpFlight, SrmpLaunch, SrmpPlan
+from jumplab.srmp.problem import SYMMETRY_OFF, build_problem
+from jumplab.srmp.settings import SrmpSettings
+from jumplab.task import JumpTask
+
+
+def parameters(task: JumpTask, envelope: Reach) -> dict:
+    """Parameter values of the stage-1 problem for a target."""
+    return dict(start=envelope.start, distance=task.distance_m, platform=task.platform_m,
+                takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
+
+
+def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict[str, PhaseGuess]:
+    """Start values that know only the target: crouch and rise on a straight line, constant inertia, steady turning."""
+    n_flat, n_toe, n = settings.intervals
+    phi0, t_f = envelope.start[1], task.flight_time(min(task.platform_m, 0.9 * task.height_m))
+    flat_s, toe_s = 0.6, 0.12  # our choice
+    share = flat_s / (flat_s + toe_s)
+    s = np.concatenate([np.linspace(0, share, n_flat + 1), np.linspace(share, 1, n_toe + 1)])
+    crouch = 0.62 * phi0  # our choice: a knee bend of about a right angle
+    length = np.interp(s, [0, 0.65, 1], [phi0, crouch, 0.9 * phi0])
+    vel_x = 0.8 * task.distance_m / t_f
+    lean = 0.3 * np.tanh(vel_x) * s**2
+    radius = np.sqrt(np.clip(envelope.start[3] ** 2 * length / phi0, 0.01, None))
+    q = np.stack([lean, length, 0.4 * s, radius], -1)
+    rho = envelope.mass * radius[-1] ** 2
+    spin = (task.rotation_rad - 2 * lean[-1]) / t_f
+    flight = PhaseGuess(t_f, np.full((n + 1, 1), rho), np.zeros((n + 1, 1)), np.zeros((n + 1, 1)),
+                        (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None],
+                        dict(L=rho * spin, com_x=length[-1] * np.sin(lean[-1]), com_z=length[-1] * np.cos(lean[-1]),
+                             vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.88 * phi0))  # fmt: skip
+    flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
+    return {"flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0), "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
+            "flight": flight}  # fmt: skip
+
+
+class SrmpPlanner:
+    """Stage 1 for one robot: built once, solved for any target."""
+
+    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None):
+        self.robot, self.settings, self.reach = robot, settings, reach(robot)
+        self.nlp = Nlp(build_problem(robot, settings, self.reach), options)
+
+    def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF) -> SrmpPlan:
+        """Solve for a target; raises :class:`SolverError` with the violated terms if there is no solution."""
+        guess = guess or naive_guess(task, self.reach, self.settings)
+        solution = self.nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off)
+        return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
+
+
+def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float, step_s: float = 0.005) -> SrmpPlan:
+    """Sample a stage-1 solution on grids of about ``step_s`` that include both ends of both phases."""
+    flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
+    launch_s = flat.duration + toe.duration
+    t = np.linspace(0, launch_s, int(np.ceil(launch_s / step_s)) + 1)
+    quantities = _launch_function(mass, task.gravity).map(len(t))
+    first = t < flat.duration
+    later = np.minimum(t[~first] - flat.duration, toe.duration)
+    q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
+    out = [x.full().T.squeeze() for x in quantities(q.T, v.T, a.T)]
+    com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = out
+    up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
+    cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
+    cop[~up] = cop[up][-1]
+    launched = SrmpLaunch(t, com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force[:, 0], force[:, 1], cop,
+                          q[:, 0], q[:, 0] + q[:, 2], q)  # fmt: skip
+    return SrmpPlan(task, launched, _sample_flight(task, flight, toe.q[-1, 1], step_s), solution, envelope,
+                    flight.constants["leg"])  # fmt: skip
+
+
+def _launch_function(mass, gravity):
+    q, v, a = (ca.SX.sym(n, 4) for n in "qva")
+    s = SrmpState(mass, q, v, a, gravity)
+    return ca.Function("srmp", [q, v, a], [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum,
+                                           s.angular_momentum_rate, s.inertia, s.inertia_rate, s.inertia_accel,
+                                           s.ground_force, s.pivot_torque])  # fmt: skip
+
+
+def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
+    t = np.linspace(0, flight.duration, int(np.ceil(flight.duration / step_s)) + 1)
+    rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
+    c, ones = flight.constants, np.ones_like(t)
+    nodes = flight.t
+    # theta between nodes: the cubic through the node values with the exact rates L / rho
+    theta = CubicHermiteSpline(nodes, flight.z[:, 0], c["L"] / flight.q[:, 0])(t)
+    rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
+    # leg length from take-off to touchdown: smooth, only the ends matter (the rod has no mass)
+    s = t / flight.duration
+    blend, blend1, blend2 = (10 * s**3 - 15 * s**4 + 6 * s**5, (30 * s**2 - 60 * s**3 + 30 * s**4) / flight.duration,
+                             (60 * s - 180 * s**2 + 120 * s**3) / flight.duration**2)  # fmt: skip
+    d = c["leg"] - takeoff_length
+    leg, leg1, leg2 = takeoff_length + d * blend, d * blend1, d * blend2
+    along = -np.stack([np.sin(theta), np.cos(theta)], -1)
+    across = np.stack([along[:, 1], -along[:, 0]], -1)
+    foot = leg[:, None] * along
+    foot_v = leg1[:, None] * along + (leg * rate)[:, None] * across
+    foot_a = (leg2 - leg * rate**2)[:, None] * along + (leg * accel + 2 * leg1 * rate)[:, None] * across
+    com = np.stack([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - task.gravity * t**2 / 2], -1)
+    com_v = np.stack([c["vel_x"] * ones, c["vel_z"] - task.gravity * t], -1)
+    com_a = np.stack([0 * ones, -task.gravity * ones], -1)
+    return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)

@@ -1,0 +1,38 @@
+"""Weights and bounds of stage 1. The paper prints none of them: every number is our choice, with its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SrmpSettings:
+    """Weights and bounds of stage 1. The paper prints none; all are our choice, integrated over time where they run."""
+
+    intervals: tuple[int, int, int] = (28, 12, 40)  # flat foot, toe, flight
+    friction: float = 0.45  # as in stage 3
+    cop_margin_m: float = 0.015  # inside the sole's edges
+    flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot part of the launch, as in stage 3
+    toe_s: tuple[float, float] = (0.10, 0.15)  # duration of its toe part (heel up, CoP at the toe), as in stage 3
+    posture_end: tuple[float, float] = (0.2, 0.8)  # trunk at take-off [rad]: leaning into the jump, so it bends first
+    speed_share: float = 0.95  # of the extension speed: the foot's own rotation, not counted there, helps
+    corner_speed: float = 0.5  # share of the extension speed up to which the full leg force is there
+    momentum: tuple[float, float] = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
+    inertia_margin: float = 0.05  # share of the envelope's width kept free on either side
+    takeoff_lean: tuple[float, float] = (-0.5, 0.7)  # [rad]
+    inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
+    inertia_accel: float = 600.0  # box on d^2 rho/dt^2
+    touchdown_inertia_rate: float = 8.0  # the limbs come nearly to rest before touchdown
+    touchdown_length: tuple[float, float] = (0.80, 0.95)  # share of the standing phi: knees bent to absorb the fall
+    capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown, offset + slope v_x, as in stage 3
+    capture_slope_s: float = 0.13
+    capture_window_m: tuple[float, float] = (-0.03, 0.02)
+    w_jerk: tuple[float, float, float, float] = (8e-5, 8e-5, 4e-4, 8e-4)  # SL-J1; the barbell's turn weighs more
+    w_posture_end: float = 1.0  # SL-J2
+    w_velocity: float = 2.0  # SL-J2
+    w_momentum_end: float = 0.01  # SL-J3
+    w_momentum_rate: float = 2e-3  # SL-J3
+    w_turn: float = 0.5  # SL-J4
+    w_time: float = 0.5  # SL-J5
+    w_inertia_accel: float = 1e-4  # SF-J1
+    w_inertia_jerk: float = 1e-7  # SF-J1
