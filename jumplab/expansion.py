@@ -34,10 +34,10 @@ def _joint_columns(robot: Robot):
 
 
 def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:
-    """Sample the planner's own interpolant at 1 kHz: t, angles, rates, accels (n, 5), toe and derivatives (n, 2), flying.
+    """Sample the planner's own interpolant at 1 kHz: t, angles, rates, accels (n, 5), toe with derivatives (n, 2).
 
-    The grid is laid so that take-off falls on a sample (which appears twice): the robot stands still for up to 1 ms more
-    at the start. The last sample is the touchdown itself.
+    The grid is laid so that take-off falls on a sample (which appears twice): the robot stands still for up to 1 ms
+    more at the start. The last sample is the touchdown itself.
     """
     flat, toe, flight = phases["flat"], phases["toe"], phases["flight"]
     launch_s = flat.duration + toe.duration
@@ -71,7 +71,7 @@ def _launch_sample(flat, toe, t):
 
 
 def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: dict | None = None) -> Tape:
-    """Full-robot tape from a sampled planar motion (see :func:`planar_motion`); the world's x is zero mid-sole at start.
+    """Full-robot tape from a sampled planar motion (see :func:`planar_motion`); x is zero mid-sole at the start.
 
     Foot wrenches are half of the planar ground wrench each; joint torques follow from inverse dynamics of the full
     robot, whose base rows are left for the audit to judge.

@@ -12,7 +12,7 @@ from jumplab.errors import InputError
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.robot import Robot
-from jumplab.solver import PhaseGuess, Statistics
+from jumplab.solver import PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
@@ -67,6 +67,14 @@ class JumpPlan:
         return float(com.max() - com[0])
 
     @property
+    def weights(self) -> dict[str, dict[str, float]]:
+        """Cost weights of the nonlinear stages, as solved: stage -> "phase/term" -> weight."""
+        stages = {"whole body": self.whole_body.solution}
+        if self.srmp is not None:
+            stages = {"SRMP": self.srmp.solution, **stages}
+        return {name: _weights(solution) for name, solution in stages.items()}
+
+    @property
     def summary(self) -> dict:
         """What ``summary.json`` says: target, method, results, cost of the stages; plain types."""
         task = {f: getattr(self.task, f) for f in ("distance_m", "height_m", "platform_m", "rotation_rad", "gravity")}
@@ -82,7 +90,12 @@ class JumpPlan:
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],
+            "manifest": {"weights": self.weights},
         }
+
+
+def _weights(solution: Solution) -> dict[str, float]:
+    return {f"{row['phase']}/{row['name']}": row["weight"] for row in solution.cost_shares}
 
 
 def _peaks(names, values) -> dict[str, float]:
@@ -90,7 +103,7 @@ def _peaks(names, values) -> dict[str, float]:
 
 
 class Planner:
-    """All three stages for one robot, built once and reused for any target (and the direct planner, built on demand)."""
+    """All stages for one robot, built on first use and kept for further targets."""
 
     def __init__(self, robot: Robot):
         self.robot = robot
@@ -146,7 +159,9 @@ def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> Ju
     return Planner(robot).plan(task, method)
 
 
-def guess_from_joints(joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float) -> Mapping[str, PhaseGuess]:
+def guess_from_joints(
+    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float
+) -> Mapping[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles."""
     robot = planner.robot
     angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)
@@ -159,7 +174,9 @@ def guess_from_joints(joints: JointPlan, planner: WholeBodyPlanner, task: JumpTa
 def to_link_angles(robot: Robot, q, v, a) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Absolute link angles (n, 5) with rates and accelerations from full-robot q, v, a; the mean of left and right."""
     model, sagittal = robot.model, robot.sagittal
-    ids = [[model.getJointId(n) for n in robot.joints[r]] for r in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")]
+    ids = [
+        [model.getJointId(n) for n in robot.joints[r]] for r in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+    ]
     iq = [[model.idx_qs[j] for j in pair] for pair in ids]
     iv = [[model.idx_vs[j] for j in pair] for pair in ids]
     pitch = np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
@@ -176,7 +193,10 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
     motion = planar_motion(body.solution.phases, gravity, robot)
     values = planar_quantities(robot, motion["angles"], motion["rates"], motion["accels"], motion["toe_acceleration"],
                                gravity)  # fmt: skip
-    extra = {"planar_com": motion["toe"] + values["com"], "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"]}
+    extra = {
+        "planar_com": motion["toe"] + values["com"],
+        "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"],
+    }
     extra |= {f"planar_{k}": values[k] for k in ("L", "rho", "rho_rate", "joints", "joint_rates", "torques")}
     if srmp is not None:
         for name in ("launch", "flight"):

@@ -1,4 +1,4 @@
-"""Solving an assembled problem with ipopt, and saying what came out: statistics, cost shares, tightest rows, or why not."""
+"""Solving an assembled problem with ipopt, and saying what came out: cost shares, tightest rows, or why not."""
 
 from __future__ import annotations
 
@@ -134,8 +134,12 @@ class Nlp:
         a, problem = self.assembled, self.problem
         unknown = set(parameters) ^ set(problem.parameters)
         if unknown:
-            raise InputError(f"{problem.name}: parameters {sorted(unknown)} do not fit; it takes {list(problem.parameters)}")
-        values = [np.broadcast_to(np.asarray(parameters[n], float).ravel(), (s,)) for n, s in problem.parameters.items()]
+            raise InputError(
+                f"{problem.name}: parameters {sorted(unknown)} do not fit; it takes {list(problem.parameters)}"
+            )
+        values = [
+            np.broadcast_to(np.asarray(parameters[n], float).ravel(), (s,)) for n, s in problem.parameters.items()
+        ]
         weight = []
         for owner, term in a.cost_terms:
             w = weights.get(f"{owner}/{term.name}", weights.get(term.name, term.weight))
@@ -147,7 +151,9 @@ class Nlp:
             for ref, size in layout.phase.references.items():
                 given = np.asarray(references.get(name, {}).get(ref, np.zeros((size, n + 1))), float)
                 if given.shape != (size, n + 1) or not np.all(np.isfinite(given)):
-                    raise InputError(f"{problem.name}: reference {ref!r} of phase {name!r} must be finite, {(size, n + 1)}")
+                    raise InputError(
+                        f"{problem.name}: reference {ref!r} of phase {name!r} must be finite, {(size, n + 1)}"
+                    )
                 rows.append(given)
             columns.append(np.concatenate(rows).ravel(order="F"))
         vector = np.concatenate([np.concatenate([*values, [0.0]])[:-1], weight, *columns])
@@ -303,7 +309,8 @@ class Nlp:
                 worst[key] = (amount, amount * row.term.scale, row.term.unit, row.node, when)
         ranked = sorted(worst.items(), key=lambda kv: -kv[1][0])
         lines = tuple(
-            f"{owner}/{name}: off by {amount:.3g} {unit} at node {node}" + (f" (t = {when:.3f} s)" if when is not None else "")
+            f"{owner}/{name}: off by {amount:.3g} {unit} at node {node}"
+            + (f" (t = {when:.3f} s)" if when is not None else "")
             for (owner, name), (_, amount, unit, node, when) in ranked[:5]
         )
         reason = "; ".join(lines) or "all constraints are met but the cost did not converge"

@@ -57,8 +57,8 @@ class JumpTask:
         turns = self.rotation_rad / (2 * math.pi)
         if abs(turns - round(turns)) > 1e-6:
             raise InputError(
-                f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet only after a multiple "
-                f"of 360 deg; nearest is {360 * round(turns):g} deg"
+                f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet only after a "
+                f"multiple of 360 deg; nearest is {360 * round(turns):g} deg"
             )
 
     @property

@@ -174,7 +174,9 @@ class Problem:
         for owner, t in self.terms():
             kind = "cost" if t.is_cost else "constraint"
             size = f"weight {t.weight:g}" if t.is_cost else f"{_text(t.lower)} ... {_text(t.upper)}"
-            rows.append(dict(phase=owner, name=t.name, kind=kind, at=t.at, unit=t.unit, equation=t.equation, value=size))
+            rows.append(
+                dict(phase=owner, name=t.name, kind=kind, at=t.at, unit=t.unit, equation=t.equation, value=size)
+            )
         for p in self.phases:
             for b in p.bounds:
                 size = f"{_text(b.lower)} ... {_text(b.upper)}"

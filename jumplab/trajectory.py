@@ -74,7 +74,7 @@ class Tape:
 
     @classmethod
     def load(cls, path: str | Path) -> Tape:
-        """Read ``plan.npz``; raises :class:`InputError` in one sentence if it is missing, damaged or of another schema."""
+        """Read ``plan.npz``; raises :class:`InputError` if it is missing, damaged or of another schema."""
         path = Path(path)
         if not path.is_file():
             raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")

@@ -116,7 +116,9 @@ class ElementBuilder:
             setattr(ref, name, refs[at : at + size])
             at += size
         j = jerk * ca.DM(phase.scale("j", nq)) if jerk is not None else None
-        return Point(x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], j, x[3 * nq :], const[0], s, names, self.parameters, ref)
+        return Point(
+            x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], j, x[3 * nq :], const[0], s, names, self.parameters, ref
+        )
 
     def _phase(self, layout):
         phase, n = layout.phase, layout.phase.intervals
@@ -130,9 +132,13 @@ class ElementBuilder:
         for place, nodes in (("node", range(n + 1)), ("start", (0,)), ("end", (n,))):
             terms = [t for t in phase.terms if t.at == place]
             if terms:
-                out = [self._weighted(t, _columns(t.expression(at_node)), step if place == "node" else 1.0) for t in terms]
+                out = [
+                    self._weighted(t, _columns(t.expression(at_node)), step if place == "node" else 1.0) for t in terms
+                ]
                 index = np.array([node_index[k] for k in nodes])
-                yield Element(ca.vertcat(constants, state), data, out, terms, index, list(nodes), phase.name, list(nodes))
+                yield Element(
+                    ca.vertcat(constants, state), data, out, terms, index, list(nodes), phase.name, list(nodes)
+                )
         left = self._point(layout, state, jerk, constants, s, refs)
         after = self._point(layout, right, None, constants, s + 1 / n, refs)
         q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
@@ -178,7 +184,9 @@ def _defect_term() -> Term:
 def _defect(layout, left, right, step):
     q, v, a = chain(left.q, left.v, left.a, left.j, step)
     p, nq = layout.phase, layout.nq
-    return ca.vertcat((right.q - q) / p.scale("q", nq), (right.v - v) / p.scale("v", nq), (right.a - a) / p.scale("a", nq))
+    return ca.vertcat(
+        (right.q - q) / p.scale("q", nq), (right.v - v) / p.scale("v", nq), (right.a - a) / p.scale("a", nq)
+    )
 
 
 class Assembled:
@@ -210,70 +218,32 @@ class Assembled:
 
     def _assemble(self, builder):
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", self.p_size)
-        lam_f, n_rows = ca.MX.sym("lam_f"), 0
-        cost, values, grad, jac, hess = 0, [], 0, [], []
-        cost_parts, jac_ij, hess_ij, lam_users, weight_at = [], [], [], [], 0
+        lam_f, rows, weight_at = ca.MX.sym("lam_f"), 0, 0
+        pieces = []
         for e in builder.elements:
-            n, ny = e.index.shape
-            w = ca.SX.sym("w", len(e.costs))
-            y, d, par = e.local, e.data, builder.parameter_vector
-            total = ca.dot(w, ca.vertcat(*(c for _, c in e.costs))) if e.costs else ca.SX(0)
-            g = ca.vertcat(*(c for _, c in e.constraints)) if e.constraints else ca.SX(0, 1)
             keep = self._add_rows(e)
-            inputs = [x[e.index.ravel().tolist()].reshape((ny, n)), self._data(p, e), self._repeat(p[: self.n_par], n)]
             weights = p[self.n_par + weight_at : self.n_par + weight_at + len(e.costs)]
-            weight_at += len(e.costs)
-            one = {"cse": True}
-            parts = ca.vertcat(*(c for _, c in e.costs)) if e.costs else ca.SX(0, 1)
-            f_val = ca.Function("value", [y, d, par], [parts, g], one)
-            part_val, g_val = f_val.map(n)(*inputs)
-            if e.costs:
-                cost += ca.dot(weights, ca.sum2(part_val))
-                cost_parts.append(ca.sum2(part_val))
-                f_grad = ca.Function("gradient", [y, d, par, w], [ca.gradient(total, y)], one)
-                local = ca.vec(f_grad.map(n)(*inputs, self._repeat(weights, n)))
-                grad += _scatter(e.index.ravel(), self.size) @ local
-            lam = None
-            if e.constraints:
-                values.append(ca.vec(g_val)[keep.tolist()])
-                j = ca.jacobian(g, y)
-                rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
-                f_jac = ca.Function("jacobian", [y, d, par], [ca.vertcat(*j.nonzeros())], one)
-                row_of = np.full(g.numel() * n, -1)
-                row_of[keep] = n_rows + np.arange(len(keep))
-                i = row_of[(np.arange(n)[:, None] * g.numel() + rows[None]).ravel()]
-                used = i >= 0
-                jac.append(ca.vec(f_jac.map(n)(*inputs))[np.flatnonzero(used).tolist()])
-                jac_ij.append((i[used], e.index[:, cols].ravel()[used]))
-                lam_users.append((e, g, keep, n_rows))
-                n_rows += len(keep)
-                lam = ca.SX.sym("lam", g.numel())
-            lagrangian = ca.SX.sym("lam_f") if e.costs else None
-            scalar = (lagrangian * total if e.costs else 0) + (ca.dot(lam, g) if lam is not None else 0)
-            h = ca.triu(ca.hessian(scalar, y)[0])
-            rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
-            if len(rows):
-                args = [y, d, par, w, lam if lam is not None else ca.SX(0, 1), lagrangian if e.costs else ca.SX.sym("unused")]
-                f_hess = ca.Function("hessian", args, [ca.vertcat(*h.nonzeros())], one)
-                hess.append((f_hess, inputs, weights, e, g, keep, n_rows - len(keep), n))
-                gi, gj = e.index[:, rows].ravel(), e.index[:, cols].ravel()
-                hess_ij.append((np.minimum(gi, gj), np.maximum(gi, gj)))
-        g_all = ca.vertcat(*values)
-        lam_g = ca.MX.sym("lam_g", n_rows)
-        self.n_rows = n_rows
-        jac_m = _gather(jac, jac_ij, (n_rows, self.size))
-        locals_ = []
-        for f_hess, inputs, weights, _, g, keep, first, n in hess:
-            lam = _scatter(keep, g.numel() * n) @ lam_g[first : first + len(keep)] if len(keep) else ca.MX(0, 1)
-            lam = ca.reshape(lam, g.numel(), n) if len(keep) else ca.MX(0, n)
-            locals_.append(ca.vec(f_hess.map(n)(*inputs, self._repeat(weights, n), lam, self._repeat(lam_f, n))))
-        hess_m = _gather(locals_, hess_ij, (self.size, self.size))
-        self.nlp = ca.Function("nlp", [x, p], [cost, g_all], ["x", "p"], ["f", "g"])
-        self.grad_f = ca.Function("nlp_grad_f", [x, p], [cost, grad], ["x", "p"], ["f", "grad_f_x"])
-        self.jac_g = ca.Function("nlp_jac_g", [x, p], [g_all, jac_m], ["x", "p"], ["g", "jac_g_x"])
-        self.hess_lag = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess_m], ["x", "p", "lam_f", "lam_g"],
+            inputs = [
+                ca.reshape(x[e.index.ravel().tolist()], e.index.shape[1], len(e.index)),
+                self._data(p, e),
+                p[: self.n_par],
+            ]
+            pieces.append(_Piece(e, builder.parameter_vector, inputs, weights, keep, rows))
+            rows, weight_at = rows + len(keep), weight_at + len(e.costs)
+        self.n_rows = rows
+        lam_g = ca.MX.sym("lam_g", rows)
+        costs = [c for c in (piece.costs() for piece in pieces) if c is not None]
+        f, parts = sum(c[0] for c in costs), ca.vertcat(*(c[1] for c in costs))
+        grad = sum(_scatter(piece.e.index.ravel(), self.size) @ piece.gradient() for piece in pieces if piece.e.costs)
+        g = ca.vertcat(*(piece.rows() for piece in pieces if piece.e.constraints))
+        jac = _gather([piece.jacobian() for piece in pieces if piece.e.constraints], (rows, self.size))
+        hess = _gather([h for h in (piece.hessian(lam_f, lam_g) for piece in pieces) if h], (self.size, self.size))
+        self.nlp = ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"])
+        self.grad_f = ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"])
+        self.jac_g = ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"])
+        self.hess_lag = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess], ["x", "p", "lam_f", "lam_g"],
                                     ["triu_hess_gamma_x_x"])  # fmt: skip
-        self.cost_parts = ca.Function("cost_parts", [x, p], [ca.vertcat(*cost_parts)])
+        self.cost_parts = ca.Function("cost_parts", [x, p], [parts])
 
     def _add_rows(self, e) -> np.ndarray:
         """Record the constraint rows of an element; return which of its local rows are kept."""
@@ -296,10 +266,6 @@ class Assembled:
         index = np.concatenate([first + k * rows + np.arange(rows) for k in e.data_columns])
         return ca.reshape(p[index.tolist()], rows, len(e.data_columns))
 
-    @staticmethod
-    def _repeat(column, n):
-        return ca.repmat(column, 1, n)
-
 
 def _scatter(index, size) -> ca.DM:
     """0/1 matrix that adds entry i of a vector to position index[i]."""
@@ -307,14 +273,72 @@ def _scatter(index, size) -> ca.DM:
     return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
 
 
-def _gather(pieces, ij, shape):
-    """Sparse MX matrix whose entries are sums of the local nonzeros at the given rows and columns."""
-    rows, cols = (np.concatenate([pair[k] for pair in ij]) for k in (0, 1))
+def _gather(pieces, shape):
+    """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
+    values = ca.vertcat(*(piece[0] for piece in pieces))
+    rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
     key = cols.astype(np.int64) * shape[0] + rows
     unique, inverse = np.unique(key, return_inverse=True)
     pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
-    values = ca.vertcat(*pieces)
     if len(unique) == len(key):
-        order = np.argsort(key)
-        return ca.MX(pattern, values[order.tolist()])
+        return ca.MX(pattern, values[np.argsort(key).tolist()])
     return ca.MX(pattern, _scatter(inverse, len(unique)) @ values)
+
+
+class _Piece:
+    """What one element contributes to the NLP: its small functions, differentiated once, called for all repetitions."""
+
+    def __init__(self, element: Element, parameters, inputs, weights, keep, first_row):
+        self.e, self.keep, self.first_row = element, keep, first_row
+        self.n, self.ny = element.index.shape
+        self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
+        self.weights = ca.repmat(weights, 1, self.n)
+        self.arguments = [element.local, element.data, parameters]
+        self.w = ca.SX.sym("w", len(element.costs))
+        self.cost_parts = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.costs))
+        self.g = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.constraints))
+        self.total = ca.dot(self.w, self.cost_parts) if element.costs else ca.SX(0)
+
+    def _map(self, name, extra_symbols, output, extra_values):
+        function = ca.Function(name, [*self.arguments, *extra_symbols], [output], {"cse": True})
+        return function.map(self.n)(*self.inputs, *extra_values)
+
+    def costs(self):
+        """(weighted sum, unweighted parts) or None."""
+        if not self.e.costs:
+            return None
+        parts = ca.sum2(self._map("costs", [], self.cost_parts, []))
+        return ca.dot(self.weights[:, 0], parts), parts
+
+    def gradient(self):
+        """Local gradients, one under the other."""
+        return ca.vec(self._map("gradient", [self.w], ca.gradient(self.total, self.e.local), [self.weights]))
+
+    def rows(self):
+        """Kept constraint rows."""
+        return ca.vec(self._map("rows", [], self.g, []))[self.keep.tolist()]
+
+    def jacobian(self):
+        """(values, rows, columns) of the kept rows' Jacobian."""
+        j = ca.jacobian(self.g, self.e.local)
+        rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
+        row_of = np.full(self.g.numel() * self.n, -1)
+        row_of[self.keep] = self.first_row + np.arange(len(self.keep))
+        i = row_of[(np.arange(self.n)[:, None] * self.g.numel() + rows[None]).ravel()]
+        used = i >= 0
+        values = ca.vec(self._map("jacobian", [], ca.vertcat(*j.nonzeros()), []))[np.flatnonzero(used).tolist()]
+        return values, i[used], self.e.index[:, cols].ravel()[used]
+
+    def hessian(self, lam_f, lam_g):
+        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
+        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
+        h = ca.triu(ca.hessian(scale * self.total + ca.dot(lam, self.g), self.e.local)[0])
+        rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
+        if not len(rows):
+            return None
+        mine = lam_g[self.first_row : self.first_row + len(self.keep)]
+        spread = ca.reshape(_scatter(self.keep, self.g.numel() * self.n) @ mine, self.g.numel(), self.n)
+        values = self._map("hessian", [self.w, lam, scale], ca.vertcat(*h.nonzeros()),
+                           [self.weights, spread, ca.repmat(lam_f, 1, self.n)])  # fmt: skip
+        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
+        return ca.vec(values), np.minimum(i, j), np.maximum(i, j)

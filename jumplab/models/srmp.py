@@ -1,7 +1,7 @@
 """Stage 1's model: the static reaction mass pendulum (Sec. II-A of the paper).
 
-A massless rod of length phi leans by theta_l from a pivot fixed on the ground and carries a barbell of two masses m/2 at
-distance varphi from the CoM, turned by theta_pl against the rod. Words here: ``lean`` (theta_l), ``length`` (phi),
+A massless rod of length phi leans by theta_l from a pivot fixed on the ground and carries a barbell, two masses m/2
+at distance varphi from the CoM, turned by theta_pl against the rod. Words here: ``lean`` (theta_l), ``length`` (phi),
 ``turn`` (theta_pl), ``radius`` (varphi). Angles positive about +y.
 """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,33 @@ from jumplab.robot.sagittal import SagittalModel, reduce
 GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
 SHIPPED = {"bhr": Path(__file__).parent / "bhr" / "bhr.toml"}
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+
+
+def _toml(text: str, where: str) -> dict:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
+        raise RobotError(f"{where}: not a TOML file: {e}") from e
+
+
+def _entry(config: dict, *path: str, kind: type = float, count: int | None = None):
+    """One checked entry of the configuration: a finite number or a text, or ``count`` of them."""
+    where, value = ".".join(path), config
+    for key in path:
+        if not isinstance(value, dict) or key not in value:
+            raise RobotError(f"robot configuration: the entry {where!r} is missing")
+        value = value[key]
+    items = value if count else [value]
+    numbers = kind is float
+    good = isinstance(items, list) and len(items) == (count or 1)
+    good = good and all(isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items)
+    if not good or (numbers and not np.all(np.isfinite(items))):
+        wanted = "a finite number" if numbers else "a text"
+        raise RobotError(
+            f"robot configuration: {where!r} = {value!r}, must be {f'{count} of ' if count else ''}{wanted}"
+        )
+    clean = [float(x) if numbers else x for x in items]
+    return clean if count else clean[0]
 
 
 @dataclass(frozen=True)
@@ -67,34 +94,44 @@ class Robot:
     def load(cls, name_or_config: str | Path = "bhr") -> Robot:
         """Load a shipped robot by name, or any robot by the path of its TOML file."""
         path = SHIPPED.get(str(name_or_config)) or Path(name_or_config)
-        if not path.is_file():
-            known = ", ".join(SHIPPED)
-            raise RobotError(f"robot {str(name_or_config)!r}: neither a shipped robot ({known}) nor a readable TOML file")
-        text = path.read_text()
+        known = ", ".join(SHIPPED)
         try:
-            config = tomllib.loads(text)
-            urdf = (path.parent / config["urdf"]).read_text()
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-            raise RobotError(f"{path}: not a TOML file: {e}") from e
-        except KeyError as e:
-            raise RobotError(f"{path}: the entry {e} is missing") from e
-        except OSError as e:
-            raise RobotError(f"{path}: its URDF {config['urdf']!r} cannot be read: {e.strerror}") from e
-        return cls.from_text(urdf, text)
+            text = path.read_text()
+        except UnicodeDecodeError as e:
+            raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
+        except (OSError, ValueError) as e:
+            name = str(name_or_config)
+            short = name if len(name) < 80 else name[:77] + "..."
+            raise RobotError(f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file") from e
+        config = _toml(text, str(path))
+        urdf = config.get("urdf")
+        if not isinstance(urdf, str):
+            raise RobotError(f"{path}: the entry 'urdf' must name the URDF file beside it, got {urdf!r}")
+        try:
+            return cls.from_text((path.parent / urdf).read_text(), text)
+        except (OSError, UnicodeDecodeError) as e:
+            raise RobotError(f"{path}: its URDF {urdf!r} cannot be read as text ({type(e).__name__})") from e
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:
-        """Build a robot from the text of its URDF and of its TOML configuration."""
-        config = tomllib.loads(config_text)
-        try:
-            feet, sole_x, sole_y = config["feet"], config["feet"]["sole_x_m"], config["feet"]["sole_y_m"]
-            foot = Foot(tuple(feet["links"]), sole_x[0], sole_x[1], (sole_y[1] - sole_y[0]) / 2, feet["sole_z_m"])
-            joints = {role: tuple(config["joints"][role]) for role in ROLES}
-            robot = cls(config["name"], urdf, joints, foot, dict(config["stance"]),
-                        float(config["actuators"]["corner_speed_ratio"]), config_text)  # fmt: skip
-        except KeyError as e:
-            raise RobotError(f"robot configuration: the entry {e} is missing") from e
+        """Build a robot from the text of its URDF and of its TOML configuration; raises :class:`RobotError`."""
+        config = _toml(config_text, "robot configuration")
+        get = partial(_entry, config)
+        x, y = get("feet", "sole_x_m", count=2), get("feet", "sole_y_m", count=2)
+        links = get("feet", "links", kind=str, count=2)
+        foot = Foot(tuple(links), x[0], x[1], (y[1] - y[0]) / 2, get("feet", "sole_z_m"))
+        if not (x[0] < x[1] and y[0] < y[1]):
+            raise RobotError(
+                f"robot configuration: the sole {x} x {y} m has no area; give [heel, toe] and [right, left]"
+            )
+        joints = {role: tuple(get("joints", role, kind=str, count=2)) for role in ROLES}
+        stance = {key: get("stance", key) for key in ("knee_rad", "trunk_pitch_rad", "shoulder_rad")}
+        corner = get("actuators", "corner_speed_ratio")
+        if not 0 < corner < 1:
+            raise RobotError(f"robot configuration: corner_speed_ratio = {corner:g} must lie between 0 and 1")
+        robot = cls(get("name", kind=str), urdf, joints, foot, stance, corner, config_text)
         robot._check_names()
+        robot._check_numbers()
         return robot
 
     def _check_names(self) -> None:
@@ -105,6 +142,20 @@ class Robot:
         for name in self.foot.frames:
             if not self.model.existFrame(name):
                 raise RobotError(f"robot {self.name}: the foot link {name!r} is not in the URDF")
+
+    def _check_numbers(self) -> None:
+        for joint, inertia in enumerate(self.model.inertias):
+            name = self.model.names[joint]
+            if joint and not (np.isfinite(inertia.mass) and inertia.mass >= 0 and np.all(np.isfinite(inertia.inertia))):
+                raise RobotError(f"robot {self.name}: the body moved by {name!r} has mass {inertia.mass:g} kg")
+        for name, a in self.actuators.items():
+            if not (
+                a["lower"] < a["upper"] and a["effort"] > 0 and a["speed"] > 0 and np.all(np.isfinite([*a.values()]))
+            ):
+                raise RobotError(
+                    f"robot {self.name}: joint {name!r} has range {a['lower']:g} ... {a['upper']:g} rad, effort "
+                    f"{a['effort']:g} N m, speed {a['speed']:g} rad/s; all must be finite, positive and in order"
+                )
 
     @cached_property
     def model(self) -> pin.Model:

@@ -7,6 +7,7 @@ those outside the joint ranges are dropped, and the extremes over each CoM dista
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import qmc
@@ -16,12 +17,15 @@ from jumplab.robot.stance import stance_angles
 
 SAMPLES = 2**16  # our choice: envelopes move by less than 1 % when doubled
 BINS = 24  # our choice: about 2 cm of CoM distance each
-EDGE = 0.02  # our choice: share of extreme samples cut off on either side, so that the envelope is not a singular posture
+EDGE = (
+    0.02  # our choice: share of extreme samples cut off on either side, so that the envelope is not a singular posture
+)
 HEEL_UP_RAD = 0.5  # our choice: foot pitch considered as still pushing off
 TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; forward lean of a deep bow
 COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
 FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
 MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
+FORCE_CAP = 1.5  # our choice: nearly straight legs carry any load; the fit shall not chase that
 SPEED_QUANTILE = 0.98  # our choice: as for the force; a good posture for extending the leg fast
 
 
@@ -117,7 +121,7 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     edges = np.linspace(low, high, BINS + 1)
     grid = (edges[1:] + edges[:-1]) / 2
     rows = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         inside = (phi >= a) & (phi < b)
         rows.append([*np.quantile(rho[inside], [EDGE, 1 - EDGE]), np.quantile(force[inside], 1 - EDGE),
                      np.quantile(speed[inside], SPEED_QUANTILE)])  # fmt: skip
@@ -131,5 +135,6 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     start = np.array([np.arctan2(*from_sole), np.hypot(*from_sole), stance[3], np.sqrt(stance_rho / mass.sum())])
     half = -m.heel[0] / 2
     return Reach((float(low), float(high)), grid, lower, upper, strongest, fastest, np.polyfit(grid, lower, 2),
-                 np.polyfit(grid, upper, 2), np.polyfit(grid, np.minimum(strongest, 1.5 * strongest[0]), 3), np.polyfit(grid, fastest, 3), (float(lower.min()), float(upper.max())),
+                 np.polyfit(grid, upper, 2), np.polyfit(grid, np.minimum(strongest, FORCE_CAP * strongest[0]), 3), np.polyfit(grid, fastest, 3),
+                 (float(lower.min()), float(upper.max())),
                  float(m.inertia.sum()), (-half, half), TRUNK_RAD, start, float(mass.sum()))  # fmt: skip

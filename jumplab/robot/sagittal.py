@@ -33,7 +33,7 @@ class SagittalModel:
     ----------
     mass, inertia : (5,) kg and kg m^2 about each link's own CoM, both sides summed; order :data:`SAGITTAL_LINKS`.
     com : (5, 2) CoM from the link's lower joint: toe, ankle, knee, hip; for the arm from the shoulder.
-    span : (5, 2) from that joint to the next: toe to ankle, ankle to knee, knee to hip, hip to shoulder, shoulder to hand.
+    span : (5, 2) from that joint to the next: toe to ankle, to knee, to hip, to shoulder, to hand.
     heel, sole_center : (2,) from the toe.
     base : (2,) from the hip to the origin of the robot's base link, fixed in the trunk.
     sign : (4,) +1 or -1, robot joint angle = sign * sagittal joint angle; order :data:`SAGITTAL_JOINTS`.

@@ -41,8 +41,8 @@ def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
         return angles(brentq(offset, -0.6, 1.4))  # our choice: generous lean of the shank, both ways
     except ValueError:
         raise RobotError(
-            f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank brings "
-            f"the CoM above the middle of the sole; change [stance] in its configuration"
+            f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank "
+            f"brings the CoM above the middle of the sole; change [stance] in its configuration"
         ) from None
 
 

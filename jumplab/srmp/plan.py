@@ -15,8 +15,8 @@ from jumplab.task import JumpTask
 class SrmpLaunch:
     """Stage 1's launch on a fixed grid; positions from the pivot, the middle of the sole at its initial place.
 
-    t (n,) [s]; com, com_velocity, com_acceleration (n, 2) [m ...]; L [kg m^2/s]; L_rate [N m]; rho [kg m^2] with rate and
-    accel; F_x, F_z [N]; cop_x [m]; lean, posture (theta_l + theta_pl) [rad]; coordinates (n, 4).
+    t (n,) [s]; com, com_velocity, com_acceleration (n, 2) [m ...]; L [kg m^2/s]; L_rate [N m]; rho [kg m^2] with rate
+    and accel; F_x, F_z [N]; cop_x [m]; lean, posture (theta_l + theta_pl) [rad]; coordinates (n, 4).
     """
 
     t: np.ndarray

@@ -9,6 +9,8 @@ from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.terms import cop_term, flight_terms, joining_terms, launch_terms, takeoff_terms
 from jumplab.terms import Bound, Phase, Problem
 
+COM_BOX_M = (-1.5, 2.5)  # our choice: the CoM at take-off, seen from the pivot
+SPEED_BOX_M_S = (-6.0, 6.0)  # our choice: a CoM rise of 1.8 m
 TOE_BAND_M = 0.005  # our choice: the toe part's CoP lies within this distance of the toe edge
 SCALES = {"q": 1.0, "v": [5.0, 3.0, 5.0, 2.0], "a": [50.0, 30.0, 50.0, 20.0], "j": [1000.0, 500.0, 1000.0, 500.0]}
 FLIGHT_SCALES = {"q": 1.0, "v": 20.0, "a": 200.0, "j": 5000.0}
@@ -31,10 +33,10 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
     )
     heel, toe, margin = *reach.cop, s.cop_margin_m
     along = launch_terms(mass, reach, s)
-    flat = Phase("flat", COORDINATES, s.intervals[0], s.flat_s, (*along, cop_term(mass, heel + margin, toe - margin)), bounds,
-                 scales=SCALES)  # fmt: skip
-    tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s,
-                (*along, cop_term(mass, toe - TOE_BAND_M, toe), *takeoff_terms(mass, s)), (box,), scales=SCALES)  # fmt: skip
+    inside, edge = cop_term(mass, heel + margin, toe - margin), cop_term(mass, toe - TOE_BAND_M, toe)
+    flat = Phase("flat", COORDINATES, s.intervals[0], s.flat_s, (*along, inside), bounds, scales=SCALES)
+    tip_terms = (*along, edge, *takeoff_terms(mass, s))
+    tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip_terms, (box,), scales=SCALES)
     return flat, tip
 
 
@@ -48,8 +50,8 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
         Bound("inertia acceleration range", "SF-B1", "kg m^2/s^2", "a", -s.inertia_accel, s.inertia_accel),
     )
     leg = (s.touchdown_length[0] * stance, s.touchdown_length[1] * stance, 1.0)
-    constants = {"L": (*s.momentum, 10.0), "com_x": (-1.0, 1.0, 1.0), "com_z": (0.0, 2.0, 1.0), "vel_x": (-5.0, 5.0, 1.0),
-                 "vel_z": (0.0, 6.0, 1.0), "leg": leg}  # fmt: skip
+    constants = {"L": (*s.momentum, 10.0), "com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0),
+                 "vel_x": (*SPEED_BOX_M_S, 1.0), "vel_z": (*SPEED_BOX_M_S, 1.0), "leg": leg}  # fmt: skip
     return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), tuple(flight_terms(s)), bounds, states=("theta",),
                  constants=constants, scales=FLIGHT_SCALES)  # fmt: skip
 

@@ -56,9 +56,11 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
         Term("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_box, lower=0.0, upper=inf),
         Term("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, lower=s.momentum[0],
              upper=s.momentum[1], scale=10.0),
-        Term("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], lower=0.0, upper=inf, scale=mg, skip=(0, 1)),
+        Term("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], lower=0.0, upper=inf, scale=mg,
+             skip=(0, 1)),
         Term("friction", "ours", "N", "node", cone, lower=0.0, upper=inf, scale=mg, skip=(0, 1)),
-        Term("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, lower=0.0, upper=inf, scale=mg),
+        Term("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, lower=0.0, upper=inf,
+             scale=mg),
         Term("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, lower=0.0, upper=inf),
     ]  # fmt: skip
 
@@ -129,7 +131,9 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
 
     def continuity(e):
         a, b = e["flat"].end, e["toe"].start
-        return ca.vertcat(*((x - y) / ca.DM(scale) for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0))))
+        return ca.vertcat(
+            *((x - y) / ca.DM(scale) for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0)))
+        )
 
     def inertia_link(e):
         a, b = srmp_state(e["toe"].end, mass), e["flight"].start

@@ -80,7 +80,10 @@ class WholeBodyPlanner:
         """Stage 1's trajectories at this mesh's nodes, by share of each phase."""
         launch, flight, split = srmp.launch, srmp.flight, srmp.launch_s - srmp.toe_s
         out = {}
-        for name, first, last, n in (("flat", 0.0, split, self.mesh.flat), ("toe", split, srmp.launch_s, self.mesh.toe)):
+        for name, first, last, n in (
+            ("flat", 0.0, split, self.mesh.flat),
+            ("toe", split, srmp.launch_s, self.mesh.toe),
+        ):
             t = np.linspace(first, last, n + 1)
             columns = {k: np.interp(t, launch.t, getattr(launch, k))[None] for k in ("rho", "rho_rate", "L")}
             velocity = [np.interp(t, launch.t, launch.com_velocity[:, i]) for i in range(2)]
@@ -108,16 +111,20 @@ class WholeBodyPlanner:
         toe = _through([push, p["take-off"]], [0, 1], n.toe)
         fly = _through([p["take-off"], p["tuck"] + turn / 2, p["touchdown"] + turn], [0, 0.5, 1], n.flight)
         lean = 0.3 * np.tanh(task.distance_m)
-        constants = dict(com_x=lean - 0.12, com_z=0.65, vel_x=(task.distance_m - lean) / flight_s, vel_z=task.takeoff_speed)
+        constants = dict(
+            com_x=lean - 0.12, com_z=0.65, vel_x=(task.distance_m - lean) / flight_s, vel_z=task.takeoff_speed
+        )
         return {
             "flat": PhaseGuess(0.7, flat, zero(flat.shape), zero(flat.shape)),
             "toe": PhaseGuess(TOE_PHASE_S, toe, zero(toe.shape), zero(toe.shape)),
             "flight": PhaseGuess(flight_s, fly, zero(fly.shape), zero(fly.shape), None, constants),
         }
 
-    def guess_from_motion(self, t, angles, rates, accels, takeoff_s: float, toe_s: float, com, com_velocity) -> dict[str, PhaseGuess]:
-        """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time and length of
-        the toe phase [s].
+    def guess_from_motion(
+        self, t, angles, rates, accels, takeoff_s: float, toe_s: float, com, com_velocity
+    ) -> dict[str, PhaseGuess]:
+        """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time and
+        length of the toe phase [s].
 
         ``com`` and ``com_velocity`` (2,) are the CoM from the toe and its velocity at take-off.
         """

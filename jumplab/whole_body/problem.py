@@ -75,7 +75,9 @@ def _durations(weights: Weights) -> Term:
     def difference(ends):
         return ca.vertcat(ends["flat"].end.duration, ends["toe"].end.duration) - ends["flat"].end.p.launch_s
 
-    return Term("track durations", "ours: fixed in the paper", "s", "problem", difference, weight=weights.track_duration)
+    return Term(
+        "track durations", "ours: fixed in the paper", "s", "problem", difference, weight=weights.track_duration
+    )
 
 
 def build_problem(robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,

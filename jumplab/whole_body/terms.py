@@ -148,7 +148,8 @@ class WholeBodyTerms:
             Term("CoP at the toe", "ours: heel up", "N m", "node", lambda p: self.wrench(p)[2], scale=0.1 * mg,
                  skip=(0, 1)),
             Term("CoP at the toe (mid)", "ours: heel up", "N m", "mid", lambda p: self.wrench(p)[2], scale=0.1 * mg),
-            Term("zero wrench at take-off", "SL-E3, E4, E6 for the whole body", "N", "end", self.wrench, scale=0.1 * mg),
+            Term("zero wrench at take-off", "SL-E3, E4, E6 for the whole body", "N", "end", self.wrench,
+                 scale=0.1 * mg),
             Term("vertical take-off speed", "SL-E2, WL-E1", "m/s", "end",
                  lambda p: self.state(p).com_velocity[1] - p.p.takeoff_speed),
         ]  # fmt: skip
@@ -182,7 +183,8 @@ class WholeBodyTerms:
             difference = self.state(p).angular_momentum - p.p.momentum
             return ca.vertcat(slack - difference, slack + difference)
 
-        return self.tracking(False) + [
+        return [
+            *self.tracking(False),
             Term("heel velocity", "WL-J3", "m/s", "node", lambda p: self.state(p).point("heel", 1)[1],
                  weight=w.heel_velocity),
             Term("L at take-off", "WL-D1", "kg m^2/s", "end", momentum, lower=0.0, upper=np.inf),
@@ -221,7 +223,7 @@ class WholeBodyTerms:
         return [
             Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
                  lambda p: self.toe(p) - ca.vertcat(p.p.distance, p.p.platform)),
-            Term("foot flat at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[0]),
+            Term("foot flat at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[0] - p.p.rotation),
             Term("knee at touchdown", "ours: stroke", "rad", "end", lambda p: self.state(p).joints[1],
                  lower=lim.touchdown_knee[0], upper=lim.touchdown_knee[1]),
             Term("trunk at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[3] - p.p.rotation,

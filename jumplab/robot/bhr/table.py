@@ -42,7 +42,9 @@ TABLE: dict[str, Row] = {
     "foot_width": Row(0.10, "m", "our choice"),
     "foot_thickness": Row(0.03, "m", "our choice: clears the shank over the whole ankle range"),
     # collision geometry -----------------------------------------------------------------------------------------
-    "trunk_depth": Row(0.16, "m", "our choice: with the box starting 0.10 m above the hip, flexion to -2.1 rad is free"),
+    "trunk_depth": Row(
+        0.16, "m", "our choice: with the box starting 0.10 m above the hip, flexion to -2.1 rad is free"
+    ),
     "trunk_width": Row(0.28, "m", "our choice: inner arm surface at 0.195 m"),
     "trunk_bottom_above_hip": Row(0.10, "m", "our choice: see trunk_depth"),
     "pelvis_width": Row(0.08, "m", "our choice: fits between the thighs"),
@@ -54,7 +56,9 @@ TABLE: dict[str, Row] = {
     "shank_mass": Row(3.0, "kg", "our choice: 7 %, ankle drives in the upper half"),
     "foot_mass": Row(1.0, "kg", "our choice: 2.4 %, with force sensor"),
     "arm_mass": Row(2.0, "kg", "our choice: 4.8 %"),
-    "dummy_mass": Row(0.001, "kg", "our choice: zero is refused by MuJoCo and read as 1 kg by PyBullet; taken off the trunk"),
+    "dummy_mass": Row(
+        0.001, "kg", "our choice: zero is refused by MuJoCo and read as 1 kg by PyBullet; taken off the trunk"
+    ),
     "dummy_inertia": Row(1e-6, "kg m^2", "our choice: see dummy_mass"),
     # centres of mass --------------------------------------------------------------------------------------------
     "trunk_com_below_top": Row(0.20, "m", "our choice: hip drives and battery below, head above"),
@@ -72,7 +76,9 @@ TABLE: dict[str, Row] = {
     "hip_roll_effort": Row(120.0, "N m", "our choice: carries one-legged stance (0.5 m g * 0.2 m) with margin"),
     "hip_pitch_effort": Row(200.0, "N m", "our choice: between Unitree G1 (88, 35 kg) and H1 (220, 47 kg)"),
     "knee_effort": Row(210.0, "N m", "our choice: 2 tau / (m g leg) = 1.46; published robots of this size 1.3 to 1.6"),
-    "ankle_pitch_effort": Row(150.0, "N m", "our choice: half the body weight at 3.5 g on the toe lever, parallel drive"),
+    "ankle_pitch_effort": Row(
+        150.0, "N m", "our choice: half the body weight at 3.5 g on the toe lever, parallel drive"
+    ),
     "ankle_roll_effort": Row(60.0, "N m", "our choice: half the body weight at 3 g on the half-width"),
     "shoulder_pitch_effort": Row(45.0, "N m", "our choice: G1 25, H1 40 to 75"),
     "hip_yaw_speed": Row(15.0, "rad/s", "our choice: published 15 to 20"),

@@ -1,0 +1,275 @@
+"""Stage 2's model: nine links, 20 degrees of freedom, from Pinocchio (Sec. II-B and IV of the paper).
+
+The configuration is Pinocchio's free-flyer one; rates and accelerations are its tangent (base twist in the base frame,
+then joints), theta^js of the paper. Wrenches act at the two tiptoes, the middles of the soles' front edges, in world
+axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import RobotError
+from jumplab.robot import Robot
+
+LATERAL = np.array([0.0, 1.0, 0.0])  # the pitch axis, world
+PARALLEL_TOLERANCE = 1e-6  # our choice: how far an axis may be off before a robot counts as crooked
+POINTS = ("toe", "heel", "sole")
+
+
+CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
+
+
+def skew(x: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) with skew(x) @ y = x cross y, for vectors (..., 3)."""
+    return (x @ CROSS).reshape(*x.shape, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class FullTerms:
+    """Every quantity of the nine-link robot that the QPs need, at one (q, v); feet are ordered left, right.
+
+    In each "drift" the acceleration is that of theta'' = 0, so ``x'' = J_x theta'' + drift``.
+
+    Attributes
+    ----------
+    q, v : configuration (nq,) and rates (nv,).
+    M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
+    com, com_velocity : c and its rate (3,) [m, m/s].
+    A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
+    momentum : linear then centroidal angular momentum (6,) [kg m/s, kg m^2/s]; ``momentum[4]`` is L.
+    A_h, B_h : centroidal momentum matrix (6, nv) and drift (6,).
+    rho : pitch inertia about the CoM, rho_total [kg m^2].
+    J_rho, drift_rho : its Jacobian (nv,) and drift [kg m^2/s^2].
+    toe, heel, sole : places of the middles of the soles' front edge, rear edge, and of the sole itself (2, 3) [m].
+    toe_velocity, heel_velocity, sole_velocity : (2, 3) [m/s].
+    J_toe, drift_toe : Jacobian (2, 6, nv), linear then angular, and drift (2, 6) of the tiptoes; J^js of the paper.
+    J_heel, drift_heel : linear Jacobian (2, 3, nv) and drift (2, 3) of the heels.
+    foot_com, foot_com_rate : sole minus CoM, p_rd, and its rate (2, 3).
+    J_rd, drift_rd : Jacobian (2, 3, nv) and drift (2, 3) of p_rd.
+    foot_rotation : rotation matrices of the feet (2, 3, 3).
+    foot_spin : angular velocity of the feet, world axes (2, 3) [rad/s].
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    M: np.ndarray
+    H: np.ndarray
+    com: np.ndarray
+    com_velocity: np.ndarray
+    A_c: np.ndarray
+    B_c: np.ndarray
+    momentum: np.ndarray
+    A_h: np.ndarray
+    B_h: np.ndarray
+    rho: float
+    J_rho: np.ndarray
+    drift_rho: float
+    toe: np.ndarray
+    heel: np.ndarray
+    sole: np.ndarray
+    toe_velocity: np.ndarray
+    heel_velocity: np.ndarray
+    sole_velocity: np.ndarray
+    J_toe: np.ndarray
+    drift_toe: np.ndarray
+    J_heel: np.ndarray
+    drift_heel: np.ndarray
+    foot_com: np.ndarray
+    foot_com_rate: np.ndarray
+    J_rd: np.ndarray
+    drift_rd: np.ndarray
+    foot_rotation: np.ndarray
+    foot_spin: np.ndarray
+
+    @property
+    def J(self) -> np.ndarray:
+        """J^js (12, nv): both tiptoes, so that the ground acts on the robot as J^T F."""
+        return self.J_toe.reshape(12, -1)
+
+    @property
+    def A_f(self) -> np.ndarray:
+        """A_f (6, 12): A_f F is the rate of linear momentum without gravity, then of centroidal angular momentum."""
+        out = np.zeros((6, 12))
+        for k, arm in enumerate(skew(self.toe - self.com)):
+            at = 6 * k
+            out[[0, 1, 2, 3, 4, 5], [at, at + 1, at + 2, at + 3, at + 4, at + 5]] = 1.0
+            out[3:, at : at + 3] = arm
+        return out
+
+    @property
+    def rho_rate(self) -> float:
+        """d rho / dt [kg m^2/s]."""
+        return float(self.J_rho @ self.v)
+
+    @property
+    def foot_pitch(self) -> np.ndarray:
+        """Pitch of the feet (2,) [rad]; positive is heel up."""
+        return np.arctan2(-self.foot_rotation[:, 2, 0], self.foot_rotation[:, 0, 0])
+
+
+def force_target(mass: float, gravity: float, com_acceleration, momentum_rate) -> np.ndarray:
+    """B_f (6,): what A_f F must be for a CoM acceleration (3,) and a rate of centroidal angular momentum (3,)."""
+    lift = np.array([0.0, 0.0, gravity])
+    return np.concatenate([mass * (np.asarray(com_acceleration) + lift), momentum_rate])
+
+
+class FullBody:
+    """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
+
+    Attributes
+    ----------
+    robot, model : the robot and its Pinocchio model.
+    nq, nv, mass, gravity : sizes [-], kg, m/s^2 (positive).
+    pairs : (left column, right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
+    """
+
+    def __init__(self, robot: Robot):
+        self.robot, self.model = robot, robot.model
+        self.data = self.model.createData()
+        self.nq, self.nv = self.model.nq, self.model.nv
+        self.mass = robot.total_mass
+        self.gravity = -float(self.model.gravity.linear[2])
+        self._read_tree()
+        self._read_feet()
+        self.pairs, self.groups = self._pair_joints()
+
+    # constants of the robot -------------------------------------------------------------------------------------
+    def _read_tree(self):
+        model, n = self.model, self.model.njoints - 1
+        self._column_joint = np.concatenate([[j - 1] * model.joints[j].nv for j in range(1, n + 1)])  # (nv,)
+        self._above = np.zeros((n, n))  # [i, j] = 1 if joint j carries body i
+        self._pseudo = np.zeros((n, 4, 4))  # integral of [x; 1][x; 1]^T dm over each body, joint frame
+        for i in range(n):
+            self._above[i, [j - 1 for j in model.supports[i + 1] if j > 0]] = 1.0
+            body = model.inertias[i + 1]
+            about_com = np.trace(body.inertia) / 2 * np.eye(3) - body.inertia
+            lever = np.append(body.lever, 1.0)
+            self._pseudo[i] = body.mass * np.outer(lever, lever)
+            self._pseudo[i, :3, :3] += about_com
+        self._carries = self._above[:, self._column_joint]  # (n, nv): column moves body
+
+    def _read_feet(self):
+        model, foot, data = self.model, self.robot.foot, self.data
+        frames = [model.frames[model.getFrameId(name)] for name in foot.frames]
+        self.foot_joints = [f.parentJoint for f in frames]
+        middle = {"toe": [foot.toe, 0.0, foot.sole_z], "heel": [foot.heel, 0.0, foot.sole_z], "sole": foot.center}
+        self._points = np.array([[f.placement.act(np.array(middle[p], float)) for p in POINTS] for f in frames])
+        self._foot_turn = np.array([f.placement.rotation for f in frames])
+        self.foot_origin = np.array([f.placement.translation for f in frames])  # (2, 3), in the foot joint
+        self._foot_carries = self._carries[[j - 1 for j in self.foot_joints]]  # (2, nv)
+        pin.framesForwardKinematics(model, data, pin.neutral(model))
+        for name in foot.frames:
+            turn = data.oMf[model.getFrameId(name)].rotation
+            if np.abs(turn - np.eye(3)).max() > PARALLEL_TOLERANCE:
+                raise RobotError(
+                    f"robot {self.robot.name}: the axes of {name!r} are not parallel to the base's in the neutral pose "
+                    f"(off by {np.abs(turn - np.eye(3)).max():.2g}); turn the link frame of the foot"
+                )
+
+    def _chain(self, joint: int) -> list[int]:
+        return [j for j in self.model.supports[joint] if j > 1]
+
+    def _pair_joints(self):
+        """Pairs of joints, left and right, with the sign of a mirrored motion, and the pairs of each role."""
+        model, data, roles = self.model, self.data, self.robot.joints
+        pin.computeJointJacobians(model, data, pin.neutral(model))
+        shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]]
+        legs = [self._chain(j) for j in self.foot_joints]
+        hip = self._chain(model.getJointId(roles["hip_pitch"][0]))
+        pairs, groups = [], {"hip": [], "knee": [], "ankle": [], "shoulder": []}
+        for chains, arm in ((legs, False), (shoulders, True)):
+            if len(chains[0]) != len(chains[1]):
+                raise RobotError(f"robot {self.robot.name}: left and right limbs have different numbers of joints")
+            for left, right in zip(*chains, strict=True):
+                knee = model.names[left] == roles["knee"][0]
+                group = "shoulder" if arm else "hip" if left in hip else "knee" if knee else "ankle"
+                groups[group].append(len(pairs))
+                pairs.append((model.idx_vs[left], model.idx_vs[right], self._mirror_sign(left, right)))
+        return pairs, groups
+
+    def _mirror_sign(self, left: int, right: int) -> float:
+        """+1 if equal angles mirror each other, -1 if opposite ones do: found by motion in the neutral pose."""
+        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobians = [pin.getJointJacobian(self.model, self.data, j, frame)[3:, self.model.idx_vs[j]] for j in (left, right)]
+        mirrored = jacobians[0] * [-1.0, 1.0, -1.0]  # a rotation's mirror image in the x-z plane
+        sign = float(np.sign(mirrored @ jacobians[1]))
+        if np.abs(jacobians[1] - sign * mirrored).max() > PARALLEL_TOLERANCE:
+            names = self.model.names[left], self.model.names[right]
+            raise RobotError(f"robot {self.robot.name}: {names[0]!r} and {names[1]!r} are not mirror images of each other")
+        return sign
+
+    def symmetry_rows(self, groups=("hip", "knee", "ankle", "shoulder")) -> np.ndarray:
+        """Rows (k, nv) with row @ theta'' = 0 for mirrored motion: right - sign * left, one row per joint pair.
+
+        The paper's "sum of both hip joints = 0" holds for the joints with sign -1 (yaw and roll with axes that are not
+        mirrored); for pitch the sign is +1 and the row is a difference.
+        """
+        rows = np.zeros((len(self.pairs), self.nv))
+        for row, (left, right, sign) in zip(rows, self.pairs, strict=True):
+            row[right], row[left] = 1.0, -sign
+        return rows[[i for g in groups for i in self.groups[g]]]
+
+    # quantities of one state ------------------------------------------------------------------------------------
+    def terms(self, q: np.ndarray, v: np.ndarray) -> FullTerms:
+        """All quantities at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
+        model, data = self.model, self.data
+        pin.dccrba(model, data, q, v)
+        J, dJ = data.J.copy(), data.dJ.copy()  # (6, nv) about the world origin
+        A_h, B_h = data.Ag.copy(), data.dAg @ v
+        A_c, B_c, com = A_h[:3] / self.mass, B_h[:3] / self.mass, data.com[0].copy()
+        momentum = A_h @ v
+        velocity = momentum[:3] / self.mass
+        H = pin.nonLinearEffects(model, data, q, v).copy()
+        M = np.triu(pin.crba(model, data, q))
+        M += np.triu(M, 1).T
+        spatial = (J * v) @ self._carries.T, (dJ * v) @ self._carries.T  # (6, bodies) velocity, drift of each body
+        inertia = self._inertia(J, *spatial, com, velocity, A_c, B_c)
+        feet = self._feet(J, *spatial, v, com, velocity, A_c, B_c)
+        return FullTerms(q, v, M, H, com, velocity, A_c, B_c, momentum, A_h, B_h, *inertia, *feet)
+
+    def _inertia(self, J, velocity, drift, com, com_velocity, A_c, B_c):
+        """rho, J_rho and its drift: with the integral D of [x; 1][x; 1]^T dm, rho is D_xx + D_zz - m (c_x^2 + c_z^2)."""
+        place = np.array([x.homogeneous for x in self.data.oMi])[1:]  # (n, 4, 4)
+        D = place @ self._pseudo @ place.transpose(0, 2, 1)  # (n, 4, 4)
+        sub = (self._above.T @ D.reshape(-1, 16)).reshape(-1, 4, 4)  # of everything a joint carries
+        total, m, xz = sub[0], self.mass, [0, 2]
+        rho = total[0, 0] + total[2, 2] - m * (com[xz] @ com[xz])
+        g = np.zeros((6, len(sub)))  # gradient of D_xx + D_zz along a twist (linear, angular) about the origin
+        g[0], g[2], g[3], g[5] = sub[:, 0, 3], sub[:, 2, 3], sub[:, 2, 1], -sub[:, 0, 1]
+        J_rho = 2 * np.einsum("ij,ij->j", J, g[:, self._column_joint]) - 2 * m * (com[xz] @ A_c[xz])  # (nv,)
+        spin = skew(velocity[3:].T)  # (n, 3, 3)
+        rate = np.concatenate([spin, velocity[:3].T[:, :, None]], 2)  # x' = rate [x; 1]
+        second = np.concatenate([skew(drift[3:].T), drift[:3].T[:, :, None]], 2) + spin @ rate  # x'' at theta'' = 0
+        twice = np.einsum("nij,nij->i", rate @ D, rate) + np.einsum("nij,nij->i", D[:, :3], second)
+        moving = com_velocity[xz] @ com_velocity[xz] + com[xz] @ B_c[xz]
+        drift_rho = 2 * (twice[0] + twice[2]) - 2 * m * moving
+        return rho, J_rho, drift_rho
+
+    def _feet(self, J, velocity, drift, v, com, com_velocity, A_c, B_c):
+        """Places, velocities, Jacobians and drifts of tiptoes, heels and soles, and p_rd = sole - CoM."""
+        bodies = [j - 1 for j in self.foot_joints]
+        turn = np.array([self.data.oMi[j].rotation for j in self.foot_joints])
+        origin = np.array([self.data.oMi[j].translation for j in self.foot_joints])
+        points = self._points @ turn.transpose(0, 2, 1) + origin[:, None]  # (2, 3 points, 3)
+        own = J * self._foot_carries[:, None]  # (2, 6, nv)
+        spin, alpha = velocity[3:, bodies].T, drift[3:, bodies].T  # (2, 3)
+        spin_x, at_x = skew(spin)[:, None], skew(points)  # (2, 1, 3, 3), (2, 3, 3, 3)
+        linear = own[:, None, :3] - at_x @ own[:, None, 3:]  # (2, 3 points, 3, nv)
+        speed = linear @ v  # (2, 3 points, 3)
+        bias = drift[:3, bodies].T[:, None] + (skew(alpha)[:, None] @ points[..., None] + spin_x @ speed[..., None])[..., 0]
+        J_toe = np.concatenate([linear[:, 0], own[:, 3:]], 1)  # (2, 6, nv)
+        drift_toe = np.concatenate([bias[:, 0], alpha], 1)  # (2, 6)
+        sole = points[:, 2]
+        return (
+            *(points[:, i] for i in range(3)),
+            *(speed[:, i] for i in range(3)),
+            J_toe, drift_toe, linear[:, 1], bias[:, 1],
+            sole - com, speed[:, 2] - com_velocity, linear[:, 2] - A_c, bias[:, 2] - B_c,
+            turn @ self._foot_turn, spin,
+        )  # fmt: skip
