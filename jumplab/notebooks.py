@@ -1,0 +1,325 @@
+"""Runs the notebooks in order with papermill, under the very Python that runs this, and publishes what they made.
+
+A chain works in ``OUT/.run``: the notebooks execute there with ``out = "result"`` and ``figures = "figures"``. Only
+when the last one has passed are the results moved to OUT, the executed notebooks to ``OUT/notebooks`` and the figures
+to their folder. A chain that fails leaves all of them as they were, and the notebook that failed in ``OUT/failed``.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import inspect
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jumplab import errors, store
+from jumplab.errors import InputError, JumplabError
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+
+PATTERN = "[0-9][0-9]_*.ipynb"
+STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
+INJECTED = "# Parameters\n"  # how the cell begins that papermill adds
+_PACKAGE_PARENT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """Where a finished chain put its things, and how long it took.
+
+    Attributes
+    ----------
+    out : result folder: plan, simulation, and the executed notebooks in ``notebooks``.
+    figures : folder of the figures.
+    notebooks : names of the notebooks, in the order in which they ran.
+    wall_s : wall time of the whole chain [s].
+    """
+
+    out: Path
+    figures: Path
+    notebooks: tuple[str, ...]
+    wall_s: float
+
+
+# ---------------------------------------------------------------------------------------------- inside a notebook
+
+
+def check_parameters(namespace: Mapping[str, Any], **extra: type) -> None:
+    """Refuse injected parameters that a notebook does not know, and values that cannot be meant.
+
+    papermill merely warns of an unknown name and then runs with the default. Call this in the cell after the
+    parameters: ``check_parameters(globals(), samples=int)``.
+
+    Parameters
+    ----------
+    namespace : the notebook's ``globals()``.
+    extra : further parameters of this notebook and their types; those of ``STANDARD`` are always known.
+
+    Raises
+    ------
+    InputError
+        Naming the parameter, its value and what it should be.
+    """
+    known = {**STANDARD, **extra}
+    for name in _injected(namespace):
+        if name not in known:
+            raise InputError(f"unknown notebook parameter {name!r}; this notebook knows {', '.join(known)}")
+    for name, kind in known.items():
+        if name in namespace:
+            _check_value(name, namespace[name], kind)
+    if "distance_m" in namespace or "height_m" in namespace:
+        JumpTask(namespace.get("distance_m", 0.0), namespace.get("height_m", 0.5))
+
+
+def _injected(namespace: Mapping[str, Any]) -> list[str]:
+    """Names assigned by the cell that papermill added, from IPython's list of what has been executed."""
+    cells = [source for source in namespace.get("In", []) if source.startswith(INJECTED)]
+    names = [t.id for c in cells for node in ast.walk(ast.parse(c)) if isinstance(node, ast.Assign)
+             for t in node.targets if isinstance(t, ast.Name)]  # fmt: skip
+    return list(dict.fromkeys(names))
+
+
+def _check_value(name: str, value: Any, kind: type) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    good = number if kind is float else isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    if not good:
+        raise InputError(f"parameter {name} must be of type {kind.__name__}, got {value!r}")
+    if kind is float and not math.isfinite(value):
+        raise InputError(f"parameter {name} must be finite, got {value}")
+    if kind is str and (not value or "\0" in value):
+        raise InputError(f"parameter {name} must be a name or a path, got {value!r}")
+
+
+# ---------------------------------------------------------------------------------------------- finding them
+
+
+def find_notebooks() -> list[Path]:
+    """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
+
+    Raises
+    ------
+    InputError
+        If there are none; an installed package carries no notebooks.
+    """
+    places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
+    for place in places:
+        found = sorted(place.glob(PATTERN))
+        if found:
+            return found
+    raise InputError(
+        f"no notebooks in {' nor in '.join(repr(str(p)) for p in places)}; run this in a clone of the repository"
+    )
+
+
+def declared_parameters(notebook: Path) -> tuple[str, ...]:
+    """Names that the notebook's ``parameters`` cell declares."""
+    from papermill import inspect_notebook
+
+    try:
+        return tuple(inspect_notebook(_literal(notebook)))
+    except Exception as e:  # nbformat raises a whole zoo
+        raise InputError(f"{notebook}: not a readable notebook ({type(e).__name__})") from e
+
+
+def _literal(path: Path) -> str:
+    """Path for papermill, which would otherwise fill in what stands between braces."""
+    return str(path).replace("{", "{{").replace("}", "}}")
+
+
+# ---------------------------------------------------------------------------------------------- running them
+
+
+def run_notebooks(
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    out: str | Path | None = None,
+    figures: str | Path | None = None,
+    notebooks: list[Path] | None = None,
+    progress: bool = True,
+) -> RunReport:
+    """Execute the notebooks in order; each gets those parameters that it declares.
+
+    Parameters
+    ----------
+    parameters : name -> value, for instance ``{"distance_m": 0.8}``.
+    out : result folder; ``executed`` in the checkout if None.
+    figures : folder of the figures; if None, ``figures`` in the checkout, or in ``out`` where that is read-only.
+    notebooks : which ones; all of the package's if None.
+    progress : show a bar per notebook on stderr.
+
+    Raises
+    ------
+    InputError
+        If a parameter is unknown to all notebooks or cannot be meant, or a folder cannot be written. Nothing has run.
+    JumplabError
+        If a cell fails: of the class that the cell raised, if that is one of the package's.
+    """
+    start = time.perf_counter()
+    notebooks = [Path(n).resolve() for n in notebooks or find_notebooks()]
+    declared = {n: declared_parameters(n) for n in notebooks}
+    values = _checked(dict(parameters or {}), set().union(*declared.values()))
+    root = notebooks[0].parent.parent
+    out = store.ensure_writable(root / "executed" if out is None else out).resolve()
+    figures = _figures_folder(figures, root, out)
+    with _workshop(out) as work:
+        for i, notebook in enumerate(notebooks, start=1):
+            given = {k: v for k, v in values.items() if k in declared[notebook]}
+            label = f"{i}/{len(notebooks)} {notebook.stem}" if progress else None
+            _execute(notebook, given, work, label, keep_failed=out / "failed")
+        _publish(work, out, figures)
+    return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
+
+
+def _checked(values: dict[str, Any], known: set[str]) -> dict[str, Any]:
+    for name, value in values.items():
+        if name in ("out", "figures"):
+            raise InputError(f"the parameter {name!r} is set by the runner; use its own argument {name}")
+        if name not in known:
+            raise InputError(f"unknown notebook parameter {name!r}; the notebooks know {', '.join(sorted(known))}")
+        if name in STANDARD:
+            _check_value(name, value, STANDARD[name])
+    JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
+    if "robot" in values:
+        load_robot(values["robot"])
+        if Path(values["robot"]).is_file():
+            values["robot"] = str(Path(values["robot"]).resolve())
+    return {**values, "out": "result", "figures": "figures"}
+
+
+def _figures_folder(figures: str | Path | None, root: Path, out: Path) -> Path:
+    if figures is not None:
+        return store.ensure_writable(figures).resolve()
+    with contextlib.suppress(InputError):
+        return store.ensure_writable(root / "figures")
+    return out / "figures"
+
+
+@contextlib.contextmanager
+def _workshop(out: Path) -> Iterator[Path]:
+    """An empty ``.run`` in ``out``, for one chain at a time; gone at the end, however that comes."""
+    executed, work = out / "notebooks", out / ".run"
+    new = [p for p in (executed, out, *out.parents) if not p.exists()]
+    executed.mkdir(parents=True, exist_ok=True)
+    try:
+        with store.locked(executed, wait_s=0.0):
+            shutil.rmtree(work, ignore_errors=True)  # left by a chain that was killed
+            for name in ("result", "figures", "notebooks"):
+                (work / name).mkdir(parents=True)
+            try:
+                yield work
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
+    finally:
+        for p in new:
+            with contextlib.suppress(OSError):  # only what is still empty goes
+                p.rmdir()
+
+
+def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | None, keep_failed: Path) -> None:
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+    from papermill.exceptions import PapermillExecutionError
+
+    executed = work / "notebooks" / notebook.name
+    with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
+        try:
+            papermill.execute_notebook(
+                _literal(notebook), _literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
+                progress_bar={"desc": label} if label else False, kernel_manager_class=_kernel_manager(Path(scratch)),
+            )  # fmt: skip
+        except PapermillExecutionError as e:
+            keep_failed.mkdir(exist_ok=True)
+            place = shutil.copy(executed, keep_failed)
+            raise _explained(notebook.name, e, place) from e
+        except DeadKernelError as e:
+            raise JumplabError(f"notebook {notebook.name}: its Python process died; is there enough memory?") from e
+
+
+def _explained(name: str, e: Any, place: str) -> JumplabError:
+    """The error of a cell as one sentence, of the class that the cell raised if that is ours."""
+    kind = getattr(errors, e.ename, None)
+    ours = inspect.isclass(kind) and issubclass(kind, JumplabError)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(e.traceback))
+    arrows = re.findall(r"^-+> \d+ (.*)$", plain, flags=re.MULTILINE)
+    said = (e.evalue.strip().splitlines() or [""])[-1] or (arrows[-1].strip() if arrows else "no message")
+    text = said if ours else f"{e.ename}: {said}"
+    return (kind if ours else JumplabError)(f"notebook {name}, cell In [{e.exec_count}]: {text} (see {place})")
+
+
+def _kernel_manager(scratch: Path) -> type:
+    """Kernel manager that knows one kernel: this interpreter, with no user configuration."""
+    from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
+    from jupyter_client.manager import AsyncKernelManager
+    from traitlets import default
+
+    path = [os.environ["PYTHONPATH"]] if os.environ.get("PYTHONPATH") else []
+    if (_PACKAGE_PARENT / "pyproject.toml").is_file():  # a checkout, perhaps not installed
+        path.insert(0, str(_PACKAGE_PARENT))
+    env = {
+        "PYTHONPATH": os.pathsep.join(path),
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+        "IPYTHONDIR": str(scratch / "ipython"),
+        "JUPYTER_RUNTIME_DIR": str(scratch),
+        "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+    }
+
+    class ThisInterpreter(KernelSpecManager):
+        def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
+            argv = [sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+            escaped = {k: v.replace("$", "$$") for k, v in env.items()}
+            return KernelSpec(argv=argv, env=escaped, language="python", display_name="Python of jumplab")
+
+    class Manager(AsyncKernelManager):
+        @default("kernel_spec_manager")
+        def _kernel_spec_manager_default(self) -> KernelSpecManager:
+            return ThisInterpreter(parent=self)
+
+        @default("connection_file")
+        def _connection_file_default(self) -> str:
+            return str(scratch / "kernel.json")
+
+        async def start_kernel(self, **kwargs: Any) -> None:
+            # What cells print reaches the notebook another way; here would only come the kernel's own chatter.
+            await super().start_kernel(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **kwargs)
+
+    return Manager
+
+
+# ---------------------------------------------------------------------------------------------- publishing
+
+
+def _publish(work: Path, out: Path, figures: Path) -> None:
+    with store.transaction(out) as staging:
+        for p in (work / "result").iterdir():
+            if p.is_file():
+                os.replace(p, staging / p.name)
+    for old in (out / "notebooks").glob(PATTERN):
+        if not (work / "notebooks" / old.name).exists():
+            old.unlink()
+    _place(work / "notebooks", out / "notebooks")
+    _place(work / "figures", figures)
+    shutil.rmtree(out / "failed", ignore_errors=True)
+
+
+def _place(source: Path, target: Path) -> None:
+    """Copy a tree's files, then rename all of them into their places, so that nobody finds half a file."""
+    ready = []
+    for p in sorted(q for q in source.rglob("*") if q.is_file()):
+        final = target / p.relative_to(source)
+        final.parent.mkdir(parents=True, exist_ok=True)
+        half = final.with_name(f".{final.name}.half")
+        shutil.copyfile(p, half)
+        ready.append((half, final))
+    for half, final in ready:
+        os.replace(half, final)

@@ -1,0 +1,314 @@
+"""The command line: every refusal is one sentence on stderr, with its exit code, and leaves nothing behind."""
+
+import importlib
+import json
+import os
+import random
+import signal
+import string
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+
+import pytest
+from test_store import Result, make_summary, make_tape, names
+
+import jumplab
+from jumplab import __main__ as cli
+from jumplab import store
+from jumplab.errors import InfeasibleError, SolverError
+
+ROOT = Path(__file__).resolve().parent.parent
+STAGES = [{"stage": "SRMP launch", "iterations": 31, "build_s": 0.25, "solve_s": 0.125}]
+METRICS = {"foot_distance_m": 1.002, "com_rise_m": 0.497, "standing_s": 3.4, "landed": True, "reason": "stood"}
+FALL = {"foot_distance_m": None, "com_rise_m": None, "standing_s": 0.0, "landed": False, "reason": "fell"}
+HELP = "'jumplab --help' shows what is possible"
+HELP_PLAN = "'jumplab plan --help' shows what is possible"
+
+
+def run(capsys, *argv):
+    """Exit code, stdout and stderr of one command."""
+    code = cli.main([str(a) for a in argv])
+    return code, *capsys.readouterr()
+
+
+def one_sentence(code, out, err, expected_code=2):
+    assert code == expected_code, err
+    assert out == ""
+    assert err.startswith("jumplab: ") and err.count("\n") == 1 and err.endswith("\n")
+    assert "Traceback" not in err
+    return err.removeprefix("jumplab: ").rstrip("\n")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+REFUSALS = [
+    ("", "choose a command: run, plan, simulate or audit; " + HELP),
+    ("plan", "the following arguments are required: --out; " + HELP_PLAN),
+    ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
+    ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),
+    (
+        "plan --out x --distance-m",
+        "argument --distance-m: expected one argument; 'jumplab plan --help' shows what is possible",
+    ),
+    ("plan --out x --distance-m=--", "--distance-m=--: '--' is not a value; " + HELP),
+    ("plan --out x --distance-m far", "--distance-m must be a number, got 'far'"),
+    ("plan --out x --distance-m nan", "distance must be finite, got nan"),
+    ("plan --out x --distance-m -inf", "distance must be finite, got -inf"),
+    ("plan --out x --distance-m 1e9", "distance = 1e+09 m is outside -3 ... 3 m"),
+    ("plan --out x --distance-m -1e1", "distance = -10 m is outside -3 ... 3 m"),
+    ("plan --out x --height-m 0", "height = 0 m is outside 0.02 ... 1.5 m"),
+    ("plan --out x --height-m -0.5", "height = -0.5 m is outside 0.02 ... 1.5 m"),
+    ("plan --out x --platform-m 5", "platform = 5 m is outside -1 ... 1 m"),
+    ("plan --out x --rotation-deg x", "--rotation-deg must be a number, got 'x'"),
+    ("plan --out x --rotation-deg 1e400", "rotation must be finite, got inf"),
+    (
+        "plan --out x --rotation-deg 350",
+        "rotation = 350 deg: the robot lands on its feet only after a multiple of 360 deg; nearest is 360 deg",
+    ),
+    (
+        "plan --out x --method magic",
+        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); " + HELP_PLAN,
+    ),
+    ("plan --out x --robot asimo", "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+    ("plan --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
+    ("simulate", "the following arguments are required: DIR; 'jumplab simulate --help' shows what is possible"),
+    ("simulate nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
+    ("simulate .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
+    ("audit nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
+    ("run --distance-m nan", "distance must be finite, got nan"),
+    ("run --parameter fast", "--parameter must be NAME=VALUE, got 'fast'"),
+    ("run -p height_m=1", "--parameter height_m is given twice, or has an option of its own"),
+    ("run -p out=1", "the parameter 'out' is set by the runner; use its own argument out"),
+    ("run --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
+]
+
+
+@pytest.mark.parametrize(("command", "sentence"), REFUSALS, ids=[c for c, _ in REFUSALS])
+def test_refusal(capsys, here, command, sentence):
+    assert one_sentence(*run(capsys, *command.split())) == sentence
+    assert names(here) == []
+
+
+def test_unknown_notebook_parameter(capsys, here):
+    said = one_sentence(*run(capsys, "run", "-p", "speed=3"))
+    assert said.startswith("unknown notebook parameter 'speed'; the notebooks know ")
+    assert names(here) == []
+
+
+def test_empty_folder_name(capsys, here):
+    assert one_sentence(*run(capsys, "plan", "--out", "")) == "--out must name a folder, got ''"
+
+
+def test_seeded_random_bad_inputs(capsys, here):
+    """Never a traceback, never accepted, never a file."""
+    rng = random.Random(11)
+    bad = [*"nan -nan inf -inf 1e999 one 1,0 0x10 -- - 1m ½ 10 -7.5 1e17".split(), "", " "]
+    options = ["--distance-m", "--height-m", "--platform-m"]
+    for _ in range(1000):
+        junk = "".join(rng.choices(string.printable, k=rng.randint(1, 12)))
+        argv = {
+            0: ["plan", "--out", "x", rng.choice(options), rng.choice(bad)],
+            1: ["plan", "--out", "x", f"{rng.choice(options)}={rng.choice(bad)}"],
+            2: ["plan", "--out", "x", "--rotation-deg", rng.choice([*bad, "90", "-361", "720.5"])],
+            3: ["plan", "--out", "x", "--robot", f"{junk}?"],
+            4: ["plan", "--out", f"/dev/null/{junk}"],
+            5: [rng.choice(["simulate", "audit"]), f"no {junk}"],
+            6: ["run", "--distance-m", rng.choice(bad)],
+            7: ["run", "-p", f"no_such{rng.randint(0, 99)}={junk}"],
+            8: [rng.choice(["plan", "run", "simulate", "audit"]), f"--{junk}", "x"],
+            9: [f"{junk}!"],
+        }[rng.randrange(10)]
+        code, out, err = run(capsys, *argv)
+        one_sentence(code, out, err)
+        assert names(here) == [], argv
+
+
+# ------------------------------------------------------------------------------------------ commands that go through
+
+
+@pytest.fixture
+def planner(bhr, monkeypatch):
+    """A planner and an audit that answer at once; tests may change what they say."""
+    said = types.SimpleNamespace(error=None, checks=[types.SimpleNamespace(name="slip", passed=True)], task=None)
+
+    def plan_jump(task, robot, method):
+        said.task, said.method = task, method
+        if said.error:
+            raise said.error
+        return types.SimpleNamespace(
+            tape=make_tape(robot), robot=robot, task=task, summary=make_summary() | {"stages": STAGES}
+        )
+
+    def write_passport(folder):
+        (folder / "passport.json").write_text("{}")
+        return types.SimpleNamespace(checks=said.checks, table=lambda: "the table")
+
+    for name, module in {
+        "pipeline": types.SimpleNamespace(plan_jump=plan_jump),
+        "passport": types.SimpleNamespace(write_passport=write_passport),
+    }.items():
+        monkeypatch.setitem(sys.modules, f"jumplab.{name}", module)
+        monkeypatch.setattr(jumplab, name, module, raising=False)
+    return said
+
+
+def test_plan_and_audit(capsys, odd_folder, planner):
+    out = odd_folder / "plan"
+    arguments = ("--distance-m", "-0.2", "--height-m", "3e-1", "--rotation-deg", "-360", "--method", "direct")
+    code, said, err = run(capsys, "plan", "--out", out, *arguments)
+    assert (code, err) == (0, "")
+    assert planner.task.distance_m == -0.2 and planner.task.height_m == 0.3 and planner.method == "direct"
+    assert planner.task.rotation_rad == pytest.approx(-2 * 3.141592653589793)
+    assert said.splitlines()[:3] == [
+        "stage                  iterations     build     solve",
+        "SRMP launch                    31    0.25 s    0.12 s",
+        "planned: distance 1.000 m, rise 0.500 m",
+    ]
+    assert names(out) == ["passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+    code, said, err = run(capsys, "audit", out)
+    assert (code, said, err) == (0, "the table\naudit: all 1 checks passed\n", "")
+
+
+def test_plan_that_fails_its_audit(capsys, here, planner):
+    planner.checks.append(types.SimpleNamespace(name="friction", passed=False))
+    code, _, err = run(capsys, "plan", "--out", "p")
+    assert code == 3
+    assert err == ("jumplab: the plan fails 1 of 2 checks of its audit (friction); see passport.json in 'p'\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "sentence"),
+    [
+        (InfeasibleError("too high\n for this robot"), 3, "too high for this robot"),
+        (SolverError("stage 1 stopped", stage="SRMP launch"), 3, "stage 1 stopped"),
+        (
+            ZeroDivisionError("x\ny"),
+            4,
+            "internal failure, ZeroDivisionError: x; run it again with --debug for the traceback",
+        ),
+        (KeyboardInterrupt(), 130, "interrupted; what was there before is unchanged"),
+    ],
+)
+def test_failed_plan(capsys, here, planner, error, code, sentence):
+    planner.error = error
+    assert one_sentence(*run(capsys, "plan", "--out", "p"), expected_code=code) == sentence
+    assert names(here) == []
+
+
+def test_debug_shows_the_traceback(capsys, here, planner):
+    planner.error = ZeroDivisionError("x")
+    for argv in (["--debug", "plan", "--out", "p"], ["plan", "--out", "p", "--debug"]):
+        code, _, err = run(capsys, *argv)
+        assert code == 4
+        assert "Traceback (most recent call last)" in err
+        assert err.endswith("\njumplab: internal failure, ZeroDivisionError: x\n")
+
+
+@pytest.mark.parametrize(
+    ("metrics", "lines"),
+    [
+        (
+            METRICS,
+            "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n",
+        ),
+        (
+            FALL,
+            "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n",
+        ),
+    ],
+)
+def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
+    class Simulated(Result):
+        def to_json(self):
+            return metrics
+
+    simulation = importlib.import_module("jumplab.simulation")
+    asked = {}
+    monkeypatch.setattr(simulation, "simulate_jump", lambda tape, robot, **kw: asked.update(kw) or Simulated())
+    target = {"distance_m": 1.0, "height_m": 0.5, "platform_m": 0.3}
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary() | {"target": target, "platform_edge_m": 0.71})
+    code, said, err = run(capsys, "simulate", tmp_path, "--mode", "pd")
+    assert (code, said, err) == (0, lines, "")
+    assert asked["mode"] == "pd"
+    assert [asked["scene"].top_at(x) for x in (0.0, 0.82, 0.84, 1.0)] == [0.0, 0.0, 0.3, 0.3]
+    assert json.loads((tmp_path / "simulation.json").read_text())["planned_rise_m"] == 0.5
+
+
+def test_help_is_quick_and_complete():
+    """Asked of a new process: help must not import the numerical libraries."""
+    code = (
+        "import sys; from jumplab.__main__ import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as e: assert not e.code\n"
+        "print(sorted({'numpy', 'casadi', 'pinocchio', 'pybullet', 'papermill'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert all(word in done.stdout for word in ("run", "plan", "simulate", "audit", "--debug"))
+    assert done.stdout.splitlines()[-1] == "[]" and done.stderr == ""
+
+
+def test_module_and_version():
+    done = subprocess.run([sys.executable, "-m", "jumplab", "--version"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0 and done.stdout.startswith("jumplab ")
+
+
+def test_reader_that_goes_away_is_no_traceback():
+    command = f"'{sys.executable}' -m jumplab --version | true"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=ROOT)
+    assert done.stderr == ""
+
+
+# ------------------------------------------------------------------------------------------ the real thing
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    """The paper's jump, by the command line."""
+    folder = tmp_path_factory.mktemp("real") / "plan"
+    command = [sys.executable, "-m", "jumplab", "plan", "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "" and "audit: all" in done.stdout
+    return folder
+
+
+def test_real_plan_is_self_contained(planned):
+    assert names(planned) == ["passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+    summary = store.read_plan(planned)[2]
+    assert summary["planned_distance_m"] == pytest.approx(1.0, abs=0.02)
+    assert summary["planned_rise_m"] == pytest.approx(0.5, abs=0.02)
+    assert all({"stage", "iterations", "build_s", "solve_s"} <= set(row) for row in summary["stages"])
+
+
+def test_real_simulation_of_the_plan(capsys, planned):
+    code, said, err = run(capsys, "simulate", planned)
+    assert (code, err) == (0, "")
+    assert "landing: stands" in said
+    metrics = store.read_json(planned / "simulation.json")
+    assert metrics["foot_distance_m"] == pytest.approx(1.0, abs=0.05)
+    assert metrics["com_rise_m"] == pytest.approx(0.5, abs=0.03)
+    assert metrics["standing_s"] >= 3.0
+
+
+def test_plans_killed_at_random_moments_damage_nothing(planned, tmp_path):
+    """A plan exists; new ones into the same folder are killed or stopped; the old or a new one stands."""
+    moments = random.Random(5)
+    for name in names(planned):
+        (tmp_path / name).write_bytes((planned / name).read_bytes())
+    command = [sys.executable, "-m", "jumplab", "plan", "--height-m", "0.45", "--out", str(tmp_path)]
+    for k in range(4):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT,
+                                   env=os.environ | {"OMP_NUM_THREADS": "1"})  # fmt: skip
+        time.sleep(moments.uniform(0.5, 4.0))
+        process.send_signal([signal.SIGKILL, signal.SIGTERM, signal.SIGINT][k % 3])
+        process.wait()
+        target = store.read_plan(tmp_path)[2]["target"]
+        assert target["height_m"] in (0.45, 0.5)
+        assert {"passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"} <= set(names(tmp_path))

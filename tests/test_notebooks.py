@@ -1,0 +1,317 @@
+"""The runner on small notebooks made here, then the package's own: how they are written, and that they run."""
+
+import ast
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+from jumplab import notebooks, store
+from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
+EXPECTED = {"00_overview", "01_models", "02_srmp", "03_joint_space_mapping", "04_whole_body", "05_simulation"}
+STEMS = sorted(EXPECTED | {p.stem for p in SOURCES})
+PARAMETERS = """distance_m: float = 1.0  # [m]
+height_m: float = 0.5
+robot: str = "bhr"
+out: str = "x"
+figures: str = "y"
+n: int = 1"""
+CHECK = "from jumplab.notebooks import check_parameters\ncheck_parameters(globals(), n=int)"
+RECORD = """
+import json, pathlib, sys, os
+pathlib.Path(out, "seen_%s.json").write_text(json.dumps({
+    "distance_m": distance_m, "n": n, "python": sys.executable, "prefix": sys.prefix}))
+pathlib.Path(figures, "figure_%s.png").write_bytes(b"png")
+"""
+
+
+def make_notebook(folder, name, *cells):
+    """Write notebooks/NAME.ipynb with the parameters, the check and further code cells."""
+    head = new_code_cell(PARAMETERS, metadata={"tags": ["parameters"]})
+    nb = new_notebook(cells=[new_markdown_cell("# Title"), head, *(new_code_cell(c) for c in (CHECK, *cells))])
+    nb.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    path = folder / "notebooks" / f"{name}.ipynb"
+    path.parent.mkdir(exist_ok=True)
+    nbformat.write(nb, path)
+    return path
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+# ------------------------------------------------------------------------------------------ the runner
+
+
+def test_chain_in_an_odd_place_under_this_very_python(odd_folder, monkeypatch):
+    """Two notebooks pass results on; a kernel called python3 that is another program is not used."""
+    bogus = odd_folder / "jupyter" / "kernels" / "python3"
+    bogus.mkdir(parents=True)
+    spec = {"argv": ["/bin/false", "{connection_file}"], "display_name": "x", "language": "python"}
+    (bogus / "kernel.json").write_text(json.dumps(spec))
+    monkeypatch.setenv("JUPYTER_PATH", str(odd_folder / "jupyter"))
+    monkeypatch.setenv("HOME", "/nonexistent")
+    second = "import pathlib\nassert pathlib.Path(out, 'seen_0.json').exists()" + RECORD % (1, 1)
+    chain = [make_notebook(odd_folder, "00_first", RECORD % (0, 0)), make_notebook(odd_folder, "01_second", second)]
+    monkeypatch.chdir("/")
+    report = notebooks.run_notebooks({"distance_m": 0.8, "n": 3}, notebooks=chain, progress=False)
+    assert report.notebooks == ("00_first", "01_second") and report.wall_s > 0
+    assert report.out == odd_folder / "executed" and report.figures == odd_folder / "figures"
+    seen = json.loads((report.out / "seen_1.json").read_text())
+    assert seen == {"distance_m": 0.8, "n": 3, "python": sys.executable, "prefix": sys.prefix}
+    assert names(report.out) == ["notebooks", "seen_0.json", "seen_1.json"]
+    assert names(report.out / "notebooks") == ["00_first.ipynb", "01_second.ipynb"]
+    assert names(report.figures) == ["figure_0.png", "figure_1.png"]
+    assert names(odd_folder) == ["executed", "figures", "jupyter", "notebooks"]
+
+
+@pytest.mark.parametrize(
+    ("cell", "kind", "sentence"),
+    [
+        ("from jumplab.errors import InputError\nraise InputError('too far')", InputError, "too far"),
+        ("from jumplab.errors import SolverError\nraise SolverError('stuck')", SolverError, "stuck"),
+        ("x = 1\nassert x == 2, f'x is {x},\\nnot 2'", JumplabError, "AssertionError: not 2"),
+        ("x = 1\nassert x == 2", JumplabError, "AssertionError: assert x == 2"),
+        ("import os\nos._exit(3)", JumplabError, "its Python process died"),
+    ],
+)
+def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
+    """One sentence with notebook and cell, of the class that the cell raised; what was there before stays."""
+    out, figures = tmp_path / "out", tmp_path / "figures"
+    for folder in (out, figures):
+        folder.mkdir()
+        (folder / "old").write_text("old")
+    chain = [
+        make_notebook(tmp_path, "00_bad", RECORD % (0, 0), cell),
+        make_notebook(tmp_path, "01_never", RECORD % (1, 1)),
+    ]
+    with pytest.raises(JumplabError) as e:
+        notebooks.run_notebooks(notebooks=chain, out=out, figures=figures, progress=False)
+    assert type(e.value) is kind
+    assert "notebook 00_bad.ipynb" in str(e.value) and sentence in str(e.value) and "\n" not in str(e.value)
+    assert names(figures) == ["old"]
+    if "died" in sentence:
+        assert names(out) == ["old"]
+    else:
+        assert "cell In [5]" in str(e.value)
+        assert names(out) == ["failed", "old"] and names(out / "failed") == ["00_bad.ipynb"]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        (
+            {"distance": 1.0},
+            "unknown notebook parameter 'distance'; the notebooks know distance_m, figures, height_m, n, out, robot",
+        ),
+        ({"out": "x"}, "the parameter 'out' is set by the runner; use its own argument out"),
+        ({"distance_m": "far"}, "parameter distance_m must be of type float, got 'far'"),
+        ({"distance_m": True}, "parameter distance_m must be of type float, got True"),
+        ({"distance_m": float("nan")}, "parameter distance_m must be finite, got nan"),
+        ({"distance_m": 50}, "distance = 50 m is outside -3 ... 3 m"),
+        ({"robot": ""}, "parameter robot must be a name or a path, got ''"),
+        ({"robot": "asimo"}, "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+    ],
+)
+def test_bad_parameters_are_refused_before_anything_runs(tmp_path, parameters, sentence):
+    chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
+    with pytest.raises(InputError) as e:
+        notebooks.run_notebooks(parameters, notebooks=chain, progress=False)
+    assert str(e.value) == sentence
+    assert names(tmp_path) == ["notebooks"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"out": "/dev/null/x"}, "'/dev/null/x' cannot be written"),
+        ({"figures": "/proc/x"}, "'/proc/x' cannot be written"),
+    ],
+)
+def test_unwritable_folders_are_refused_before_anything_runs(tmp_path, arguments, sentence):
+    chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
+    with pytest.raises(InputError, match=sentence):
+        notebooks.run_notebooks(notebooks=chain, progress=False, **arguments)
+    assert names(tmp_path) == ["notebooks"]
+
+
+def test_read_only_checkout_sends_everything_to_out(tmp_path, monkeypatch):
+    """Whoever runs the tests may be allowed everything, so the refusal is played by ensure_writable."""
+    checkout, out = tmp_path / "checkout", tmp_path / "out"
+    checkout.mkdir()
+    chain = [make_notebook(checkout, "00_first", RECORD % (0, 0))]
+    real = store.ensure_writable
+
+    def refuse_checkout(folder):
+        if checkout in Path(folder).parents:
+            raise InputError("read-only")
+        return real(folder)
+
+    monkeypatch.setattr(store, "ensure_writable", refuse_checkout)
+    report = notebooks.run_notebooks(notebooks=chain, out=out, progress=False)
+    assert report.figures == out / "figures"
+    assert names(out) == ["figures", "notebooks", "seen_0.json"] and names(checkout) == ["notebooks"]
+    with pytest.raises(InputError, match="read-only"):
+        notebooks.run_notebooks(notebooks=chain, progress=False)
+
+
+def test_a_second_chain_in_one_folder_is_refused(tmp_path):
+    chain = [make_notebook(tmp_path, "00_first", RECORD % (0, 0))]
+    (tmp_path / "executed" / "notebooks").mkdir(parents=True)
+    with store.locked(tmp_path / "executed" / "notebooks"), pytest.raises(InputError, match="another jumplab"):
+        notebooks.run_notebooks(notebooks=chain, progress=False)
+
+
+def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
+    path = tmp_path / "notebooks" / "00_x.ipynb"
+    path.parent.mkdir()
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"00_x\.ipynb: not a readable notebook"):
+        notebooks.run_notebooks(notebooks=[path], progress=False)
+    path.unlink()
+    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks'; run this in a clone of the repository$"):
+        notebooks.find_notebooks()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
+    """No half result, no kernel: the sleeping notebook's process is gone soon after."""
+    pid_file = tmp_path / "pid"
+    sleeper = f"import os, pathlib, time\npathlib.Path({str(pid_file)!r}).write_text(str(os.getpid()))\ntime.sleep(300)"
+    make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
+    code = (
+        f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab import notebooks;"
+        f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.__main__ import main;"
+        f"sys.exit(main(['run', '-p', 'n=2']))"
+    )
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=env)
+    try:
+        wait_for(lambda: process.poll() is not None or (pid_file.exists() and pid_file.read_text()))
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
+    assert process.returncode == (130 if number == signal.SIGINT else 143)
+    assert "Traceback" not in said
+    assert names(tmp_path) == ["notebooks", "pid"]
+    wait_for(lambda: not Path(f"/proc/{pid_file.read_text()}").exists())
+
+
+def wait_for(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.05)
+
+
+# ------------------------------------------------------------------------------------------ inside a notebook
+
+
+@pytest.mark.parametrize(
+    ("injected", "sentence"),
+    [
+        ("distnace_m = 2.0", "unknown notebook parameter 'distnace_m'; this notebook knows distance_m"),
+        ("distance_m = 'far'", "parameter distance_m must be of type float, got 'far'"),
+        ("distance_m = float('inf')", "parameter distance_m must be finite, got inf"),
+        ("height_m = -1", "height = -1 m is outside 0.02 ... 1.5 m"),
+        ("n = 1.5", "parameter n must be of type int, got 1.5"),
+        ("n = True", "parameter n must be of type int, got True"),
+        ("out = ''", "parameter out must be a name or a path, got ''"),
+        ("robot = None", "parameter robot must be of type str, got None"),
+    ],
+)
+def test_check_parameters_refuses(injected, sentence):
+    cell = f"# Parameters\n{injected}\n"
+    namespace = {"In": ["", "distance_m = 1.0\nn = 1", cell], "distance_m": 1.0, "n": 1}
+    exec(cell, namespace)
+    with pytest.raises(InputError) as e:
+        notebooks.check_parameters(namespace, n=int)
+    assert str(e.value).startswith(sentence)
+
+
+def test_check_parameters_accepts_what_is_meant():
+    notebooks.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
+    notebooks.check_parameters({"fast": True, "In": ["# Parameters\nfast = True"]}, fast=bool)
+
+
+def test_plain_papermill_with_an_unknown_parameter_fails(tmp_path):
+    import papermill
+
+    path = make_notebook(tmp_path, "00_first", RECORD % (0, 0))
+    with pytest.raises(papermill.PapermillExecutionError, match="unknown notebook parameter 'distnace_m'"):
+        papermill.execute_notebook(path, tmp_path / "x.ipynb", {"distnace_m": 2.0}, progress_bar=False, cwd=str(ROOT))
+
+
+# ------------------------------------------------------------------------------------------ the package's notebooks
+
+
+@pytest.mark.parametrize("stem", STEMS)
+def test_source_notebook_keeps_the_house_rules(stem):
+    """No outputs committed, short cells without classes, the standard parameters, refusal of unknown ones."""
+    path = ROOT / "notebooks" / f"{stem}.ipynb"
+    nb = nbformat.read(path, as_version=4)
+    nbformat.validate(nb)
+    code = [c for c in nb.cells if c.cell_type == "code"]
+    assert nb.cells[0].cell_type == "markdown" and nb.cells[0].source.startswith("# ")
+    assert all(not c.outputs and c.execution_count is None for c in code), "commit notebooks without outputs"
+    assert set(notebooks.STANDARD) <= set(notebooks.declared_parameters(path))
+    assert any("check_parameters(" in c.source for c in code)
+    for cell in code:
+        assert len(cell.source.splitlines()) <= 25, cell.source
+        plain = "\n".join(line for line in cell.source.splitlines() if not line.startswith(("%", "!")))
+        assert not any(isinstance(node, ast.ClassDef) for node in ast.walk(ast.parse(plain))), cell.source
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """The whole chain once, from another folder, into a path with a space and letters beyond ASCII."""
+    folder = tmp_path_factory.mktemp("chain") / "voll ständig"
+    declared = set().union(*map(notebooks.declared_parameters, SOURCES))
+    fast = {"fast": True} if "fast" in declared else {}
+    return notebooks.run_notebooks(fast, out=folder / "out", figures=folder / "figures", progress=False)
+
+
+def test_chain_runs_and_publishes(chain):
+    assert list(chain.notebooks) == STEMS
+    assert names(chain.out / "notebooks") == [p.name for p in SOURCES]
+    tape, _, summary = store.read_plan(chain.out)
+    assert len(tape.t) > 500 and summary["stages"]
+    figures = [p for p in chain.figures.rglob("*") if p.is_file()]
+    assert {p.suffix for p in figures} >= {".png", ".pdf"}
+    assert all(p.stat().st_size > 500 for p in figures)
+
+
+def test_chain_lands_where_it_should(chain):
+    simulation = store.read_json(chain.out / "simulation.json")
+    assert simulation["foot_distance_m"] == pytest.approx(1.0, abs=0.05)
+    assert simulation["com_rise_m"] == pytest.approx(0.5, abs=0.03)
+    assert simulation["standing_s"] >= 3.0
+
+
+@pytest.mark.parametrize("stem", STEMS)
+def test_executed_notebook_is_quiet(chain, stem):
+    """Nothing on stderr, no warning, and pictures that are really embedded."""
+    nb = nbformat.read(chain.out / "notebooks" / f"{stem}.ipynb", as_version=4)
+    outputs = [o for c in nb.cells if c.cell_type == "code" for o in c.outputs]
+    noise = [o.text for o in outputs if o.output_type == "stream" and o.name == "stderr"]
+    assert not noise
+    assert not any("Warning" in o.get("text", "") for o in outputs)
+
+
+def test_infeasible_is_not_confused_with_internal():
+    """The exit codes that a failing notebook hands on."""
+    codes = [kind.exit_code for kind in (InputError, InfeasibleError, SolverError, JumplabError)]
+    assert codes == [2, 3, 3, 4]

@@ -1,0 +1,250 @@
+"""Result folders: whole or not at all, whoever kills, races or damages them."""
+
+import itertools
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jumplab import store
+from jumplab.errors import InputError
+from jumplab.trajectory import Tape
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def make_tape(robot, value=0.0, n=200):
+    """A tape that is no jump, all of whose numbers are ``value``, long enough for a write to take a while."""
+    nq, nv = robot.model.nq, robot.model.nv
+    phase = np.array(["launch"] * (n // 2) + ["flight"] * (n - n // 2))
+    rows = {"q": (n, nq), "v": (n, nv), "a": (n, nv), "tau": (n, nv - 6), "f": (n, 2, 6)}
+    return Tape(t=np.full(n, value), phase=phase, contact_frames=np.array(robot.foot.frames),
+                joint_names=np.array(robot.joint_names), **{k: np.full(s, value) for k, s in rows.items()})  # fmt: skip
+
+
+def make_summary(value=0.0):
+    return {"target": {"distance_m": 1.0, "height_m": 0.5}, "value": value, "planned_distance_m": 1.0,
+            "planned_rise_m": 0.5}  # fmt: skip
+
+
+class Result:
+    """Stands in for a simulation's result."""
+
+    def save(self, folder, extra=None):
+        np.savez(folder / "simulation.npz", t=np.zeros(3))
+        (folder / "simulation.json").write_text(json.dumps(extra))
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_round_trip(bhr, odd_folder):
+    folder = odd_folder / "new" / "plan"
+    store.write_plan(folder, make_tape(bhr, 2.0), bhr, make_summary(2.0) | {"bad": float("nan"), "n": np.int64(3)})
+    assert names(folder) == ["plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+    tape, robot, summary = store.read_plan(folder)
+    assert np.array_equal(tape.q, make_tape(bhr, 2.0).q)
+    assert robot.hash == bhr.hash
+    assert summary["bad"] is None and summary["n"] == 3
+    assert summary["manifest"]["robot"] == {"name": bhr.name, "hash": bhr.hash}
+    assert summary["manifest"]["versions"]["casadi"][0].isdigit()
+
+
+def test_new_plan_removes_what_was_said_of_the_old_one_and_nothing_else(bhr, tmp_path):
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary(), lambda d: (d / "passport.json").write_text("{}"))
+    store.write_simulation(tmp_path, Result(), store.read_plan(tmp_path)[2])
+    (tmp_path / "notes.txt").write_text("mine")
+    assert {"passport.json", "simulation.npz", "simulation.json"} < set(names(tmp_path))
+    assert json.loads((tmp_path / "simulation.json").read_text()) == {"planned_distance_m": 1.0, "planned_rise_m": 0.5}
+    store.write_plan(tmp_path, make_tape(bhr, 1.0), bhr, make_summary(1.0))
+    assert names(tmp_path) == ["notes.txt", "plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+
+
+def test_simulation_of_a_plan_that_has_gone_is_refused(bhr, tmp_path):
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    old = store.read_plan(tmp_path)[2]
+    store.write_plan(tmp_path, make_tape(bhr, 1.0), bhr, make_summary(1.0))
+    with pytest.raises(InputError, match="planned again in the meantime"):
+        store.write_simulation(tmp_path, Result(), old)
+    assert "simulation.json" not in names(tmp_path)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit, OSError])
+def test_failed_write_leaves_the_old_result(bhr, tmp_path, error):
+    def fail(staging):
+        raise error("no")
+
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    with pytest.raises(InputError if error is OSError else error):
+        store.write_plan(tmp_path, make_tape(bhr, 1.0), bhr, make_summary(1.0), fail)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_failed_first_write_leaves_no_folder(bhr, tmp_path):
+    def fail(staging):
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        store.write_plan(tmp_path / "a" / "b", make_tape(bhr), bhr, make_summary(), fail)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("moved", range(5))
+def test_commit_that_was_killed_is_completed_by_the_next_reader(bhr, tmp_path, monkeypatch, moved):
+    """The process dies after ``moved`` renames of the commit."""
+
+    class Killed(BaseException):
+        pass
+
+    count = itertools.count()
+
+    def dying(source, target):
+        if next(count) >= moved:
+            raise Killed
+        os.rename(source, target)
+
+    def passport(staging):
+        (staging / "passport.json").write_text("{}")
+
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    store.write_simulation(tmp_path, Result(), store.read_plan(tmp_path)[2])
+    monkeypatch.setattr(store.os, "replace", dying)
+    with pytest.raises(Killed):
+        store.write_plan(tmp_path, make_tape(bhr, 1.0), bhr, make_summary(1.0), passport)
+    monkeypatch.undo()
+    assert "summary.json" not in names(tmp_path), "a mix must have no summary"
+    tape, _, summary = store.read_plan(tmp_path)
+    assert tape.t[0] == summary["value"] == 1.0
+    assert names(tmp_path) == ["passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+
+
+WRITER = """
+    import sys, itertools, time
+    sys.path[:0] = [{root!r}, {tests!r}]
+    from test_store import make_summary, make_tape
+    from jumplab import store
+    from jumplab.robot import load_robot
+    robot = load_robot()
+    for k in itertools.count({start}, 2):
+        store.write_plan({folder!r}, make_tape(robot, float(k)), robot, make_summary(float(k)))
+        print(k, flush=True)
+        time.sleep(0.01)
+"""
+
+
+def start_writer(folder, start):
+    code = WRITER.format(root=str(ROOT), tests=str(ROOT / "tests"), folder=str(folder), start=start)
+    return subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, text=True)
+
+
+def check_whole(folder):
+    """Tape, robot and summary of one and the same write; returns which."""
+    tape, _, summary = store.read_plan(folder)
+    assert tape.t[0] == tape.f[-1, -1, -1] == summary["value"]
+    return summary["value"]
+
+
+def test_writers_killed_at_random_moments(bhr, tmp_path):
+    moments = random.Random(7)
+    for k in range(4):
+        writer = start_writer(tmp_path, start=100 * k)
+        assert writer.stdout.readline(), "the writer did not start"
+        time.sleep(moments.uniform(0.0, 0.1))
+        writer.send_signal(signal.SIGKILL if k % 2 else signal.SIGTERM)
+        writer.wait()
+        writer.stdout.close()
+        assert check_whole(tmp_path) >= 100 * k
+    store.write_plan(tmp_path, make_tape(bhr, -1.0), bhr, make_summary(-1.0))
+    assert names(tmp_path) == ["plan.npz", "robot.toml", "robot.urdf", "summary.json"]
+
+
+def test_two_writers_and_a_reader_in_one_folder(tmp_path):
+    writers = [start_writer(tmp_path, start=k) for k in (0, 1)]
+    for w in writers:
+        assert w.stdout.readline(), "the writer did not start"
+    seen = set()
+    for _ in range(20):
+        seen.add(check_whole(tmp_path))
+        time.sleep(0.01)  # a reader that never pauses would keep the writers out
+    for w in writers:
+        assert w.poll() is None
+        w.kill()
+        w.wait()
+        w.stdout.close()
+    assert len(seen) > 1
+    check_whole(tmp_path)
+
+
+def test_second_writer_gives_up_in_one_sentence(bhr, tmp_path, monkeypatch):
+    monkeypatch.setattr(store.locked.__wrapped__, "__kwdefaults__", {"shared": False, "wait_s": 0.05})
+    with store.locked(tmp_path), pytest.raises(InputError, match="another jumplab is writing into"):
+        store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("/dev/null/x", "cannot be written (Not a directory); choose another one"),
+        ("/proc/x", "cannot be written"),
+        ("x" * 300, "cannot be written (File name too long); choose another one"),
+        ("a\0b", "cannot be the name of a folder"),
+        (__file__, "is a file; choose a folder"),
+    ],
+)
+def test_unwritable_folder(bhr, tmp_path, monkeypatch, name, sentence):
+    monkeypatch.chdir(tmp_path)
+    for attempt in (
+        lambda: store.ensure_writable(name),
+        lambda: store.write_plan(name, make_tape(bhr), bhr, make_summary()),
+    ):
+        with pytest.raises(InputError) as e:
+            attempt()
+        assert sentence in str(e.value)
+        assert "\n" not in str(e.value)
+    assert names(tmp_path) == []
+
+
+def test_ensure_writable_leaves_no_trace(tmp_path):
+    store.ensure_writable(tmp_path / "a" / "b")
+    assert names(tmp_path) == []
+
+
+def damage(folder, name, how):
+    path = folder / name
+    data = path.read_bytes()
+    if how == "missing":
+        path.unlink()
+    elif how == "cut":
+        path.write_bytes(data[: len(data) // 2])
+    elif how == "flipped":
+        path.write_bytes(data[:40] + bytes([data[40] ^ 1]) + data[41:])
+    else:
+        path.write_bytes(how)
+
+
+@pytest.mark.parametrize("name", ["plan.npz", "robot.urdf", "robot.toml"])
+@pytest.mark.parametrize("how", ["missing", "cut", "flipped", b""])
+def test_damaged_file_is_refused(bhr, tmp_path, name, how):
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    damage(tmp_path, name, how)
+    with pytest.raises(InputError, match="changed or damaged" if how != "missing" else "cannot be read"):
+        store.read_plan(tmp_path)
+
+
+@pytest.mark.parametrize("how", ["missing", "cut", b"", b"[]", b"{}", b"\xff", b"[" * 100_000, b'{"manifest": 3}'])
+def test_damaged_summary_is_refused(bhr, tmp_path, how):
+    store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
+    damage(tmp_path, "summary.json", how)
+    with pytest.raises(InputError, match=r"summary\.json"):
+        store.read_plan(tmp_path)
