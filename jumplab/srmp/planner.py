@@ -40,7 +40,7 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
     flight = PhaseGuess(t_f, np.full((n + 1, 1), rho), np.zeros((n + 1, 1)), np.zeros((n + 1, 1)),
                         (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None],
                         dict(L=rho * spin, com_x=length[-1] * np.sin(lean[-1]), com_z=length[-1] * np.cos(lean[-1]),
-                             vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.88 * phi0))  # fmt: skip
+                             vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.94 * phi0))  # fmt: skip
     flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
     return {"flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0), "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
             "flight": flight}  # fmt: skip
@@ -65,7 +65,7 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
     flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
     launch_s = flat.duration + toe.duration
     t = np.linspace(0, launch_s, int(np.ceil(launch_s / step_s)) + 1)
-    quantities = _launch_function(mass, task.gravity).map(len(t))
+    quantities = launch_function(mass, task.gravity).map(len(t))
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
     q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
@@ -80,7 +80,7 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
                     flight.constants["leg"])  # fmt: skip
 
 
-def _launch_function(mass, gravity):
+def launch_function(mass, gravity):
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
     s = SrmpState(mass, q, v, a, gravity)
     return ca.Function("srmp", [q, v, a], [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum,

@@ -49,7 +49,12 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
         Bound("inertia rate range", "SF-B1", "kg m^2/s", "v", -s.inertia_rate, s.inertia_rate),
         Bound("inertia acceleration range", "SF-B1", "kg m^2/s^2", "a", -s.inertia_accel, s.inertia_accel),
     )
-    leg = (s.touchdown_length[0] * stance, s.touchdown_length[1] * stance, 1.0)
+
+    def shortest(parameters):
+        fold = s.touchdown_fold_per_m * max(0.0, parameters["platform"])
+        return (s.touchdown_length[0] - fold) * stance
+
+    leg = (shortest, s.touchdown_length[1] * stance, 1.0)
     constants = {"L": (*s.momentum, 10.0), "com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0),
                  "vel_x": (*SPEED_BOX_M_S, 1.0), "vel_z": (*SPEED_BOX_M_S, 1.0), "leg": leg}  # fmt: skip
     return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), tuple(flight_terms(s)), bounds, states=("theta",),

@@ -23,7 +23,8 @@ class SrmpSettings:
     inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
     inertia_accel: float = 600.0  # box on d^2 rho/dt^2
     touchdown_inertia_rate: float = 8.0  # the limbs come nearly to rest before touchdown
-    touchdown_length: tuple[float, float] = (0.80, 0.95)  # share of the standing phi: knees bent to absorb the fall
+    touchdown_length: tuple[float, float] = (0.92, 0.97)  # share of the standing phi: knees bent by about 0.7 rad
+    touchdown_fold_per_m: float = 0.35  # lower share per metre of platform: legs folded to reach it
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown, offset + slope v_x, as in stage 3
     capture_slope_s: float = 0.13
     capture_window_m: tuple[float, float] = (-0.03, 0.02)

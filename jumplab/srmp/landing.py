@@ -1,0 +1,205 @@
+"""Stage 1's landing: CoM and angular momentum from touchdown to standing (LD-*, Sec. III and VI-A of the paper).
+
+The paper takes its landing trajectory from an earlier work and does not repeat it. This one is ours, on the same
+reaction mass pendulum and with the same terms as the launch: CoP inside the sole, friction, unilateral force, leg force
+and inertia envelope of the robot, smooth, of free duration. It begins right after the impact (see
+:mod:`jumplab.srmp.touchdown`) and ends at rest in the stance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from jumplab.models.srmp import COORDINATES
+from jumplab.robot import Robot
+from jumplab.robot.reach import FORCE_SHARE, Reach, reach
+from jumplab.solver import Nlp, PhaseGuess, PhaseSolution, Statistics
+from jumplab.srmp.planner import launch_function
+from jumplab.srmp.settings import SrmpSettings
+from jumplab.srmp.terms import cop_term, launch_terms, srmp_state
+from jumplab.srmp.touchdown import Touchdown
+from jumplab.task import GRAVITY
+from jumplab.terms import Bound, Phase, Point, Problem, Term
+
+SHARED = ("jerk", "L rate", "trunk range", "unilateral", "friction", "leg force", "inertia envelope", "L range")
+SCALES = {"q": 1.0, "v": [5.0, 3.0, 5.0, 2.0], "a": [50.0, 30.0, 50.0, 20.0], "j": [1000.0, 500.0, 1000.0, 500.0]}
+SAMPLE_S = 0.005  # our choice: a hundred samples and more over the landing
+
+
+@dataclass(frozen=True)
+class LandingSettings:
+    """Weights and bounds of the landing; the paper prints none, all are our choice."""
+
+    intervals: int = 36  # steps of about 25 ms; twice as many change the CoM by less than a millimetre
+    duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
+    cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
+    press_share: float = 0.4  # of the weight, least vertical force: soles that are hardly loaded slip and tip
+    force_gain: float = 1.0 / FORCE_SHARE  # a landing may use the whole peak torque, it lasts a tenth of a second
+    w_jerk: float = 3e-2  # share of the launch's: the catch has to be quick
+    w_momentum_rate: float = 2e-3  # [1 / (N m)^2 / s], as in the launch
+    w_acceleration: float = 5e-3  # [1 / (m/s^2)^2 / s] of the CoM
+    w_cop: float = 20.0  # [1 / m^2 / s] distance from the middle of the sole
+    w_posture: float = 2.0  # [1 / rad^2 / s] trunk against its pitch in the stance
+    w_time: float = 0.5  # [1 / s^2]
+
+
+@dataclass(frozen=True)
+class LandingPlan:
+    """A planned landing, sampled; positions from the middle between the soles.
+
+    Attributes
+    ----------
+    t : (N,) since touchdown [s].
+    com, com_velocity, com_acceleration : (N, 2) x and z [m, m/s, m/s^2].
+    L, L_rate : (N,) [kg m^2/s, N m];  rho : (N,) [kg m^2];  F_x, F_z : (N,) [N];  cop_x : (N,) [m].
+    touchdown : the state it began in;  statistics : what the solve cost;  solution : its nodes.
+    """
+
+    t: np.ndarray
+    com: np.ndarray
+    com_velocity: np.ndarray
+    com_acceleration: np.ndarray
+    L: np.ndarray
+    L_rate: np.ndarray
+    rho: np.ndarray
+    F_x: np.ndarray
+    F_z: np.ndarray
+    cop_x: np.ndarray
+    touchdown: Touchdown
+    statistics: Statistics
+    solution: PhaseSolution
+
+    @property
+    def duration_s(self) -> float:
+        """From touchdown to standing [s]."""
+        return float(self.t[-1])
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for ever."""
+        x, z, dx, dz, momentum = (
+            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
+        )
+        return np.array([x, z]), np.array([dx, dz]), float(momentum)
+
+
+def _own_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:
+    """Costs and constraints that the launch does not have."""
+    upright = float(envelope.start[0] + envelope.start[2])
+
+    def room(p: Point):
+        speed = ca.polyval(ca.DM(envelope.speed_fit), p.q[1])
+        return ca.vertcat(speed - p.v[1], speed + p.v[1])
+
+    def cop(p: Point):
+        return -srmp_state(p, mass).pivot_torque / (mass * GRAVITY)
+
+    def acceleration(p: Point):
+        return srmp_state(p, mass).com_acceleration
+
+    return [
+        Term("CoM acceleration", "ours: a soft catch", "m/s^2", "node", acceleration, weight=s.w_acceleration),
+        Term("CoP from the middle", "ours, times F_z / m g", "m", "node", cop, weight=s.w_cop),
+        Term("trunk upright", "ours", "rad", "node", lambda p: p.q[0] + p.q[2] - upright, weight=s.w_posture),
+        Term("landing time", "ours", "s", "end", lambda p: p.duration, weight=s.w_time),
+        Term("leg speed", "ours: from the joint speeds", "m/s", "node", room, lower=0.0, upper=np.inf, skip=(1, 0)),
+        Term("L at touchdown", "after the impact", "kg m^2/s", "start",
+             lambda p: srmp_state(p, mass).angular_momentum - p.p.L, scale=10.0),
+        Term("L at rest", "standing", "kg m^2/s", "end", lambda p: srmp_state(p, mass).angular_momentum, scale=10.0),
+    ]  # fmt: skip
+
+
+def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> Problem:
+    """The landing as a problem of one phase; parameters: start (lean, length, turn, radius), their rates, L."""
+    mass = robot.sagittal.total_mass
+    strong = replace(envelope, force_fit=settings.force_gain * envelope.force_fit)
+    base = SrmpSettings()
+    shared = [t for t in launch_terms(mass, strong, base) if t.name in SHARED]
+    weights = {"jerk": settings.w_jerk, "L rate": settings.w_momentum_rate}
+    shared = [replace(t, weight=weights.get(t.name, t.weight)) if t.is_cost else t for t in shared]
+    # what is measured at touchdown is a fact: constraints that its fixed part alone decides begin one node later
+    shared = [replace(t, skip=(1, 0)) if t.name in ("trunk range", "inertia envelope", "L range") else t for t in shared]
+    press = settings.press_share * mass * GRAVITY
+    shared = [replace(t, lower=press) if t.name == "unilateral" else t for t in shared]
+    heel, toe = envelope.cop
+    sole = cop_term(mass, heel + settings.cop_margin_m, toe - settings.cop_margin_m)
+    low, high = envelope.length
+    unset = np.inf
+
+    def start(parameters):
+        return parameters["start"]
+
+    def rates(sign):
+        return lambda parameters: np.array([*parameters["rates"], sign * unset, sign * unset])
+
+    bounds = (
+        Bound("touchdown", "flight's end", "rad, m", "q", start, start, "start"),
+        Bound("touchdown rates", "after the impact", "1/s", "v", rates(-1), rates(1), "start"),
+        Bound("state box", "SL-B1", "rad, m", "q", [-0.8, low, -2.5, 0.1], [0.8, high, 2.5, 1.0], "inner"),
+        Bound("stance", "standing", "rad, m", "q", [0.0, envelope.start[1], -unset, envelope.start[3]],
+              [0.0, envelope.start[1], unset, envelope.start[3]], "end"),
+        Bound("at rest", "standing", "1/s", "v", [0.0, 0.0, -unset, 0.0], [0.0, 0.0, unset, 0.0], "end"),
+        Bound("at rest (acceleration)", "standing", "1/s^2", "a", 0.0, 0.0, "end"),
+    )  # fmt: skip
+    phase = Phase("landing", COORDINATES, settings.intervals, settings.duration_s,
+                  (*shared, sole, *_own_terms(mass, envelope, settings)), bounds, scales=SCALES)  # fmt: skip
+    return Problem("landing", (phase,), (), dict(start=4, rates=2, L=1, gravity=1))
+
+
+class LandingPlanner:
+    """Landings of one robot: built once, solved from any touchdown."""
+
+    def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings(), options: dict | None = None):
+        self.robot, self.settings, self.reach = robot, settings, reach(robot)
+        self._mass, self._margin = robot.sagittal.total_mass, SrmpSettings().inertia_margin
+        self.nlp = Nlp(build_landing(robot, settings, self.reach), options)
+
+    def plan(self, touchdown: Touchdown, *, gravity: float = GRAVITY, guess: PhaseGuess | None = None) -> LandingPlan:
+        """Plan from ``touchdown`` to standing.
+
+        Parameters
+        ----------
+        touchdown : velocities right after the impact.
+        guess : another landing's ``solution.guess()``; a knee bend if None.
+
+        Raises
+        ------
+        SolverError
+            If there is no such landing: the message names what would have to give (CoP, friction, leg force).
+        """
+        data = self._parameters(touchdown)
+        solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": guess or self._guess(data)})
+        phase = solution.phases["landing"]
+        return _sample(phase, touchdown, solution.statistics, self._mass, gravity)
+
+    def _parameters(self, touchdown: Touchdown) -> dict:
+        (x, z), (dx, dz) = touchdown.com, touchdown.com_velocity
+        lean, length = np.arctan2(x, z), np.hypot(x, z)
+        along, across = np.array([np.sin(lean), np.cos(lean)]), np.array([np.cos(lean), -np.sin(lean)])
+        low, high = (np.polyval(f, length) for f in (self.reach.inertia_low_fit, self.reach.inertia_high_fit))
+        inside = 2 * self._margin * (high - low)
+        rho = np.clip(touchdown.rho, low + inside, high - inside)  # the envelope is sampled, the robot may be just outside
+        start = np.array([lean, length, touchdown.trunk_pitch - lean, np.sqrt(rho / self._mass)])
+        return dict(start=start, rates=np.array([dx, dz]) @ np.array([across / length, along]).T, L=touchdown.L)
+
+    def _guess(self, data: dict) -> PhaseGuess:
+        """Sink and rise: Hermite curve of the leg length with the given speed, everything else straight to the stance."""
+        n, first, last = self.settings.intervals, data["start"], self.reach.start
+        duration = 0.8  # our choice
+        s = np.linspace(0, 1, n + 1)[:, None]
+        q = first + (last - first) * (3 * s**2 - 2 * s**3)
+        q[:, 1:2] += duration * data["rates"][1] * s * (1 - s) ** 4
+        q[:, 0:1] += duration * data["rates"][0] * s * (1 - s) ** 4
+        q[:, 1] = np.clip(q[:, 1], *self.reach.length)
+        return PhaseGuess(duration, q)
+
+
+def _sample(phase: PhaseSolution, touchdown: Touchdown, statistics, mass: float, gravity: float) -> LandingPlan:
+    t = np.linspace(0, phase.duration, int(np.ceil(phase.duration / SAMPLE_S)) + 1)
+    q, v, a = phase.sample(t)
+    out = [x.full().T.squeeze() for x in launch_function(mass, gravity).map(len(t))(q.T, v.T, a.T)]
+    com, com_v, com_a, momentum, rate, rho, _, _, force, torque = out
+    return LandingPlan(t, com, com_v, com_a, momentum, rate, rho, force[:, 0], force[:, 1], -torque / force[:, 1],
+                       touchdown, statistics, phase)  # fmt: skip
