@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
+from jumplab.elastic import least_violation
 from jumplab.errors import InputError, SolverError
+from jumplab.solution import PhaseGuess, PhaseSolution, Solution, Statistics
 from jumplab.terms import Bound, Problem
-from jumplab.transcription import Assembled, PhaseLayout, chain
+from jumplab.transcription import Assembled, PhaseLayout
 
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # our choice: scaled row error above which a "solved" status is not believed
+CONFLICT_LIMIT = 1e-3  # our choice: scaled row error that an explanation mentions
 IPOPT = {
     "tol": 1e-6,  # our choice: scaled; the tape's own audit is the judge of physics
     "constr_viol_tol": 1e-6,
@@ -27,82 +29,6 @@ IPOPT = {
     "print_level": 0,
     "sb": "yes",
 }
-
-
-@dataclass(frozen=True)
-class PhaseGuess:
-    """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
-
-    duration: float
-    q: np.ndarray  # (N + 1, nq)
-    v: np.ndarray | None = None
-    a: np.ndarray | None = None
-    z: np.ndarray | None = None
-    constants: dict = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class PhaseSolution:
-    """One phase at its nodes, and between them.
-
-    Attributes
-    ----------
-    t : (N + 1,) from the start of the phase [s];  q, v, a : (N + 1, nq);  j : (N, nq);  z : (N + 1, nz).
-    duration : [s];  constants : the phase's further constants.
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    j: np.ndarray
-    z: np.ndarray
-    duration: float
-    constants: dict
-
-    def sample(self, t) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
-        t = np.atleast_1d(np.asarray(t, float))
-        n = len(self.j)
-        k = np.clip((t / self.duration * n).astype(int), 0, n - 1)
-        h = (t - self.t[k])[:, None]
-        return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
-
-    def guess(self, intervals: int | None = None) -> PhaseGuess:
-        """This solution as the start of another solve, on another mesh if asked."""
-        t = np.linspace(0, self.duration, (intervals or len(self.j)) + 1)
-        q, v, a = self.sample(t)
-        z = np.stack([np.interp(t, self.t, col) for col in self.z.T], -1) if self.z.shape[1] else None
-        return PhaseGuess(self.duration, q, v, a, z, dict(self.constants))
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """What a solve cost."""
-
-    iterations: int
-    status: str
-    build_s: float
-    solve_s: float
-    variables: int
-    rows: int
-    objective: float
-    residual: float
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Result of one solve; ``phases`` by name, tables for people."""
-
-    problem: Problem
-    phases: dict[str, PhaseSolution]
-    statistics: Statistics
-    cost_shares: tuple[dict, ...]
-    constraint_report: tuple[dict, ...]
-
-    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
-        """All phases as a warm start, on another mesh if asked."""
-        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
 
 
 def _resolve(value, parameters, size):
@@ -270,7 +196,7 @@ class Nlp:
         residual = float(np.max(beyond, initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         status = stats["return_status"]
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            self._fail(status, stats["iter_count"], beyond, x)
+            self._fail(status, stats["iter_count"], x0, p, (low, high), (row_low, row_high))
         statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
                                 float(answer["f"]), residual)  # fmt: skip
         return Solution(self.problem, self._unpack(x), statistics, self._cost_shares(x, p),
@@ -299,20 +225,26 @@ class Nlp:
                                  value=float(value * scale), slack=float(slack * scale))  # fmt: skip
         return tuple(best.values())
 
-    def _fail(self, status, iterations, beyond, x):
+    def _fail(self, status, iterations, x0, p, box, rows):
+        """Re-solve with every row softened, and say which terms cannot be met together, where and by how much."""
+        x, beyond = least_violation(self.assembled, x0, p, box, rows)
         worst: dict[tuple, tuple] = {}
         phases = self._unpack(x)
-        for row, amount in zip(self.assembled.rows, np.nan_to_num(beyond, nan=np.inf), strict=True):
+        for row, amount in zip(self.assembled.rows, beyond, strict=True):
             key = (row.owner, row.term.name)
-            if amount > RESIDUAL_LIMIT and amount > worst.get(key, (0,))[0]:
+            if amount > CONFLICT_LIMIT and amount > worst.get(key, (0,))[0]:
                 when = phases[row.owner].t[row.node] if row.owner in phases else None
                 worst[key] = (amount, amount * row.term.scale, row.term.unit, row.node, when)
         ranked = sorted(worst.items(), key=lambda kv: -kv[1][0])
         lines = tuple(
-            f"{owner}/{name}: off by {amount:.3g} {unit} at node {node}"
-            + (f" (t = {when:.3f} s)" if when is not None else "")
-            for (owner, name), (_, amount, unit, node, when) in ranked[:5]
+            f"{owner}/{name} by {amount:.3g} {unit}"
+            + (f" at t = {when:.3f} s of the phase" if when is not None else "")
+            for (owner, name), (_, amount, unit, _, when) in ranked[:4]
         )
-        reason = "; ".join(lines) or "all constraints are met but the cost did not converge"
-        raise SolverError(f"{self.problem.name}: ipopt stopped with {status} after {iterations} iterations; {reason}",
+        if lines:
+            reason = "the best compromise still violates " + "; ".join(lines)
+            reason += "; ask for less, or give these terms more room"
+        else:
+            reason = "a motion that meets every constraint exists, but the search did not settle; try another guess"
+        raise SolverError(f"{self.problem.name}: no plan ({status} after {iterations} iterations): {reason}",
                           stage=self.problem.name, status=status, violations=lines)  # fmt: skip

@@ -1,0 +1,87 @@
+"""What goes into a solve and what comes out: guesses, solutions at and between the nodes, statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jumplab.terms import Problem
+from jumplab.transcription import chain
+
+
+@dataclass(frozen=True)
+class PhaseGuess:
+    """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
+
+    duration: float
+    q: np.ndarray  # (N + 1, nq)
+    v: np.ndarray | None = None
+    a: np.ndarray | None = None
+    z: np.ndarray | None = None
+    constants: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PhaseSolution:
+    """One phase at its nodes, and between them.
+
+    Attributes
+    ----------
+    t : (N + 1,) from the start of the phase [s];  q, v, a : (N + 1, nq);  j : (N, nq);  z : (N + 1, nz).
+    duration : [s];  constants : the phase's further constants.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    j: np.ndarray
+    z: np.ndarray
+    duration: float
+    constants: dict
+
+    def sample(self, t) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
+        t = np.atleast_1d(np.asarray(t, float))
+        n = len(self.j)
+        k = np.clip((t / self.duration * n).astype(int), 0, n - 1)
+        h = (t - self.t[k])[:, None]
+        return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
+
+    def guess(self, intervals: int | None = None) -> PhaseGuess:
+        """This solution as the start of another solve, on another mesh if asked."""
+        t = np.linspace(0, self.duration, (intervals or len(self.j)) + 1)
+        q, v, a = self.sample(t)
+        z = np.stack([np.interp(t, self.t, col) for col in self.z.T], -1) if self.z.shape[1] else None
+        return PhaseGuess(self.duration, q, v, a, z, dict(self.constants))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a solve cost."""
+
+    iterations: int
+    status: str
+    build_s: float
+    solve_s: float
+    variables: int
+    rows: int
+    objective: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of one solve; ``phases`` by name, tables for people."""
+
+    problem: Problem
+    phases: dict[str, PhaseSolution]
+    statistics: Statistics
+    cost_shares: tuple[dict, ...]
+    constraint_report: tuple[dict, ...]
+
+    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
+        """All phases as a warm start, on another mesh if asked."""
+        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
