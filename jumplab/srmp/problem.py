@@ -35,7 +35,7 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
     along = launch_terms(mass, reach, s)
     inside, edge = cop_term(mass, heel + margin, toe - margin), cop_term(mass, toe - TOE_BAND_M, toe)
     flat = Phase("flat", COORDINATES, s.intervals[0], s.flat_s, (*along, inside), bounds, scales=SCALES)
-    tip_terms = (*along, edge, *takeoff_terms(mass, s))
+    tip_terms = (*along, edge, *takeoff_terms(mass, reach, s))
     tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip_terms, (box,), scales=SCALES)
     return flat, tip
 

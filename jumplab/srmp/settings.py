@@ -20,6 +20,7 @@ class SrmpSettings:
     momentum: tuple[float, float] = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
     inertia_margin: float = 0.05  # share of the envelope's width kept free on either side
     takeoff_lean: tuple[float, float] = (-0.5, 0.7)  # [rad]
+    takeoff_length: float = 0.95  # share of the standing phi at most: knees still bent, far from the straight leg
     inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
     inertia_accel: float = 600.0  # box on d^2 rho/dt^2
     touchdown_inertia_rate: float = 8.0  # the limbs come nearly to rest before touchdown

@@ -76,7 +76,7 @@ def cop_term(mass: float, low: float, high: float) -> Term:
                 skip=(0, 1))  # fmt: skip
 
 
-def takeoff_terms(mass: float, s: SrmpSettings) -> list[Term]:
+def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     """Costs and constraints at the end of the launch, SL-J2, J3 and SL-E* (Sec. III-A)."""
 
     def at(p):
@@ -90,6 +90,8 @@ def takeoff_terms(mass: float, s: SrmpSettings) -> list[Term]:
         Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
         Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
         Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
+        Term("take-off length", "SL-B1 at the end; ours", "m", "end", lambda p: p.q[1], lower=reach.length[0],
+             upper=s.takeoff_length * reach.start[1]),
         Term("posture range", "SL-P1", "rad", "end", lambda p: p.q[0] + p.q[2], lower=posture[0], upper=posture[1]),
     ]
 
