@@ -16,7 +16,7 @@ MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump
 def _number(name: str, value, low: float, high: float, unit: str) -> float:
     try:
         x = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} must be a number in {unit}, got {value!r}") from None
     if not math.isfinite(x):
         raise InputError(f"{name} must be finite, got {x}")
@@ -73,7 +73,7 @@ class JumpTask:
         """
         v, g = self.takeoff_speed, self.gravity
         rest = v * v - 2 * g * com_rise_at_touchdown_m
-        if rest < 0:
+        if not rest >= 0:
             raise InputError(
                 f"a CoM rise of {self.height_m:g} m cannot reach a touchdown {com_rise_at_touchdown_m:.3f} m above "
                 f"take-off; ask for at least that height"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from jumplab.errors import InputError
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
+_DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
+# what reading a cut, altered or foreign file may raise
+_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -45,11 +49,14 @@ class Tape:
     extra: dict = field(default_factory=dict)
 
     def __post_init__(self):
+        for name, count in _DIMENSIONS.items():
+            if np.ndim(getattr(self, name)) != count:
+                raise InputError(f"tape: {name} has {np.ndim(getattr(self, name))} dimensions, needs {count}")
         n = len(self.t)
         for name in ("q", "v", "a", "tau", "phase", "f"):
             if len(getattr(self, name)) != n:
                 raise InputError(f"tape: {name} has {len(getattr(self, name))} rows, t has {n}")
-        for x in (self.t, self.q, self.v, self.a, self.tau, self.f, self.phase, *self.extra.values()):
+        for x in (*(getattr(self, name) for name in _DIMENSIONS), *self.extra.values()):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
@@ -81,7 +88,7 @@ class Tape:
         try:
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in file.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as e:
+        except _DAMAGE as e:
             raise InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated") from e
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:

@@ -1,0 +1,195 @@
+"""The stages in order: what a finished plan says, what is refused, and that a failed stage feeds nothing."""
+
+import json
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from fixtures_core import LIMBS, Replay, jump, planner
+
+from jumplab import pipeline
+from jumplab.errors import InputError, SolverError
+from jumplab.pipeline import METHODS, Planner, guess_from_joints, plan_jump
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+from jumplab.trajectory import Tape
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return jump(1.0, 0.5)
+
+
+@pytest.mark.slow
+def test_three_steps_and_one(plan):
+    direct = jump(1.0, 0.5, 0.0, "direct")
+    assert (plan.method, direct.method) == METHODS
+    assert [row.stage for row in plan.statistics] == ["1 SRMP", "2 joint map", "3 whole body"]
+    assert [row.stage for row in direct.statistics] == ["direct"]
+    assert plan.srmp is not None and plan.joints is not None
+    assert direct.srmp is None and direct.joints is None
+    assert all(row.iterations > 0 and row.build_s >= 0 and row.solve_s > 0 for row in plan.statistics)
+
+
+def test_planned_numbers_are_the_tapes(plan):
+    assert plan.planned_distance_m == pytest.approx(1.0, abs=1e-4)
+    assert plan.planned_rise_m == pytest.approx(0.5, abs=1e-4)
+    v = plan.tape.extra["planar_com_velocity"][plan.tape.takeoff_index, 1]
+    assert plan.planned_rise_m == pytest.approx(v * v / (2 * 9.8), abs=1e-4)
+
+
+def test_tape_fits_the_robot_and_the_file(plan, tmp_path):
+    tape, robot = plan.tape, plan.robot
+    n = len(tape.t)
+    shapes = {"q": (n, 21), "v": (n, 20), "a": (n, 20), "tau": (n, 14), "f": (n, 2, 6), "phase": (n,)}
+    assert {k: getattr(tape, k).shape for k in shapes} == shapes
+    assert tuple(tape.joint_names) == robot.joint_names and tuple(tape.contact_frames) == robot.foot.frames
+    assert list(dict.fromkeys(tape.phase)) == ["launch", "flight"]
+    assert all(np.all(np.isfinite(x)) for x in tape.arrays().values() if x.dtype.kind == "f")
+    tape.save(tmp_path / "plan.npz")
+    back = Tape.load(tmp_path / "plan.npz")
+    for name, x in tape.arrays().items():
+        np.testing.assert_array_equal(x, back.arrays()[name])
+
+
+def test_tape_carries_stage_one_under_its_own_name(plan):
+    extra = plan.tape.extra
+    for name in ("com", "com_velocity", "L", "rho", "cop_x", "F_z"):
+        np.testing.assert_array_equal(extra[f"srmp_launch_{name}"], getattr(plan.srmp.launch, name))
+    np.testing.assert_array_equal(extra["srmp_flight_lean"], plan.srmp.flight.lean)
+    assert not any(name.startswith("srmp") for name in jump(1.0, 0.5, 0.0, "direct").tape.extra)
+
+
+def test_summary_is_plain_and_true(plan):
+    summary = json.loads(json.dumps(plan.summary))
+    assert summary["target"] == {
+        "distance_m": 1.0,
+        "height_m": 0.5,
+        "platform_m": 0.0,
+        "rotation_rad": 0.0,
+        "gravity": 9.8,
+    }
+    assert summary["robot"]["hash"] == plan.robot.hash and summary["robot"]["mass_kg"] == pytest.approx(42.0)
+    assert summary["planned_distance_m"] == plan.planned_distance_m
+    assert summary["launch_s"] + summary["flight_s"] == pytest.approx(plan.tape.t[-1], abs=1.1e-3)
+    for i, name in enumerate(plan.tape.joint_names):
+        assert summary["peak_torque_nm"][str(name)] == np.abs(plan.tape.tau[:, i]).max()
+        assert summary["peak_torque_nm"][str(name)] <= plan.robot.actuators[str(name)]["effort"]
+        assert summary["peak_speed_rad_s"][str(name)] <= plan.robot.actuators[str(name)]["speed"]
+    assert [row["stage"] for row in summary["stages"]] == [row.stage for row in plan.statistics]
+
+
+def test_result_is_immutable(plan):
+    with pytest.raises(FrozenInstanceError):
+        plan.method = "other"
+    with pytest.raises(ValueError, match="read-only"):
+        plan.tape.q[0, 0] = 1.0
+
+
+def test_the_robots_hash_ties_plan_and_robot(plan):
+    assert plan.summary["robot"]["hash"] == load_robot().hash
+
+
+@pytest.mark.slow
+def test_the_same_twice():
+    """Planning the same target again with the same planner gives the same tape, to the solver's tolerance."""
+    again, first = planner().plan(JumpTask(0.8, 0.3, -0.2)), jump(0.8, 0.3, -0.2)
+    np.testing.assert_allclose(again.tape.q, first.tape.q, atol=1e-5)
+
+
+def test_trunk_bends_forward_first(plan):  # N-15
+    """The trunk bows during the launch before it opens again, in stage 1 and on the tape."""
+    pitch = plan.tape.extra["planar_angles"][plan.tape.phase == "launch", 3]
+    assert pitch.max() > pitch[0] + 0.1
+    posture = plan.srmp.launch.posture
+    assert posture.max() > posture[0] + 0.1
+
+
+def test_inertia_is_shaped_in_flight(plan):  # N-16
+    flight = plan.tape.phase == "flight"
+    foot = plan.tape.extra["planar_toe"][flight][-1, 0] - plan.tape.extra["planar_com"][flight][-1, 0]
+    rho = plan.tape.extra["planar_rho"][flight]
+    assert rho.min() < rho[0] and foot > 0.0
+
+
+@pytest.mark.parametrize("method", ["", "two-step", "Direct", None])
+def test_unknown_method(method):
+    with pytest.raises(InputError) as e:
+        Planner(load_robot()).plan(JumpTask(1.0, 0.5), method)
+    assert str(e.value) == f"method {method!r}: choose one of three-step, direct"
+
+
+class Broken:
+    """A stage that fails, or one that must not be reached."""
+
+    toe_s = 0.1
+
+    def __init__(self, error):
+        self.error = error
+
+    def plan(self, *arguments, **options):
+        raise self.error
+
+
+def test_a_failed_stage_feeds_nothing(monkeypatch):
+    failure, reached = SolverError("SRMP: no", stage="SRMP", status="Infeasible"), AssertionError("a later stage ran")
+    one = Planner(load_robot())
+    one._stages = {"srmp": Broken(failure), "whole body": Broken(reached), "direct": Broken(failure)}
+    monkeypatch.setattr(pipeline, "map_to_joints", lambda *a, **k: (_ for _ in ()).throw(reached))
+    for method in METHODS:
+        with pytest.raises(SolverError) as e:
+            one.plan(JumpTask(1.0, 0.5), method)
+        assert e.value is failure
+
+
+def test_a_failed_map_feeds_nothing(monkeypatch):
+    failure, reached = SolverError("stage 2: no", stage="stage 2"), AssertionError("stage 3 ran")
+    one = Planner(load_robot())
+    one._stages = {"srmp": planner()._stage("srmp"), "whole body": Broken(reached)}
+
+    def fail(*arguments, **options):
+        raise failure
+
+    monkeypatch.setattr(pipeline, "map_to_joints", fail)
+    with pytest.raises(SolverError) as e:
+        one.plan(JumpTask(1.0, 0.5))
+    assert e.value is failure
+
+
+def test_plan_jump_is_a_planner_for_one(monkeypatch):
+    monkeypatch.setattr(Planner, "plan", lambda self, task, method: (self.robot.name, task.distance_m, method))
+    assert plan_jump(JumpTask(0.7, 0.3), load_robot(), method="direct") == ("bhr", 0.7, "direct")
+
+
+def test_guess_is_stage_twos_motion(plan):
+    body = planner()._stage("whole body")
+    guess = guess_from_joints(plan.joints, body, plan.task, plan.srmp.toe_s)
+    assert {k: len(g.q) - 1 for k, g in guess.items()} == {"flat": body.mesh.flat, "toe": body.mesh.toe,
+                                                           "flight": body.mesh.flight}  # fmt: skip
+    total = sum(g.duration for g in guess.values())
+    assert total == pytest.approx(plan.joints.t[-1], abs=1e-9)
+    assert guess["toe"].duration == pytest.approx(plan.srmp.toe_s, abs=1e-9)
+    assert np.all(guess["toe"].q[:, 0] >= 0.0)
+    robot = plan.robot
+    last = plan.joints.q[-1]
+    joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.sign
+    for angle, role in zip(joints, LIMBS, strict=True):
+        own = np.mean([last[robot.model.idx_qs[robot.model.getJointId(n)]] for n in robot.joints[role]])
+        assert angle == pytest.approx(own, abs=1e-9)
+    velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
+    rows = plan.joints.rows("flight")
+    np.testing.assert_allclose(velocity, plan.joints.actual["com_velocity"][rows][0][[0, 2]], atol=0.15)
+
+
+@pytest.mark.slow
+def test_another_gravity_is_planned_or_refused():
+    """Never a tape whose forces belong to another planet; and no stage that fails because it thinks of 9.8."""
+    task = JumpTask(0.3, 0.3, gravity=7.0)
+    for method in METHODS:
+        try:
+            plan = planner().plan(task, method)
+        except InputError:
+            continue
+        residual = np.abs(Replay(plan).residual)
+        assert residual[:, :6].max() < 0.005 * 42.0 * 7.0
+        assert residual[:, 6:].max() < 1e-6

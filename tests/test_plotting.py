@@ -1,0 +1,294 @@
+"""Figures: style, legibility, byte-stable files, drawings that agree with the models, and nothing solved on the way."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+import tokenize
+from itertools import combinations
+from pathlib import Path
+
+import casadi as ca
+import cvxpy as cp
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from fixtures_core import jump
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.text import Text
+
+from jumplab import plotting
+from jumplab.errors import InputError
+from jumplab.models.srmp import SrmpState
+from jumplab.plotting import style
+from jumplab.robot.reach import postures, reach
+from jumplab.robot.stance import configuration, stance_configuration
+from jumplab.simulation import simulate_jump
+from jumplab.solver import Nlp
+from jumplab.srmp.landing import LandingPlanner
+from jumplab.srmp.touchdown import touchdown_of_plan
+from jumplab.task import JumpTask
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted((ROOT / "jumplab" / "plotting").glob("*.py"))
+
+
+@pytest.fixture(scope="module")
+def material(bhr):
+    """Results to draw: a finished jump, a jump onto a platform, a landing, a short simulation."""
+    plan, high = jump(1.0, 0.5), jump(0.6, 0.5, 0.3)
+    tape = plan.tape
+    result = simulate_jump(tape, bhr, stand_s=0.4)
+    landing = LandingPlanner(bhr).plan(touchdown_of_plan(plan.srmp, bhr))
+    guess = tape.t[::10], tape.extra["planar_joints"][::10], tape.extra["planar_joint_rates"][::10]
+    return dict(plan=plan, high=high, tape=tape, result=result, landing=landing, guess=guess)
+
+
+FIGURES = {
+    "framework": lambda m, r: plotting.framework(),
+    "link_models": lambda m, r: plotting.link_models(r),
+    "pendulum_diagram": lambda m, r: plotting.pendulum_diagram(),
+    "inverted_pendulum": lambda m, r: plotting.inverted_pendulum(m["plan"].srmp),
+    "inverted_pendulum, platform": lambda m, r: plotting.inverted_pendulum(m["high"].srmp),
+    "launch_strobe": lambda m, r: plotting.launch_strobe(m["plan"].srmp),
+    "flight_shaping": lambda m, r: plotting.flight_shaping(m["plan"].srmp),
+    "flight_comparison": lambda m, r: plotting.flight_comparison({"flat": m["plan"].srmp, "high": m["high"].srmp}),
+    "reach_envelope": lambda m, r: plotting.reach_envelope(reach(r, 2**12), m["plan"].srmp, samples=postures(r, 2**10)),
+    "reach_envelope, empty": lambda m, r: plotting.reach_envelope(reach(r, 2**12)),
+    "landing_reference": lambda m, r: plotting.landing_reference(m["landing"], m["plan"].srmp.reach),
+    "joint_trajectories": lambda m, r: plotting.joint_trajectories(m["tape"], r),
+    "joint_trajectories, guess": lambda m, r: plotting.joint_trajectories(m["tape"], r, guess=m["guess"]),
+    "inertia_and_momentum": lambda m, r: plotting.inertia_and_momentum(m["tape"]),
+    "snapshots": lambda m, r: plotting.snapshots(m["tape"], r),
+    "snapshots, platform": lambda m, r: plotting.snapshots(m["high"].tape, r),
+    "margins": lambda m, r: plotting.margins(m["tape"], r),
+    "contact_comparison": lambda m, r: plotting.contact_comparison(
+        {"flat": plotting.ground_reaction(m["tape"], r), "high": plotting.ground_reaction(m["high"].tape, r)}, r
+    ),
+    "jump_strobe": lambda m, r: plotting.jump_strobe(m["result"], r),
+    "momentum": lambda m, r: plotting.momentum(m["result"], m["tape"], r),
+}
+
+
+@pytest.fixture(params=FIGURES)
+def figure(request, material, bhr, monkeypatch):
+    """Each figure in turn, drawn while every solver refuses to work."""
+    for owner, name in ((Nlp, "solve"), (cp.Problem, "solve"), (ca.Function, "call"), (plt, "show")):
+        monkeypatch.setattr(owner, name, lambda *args, **kwargs: pytest.fail("a picture has started a computation"))
+    fig = FIGURES[request.param](material, bhr)
+    FigureCanvasAgg(fig).draw()
+    return fig
+
+
+def texts(fig):
+    """Visible texts of a figure that say something."""
+    hidden = {t for ax in fig.axes if not ax.axison for t in tick_labels(ax)}
+    return [t for t in fig.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in hidden]
+
+
+def tick_labels(ax):
+    """Texts along both axes but the axes' own labels; those outside the view are not drawn."""
+    return [t for axis in (ax.xaxis, ax.yaxis) for t in axis.findobj(Text) if t is not axis.label]
+
+
+def placed_texts(fig):
+    """Texts that the package places itself, with their extents [pixels]."""
+    ticks = {t for ax in fig.axes for t in tick_labels(ax)}
+    return [(t.get_text(), t.get_window_extent()) for t in texts(fig) if t not in ticks]
+
+
+# what a reader needs ----------------------------------------------------------------------------------------------
+def test_figure_is_legible_in_print(figure):
+    """A column or a page wide, no text smaller than the least size, none cut off at the figure's edge."""
+    width, height = figure.get_size_inches()
+    assert width <= plotting.PAGE_IN + 1e-9 and height < 5.0
+    assert min(t.get_fontsize() for t in texts(figure)) >= style.MIN_FONT_PT
+    box, slack = figure.bbox, 0.02 * figure.dpi  # a fiftieth of an inch
+    for text, extent in placed_texts(figure):
+        assert extent.x0 > box.x0 - slack and extent.x1 < box.x1 + slack, text
+        assert extent.y0 > box.y0 - slack and extent.y1 < box.y1 + slack, text
+
+
+def test_texts_do_not_lie_on_each_other(figure):
+    """Labels, titles, legends and notes keep apart; tick labels are matplotlib's own affair."""
+    for (one, a), (other, b) in combinations(placed_texts(figure), 2):
+        overlap = [min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)]
+        assert min(overlap) < 2.0, f"{one!r} lies on {other!r}"
+
+
+def test_axes_carry_units(figure):
+    """Every label says its unit; the friction coefficient has none."""
+    for label in (text for ax in figure.axes for text in (ax.get_xlabel(), ax.get_ylabel()) if text):
+        assert "[" in label or label.startswith("friction"), label
+
+
+def test_figures_stay_out_of_pyplot(figure):
+    assert plt.get_fignums() == []
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+# style ------------------------------------------------------------------------------------------------------------
+def test_colours_are_okabe_and_ito():
+    palette = {to_hex(c).upper() for c in matplotlib.color_sequences["okabe_ito"]}
+    assert {plotting.LAUNCH, plotting.FLIGHT, plotting.LANDING, plotting.VERMILION, plotting.SKY} <= palette
+    assert plotting.PHASE_COLORS == {
+        "launch": plotting.LAUNCH,
+        "flight": plotting.FLIGHT,
+        "landing": plotting.LANDING,
+    }
+    used = {c.upper().lstrip("#") for c in re.findall(r"'([0-9A-Fa-f]{6})'", style.STYLE_FILE.read_text())}
+    assert {f"#{c}" for c in used} <= palette
+
+
+def test_style_is_package_data_and_is_used_whatever_the_caller_has():
+    assert style.STYLE_FILE.is_file()
+    with matplotlib.rc_context({"font.size": 20, "figure.figsize": (9, 9)}):
+        fig = plotting.pendulum_diagram()
+        assert {t.get_fontsize() for t in texts(fig)} <= {7.0, 8.0, 9.0}
+        assert matplotlib.rcParams["font.size"] == 20
+        plotting.use_style()
+        assert matplotlib.rcParams["font.size"] == 8
+        assert tuple(matplotlib.rcParams["figure.figsize"]) == (3.5, 2.4)
+
+
+def test_tint_and_shade():
+    assert plotting.tint(plotting.LAUNCH, 1.0) == pytest.approx(to_rgb(plotting.LAUNCH))
+    assert plotting.tint(plotting.LAUNCH, 0.0) == (1.0, 1.0, 1.0)
+    assert plotting.shade(plotting.LAUNCH, 0.0) == (0.0, 0.0, 0.0)
+
+
+def test_curves_change_colour_with_the_phase():
+    ax = plotting.new_figure().subplots()
+    phase = np.array(["launch"] * 3 + ["flight"] * 2 + ["landing"])
+    lines = plotting.by_phase(ax, np.arange(6.0), np.arange(6.0), phase, linewidth=2.0)
+    assert [line.get_color() for line in lines] == [plotting.LAUNCH, plotting.FLIGHT, plotting.LANDING]
+    assert [len(line.get_xdata()) for line in lines] == [3, 2, 1]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.name)
+def test_sources_neither_show_nor_print(path):
+    with tokenize.open(path) as file:
+        names = {t.string for t in tokenize.generate_tokens(file.readline) if t.type == tokenize.NAME}
+    assert not names & {"show", "print", "ion", "savefig"} - ({"savefig"} if path.name == "style.py" else set())
+    assert len(path.read_text().splitlines()) < 300
+
+
+# files ------------------------------------------------------------------------------------------------------------
+def test_saving_writes_three_files_without_dates(tmp_path, bhr):
+    task = JumpTask(-0.2, 0.5, platform_m=0.3, rotation_rad=-2 * np.pi)
+    fig = plotting.pendulum_diagram()
+    assert plotting.save_figure(fig, "x", tmp_path / "new" / "folder", "What is seen.", task=task, robot=bhr) is fig
+    folder = tmp_path / "new" / "folder"
+    assert sorted(p.name for p in folder.iterdir()) == ["x.pdf", "x.png", "x.txt"]
+    caption = (folder / "x.txt").read_text().splitlines()
+    assert caption[0] == "What is seen."
+    target = "0.20 m backward, CoM rise 0.50 m, landing 0.30 m higher, rotation -360 deg"
+    assert caption[1] == f"Target: {target}."
+    assert caption[2] == f"Robot: bhr, 42.0 kg, description {bhr.hash}."
+    assert caption[3].startswith("Made with python 3.") and "casadi" in caption[3]
+    for suffix in ("png", "pdf"):
+        data = (folder / f"x.{suffix}").read_bytes()
+        assert not re.search(rb"Matplotlib v|CreationDate|Software|20[2-9][0-9]-[01][0-9]-", data)
+    assert plt.imread(folder / "x.png").shape[:2] == tuple(round(style.DPI * x) for x in fig.get_size_inches()[::-1])
+
+
+def test_files_are_the_same_in_every_process(tmp_path):
+    """Same bytes whatever the hash seed, the caller's settings and the folder's name."""
+    code = (
+        "import sys, matplotlib; matplotlib.rcParams['font.size'] = float(sys.argv[2]);"
+        "from jumplab import plotting; from jumplab.robot import load_robot;"
+        "[plotting.save_figure(f, n, sys.argv[1]) for n, f in"
+        " (('a', plotting.framework()), ('b', plotting.link_models(load_robot())))]"
+    )
+    made = []
+    for seed, size in (("1", "8"), ("2", "15")):
+        folder = tmp_path / seed
+        env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONHASHSEED": seed}
+        subprocess.run([sys.executable, "-c", code, str(folder), size], env=env, check=True)
+        made.append({p.name: p.read_bytes() for p in folder.iterdir()})
+    assert made[0] == made[1] and len(made[0]) == 6
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../a", ".hidden"])
+def test_odd_names_are_refused(tmp_path, name):
+    with pytest.raises(InputError, match="must be a plain file name"):
+        plotting.save_figure(plotting.new_figure(), name, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="'x' cannot be written into"):
+        plotting.save_figure(plotting.new_figure(), "x", tmp_path / "file")
+
+
+# bodies -----------------------------------------------------------------------------------------------------------
+def test_sticks_and_shapes_are_the_same_robot(bhr):
+    """Joints and CoM of the five-link drawing and of the full robot's agree on random postures."""
+    body, m, random = plotting.Silhouette(bhr), bhr.sagittal, np.random.default_rng(0)
+    for _ in range(20):
+        angles, toe = random.uniform(-1, 1, 5), random.uniform(-1, 1, 2)
+        points, q = plotting.five_link_points(m, angles, toe), configuration(bhr, angles, toe)
+        places = body.joints(q)
+        for role, name in (
+            ("hip_pitch", "hip"),
+            ("knee", "knee"),
+            ("ankle_pitch", "ankle"),
+            ("shoulder_pitch", "shoulder"),
+        ):
+            assert places[bhr.joints[role][0]] == pytest.approx(points[name], abs=1e-12)
+        assert body.com(q) == pytest.approx(points["com"], abs=1e-12)
+
+
+def test_silhouette_stands_on_the_ground_at_its_full_size(bhr):
+    q = stance_configuration(bhr)
+    for view, width in (("side", 0.24), ("front", 0.53)):
+        points = np.concatenate([outline for _, outline in plotting.Silhouette(bhr, view).outlines(q)])
+        assert points[:, 1].min() == pytest.approx(0.0, abs=1e-9)
+        assert 1.4 < points[:, 1].max() < 1.5
+        assert np.ptp(points[:, 0]) == pytest.approx(width, abs=0.06)
+
+
+def test_pendulum_drawing_is_the_model(bhr):
+    ax, q = plotting.new_figure().subplots(), np.array([0.2, 0.7, 0.5, 0.33])
+    points = plotting.draw_srmp(ax, q, plotting.LAUNCH)
+    com = SrmpState(42.0, ca.DM(q), ca.DM.zeros(4), ca.DM.zeros(4)).com.full().ravel()
+    assert points["C0"] == pytest.approx(com)
+    assert (points["C1"] + points["C2"]) / 2 == pytest.approx(com)
+    assert np.linalg.norm(points["C1"] - points["C2"]) == pytest.approx(2 * q[3])
+    ellipse = ax.patches[0]
+    ends = ax.transData.inverted().transform(ellipse.get_transform().transform([[1, 0], [-1, 0]]))
+    assert sorted(map(tuple, ends)) == [pytest.approx(x) for x in sorted([tuple(points["C1"]), tuple(points["C2"])])]
+
+
+def test_ground_reaction_is_that_of_the_plan(material, bhr):
+    """CoP and forces from the foot wrenches agree with the planar dynamics."""
+    tape = material["tape"]
+    r = plotting.ground_reaction(tape, bhr)
+    weight = bhr.total_mass * 9.8
+    assert r["F_z"][0] == pytest.approx(weight, rel=1e-3)
+    assert r["cop_x"][0] == pytest.approx(bhr.sagittal.sole_center[0], abs=1e-3)
+    raised = r["heel_z"] > 0.005
+    assert raised.any() and np.nanmax(np.abs(r["cop_x"][raised])) < 0.01
+    assert np.isnan(r["F_z"][-1])
+
+
+# tables -----------------------------------------------------------------------------------------------------------
+def test_table_as_text_and_html():
+    rows = [{"name": "<a>", "x": 1.23456, "n": 3, "ok": True}, {"name": "b", "x": float("nan"), "n": None}]
+    shown = plotting.table(rows, {"name": "what", "x": "x [m]", "n": "n", "ok": "ok"}, digits=3)
+    assert str(shown).splitlines() == [
+        "what  x [m]  n  ok",
+        "----  -----  -  ---",
+        "<a>    1.23  3  yes",
+        "b         —",
+    ]
+    html = shown._repr_html_()
+    assert "&lt;a&gt;" in html and html.count("<tr>") == 3 and 'text-align:right">1.23<' in html
+    assert str(plotting.table([])) == "\n"
+    buffer = io.StringIO()
+    print(plotting.table(iter(rows)), file=buffer)
+    assert buffer.getvalue().startswith("name  x")

@@ -1,0 +1,223 @@
+"""Pictures of simulated jumps: which frames they show, what their curves say, and what the camera really sees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+from matplotlib.path import Path
+from matplotlib.text import Text
+from scipy.ndimage import binary_dilation
+
+from jumplab import plotting
+from jumplab.errors import RobotError
+from jumplab.plotting import render
+from jumplab.plotting import simulation as pictures
+from jumplab.plotting.style import MIN_FONT_PT, PHASE_COLORS
+from jumplab.robot.stance import stance_configuration
+from jumplab.simulation import Scene, simulate_jump
+from jumplab.task import JumpTask
+
+TASK = JumpTask(1.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def tape():
+    return jump(TASK.distance_m, TASK.height_m).tape
+
+
+@pytest.fixture(scope="module")
+def result(tape, bhr):
+    return simulate_jump(tape, bhr)
+
+
+def smallest_font(fig) -> float:
+    return min(t.get_fontsize() for t in fig.findobj(Text) if t.get_text() and t.get_visible())
+
+
+# ------------------------------------------------------------------------------------------ frames
+
+
+def test_frames_show_each_phase_and_its_turning_points(result):
+    rows = pictures.frame_rows(result)
+    assert len(rows) == 12 and (np.diff(rows) > 0).all()
+    assert [str(p) for p in result.phase[rows]] == ["launch"] * 4 + ["flight"] * 4 + ["landing"] * 4
+    flight = np.flatnonzero(result.phase == "flight")
+    assert (rows[0], rows[3], rows[8], rows[-1]) == (0, flight[0] - 1, flight[-1] + 1, len(result.t) - 1)
+    z = result.com[:, 2]
+    assert z[rows[1]] == z[: flight[0]].min() and z[rows[9]] == z[flight[-1] + 1 :].min()
+    for low, middle, high in (rows[1:4], rows[9:12]):
+        assert z[middle] == pytest.approx((z[low] + z[high]) / 2, abs=0.01)
+
+
+@pytest.mark.parametrize("end", ["before take-off", "in the air"])
+def test_frames_of_half_a_jump_are_evenly_spaced(result, end):
+    cut = int(np.argmax(result.phase == "flight")) + (0 if end == "before take-off" else 300)
+    short = replace(result, **{k: getattr(result, k)[:cut] for k in ("t", "q", "com", "phase")})
+    rows = pictures.frame_rows(short)
+    assert len(rows) == 12 and rows[0] == 0 and rows[-1] == cut - 1
+    assert np.ptp(np.diff(rows)) <= 1
+
+
+def test_frames_of_a_fall(result):
+    """The CoM ends lower than in the deepest knee bend: half-way up does not exist, half of the time does."""
+    com = result.com.copy()
+    com[-1, 2] = 0.1
+    rows = pictures.frame_rows(replace(result, com=com))
+    assert rows[10] == (rows[9] + rows[11]) // 2
+
+
+# ------------------------------------------------------------------------------------------ curves
+
+
+def test_smoothing_keeps_the_impulse():
+    force = np.zeros(200)
+    force[100], force[0] = 3000.0, 0.0
+    mean = pictures.smooth(force, 0.001)
+    assert len(mean) == 200 and mean.sum() == pytest.approx(force.sum())
+    assert mean[99] == 0 and mean[100] == pytest.approx(150.0) and mean[119] == pytest.approx(150.0)
+    assert mean[120] == pytest.approx(0.0, abs=1e-9)
+    assert pictures.smooth(np.full(5, 7.0), 0.001) == pytest.approx(7.0)
+    assert len(pictures.smooth(np.zeros(0), 0.001)) == 0
+
+
+def test_trunk_pitch_counts_full_turns():
+    angle = np.linspace(0.3, -6.0, 60)
+    q = np.zeros((60, 21))
+    q[:, 4], q[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
+    assert pictures.trunk_pitch(q) == pytest.approx(angle)
+
+
+def test_landing_figure_tells_what_the_log_says(result, tape, bhr):
+    fig = pictures.landing_loads(result, tape, bhr)
+    pitch, force, bars = fig.axes
+    launch = result.phase == "launch"
+    assert pitch.lines[0].get_ydata() == pytest.approx(np.degrees(pictures.trunk_pitch(result.q))[launch])
+    impulse = np.trapezoid(force.lines[0].get_ydata() * 1000, result.t[launch])
+    assert impulse == pytest.approx(result.metrics.launch_impulse[1], rel=0.06)  # 20 ms of it show up in the flight
+    worst = {}
+    for name, share in result.metrics.max_torque_ratio_by_joint.items():
+        group = name.split("_", 1)[1].replace("_", " ")
+        worst[group] = max(worst.get(group, 0.0), share)
+    groups = [label.get_text() for label in bars.get_yticklabels()]
+    ticks = np.array([line.get_xdata() for line in bars.lines if line.get_marker() == "|"])  # (phase, joint)
+    assert dict(zip(groups, ticks.max(axis=0), strict=True)) == pytest.approx(worst)
+    widths = np.array([bar.get_width() for bar in bars.patches]).reshape(3, -1)
+    assert (widths <= ticks + 1e-12).all() and widths.max() > 0.3
+    assert smallest_font(fig) >= MIN_FONT_PT
+
+
+def test_trials_sort_robots_by_their_fate(result):
+    m = result.metrics
+    fell = replace(m, landed=False)
+    rows = [m, replace(m, foot_distance_m=0.9), fell, replace(fell, foot_distance_m=None)]
+    fig = pictures.trials(rows, TASK, nominal=m)
+    (ax,) = fig.axes
+    drawn = {line.get_label(): np.column_stack(line.get_data()) for line in ax.lines}
+    assert {k: len(v) for k, v in drawn.items()} == {"target": 1, "landed": 2, "fell": 1, "as planned": 1}
+    assert drawn["landed"][1] == pytest.approx([0.9, m.com_rise_m])
+    assert [len(pictures.trials(some, TASK).axes) for some in ([], rows[3:])] == [1, 1]
+    assert smallest_font(fig) >= MIN_FONT_PT
+
+
+# ------------------------------------------------------------------------------------------ rendering
+
+
+@pytest.fixture(scope="module")
+def studio(bhr):
+    with render.Renderer(bhr, marks=(0.5,)) as studio:
+        yield studio
+
+
+SMALL = render.Camera(pitch_deg=0.0, pixels_per_m=120, bottom=0.01)  # eye level, without the ground's surface
+
+
+def body(picture):
+    return (picture < 0.99).any(axis=2)  # what is neither sky nor outside
+
+
+def test_camera_sees_the_robot_where_the_log_says(result, bhr):
+    """What is rendered and the outlines that Pinocchio computes differ by 4 cm at most: perspective, balls, roundings."""
+    camera = render.Camera(width=2.0, bottom=-0.1, top=1.9, pitch_deg=0.0, pixels_per_m=100)
+    outlines = plotting.Silhouette(bhr)
+    x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
+    with render.Renderer(bhr, scene=Scene("empty", ())) as studio:
+        for row in pictures.frame_rows(result)[[0, 1, 5, 9]]:
+            q = result.q[row]
+            seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
+            places = np.column_stack([x.ravel() + q[0], z.ravel()])
+            inside = [Path(outline).contains_points(places) for _, outline in outlines.outlines(q)]
+            wanted = np.any(inside, axis=0).reshape(seen.shape)
+            assert wanted.sum() > 1000
+            assert not (seen & ~binary_dilation(wanted, iterations=4)).any()
+            assert not (wanted & ~binary_dilation(seen, iterations=4)).any()
+
+
+def test_pictures_are_repeatable_and_move_with_the_robot(studio, bhr):
+    q = stance_configuration(bhr)
+    first = studio.picture(q, render.Camera(pixels_per_m=100))
+    assert first.shape == (179, 130, 3) and first.min() >= 0 and first.max() == 1.0
+    shifted = q.copy()
+    shifted[0] -= 2.0  # four pairs of stripes away from the mark
+    moved = studio.picture(shifted, render.Camera(pixels_per_m=100, x=-2.0))
+    still = studio.picture(q, render.Camera(pixels_per_m=100))
+    assert np.array_equal(first, still)
+    assert np.abs(first - moved)[:150].mean() < 2e-3
+
+
+def test_colours_reach_trunk_and_limbs_but_not_the_feet(studio, bhr):
+    q = stance_configuration(bhr)
+    own, blue = (studio.picture(q, SMALL, color) for color in (None, PHASE_COLORS["launch"]))
+    changed = np.abs(own - blue).max(axis=2) > 0.02
+    rows = np.nonzero(changed.any(axis=1))[0]
+    feet = SMALL.size[1] - round(0.03 * 120)
+    assert changed.sum() > 1000 and rows.max() < feet
+    again = studio.picture(q, SMALL)
+    assert np.array_equal(own, again)
+
+
+def test_marks_and_platform_are_drawn_in_their_places(bhr):
+    q = stance_configuration(bhr)
+    camera = render.Camera(x=0.8, width=1.0, top=0.8, bottom=-0.2, pixels_per_m=200)
+    with render.Renderer(bhr, scene=Scene.platform(0.75, 0.3), marks=(1.1,)) as studio:
+        picture = studio.picture(q, camera)
+    solid = body(picture)
+    left, right = solid[:, 40], solid[:, 160]  # x = 0.5 and x = 1.1
+    top = [0.8 - np.flatnonzero(column)[0] / 200 for column in (left, right)]
+    assert top[1] - top[0] == pytest.approx(0.3, abs=0.03)
+    red = (picture[..., 0] > 0.6) & (picture[..., 2] < 0.3)
+    assert np.nonzero(red)[1].mean() == pytest.approx(160, abs=3)
+
+
+def test_nothing_is_simulated_and_the_engine_is_freed(bhr, monkeypatch):
+    monkeypatch.setattr(render.bullet, "stepSimulation", None)
+    with render.Renderer(bhr) as studio:
+        client = studio._client
+        studio.picture(stance_configuration(bhr), replace(SMALL, pixels_per_m=20))
+        assert render.bullet.isConnected(client)
+    assert not render.bullet.isConnected(client)
+    studio.close()
+
+
+def test_unreadable_urdf_is_said_in_one_sentence(bhr, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise render.bullet.error("no such shape")
+
+    monkeypatch.setattr(render.bullet, "loadURDF", refuse)
+    with pytest.raises(RobotError, match=r"^robot bhr: PyBullet cannot read the URDF: no such shape$"):
+        render.Renderer(bhr)
+
+
+def test_frame_strip_and_model_can_be_read(result, bhr, tmp_path):
+    strip = render.frame_strip(result, bhr, marks=(0.14, 1.14))
+    titles = [ax.get_title() for ax in strip.axes]
+    assert len(titles) == 12 and titles[0] == "launch, 0.00 s" and titles[-1].startswith("landing")
+    assert all(len(ax.images) == 1 and not ax.axison for ax in strip.axes)
+    assert smallest_font(strip) >= MIN_FONT_PT
+    width, height = strip.get_size_inches()
+    assert width == plotting.PAGE_IN and height < 5
+    stored = []
+    for folder in ("one", "two"):
+        plotting.save_figure(render.simulation_model(bhr), "model", tmp_path / folder)
+        stored.append([(tmp_path / folder / f"model.{kind}").read_bytes() for kind in ("png", "pdf")])
+    assert stored[0] == stored[1]

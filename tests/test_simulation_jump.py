@@ -1,0 +1,249 @@
+"""Whole simulated jumps: what they reach, what they measure, and that a failure is called one."""
+
+import json
+import os
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from jumplab.errors import InputError, SolverError
+from jumplab.pipeline import plan_jump
+from jumplab.robot import Robot
+from jumplab.simulation import Disturbance, LandingReference, Perturbation, Scene, SensorNoise, simulate_landing
+from jumplab.simulation import simulate_jump as simulate
+from jumplab.simulation.actuation import Actuators
+from jumplab.simulation.recorder import Recorder, _events
+from jumplab.simulation.world import STEP_S, Contacts
+from jumplab.task import JumpTask
+from jumplab.trajectory import Tape
+
+DISTANCE, HEIGHT = 0.6, 0.3
+SHORT_S = 0.3  # enough to compare launches and flights
+
+
+@pytest.fixture(scope="module")
+def tape(bhr):
+    return plan_jump(JumpTask(DISTANCE, HEIGHT), bhr, method="direct").tape
+
+
+@pytest.fixture(scope="module", params=["position", "pd"])
+def jump(request, bhr, tape):
+    return simulate(tape, bhr, mode=request.param)
+
+
+def test_reaches_the_target_and_stands(jump):
+    m = jump.metrics
+    assert jump.landed, jump.reason
+    assert m.foot_distance_m == pytest.approx(DISTANCE, abs=0.02)
+    assert m.foot_distance_touchdown_m == pytest.approx(m.foot_distance_m, abs=0.01)
+    assert m.com_rise_m == pytest.approx(HEIGHT, abs=0.01)
+    assert m.standing_s >= 3
+    assert m.self_collision_s == 0 and m.stray_contacts == () and m.qp_failures == 0
+    assert m.qp_solves == pytest.approx(500 * m.standing_s, rel=0.01)
+
+
+def test_torques_stay_within_the_motors(bhr, jump):
+    """At every step, from the log alone: peak torque, and the torque-speed line at the speed of that step."""
+    motors = Actuators(bhr)
+    low, high = motors.range(jump.v[:, 6:])
+    assert (jump.tau <= high + 1e-6).all() and (jump.tau >= low - 1e-6).all()
+    m = jump.metrics
+    assert m.max_torque_ratio == pytest.approx(np.max(np.abs(jump.tau) / motors.effort))
+    assert m.max_torque_ratio <= 1 and m.max_torque_ratio_before_touchdown < 0.9
+    assert m.max_speed_ratio_before_touchdown < 0.9
+    assert set(m.max_torque_ratio_by_joint) == set(bhr.joint_names)
+    assert max(m.max_speed_ratio_by_joint.values()) == m.max_speed_ratio
+    assert max(m.overspeed_s.values()) <= 0.01
+
+
+def test_measurements_agree_with_mechanics(jump):
+    """Rise from v^2 / 2g, launch impulse from the momentum gained, flight on a parabola with constant L."""
+    m = jump.metrics
+    vx, vz = m.takeoff_velocity
+    assert m.com_rise_m == pytest.approx(vz**2 / (2 * 9.8), abs=0.003)
+    assert m.launch_impulse[0] == pytest.approx(42 * vx, abs=0.3)
+    assert m.launch_impulse[1] - 42 * 9.8 * m.liftoff_s == pytest.approx(42 * vz, abs=1.0)
+    air = jump.phase == "flight"
+    t = jump.t[air] - jump.t[air][0]
+    assert jump.com[air, 0] == pytest.approx(jump.com[air, 0][0] + vx * t, abs=0.005)
+    assert jump.com[air, 2] == pytest.approx(jump.com[air, 2][0] + vz * t - 4.9 * t**2, abs=0.005)
+    assert np.ptp(jump.L[air]) < 0.05
+    assert jump.rho.min() > 1.5 and jump.rho.max() < 9
+
+
+def test_the_record_is_complete(bhr, tape, jump):
+    n = len(jump.t)
+    assert np.diff(jump.t) == pytest.approx(STEP_S)
+    shapes = {"q": (n, 21), "v": (n, 20), "tau": (n, 14), "foot_wrench": (n, 2, 6), "com": (n, 3), "phase": (n,),
+              "com_velocity": (n, 3), "L": (n,), "rho": (n,), "touching": (n, len(jump.link_names))}  # fmt: skip
+    arrays = jump.arrays()
+    assert {name: arrays[name].shape for name in shapes} == shapes
+    assert all(a.dtype != object for a in arrays.values())
+    assert not jump.q.flags.writeable
+    assert list(dict.fromkeys(jump.phase)) == ["launch", "flight", "landing"]
+    assert jump.q[0] == pytest.approx(tape.q[0], abs=1e-9)  # where the tape begins, and untouched ever after:
+    speed = np.linalg.norm(jump.com_velocity, axis=1).max()
+    assert np.linalg.norm(np.diff(jump.com, axis=0), axis=1).max() < 1.1 * speed * STEP_S  # nothing jumps
+    feet = [jump.link_names.index(name) for name in bhr.foot.frames]
+    assert not np.delete(jump.touching, feet, axis=1).any()
+    assert jump.settings["friction_read_back"] == 0.8
+    assert jump.settings["robot_hash"] == bhr.hash
+
+
+def test_saved_whole(jump, odd_folder):
+    jump.save(odd_folder, {"planned_distance_m": DISTANCE})
+    assert sorted(os.listdir(odd_folder)) == ["simulation.json", "simulation.npz"]
+    said = json.loads((odd_folder / "simulation.json").read_text())
+    assert said["planned_distance_m"] == DISTANCE
+    assert said["foot_distance_m"] == jump.metrics.foot_distance_m
+    assert said["settings"]["mode"] in ("position", "pd")
+    assert said["max_torque_ratio_by_joint"]["left_knee"] <= 1
+    with np.load(odd_folder / "simulation.npz", allow_pickle=False) as file:
+        assert np.array_equal(file["q"], jump.q) and str(file["schema"]) == said["schema"]
+
+
+def test_saving_nowhere_is_refused(jump, tmp_path):
+    with pytest.raises(InputError, match=r"simulation\.npz cannot be written: .*choose a writable folder"):
+        jump.save(tmp_path / "nowhere")
+
+
+def test_same_seed_same_jump(bhr, tape):
+    """Everything random is seeded: robot, delay and noise; another seed is another jump."""
+    runs = [
+        simulate(tape, bhr, perturbation=Perturbation.draw(bhr, s, noise=SensorNoise.typical()), stand_s=SHORT_S)
+        for s in (5, 5, 6)
+    ]
+    assert np.array_equal(runs[0].q, runs[1].q) and np.array_equal(runs[0].tau, runs[1].tau)
+    assert len(runs[2].q) != len(runs[0].q) or not np.array_equal(runs[2].q, runs[0].q)
+    data = runs[0].settings["perturbation"]
+    assert data["seed"] == 5 and len(data["mass"]) == 9 and data["noise"]["gyro"] > 0
+    json.dumps(runs[0].to_json())
+
+
+def test_a_perturbed_robot_lands_with_reaim(bhr, tape):
+    assert simulate(tape, bhr, perturbation=Perturbation.draw(bhr, 3), reaim=True).landed
+
+
+def test_reaim_leaves_a_good_flight_alone_and_saves_a_bad_one(bhr, tape):
+    plain, aimed = (simulate(tape, bhr, reaim=on, stand_s=SHORT_S).metrics for on in (False, True))
+    assert aimed.foot_distance_touchdown_m == pytest.approx(plain.foot_distance_touchdown_m, abs=0.01)
+    tipped = Disturbance(pitch_rad=-np.radians(10))
+    assert "touched the ground" in simulate_landing(tape, bhr, tipped).reason
+    saved = simulate_landing(tape, bhr, tipped, reaim=True)
+    assert saved.landed and saved.settings["disturbance"]["pitch_rad"] < 0
+
+
+def test_disturbance_is_what_it_says(bhr, tape):
+    model, data = bhr.model, bhr.model.createData()
+
+    def look(disturbance):
+        step, q, v = disturbance.apex(tape, bhr)
+        pin.ccrba(model, data, q, v)
+        return (
+            step,
+            data.com[0].copy(),
+            data.hg.linear / 42,
+            data.hg.angular[1],
+            pin.rpy.matrixToRpy(data.oMi[1].rotation),
+        )
+
+    step, com, velocity, momentum, rpy = look(Disturbance())
+    assert abs(velocity[2]) < 0.02
+    again, moved, faster, same, turned = look(Disturbance(1.2, 0.1, 0.05))
+    assert again == step
+    assert moved - com == pytest.approx([0, 0, 0.05])
+    assert faster == pytest.approx([1.2 * velocity[0], 0, velocity[2]])
+    assert same == pytest.approx(momentum)
+    assert turned[1] - rpy[1] == pytest.approx(0.1)
+
+
+def test_follows_a_landing_planned_at_touchdown(bhr, tape):
+    """The reference may be made from the measured state at touchdown."""
+    asked = []
+
+    def plan(q, v):
+        asked.append((q.shape, v.shape))
+        return LandingReference(np.array([0.0, 1.0]), np.array([[0, 0.7], [0, 0.7]]), np.zeros((2, 2)), np.zeros(2))
+
+    run = simulate(tape, bhr, reference=plan)
+    assert asked == [((21,), (20,))]
+    assert run.landed and run.settings["landing_reference"]
+    assert run.com[-1, 2] == pytest.approx(0.7, abs=0.005)
+
+
+def test_a_ditch_swallows_a_short_jump(bhr, tape):
+    run = simulate(tape, bhr, scene=Scene.ditch(0.2, 1.4), stand_s=1.0)
+    assert not run.landed and "watched" not in run.reason
+
+
+def test_a_jump_over_the_edge_of_a_ditch_lands(bhr, tape):
+    run = simulate(tape, bhr, scene=Scene.ditch(0.2, 0.4))
+    assert run.landed and run.metrics.foot_distance_m > 0.58
+
+
+def test_a_fall_is_called_a_fall(bhr, tape):
+    run = simulate_landing(tape, bhr, Disturbance(pitch_rad=0.6))
+    assert not run.landed
+    assert "touched the ground" in run.reason
+    assert run.metrics.standing_s < 3
+    assert run.t[-1] < 2.5  # not simulated for longer than it is worth
+
+
+def test_a_short_look_is_no_landing(bhr, tape):
+    run = simulate(tape, bhr, stand_s=1.0)
+    assert not run.landed and run.reason == "watched for 1.05 s only, not 3 s"
+
+
+def test_standing_still_is_no_jump(bhr, tape):
+    """A tape that never leaves its first posture: the feet stay down, and the verdict says so."""
+    rest = {name: np.repeat(getattr(tape, name)[:1], len(tape.t), axis=0) for name in ("q", "tau", "f")}
+    still = np.zeros_like(tape.v)
+    lazy = Tape(
+        tape.t, rest["q"], still, still, rest["tau"], tape.phase, tape.contact_frames, rest["f"], tape.joint_names
+    )
+    run = simulate(lazy, bhr, stand_s=SHORT_S)
+    assert not run.landed and run.reason == "the feet never left the ground"
+    assert run.metrics.com_rise_m is None and run.metrics.foot_distance_m is None
+    json.dumps(run.to_json(), allow_nan=False)
+
+
+def test_events_from_forces():
+    def force(*parts):
+        return np.concatenate([np.full(n, f, float) for n, f in parts])
+
+    assert _events(force((100, 400), (300, 0), (100, 900))) == (100, 400)
+    assert _events(force((10, 400), (20, 0), (70, 400), (300, 4), (9, 900))) == (100, 400)  # a hop, then a jump
+    assert _events(force((100, 400), (300, 0), (10, 900), (200, 0), (10, 300))) == (100, 400)  # a bounce
+    assert _events(force((300, 0), (100, 900))) == (0, 300)  # begun in the air
+    assert _events(force((100, 400), (300, 0))) == (100, None)
+    assert _events(force((100, 400))) == (None, None)
+
+
+def test_an_exploded_engine_is_an_error(bhr, tape):
+    recorder = Recorder(bhr, tape.q[-1], ("trunk", *bhr.foot.frames))
+    nothing = Contacts(np.zeros((2, 6)), frozenset(), frozenset())
+    recorder.add(np.full(21, np.nan), np.zeros(20), np.zeros(14), nothing)
+    with pytest.raises(SolverError, match="PyBullet lost the robot"):
+        recorder.result((0, 0), {})
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"mode": "velocity"}, "mode 'velocity': must be one of position, pd"),
+        ({"stand_s": 0}, r"stand_s = 0 s is outside 0 \.\.\. 60 s"),
+        ({"stand_s": float("nan")}, "stand_s = nan s is outside"),
+    ],
+)
+def test_bad_options(bhr, tape, options, words):
+    with pytest.raises(InputError, match=words):
+        simulate(tape, bhr, **options)
+
+
+def test_a_tape_of_another_robot(bhr, tape):
+    other = Robot.from_text(
+        bhr.urdf.replace("left_knee", "left_knie"), bhr.config_text.replace("left_knee", "left_knie")
+    )
+    with pytest.raises(InputError, match="are not those of robot bhr"):
+        simulate(tape, other)

@@ -1,0 +1,164 @@
+"""The landing controller alone: it stands, it catches, it obeys its limits, it survives a solver that fails."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import brentq
+
+from jumplab.robot.stance import com_from_toe, configuration, stance_configuration
+from jumplab.simulation import LandingController, LandingReference, World
+from jumplab.simulation.actuation import Actuators
+from jumplab.simulation.body_terms import BodyTerms
+from jumplab.simulation.landing import PERIOD_STEPS
+
+
+class Catch:
+    """A robot dropped with its joints held until the feet feel the ground, then the controller; logs what matters."""
+
+    def __init__(self, robot, q, v=None, seconds=3.0, controller=None, friction=0.8):
+        self.controller = controller or LandingController(robot)
+        motors, hold, data = Actuators(robot), q[7:], robot.model.createData()
+        self.worst_torque, self.touching, touchdown, tau = 0.0, set(), None, np.zeros(14)
+        with World(robot, q, v, friction=friction) as world:
+            force = np.zeros(2)
+            for step in range(round(seconds * 1000)):
+                q, v = world.state()
+                if touchdown is None and force.sum() > 20:
+                    touchdown = step
+                    world.release()
+                if touchdown is None:
+                    world.command_position(hold, np.zeros(14), motors.effort, 0.1, 1.0)
+                else:
+                    since = step - touchdown
+                    if since % PERIOD_STEPS == 0:
+                        tau = self.controller.torque(since / 1000, q, v, force)
+                        low, high = motors.range(v[6:])
+                        assert (tau <= high + 1e-9).all() and (tau >= low - 1e-9).all()
+                    world.command_torque(tau)
+                    self.worst_torque = max(self.worst_torque, np.max(np.abs(tau) / motors.effort))
+                world.step()
+                contacts = world.contacts()
+                force, self.touching = contacts.wrench[:, 2], self.touching | contacts.touching
+            q, v = world.state()
+        pin.centerOfMass(robot.model, data, q, v)
+        self.com, self.speed, self.force = data.com[0].copy(), np.linalg.norm(data.vcom[0]), force.sum()
+
+    @property
+    def stands(self):
+        return self.touching == {"left_foot", "right_foot"} and self.speed < 0.02
+
+
+def crouched(robot, vx, knee=1.0, pitch=0.15, vz=-3.0):
+    """Feet flat just above the ground, soles ahead of the CoM by the capture law of the plan."""
+    middle = robot.sagittal.sole_center[0]
+
+    def angles(shank):
+        return np.array([0.0, shank, shank - knee, pitch, pitch])
+
+    def miss(shank):
+        return middle - com_from_toe(robot, angles(shank))[0] - (0.02 + 0.13 * vx)
+
+    q = configuration(robot, angles(brentq(miss, -1.2, 1.4)))
+    q[2] += 0.002
+    v = np.zeros(robot.model.nv)
+    v[:3] = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix().T @ [vx, 0, vz]
+    return q, v
+
+
+def test_body_terms_obey_newton(bhr):
+    """Rows and offsets of the controller against inverse dynamics and finite differences, at a random state."""
+    rng, model, terms = np.random.default_rng(1), bhr.model, BodyTerms(bhr, 100.0)
+    q = pin.integrate(model, stance_configuration(bhr), 0.3 * rng.normal(size=20))
+    v, a, wrench = rng.normal(size=20), rng.normal(size=20), rng.normal(size=(2, 6))
+    x = np.concatenate([a, *wrench])
+    terms.update(q, v)
+    terms.set_contact(np.array([True, True]))
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    pin.updateFramePlacements(model, data)
+    outer = pin.StdVec_Force()
+    for _ in range(model.njoints):
+        outer.append(pin.Force.Zero())
+    for side, name in enumerate(bhr.foot.frames):
+        frame = model.frames[model.getFrameId(name)]
+        joint = data.oMi[frame.parentJoint]
+        middle = data.oMf[model.getFrameId(name)].act(bhr.foot.center)
+        at_sole = pin.SE3(np.eye(3), middle)
+        outer[frame.parentJoint] = joint.actInv(at_sole.act(pin.Force(100 * wrench[side])))
+        assert terms.soles[side] == pytest.approx(middle)
+    tau = pin.rnea(model, data, q, v, a, outer)
+    assert terms.base_rows @ x + terms.base_offset == pytest.approx(tau[:6], abs=1e-8)
+    assert terms.torque(x) == pytest.approx(tau[6:], abs=1e-8)
+    total = 100 * wrench.sum(axis=0)
+    assert terms.force_rows @ x == pytest.approx(total[:3] / 42)
+    moment = sum(100 * w[3:] + np.cross(p - terms.com, 100 * w[:3]) for p, w in zip(terms.soles, wrench, strict=True))
+    assert terms.momentum_rows @ x == pytest.approx(moment)
+    step = 1e-6
+    twists, acceleration = terms.twists.copy(), terms.sole_rows @ x + terms.sole_drift
+    terms.update(pin.integrate(model, q, step * v), v + step * a)
+    assert (terms.twists - twists) / step == pytest.approx(acceleration, abs=1e-3)
+
+
+def test_stands_quietly(bhr):
+    run = Catch(bhr, stance_configuration(bhr), seconds=3.0)
+    assert run.stands and run.speed < 1e-3
+    assert run.force == pytest.approx(42 * 9.8, rel=1e-3)
+    assert run.worst_torque < 0.3
+    assert run.controller.failures == 0 and run.controller.solves > 1400
+
+
+def test_catches_a_drop(bhr):
+    q = stance_configuration(bhr)
+    q[2] += 0.2
+    run = Catch(bhr, q, seconds=2.0)
+    assert run.stands and run.controller.failures == 0
+    assert run.com[:2] == pytest.approx([0, 0], abs=0.01)
+
+
+@pytest.mark.parametrize(("vx", "friction"), [(0.7, 0.5), (1.0, 0.8), (1.4, 1.0)])
+def test_catches_a_jump(bhr, vx, friction):
+    run = Catch(bhr, *crouched(bhr, vx), seconds=2.0, friction=friction)
+    assert run.stands and run.controller.failures == 0
+    assert run.worst_torque <= 1.0
+
+
+def test_follows_a_reference(bhr):
+    """Sink by 10 cm in half a second and stay there, 2 cm ahead of the middle of the feet."""
+    q = stance_configuration(bhr)
+    start = float(pin.centerOfMass(bhr.model, bhr.model.createData(), q)[2])
+    s = np.linspace(0, 1, 51)
+    blend, slope = 3 * s**2 - 2 * s**3, (6 * s - 6 * s**2) / 0.5
+    com, rate = np.stack([0.02 * blend, start - 0.1 * blend], 1), np.stack([0.02 * slope, -0.1 * slope], 1)
+    controller = LandingController(bhr, reference=LandingReference(0.5 * s, com, rate, np.zeros(51)))
+    run = Catch(bhr, q, seconds=1.5, controller=controller)
+    assert run.stands
+    assert run.com[[0, 2]] == pytest.approx([0.02, start - 0.1], abs=0.005)
+
+
+def test_survives_a_failing_solver(bhr):
+    """Failures are counted, and torques stay within the limits; one lost solve in ten does not cost the stance."""
+    controller = LandingController(bhr)
+    solve, calls = controller._solve, []
+
+    def flaky(*args):
+        calls.append(1)
+        if len(calls) % 10:
+            return solve(*args)
+        controller.failures += 1
+        return None
+
+    controller._solve = flaky
+    q = stance_configuration(bhr)
+    q[2] += 0.05
+    run = Catch(bhr, q, seconds=1.5, controller=controller)
+    assert run.stands and controller.failures == len(calls) // 10
+
+
+def test_reports_an_unsolvable_problem(bhr):
+    controller = LandingController(bhr)
+    q, v = stance_configuration(bhr), np.zeros(20)
+    controller._solver.settings.max_iter = 1
+    v[6:] = np.random.default_rng(0).normal(size=14) * 10
+    tau = controller.torque(0.0, q, v, np.array([200.0, 200.0]))
+    assert controller.failures == 1
+    assert np.isfinite(tau).all() and (np.abs(tau) <= Actuators(bhr).effort).all()

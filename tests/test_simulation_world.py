@@ -1,0 +1,277 @@
+"""The simulated world against what must be true of any world."""
+
+import numpy as np
+import pinocchio as pin
+import pybullet as bullet
+import pytest
+
+from jumplab.errors import InputError, JumplabError
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+from jumplab.simulation import Perturbation, Scene, SensorNoise, World, base_from_bullet, base_to_bullet
+from jumplab.simulation.actuation import Actuators, Delay
+from jumplab.simulation.sensors import Sensors
+from jumplab.simulation.world import STEP_S
+
+HOLD = dict(position_gain=0.1, velocity_gain=1.0)
+
+
+def random_state(robot, seed, height=3.0):
+    rng = np.random.default_rng(seed)
+    lower, upper = robot.model.lowerPositionLimit[7:], robot.model.upperPositionLimit[7:]
+    q = pin.neutral(robot.model)
+    q[:3] = rng.normal(size=3) + np.array([0, 0, height])
+    q[3:7] = pin.Quaternion(pin.exp3(rng.normal(size=3))).coeffs()
+    q[7:] = lower + (upper - lower) * rng.uniform(0.4, 0.6, len(lower))  # far from the stops
+    return q, rng.normal(size=robot.model.nv)
+
+
+def momentum(robot, q, v):
+    data = robot.model.createData()
+    pin.ccrba(robot.model, data, q, v)
+    return data.com[0].copy(), data.hg.linear.copy(), data.hg.angular.copy()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_base_conversion_round_trip(bhr, seed):
+    q, v = random_state(bhr, seed)
+    lever = np.random.default_rng(seed).normal(size=3)
+    back_q, back_v = base_from_bullet(*base_to_bullet(q, v, lever), lever)
+    assert back_q == pytest.approx(q[:7], abs=1e-14)
+    assert back_v == pytest.approx(v[:6], abs=1e-14)
+
+
+def test_base_conversion_by_hand():
+    """A base turned by 90 degrees about y, spinning about z in the world, CoM 0.2 m below the link's origin."""
+    half = np.sqrt(0.5)
+    q, v = np.array([1, 2, 3, 0, half, 0, half]), np.array([0, 0, 0, -5, 0, 0])  # local x is world -z
+    position, _, velocity, rate = base_to_bullet(q, v, np.array([0, 0, -0.2]))
+    assert position == pytest.approx([0.8, 2, 3])
+    assert rate == pytest.approx([0, 0, 5])
+    assert velocity == pytest.approx([0, -1, 0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_state_round_trip_through_the_engine(bhr, seed):
+    q, v = random_state(bhr, seed)
+    with World(bhr, q, v) as world:
+        back_q, back_v = world.state()
+    assert back_q == pytest.approx(q, abs=1e-12)
+    assert back_v == pytest.approx(v, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_free_flight_conserves_momentum(bhr, seed):
+    """No damping anywhere: the CoM falls as a stone does, L stays. Bullet's default damping would eat 3 % of L."""
+    q, v = random_state(bhr, seed)
+    com, linear, angular = momentum(bhr, q, v)
+    steps = 300
+    with World(bhr, q, v) as world:
+        for _ in range(steps):
+            world.step()
+        assert world.contacts().touching == frozenset()
+        end_com, end_linear, end_angular = momentum(bhr, *world.state())
+    t = steps * STEP_S
+    assert end_linear[:2] == pytest.approx(linear[:2], abs=0.1)  # of 42 kg at about 1 m/s
+    assert end_linear[2] - linear[2] == pytest.approx(-42 * 9.8 * t, abs=0.1)
+    assert end_angular == pytest.approx(angular, abs=0.02 * max(1, np.abs(angular).max()))
+    semi_implicit = -9.8 * t * STEP_S / 2  # the engine's own error of a free fall
+    fall = linear[2] / 42 * t - 9.8 * t**2 / 2 + semi_implicit
+    assert end_com[2] - com[2] == pytest.approx(fall, abs=1e-3)
+
+
+def test_mass_is_the_planned_one(bhr):
+    """A dummy link without <inertial> weighs nothing to Pinocchio and 1 kg to PyBullet: said, not simulated."""
+    first = bhr.urdf.index("<inertial>", bhr.urdf.index('name="left_ankle_link"'))
+    last = bhr.urdf.index("</inertial>", first) + len("</inertial>")
+    robot = Robot.from_text(bhr.urdf[:first] + bhr.urdf[last:], bhr.config_text)
+    with pytest.raises(JumplabError, match=r"PyBullet's robot weighs 42\.9990 kg, Pinocchio's 41\.9990 kg"):
+        World(robot, pin.neutral(robot.model))
+
+
+@pytest.mark.parametrize("friction", [0.37, 0.8])
+def test_friction_reaches_every_link(bhr, friction):
+    with World(bhr, stance_configuration(bhr), friction=friction) as world:
+        assert set(world.friction) >= {"trunk", "left_foot", "right_foot", "left_arm"}
+        assert set(world.friction.values()) == {friction}
+
+
+def test_friction_that_did_not_arrive_is_refused(bhr, monkeypatch):
+    """PyBullet ignores friction in a call that also sets damping; the read-back must notice."""
+    real = bullet.changeDynamics
+
+    def lossy(body, link, **settings):
+        if link >= 0:
+            settings.pop("lateralFriction", None)
+        real(body, link, **settings)
+
+    monkeypatch.setattr(bullet, "changeDynamics", lossy)
+    with pytest.raises(JumplabError, match=r"PyBullet kept friction 0\.5 on \w+ where 0\.83 was set"):
+        World(bhr, stance_configuration(bhr), friction=0.83)
+
+
+def test_friction_decides_when_feet_slip(bhr):
+    """A stiff robot pushed along by its own speed stops after v^2 / (2 mu g)."""
+    q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
+    pitch = bhr.stance["trunk_pitch_rad"]
+    v[[0, 2]] = 0.3 * np.cos(pitch), 0.3 * np.sin(pitch)  # 0.3 m/s forward, in base axes
+    effort = Actuators(bhr).effort
+    for friction in (0.06, 0.12):  # so little that it slides before it tips
+        with World(bhr, q, v, friction=friction) as world:
+            for _ in range(700):
+                world.command_position(q[7:], np.zeros(14), effort, **HOLD)
+                world.step()
+            travel = world.state()[0][0] - q[0]
+        assert travel == pytest.approx(0.3**2 / (2 * friction * 9.8), rel=0.1)
+
+
+def test_foot_sensors_weigh_the_robot(bhr):
+    """In a quiet stance: m g, no net horizontal force, CoP below the CoM; only feet touch, nothing collides."""
+    q, effort = stance_configuration(bhr), Actuators(bhr).effort
+    with World(bhr, q) as world:
+        for _ in range(1000):
+            world.command_position(q[7:], np.zeros(14), effort, **HOLD)
+            world.step()
+        contacts, (end, v) = world.contacts(), world.state()
+    total = contacts.wrench.sum(axis=0)
+    assert total[2] == pytest.approx(42 * 9.8, rel=1e-4)
+    assert total[:2] == pytest.approx([0, 0], abs=0.05)
+    assert contacts.touching == {"left_foot", "right_foot"}
+    assert not contacts.colliding
+    assert np.abs(end - q).max() < 1e-3
+    data = bhr.model.createData()
+    pin.framesForwardKinematics(bhr.model, data, end)
+    feet = [data.oMf[bhr.model.getFrameId(name)].translation for name in bhr.foot.frames]
+    moment = sum(w[3:] + np.cross(p, w[:3]) for p, w in zip(feet, contacts.wrench, strict=True))
+    com = momentum(bhr, end, v)[0]
+    assert -moment[1] / total[2] == pytest.approx(com[0], abs=1e-3)
+    assert moment[0] / total[2] == pytest.approx(com[1], abs=1e-3)
+
+
+def test_contact_impulse_is_change_of_momentum(bhr):
+    """Sliding down onto the ground: every step the measured forces explain the change of momentum, sign and size."""
+    q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
+    q[2] += 0.002
+    v[0], v[2] = 0.5, -0.5
+    effort = Actuators(bhr).effort
+    impulse, start = np.zeros(3), momentum(bhr, q, v)[1]
+    with World(bhr, q, v) as world:
+        for _ in range(60):
+            world.command_position(q[7:], np.zeros(14), effort, **HOLD)
+            world.step()
+            impulse += STEP_S * (world.contacts().wrench.sum(axis=0)[:3] - [0, 0, 42 * 9.8])
+        change = momentum(bhr, *world.state())[1] - start
+    assert abs(impulse[0]) > 3
+    assert impulse == pytest.approx(change, abs=0.3)
+
+
+def test_sagittal_postures_never_collide_but_crossed_legs_do(bhr):
+    """Self-collision is on, without exclusions beyond direct neighbours: the ranges of the joints are real."""
+    rng, names = np.random.default_rng(0), bhr.joint_names
+    role = {name: role for role, pair in bhr.joints.items() for name in pair}
+    for k in range(12):
+        share = dict(zip(bhr.joints, rng.integers(0, 2, 4) if k < 6 else rng.uniform(size=4), strict=True))
+        q = pin.neutral(bhr.model)
+        q[2] = 3.0
+        for i, name in enumerate(names):
+            if name in role:
+                limits = bhr.actuators[name]
+                q[7 + i] = limits["lower"] + share[role[name]] * (limits["upper"] - limits["lower"])
+        with World(bhr, q) as world:
+            world.step()
+            assert not world.contacts().colliding
+    q = pin.neutral(bhr.model)
+    q[2] = 3.0
+    q[7 + names.index("left_hip_roll")], q[7 + names.index("right_hip_roll")] = -0.2, 0.2
+    with World(bhr, q) as world:
+        world.step()
+        assert world.contacts().colliding
+
+
+def test_scenes_have_real_edges(bhr):
+    """Over the ditch the robot falls to its floor, on the platform it stands on the platform."""
+    ditch, platform = Scene.ditch(0.3, 1.3, depth=0.5), Scene.platform(0.4, 0.3)
+    assert [ditch.top_at(x) for x in (0, 0.8, 1.5)] == [0, -0.5, 0]
+    assert [platform.top_at(x) for x in (0, 1)] == [0, 0.3]
+    effort = Actuators(bhr).effort
+    for scene, x, z, end in ((ditch, 0.8, 0.0, -0.5), (platform, 0.8, 0.3, 0.3), (platform, 0.0, 0.0, 0.0)):
+        q = stance_configuration(bhr)
+        height = q[2]
+        q[:3] += [x, 0, z]
+        with World(bhr, q, scene=scene) as world:
+            for _ in range(600):
+                world.command_position(q[7:], np.zeros(14), effort, **HOLD)
+                world.step()
+            assert world.state()[0][2] == pytest.approx(height + end, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Scene.ditch(-0.1, 1.0), "ditch from -0.1 to 1 m: it must begin ahead"),
+        (lambda: Scene.ditch(0.5, 0.5), "ditch from 0.5 to 0.5 m"),
+        (lambda: Scene.ditch(0.5, 1.0, depth=0), "ditch of depth 0 m: the depth must be positive"),
+        (lambda: Scene.platform(0.3, -0.1), "platform at 0.3 m, -0.1 m high: both numbers must be positive"),
+        (lambda: Perturbation(friction=0.0), "friction = 0 is outside 0 ... 2"),
+        (lambda: Perturbation(delay_s=0.1), "delay = 0.1 s is outside 0 ... 0.02 s"),
+    ],
+)
+def test_impossible_worlds_are_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_perturbations_are_seeded_and_bounded(bhr):
+    one, same, other = (Perturbation.draw(bhr, seed) for seed in (7, 7, 8))
+    assert one == same and one != other
+    assert len(one.mass) == 9  # the massless dummies are left alone
+    assert all(abs(f - 1) <= 0.05 for f in one.mass.values())
+    assert all(abs(f - 1) <= 0.10 for f in one.inertia.values())
+    assert all(abs(x) <= 0.015 for shift in one.com.values() for x in shift)
+    assert 0.5 <= one.friction <= 1.0 and 0 <= one.delay_s <= 0.004
+    real = one.robot(bhr)
+    model, planned = real.model, bhr.model
+    knee = model.getJointId("left_knee")
+    assert model.inertias[knee].mass == pytest.approx(planned.inertias[knee].mass * one.mass["left_shank"])
+    assert model.inertias[knee].lever == pytest.approx(planned.inertias[knee].lever + one.com["left_shank"])
+    factor = one.mass["left_shank"] * one.inertia["left_shank"]
+    assert model.inertias[knee].inertia == pytest.approx(planned.inertias[knee].inertia * factor)
+    assert Perturbation().robot(bhr) is bhr
+    with World(real, stance_configuration(bhr), friction=one.friction) as world:  # checks its mass against Pinocchio
+        assert set(world.friction.values()) == {one.friction}
+
+
+def test_motors_follow_their_torque_speed_line(bhr):
+    motors = Actuators(bhr)
+    corner = motors.speed / 2
+    for rate, share in ((0.0, 1.0), (1.0, 1.0), (1.5, 0.5), (2.0, 0.0), (3.0, 0.0)):
+        low, high = motors.range(rate * corner)
+        assert high == pytest.approx(share * motors.effort)
+        assert low == pytest.approx(-motors.effort)  # braking is free
+        assert motors.range(-rate * corner)[0] == pytest.approx(-high)
+        assert motors.either_way(-rate * corner) == pytest.approx(high)
+
+
+def test_delay_line():
+    late, prompt = Delay(2), Delay(0)
+    assert [late(x) for x in "abcd"] == ["a", "a", "a", "b"]
+    assert [prompt(x) for x in "abc"] == ["a", "b", "c"]
+
+
+def test_sensors(bhr):
+    q, v = random_state(bhr, 0)
+    wrench = np.arange(12.0).reshape(2, 6)
+    exact = Sensors(SensorNoise(), 0)
+    assert exact.state(q, v) == (q, v)
+    assert exact.vertical_forces(wrench).tolist() == [2, 8]
+    noise = SensorNoise.typical()
+    sensors, twin = Sensors(noise, 3), Sensors(noise, 3)
+    rows = [sensors.state(q, v) for _ in range(500)]
+    told_q, told_v = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    assert np.array_equal(twin.state(q, v)[0], told_q[0])
+    assert (told_q[:, 7:] - q[7:]).std() == pytest.approx(noise.joint_rad, rel=0.1)
+    assert (told_v[:, 6:] - v[6:]).std() == pytest.approx(noise.joint_rate, rel=0.1)
+    assert (told_v[:, :3] - v[:3]).std() == pytest.approx(noise.velocity, rel=0.1)
+    assert (told_v[:, 3:6] - v[3:6]).std() == pytest.approx(noise.gyro, rel=0.1)
+    assert np.linalg.norm(told_q[:, 3:7], axis=1) == pytest.approx(np.ones(500))
+    assert np.array_equal(told_q[:, :3], np.tile(q[:3], (500, 1)))

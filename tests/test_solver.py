@@ -1,0 +1,284 @@
+"""Solving: a problem with a known answer, what comes out of it, and every way of failing."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from jumplab.errors import InputError, JumplabError, SolverError
+from jumplab.solver import GOOD_STATUSES, Nlp, PhaseGuess
+from jumplab.terms import Bound, Phase, Problem, Term
+
+N = 30
+
+
+def move(*extra, bounds=(), duration=(1.0, 1.0), **other) -> Problem:
+    """From rest at 0 to rest at the goal with the least jerk."""
+    terms = (
+        Term("jerk", "-", "m/s^3", "mid", lambda p: p.j, weight=1.0),
+        Term("goal", "-", "m", "end", lambda p: p.q - p.p.goal),
+        Term("stop", "-", "m/s", "end", lambda p: ca.vertcat(p.v, p.a)),
+        *extra,
+    )
+    rest = tuple(Bound(f"rest {k}", "-", "m", k, 0.0, 0.0, "start") for k in "qva")
+    return Problem("move", (Phase("go", ("x",), N, duration, terms, (*rest, *bounds), **other),), (), {"goal": 1})
+
+
+def flat_guess(duration=1.0) -> dict[str, PhaseGuess]:
+    zero = np.zeros((N + 1, 1))
+    return {"go": PhaseGuess(duration, zero, zero, zero)}
+
+
+@pytest.fixture(scope="module")
+def nlp():
+    return Nlp(move())
+
+
+def test_least_jerk_is_the_quintic(nlp):
+    """With ever more pieces of constant jerk the answer tends to 10 s^3 - 15 s^4 + 6 s^5."""
+    solution = nlp.solve({"goal": 2.0}, flat_guess())
+    t = np.linspace(0, 1, 101)
+    q, v, _ = (x[:, 0] for x in solution.phases["go"].sample(t))
+    np.testing.assert_allclose(q, 2 * (10 * t**3 - 15 * t**4 + 6 * t**5), atol=2e-3)
+    np.testing.assert_allclose(v, 2 * (30 * t**2 - 60 * t**3 + 30 * t**4), atol=1e-2)
+    assert solution.statistics.objective == pytest.approx(4 * 720, rel=1e-2)  # int (60 - 360 s + 360 s^2)^2 = 720
+    assert solution.statistics.status in GOOD_STATUSES and solution.statistics.residual < 1e-6
+
+
+def test_sample_is_what_was_optimised(nlp):
+    phase = nlp.solve({"goal": 1.0}, flat_guess()).phases["go"]
+    for got, want in zip(phase.sample(phase.t), (phase.q, phase.v, phase.a), strict=True):
+        np.testing.assert_allclose(got, want, atol=1e-8)
+    t = np.linspace(0, 1, 3001)
+    q, v, a = (x[:, 0] for x in phase.sample(t))
+    step = t[1] - t[0]
+    np.testing.assert_allclose(np.diff(q) / step, (v[1:] + v[:-1]) / 2, atol=1e-5)
+    np.testing.assert_allclose(np.diff(v) / step, (a[1:] + a[:-1]) / 2, atol=1e-4)
+
+
+def test_warm_start_on_the_same_and_on_a_finer_mesh(nlp):
+    first = nlp.solve({"goal": 1.0}, flat_guess())
+    again = nlp.solve({"goal": 1.0}, first.guess())
+    assert again.statistics.iterations <= first.statistics.iterations
+    assert again.statistics.objective == pytest.approx(first.statistics.objective, rel=1e-6)
+    fine = first.guess({"go": 90})["go"]
+    assert fine.q.shape == (91, 1)
+    np.testing.assert_allclose(fine.q[::3], first.phases["go"].q, atol=1e-8)
+
+
+def test_cost_shares_and_tightest_rows():
+    wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.7, scale=2.0)
+    heat = Term("heat", "-", "m/s^2", "node", lambda p: p.a, weight=0.1)
+    solution = Nlp(move(wall, heat)).solve({"goal": 1.0}, flat_guess())
+    shares = {row["name"]: row for row in solution.cost_shares}
+    assert sum(row["share"] for row in shares.values()) == pytest.approx(1.0)
+    assert sum(row["cost"] for row in shares.values()) == pytest.approx(solution.statistics.objective, rel=1e-9)
+    report = {row["name"]: row for row in solution.constraint_report}
+    assert report["wall"]["slack"] == pytest.approx(0.0, abs=1e-5) and report["wall"]["kind"] == "inequality"
+    assert report["wall"]["value"] == pytest.approx(1.7, abs=1e-5)
+    assert solution.phases["go"].v[report["wall"]["node"], 0] == pytest.approx(1.7, abs=1e-5)
+    assert report["goal"]["kind"] == "equality" and "jerk chain" not in report
+
+
+# what can be changed without building again ---------------------------------------------------------------------
+def test_bounds_may_depend_on_parameters():
+    cap = Bound("cap", "-", "m/s", "v", -np.inf, lambda p: 1.75 * p["goal"])
+    row = Term("row", "-", "m/s^2", "node", lambda p: p.a, lower=lambda p: -5.5 * p["goal"], upper=np.inf)
+    nlp = Nlp(move(row, bounds=(cap,)))
+    for goal in (0.5, 1.0, 2.0):
+        phase = nlp.solve({"goal": goal}, flat_guess()).phases["go"]
+        assert phase.v.max() == pytest.approx(1.75 * goal, abs=1e-5)
+        assert phase.a.min() >= -5.5 * goal * (1 + 1e-6)
+    free = nlp.solve({"goal": 1.0}, flat_guess(), off=("cap",)).phases["go"].v.max()
+    assert free > 1.8
+
+
+def test_durations_may_depend_on_parameters():
+    nlp = Nlp(move(duration=(lambda p: p["goal"], lambda p: 2 * p["goal"])))
+    assert nlp.solve({"goal": 1.5}, flat_guess()).phases["go"].duration == pytest.approx(3.0, abs=1e-4)
+
+
+def test_weights_and_switches(nlp):
+    usual = nlp.solve({"goal": 1.0}, flat_guess()).statistics.objective
+    for name in ("jerk", "go/jerk"):
+        doubled = nlp.solve({"goal": 1.0}, flat_guess(), weights={name: 2.0}).statistics.objective
+        assert doubled == pytest.approx(2 * usual, rel=1e-6)
+    loose = nlp.solve({"goal": 1.0}, flat_guess(), off=("stop",))
+    assert loose.statistics.objective < 0.2 * usual and abs(loose.phases["go"].v[-1, 0]) > 0.5
+    still = nlp.solve({"goal": 1.0}, flat_guess(), off=("go/goal",))
+    assert still.statistics.objective == pytest.approx(0.0, abs=1e-8)
+
+
+def test_one_sided_rows_can_be_switched_off():
+    wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.5)
+    floor = Term("floor", "-", "m", "node", lambda p: p.q, lower=-1e-3, upper=np.inf)
+    nlp = Nlp(move(wall, floor))
+    held = nlp.solve({"goal": 1.0}, flat_guess()).phases["go"].v.max()
+    free = nlp.solve({"goal": 1.0}, flat_guess(), off=("wall", "go/floor")).phases["go"].v.max()
+    assert held == pytest.approx(1.5, abs=1e-5) and free > 1.8
+
+
+def test_bounds_on_each_kind_of_variable():
+    boxes = (Bound("jerk box", "-", "m/s^3", "j", -45.0, 45.0), Bound("far end", "-", "m", "q", 0.9, 1.1, "end"),
+             Bound("inside", "-", "m", "q", -0.001, 1.05, "inner"))  # fmt: skip
+    phase = Nlp(move(bounds=boxes), None).solve({"goal": 1.0}, flat_guess()).phases["go"]
+    assert np.abs(phase.j).max() <= 45.0 + 1e-5 and phase.q.min() >= -0.001 - 1e-8
+    free = Nlp(move()).solve({"goal": 1.0}, flat_guess()).phases["go"]
+    assert np.abs(free.j).max() > 45.0
+
+
+# what is refused before solving ---------------------------------------------------------------------------------
+def test_unknown_names_are_refused(nlp):
+    sentence = (
+        "weight or switch 'jrek': the problem 'move' has no such term; it has goal, jerk, rest a, rest q, rest v, stop"
+    )
+    for how in ({"weights": {"jrek": 1.0}}, {"off": ("jrek",)}):
+        with pytest.raises(InputError) as e:
+            nlp.solve({"goal": 1.0}, flat_guess(), **how)
+        assert str(e.value) == sentence
+
+
+@pytest.mark.parametrize("parameters", [{}, {"goal": 1.0, "aim": 2.0}, {"aim": 1.0}])
+def test_parameters_must_fit(nlp, parameters):
+    with pytest.raises(InputError, match=r"^move: parameters .* it takes \['goal'\]$"):
+        nlp.solve(parameters, flat_guess())
+
+
+def test_numbers_must_be_finite(nlp):
+    for parameters, weights in (({"goal": np.nan}, {}), ({"goal": np.inf}, {}), ({"goal": 1.0}, {"jerk": np.nan})):
+        with pytest.raises(InputError) as e:
+            nlp.solve(parameters, flat_guess(), weights=weights)
+        assert str(e.value) == "move: a parameter or weight is not finite"
+
+
+def test_references_must_fit():
+    track = Term("track", "-", "m", "node", lambda p: p.q - p.ref.r, weight=1.0)
+    nlp = Nlp(move(track, references={"r": 1}))
+    for wrong in (np.zeros(N), np.zeros((1, N)), np.full((1, N + 1), np.nan)):
+        with pytest.raises(InputError, match=r"^move: reference 'r' of phase 'go' must be finite, \(1, 31\)$"):
+            nlp.solve({"goal": 1.0}, flat_guess(), references={"go": {"r": wrong}})
+    nlp.solve({"goal": 1.0}, flat_guess(), references={"go": {"r": np.ones((1, N + 1))}})
+
+
+def test_references_must_be_given_and_known():
+    """A misspelt reference must not silently become zero."""
+    track = Term("track", "-", "m", "node", lambda p: p.q - p.ref.r, weight=1.0)
+    nlp = Nlp(move(track, references={"r": 1}))
+    for references in (None, {"go": {"s": np.ones((1, N + 1))}}, {"gone": {"r": np.ones((1, N + 1))}}):
+        with pytest.raises(InputError):
+            nlp.solve({"goal": 1.0}, flat_guess(), references=references)
+
+
+def test_weight_of_a_constraint_is_refused(nlp):
+    """It has none: silently doing nothing would mislead."""
+    with pytest.raises(InputError, match="stop"):
+        nlp.solve({"goal": 1.0}, flat_guess(), weights={"stop": 5.0})
+
+
+@pytest.mark.parametrize("parameters", [{"goal": [1.0, 2.0, 3.0]}, {"goal": "far"}])
+def test_parameters_of_the_wrong_kind(nlp, parameters):
+    with pytest.raises(InputError):
+        nlp.solve(parameters, flat_guess())
+
+
+GUESSES = {
+    "missing": {},
+    "short": {"go": PhaseGuess(1.0, np.zeros((5, 1)))},
+    "nan": {"go": PhaseGuess(1.0, np.full((N + 1, 1), np.nan))},
+    "nan duration": {"go": PhaseGuess(np.nan, *3 * [np.zeros((N + 1, 1))])},
+}
+
+
+@pytest.mark.parametrize("kind", GUESSES)
+def test_unusable_guesses(nlp, kind):
+    with pytest.raises(JumplabError):
+        nlp.solve({"goal": 1.0}, GUESSES[kind])
+
+
+def test_bounds_that_exclude_each_other():
+    nlp = Nlp(move(bounds=(Bound("cap", "-", "m", "q", lambda p: p["goal"], 9.0),)))
+    with pytest.raises(JumplabError, match=r"cap|rest q"):  # the start is held at 0
+        nlp.solve({"goal": 1.0}, flat_guess())
+    nlp.solve({"goal": -1.0}, flat_guess())
+
+
+# what fails while solving ---------------------------------------------------------------------------------------
+def test_infeasible_names_the_terms_in_conflict():
+    nlp = Nlp(move(Term("wall", "-", "m", "node", lambda p: p.q, lower=-np.inf, upper=0.5)))
+    with pytest.raises(SolverError) as e:
+        nlp.solve({"goal": 1.0}, flat_guess())
+    assert e.value.stage == "move" and e.value.status not in GOOD_STATUSES and e.value.exit_code == 3
+    named = " ".join(e.value.violations)
+    assert ("go/goal" in named or "go/wall" in named) and "jerk chain" not in named
+    assert str(e.value).startswith(f"move: no plan ({e.value.status} after ") and "\n" not in str(e.value)
+    amounts = [float(line.split(" by ")[1].split()[0]) for line in e.value.violations]
+    assert sum(amounts) == pytest.approx(0.5, rel=0.05)  # the goal lies half a metre behind the wall
+    nlp.solve({"goal": 0.5}, flat_guess())  # and it can still be used
+
+
+def test_infeasible_in_physical_units():
+    """What is said is in the term's unit, whatever its scale."""
+    for scale in (0.1, 1.0, 20.0):
+        term = Term("push", "-", "N", "node", lambda p: 10 * p.a, lower=-10.0, upper=10.0, scale=scale)
+        with pytest.raises(SolverError) as e:
+            Nlp(move(term)).solve({"goal": 1.0}, flat_guess())
+        assert any("N at" in line or " m at" in line for line in e.value.violations)
+
+
+def test_too_few_iterations_is_not_an_answer():
+    wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.8)
+    with pytest.raises(SolverError) as e:
+        Nlp(move(wall), {"max_iter": 1}).solve({"goal": 1.0}, flat_guess())
+    assert e.value.status == "Maximum_Iterations_Exceeded"
+    assert "exists, but the search did not settle" in str(e.value)
+
+
+class Pretender:
+    """A solver that says what it is told to say."""
+
+    def __init__(self, solver, status, shift):
+        self.solver, self.status, self.shift = solver, status, shift
+
+    def __call__(self, **arguments):
+        answer = self.solver(**arguments)
+        return {**answer, "g": answer["g"] + self.shift}
+
+    def stats(self):
+        return {**self.solver.stats(), "return_status": self.status}
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        "Search_Direction_Becomes_Too_Small",
+        "Feasible_Point_Found",
+        "User_Requested_Stop",
+        "Maximum_WallTime_Exceeded",
+        "Not_Enough_Degrees_Of_Freedom",
+        "",
+        "solve_succeeded",
+    ],
+)
+def test_only_listed_statuses_are_believed(status):  # fmt: skip
+    nlp = Nlp(move())
+    nlp._solver = Pretender(nlp._solver, status, 0.0)
+    with pytest.raises(SolverError) as e:
+        nlp.solve({"goal": 1.0}, flat_guess())
+    assert e.value.status == status
+
+
+@pytest.mark.parametrize("status", GOOD_STATUSES)
+def test_a_good_status_with_wrong_rows_is_not_believed(status):
+    nlp = Nlp(move())
+    honest = nlp._solver
+    nlp._solver = Pretender(honest, status, 0.0)
+    nlp.solve({"goal": 1.0}, flat_guess())
+    for shift in (1e-3, np.nan):
+        nlp._solver = Pretender(honest, status, shift)
+        with pytest.raises(SolverError):
+            nlp.solve({"goal": 1.0}, flat_guess())
+
+
+def test_errors_carry_their_story():
+    error = SolverError("no", stage="a", status="b", violations=("c",))
+    assert (error.stage, error.status, error.violations, error.exit_code) == ("a", "b", ("c",), 3)
+    assert isinstance(error, JumplabError)
