@@ -21,10 +21,10 @@ def least_violation(a: Assembled, x0, p, box, rows) -> tuple[np.ndarray, np.ndar
 
     Returns
     -------
-    x, beyond : the motion found, and how far each row (scaled) lies outside its bounds; the state equations, which
-        say only that the motion is one motion, stay hard.
+    x, beyond : the motion found, and how far each row (scaled) lies outside its bounds; identities, which say
+        only that the motion is one motion, stay hard.
     """
-    soft = np.array([row.term.name != "jerk chain" for row in a.rows])
+    soft = np.array([not row.term.identity for row in a.rows])
     index = np.flatnonzero(soft)
     n, m = a.size, len(index)
     place = ca.DM.triplet(index.tolist(), list(range(m)), ca.DM.ones(m), a.n_rows, m)

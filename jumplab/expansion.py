@@ -93,7 +93,7 @@ def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: d
     a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), alpha
     wrench = planar_quantities(robot, angles, rates, accels, motion["toe_acceleration"], gravity)["ground_wrench"]
     wrench = np.where(motion["flying"][:, None], 0.0, wrench)
-    f, tau = _forces(robot, q, v, a, wrench, motion["toe"] + origin)
+    f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, motion["toe"] + origin)
     phase = np.where(motion["flying"], "flight", "launch")
     planar = {f"planar_{k}": x for k, x in motion.items() if k not in ("t", "flying")}
     return Tape(motion["t"], q, v, a, tau, phase, np.array(robot.foot.frames), f, np.array(robot.joint_names),

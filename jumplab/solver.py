@@ -52,6 +52,14 @@ class Nlp:
         self._solver = ca.nlpsol("solver", "ipopt", a.nlp, nlp)
         self.build_s = time.perf_counter() - began
 
+    def _check_weights(self, weights):
+        costs = {name for owner, t in self.assembled.cost_terms for name in (t.name, f"{owner}/{t.name}")}
+        for name in weights:
+            if name not in costs:
+                raise InputError(
+                    f"{self.problem.name}: {name!r} is a constraint and has no weight; switch it off instead"
+                )
+
     # building blocks of one solve -------------------------------------------------------------------------------
     def _is_off(self, owner, name, off):
         return name in off or f"{owner}/{name}" in off
@@ -63,29 +71,42 @@ class Nlp:
             raise InputError(
                 f"{problem.name}: parameters {sorted(unknown)} do not fit; it takes {list(problem.parameters)}"
             )
-        values = [
-            np.broadcast_to(np.asarray(parameters[n], float).ravel(), (s,)) for n, s in problem.parameters.items()
-        ]
+        values = [self._parameter(n, parameters[n], s) for n, s in problem.parameters.items()]
         weight = []
         for owner, term in a.cost_terms:
             w = weights.get(f"{owner}/{term.name}", weights.get(term.name, term.weight))
             weight.append(0.0 if self._is_off(owner, term.name, off) else w)
-        columns = []
-        for name, layout in a.layouts.items():
-            n = layout.phase.intervals
-            rows = [np.linspace(0, 1, n + 1)[None]]
-            for ref, size in layout.phase.references.items():
-                given = np.asarray(references.get(name, {}).get(ref, np.zeros((size, n + 1))), float)
-                if given.shape != (size, n + 1) or not np.all(np.isfinite(given)):
-                    raise InputError(
-                        f"{problem.name}: reference {ref!r} of phase {name!r} must be finite, {(size, n + 1)}"
-                    )
-                rows.append(given)
-            columns.append(np.concatenate(rows).ravel(order="F"))
+        columns = self._reference_columns(references)
         vector = np.concatenate([np.concatenate([*values, [0.0]])[:-1], weight, *columns])
         if not np.all(np.isfinite(vector)):
             raise InputError(f"{problem.name}: a parameter or weight is not finite")
         return vector
+
+    def _parameter(self, name, value, size):
+        try:
+            x = np.asarray(value, float).ravel()
+        except (TypeError, ValueError):
+            raise InputError(f"{self.problem.name}: parameter {name!r} = {value!r} is not a number") from None
+        if len(x) not in (1, size):
+            raise InputError(f"{self.problem.name}: parameter {name!r} has {len(x)} values, it takes {size}")
+        return np.broadcast_to(x, (size,))
+
+    def _reference_columns(self, references):
+        columns, where = [], self.problem.name
+        for name, layout in self.assembled.layouts.items():
+            n, known = layout.phase.intervals, layout.phase.references
+            given = references.get(name, {})
+            odd = sorted(set(given) ^ set(known))
+            if odd:
+                raise InputError(f"{where}: references {odd} of phase {name!r} do not fit; it takes {list(known)}")
+            rows = [np.linspace(0, 1, n + 1)[None]]
+            for ref, size in known.items():
+                x = np.asarray(given[ref], float)
+                if x.shape != (size, n + 1) or not np.all(np.isfinite(x)):
+                    raise InputError(f"{where}: reference {ref!r} of phase {name!r} must be finite, {(size, n + 1)}")
+                rows.append(x)
+            columns.append(np.concatenate(rows).ravel(order="F"))
+        return columns
 
     def _variable_bounds(self, parameters, off):
         a = self.assembled
@@ -113,6 +134,11 @@ class Nlp:
                 continue
             i = layout.jerk(k) if bound.on == "j" else layout.node(k)[first : first + size]
             low[i], high[i] = np.maximum(low[i], lo), np.minimum(high[i], hi)
+            worst = int(np.argmax(low[i] - high[i]))
+            if low[i][worst] > high[i][worst]:
+                which = f"bound {bound.name!r} of phase {layout.phase.name!r} and another on {bound.on!r}"
+                gap = f"at node {k}, component {worst}: {low[i][worst]:.4g} > {high[i][worst]:.4g} (scaled)"
+                raise InputError(f"{which} exclude each other {gap}; look at those that depend on the target")
 
     def _row_bounds(self, parameters, off):
         rows, cache, sizes = self.assembled.rows, {}, {}
@@ -127,14 +153,31 @@ class Nlp:
                 lo = _resolve(row.term.lower, parameters, count) / row.term.scale
                 hi = _resolve(row.term.upper, parameters, count) / row.term.scale
                 switched = self._is_off(row.owner, row.term.name, off)
-                cache[key] = (lo * 0 - np.inf, hi * 0 + np.inf) if switched else (lo, hi)
+                cache[key] = (np.full(count, -np.inf), np.full(count, np.inf)) if switched else (lo, hi)
             low[i], high[i] = cache[key][0][row.component], cache[key][1][row.component]
         return low, high
 
+    def _checked_guess(self, guess, layout) -> PhaseGuess:
+        name, n = layout.phase.name, layout.phase.intervals
+        if name not in guess:
+            raise InputError(f"{self.problem.name}: the guess has no phase {name!r}")
+        g = guess[name]
+        for key, size in (("q", layout.nq), ("v", layout.nq), ("a", layout.nq), ("z", layout.nz)):
+            x = getattr(g, key)
+            what = f"{self.problem.name}: guess {key!r} of phase {name!r}"
+            if x is not None and np.shape(x) != (n + 1, size):
+                raise InputError(f"{what} has shape {np.shape(x)}, must be {(n + 1, size)}")
+            if x is not None and not np.all(np.isfinite(x)):
+                raise InputError(f"{what} is not finite")
+        if not (np.isfinite(g.duration) and g.duration > 0):
+            raise InputError(f"{self.problem.name}: guess of phase {name!r} has the duration {g.duration} s")
+        return g
+
     def _pack(self, guess: Mapping[str, PhaseGuess]):
         x = np.zeros(self.assembled.size)
-        for name, layout in self.assembled.layouts.items():
-            phase, g, n = layout.phase, guess[name], layout.phase.intervals
+        for layout in self.assembled.layouts.values():
+            phase, n = layout.phase, layout.phase.intervals
+            g = self._checked_guess(guess, layout)
             t = np.linspace(0, g.duration, n + 1)
             v = np.gradient(g.q, t, axis=0) if g.v is None else g.v
             a = np.gradient(v, t, axis=0) if g.a is None else g.a
@@ -183,6 +226,7 @@ class Nlp:
         """
         weights, references = dict(weights or {}), references or {}
         self.problem.check_names([*weights, *off], "weight or switch")
+        self._check_weights(weights)
         p = self._parameter_vector(parameters, references, weights, off)
         low, high = self._variable_bounds(parameters, off)
         row_low, row_high = self._row_bounds(parameters, off)

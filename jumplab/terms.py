@@ -28,7 +28,8 @@ class Point:
     q, v, a, j : (nq,) coordinate, rate, acceleration and jerk (jerk only at "mid" and "interval" points).
     z : (nz,) further states of the phase.
     duration : of the phase [s];  s : elapsed share of the phase, 0 to 1;  c : the phase's further constants by name.
-    p : the problem's parameters by name;  ref : this node's references by name.
+    p : the problem's parameters by name;  ref : this node's references by name (at "mid" and "interval" those of the
+        left node, zero at "problem" points; z likewise is the left node's at "mid").
     memo : scratch space, so that several terms can share one model evaluation.
     """
 
@@ -65,7 +66,9 @@ class Term:
     weight : cost if set, [1/unit^2] ("node", "mid": integrated over time, so also [1/s]); constraint if None.
     lower, upper : bounds of a constraint; numbers, columns, or functions of the parameter dict, read when solving.
     scale : nominal size of a constraint's expression, for conditioning only.
-    skip : how many nodes to leave out at the start and at the end of the phase.
+    skip : how many nodes to leave out at the start and at the end of the phase (constraints at "node" only).
+    identity : the constraint only says that the motion is one motion (links, integration); it is never a limit that
+        could give way, and an elastic re-solve keeps it.
     """
 
     name: str
@@ -78,8 +81,13 @@ class Term:
     upper: object = 0.0
     scale: float = 1.0
     skip: tuple[int, int] = (0, 0)
+    identity: bool = False
 
     def __post_init__(self):
+        if self.skip != (0, 0) and (self.is_cost or self.at != "node"):
+            raise InputError(
+                f"term {self.name!r}: skip is for constraints at 'node'; a cost at {self.at!r} has no use of it"
+            )
         if self.at not in PLACES:
             raise InputError(f"term {self.name!r}: at = {self.at!r}, must be one of {', '.join(PLACES)}")
 
@@ -131,6 +139,12 @@ class Phase:
     references: dict = field(default_factory=dict)
     scales: dict = field(default_factory=dict)
 
+    def __post_init__(self):
+        names = [x.name for x in (*self.terms, *self.bounds)]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise InputError(f"phase {self.name!r}: two terms are called {twice[0]!r}; names must be unique in a phase")
+
     def scale(self, key: str, size: int) -> np.ndarray:
         """(size,) nominal sizes of the variables ``key``."""
         return np.broadcast_to(np.asarray(self.scales.get(key, 1.0), float), (size,))
@@ -165,6 +179,8 @@ class Problem:
 
     def with_terms(self, phase: str, *extra: Term) -> Problem:
         """A copy with further terms in one phase (for experiments in a notebook)."""
+        if phase not in {p.name for p in self.phases}:
+            raise InputError(f"{self.name}: no phase {phase!r}; it has {', '.join(p.name for p in self.phases)}")
         phases = tuple(replace(p, terms=p.terms + extra) if p.name == phase else p for p in self.phases)
         return replace(self, phases=phases)
 

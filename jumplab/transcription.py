@@ -16,6 +16,8 @@ import numpy as np
 
 from jumplab.terms import Phase, Point, Problem, Term
 
+END_OF_PHASE = 1e-9  # share of a phase, far below one interval
+
 
 def chain(q, v, a, j, h):
     """Exact triple-integrator step of length ``h`` under constant jerk: new (q, v, a)."""
@@ -132,9 +134,8 @@ class ElementBuilder:
         for place, nodes in (("node", range(n + 1)), ("start", (0,)), ("end", (n,))):
             terms = [t for t in phase.terms if t.at == place]
             if terms:
-                out = [
-                    self._weighted(t, _columns(t.expression(at_node)), step if place == "node" else 1.0) for t in terms
-                ]
+                share = step * _trapezoid(s) if place == "node" else 1.0
+                out = [self._weighted(t, _columns(t.expression(at_node)), share) for t in terms]
                 index = np.array([node_index[k] for k in nodes])
                 yield Element(
                     ca.vertcat(constants, state), data, out, terms, index, list(nodes), phase.name, list(nodes)
@@ -177,8 +178,13 @@ class ElementBuilder:
         return step * ca.sumsqr(expression) if term.is_cost else expression / term.scale
 
 
+def _trapezoid(s):
+    """Trapezoid rule: a phase's first and last node count half."""
+    return 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
+
+
 def _defect_term() -> Term:
-    return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None)
+    return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None, identity=True)
 
 
 def _defect(layout, left, right, step):

@@ -1,6 +1,6 @@
 """From terms to a sparse program: every place, skip, scale and derivative, by hand and by CasADi's own means."""
 
-from dataclasses import replace
+import re
 
 import casadi as ca
 import numpy as np
@@ -282,14 +282,7 @@ def test_terms_can_be_added_and_must_have_their_own_name():
         Assembled(problem.with_terms("two", twin))
 
 
-def test_skip_leaves_nodes_out_of_costs_too():
-    def cost(skip):
-        one = toy().phases[0]
-        term = Term("node cost", "-", "m", "node", lambda p: p.q[0], weight=1.0, skip=skip)
-        return Assembled(Problem("toy", (replace(one, terms=(term,)),), (), {"goal": 2, "m": 1}))
-
-    x, p, _ = random_point(cost((0, 0)), 9)
-    all_nodes, some = (float(cost(skip).cost_parts(x, p)) for skip in ((0, 0), (2, 3)))
-    nodes, _, (duration, _) = physical(cost((0, 0)), x, "one")
-    assert abs(all_nodes) > abs(some)
-    assert some == pytest.approx(duration / 5 * nodes[2, 0] ** 2)
+def test_skip_is_for_constraints_at_nodes():
+    sentence = "term 'x': skip is for constraints at 'node'; a cost at 'node' has no use of it"
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        Term("x", "-", "m", "node", lambda p: p.q[0], weight=1.0, skip=(2, 3))

@@ -7,7 +7,7 @@ axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -30,8 +30,7 @@ def skew(x: np.ndarray) -> np.ndarray:
     return (x @ CROSS).reshape(*x.shape, 3)
 
 
-@dataclass(frozen=True, slots=True)
-class FullTerms:
+class FullTerms(NamedTuple):
     """Every quantity of the nine-link robot that the QPs need, at one (q, v); feet are ordered left, right.
 
     In each "drift" the acceleration is that of theta'' = 0, so ``x'' = J_x theta'' + drift``.
@@ -39,6 +38,7 @@ class FullTerms:
     Attributes
     ----------
     q, v : configuration (nq,) and rates (nv,).
+    base_rotation : of the base link (3, 3).
     M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
     com, com_velocity : c and its rate (3,) [m, m/s].
     A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
@@ -58,6 +58,7 @@ class FullTerms:
 
     q: np.ndarray
     v: np.ndarray
+    base_rotation: np.ndarray
     M: np.ndarray
     H: np.ndarray
     com: np.ndarray
@@ -95,11 +96,9 @@ class FullTerms:
     @property
     def A_f(self) -> np.ndarray:
         """A_f (6, 12): A_f F is the rate of linear momentum without gravity, then of centroidal angular momentum."""
-        out = np.zeros((6, 12))
-        for k, arm in enumerate(skew(self.toe - self.com)):
-            at = 6 * k
-            out[[0, 1, 2, 3, 4, 5], [at, at + 1, at + 2, at + 3, at + 4, at + 5]] = 1.0
-            out[3:, at : at + 3] = arm
+        left, right = skew(self.toe - self.com)
+        out = np.concatenate([np.eye(6), np.eye(6)], 1)
+        out[3:, :3], out[3:, 6:9] = left, right
         return out
 
     @property
@@ -135,6 +134,8 @@ class FullBody:
         self.nq, self.nv = self.model.nq, self.model.nv
         self.mass = robot.total_mass
         self.gravity = -float(self.model.gravity.linear[2])
+        self._upper = np.triu(np.ones((self.nv, self.nv)))
+        self._above_diagonal = np.triu(np.ones((self.nv, self.nv)), 1)
         self._read_tree()
         self._read_feet()
         self.pairs, self.groups = self._pair_joints()
@@ -195,14 +196,20 @@ class FullBody:
 
     def _mirror_sign(self, left: int, right: int) -> float:
         """+1 if equal angles mirror each other, -1 if opposite ones do: found by motion in the neutral pose."""
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobians = [pin.getJointJacobian(self.model, self.data, j, frame)[3:, self.model.idx_vs[j]] for j in (left, right)]
-        mirrored = jacobians[0] * [-1.0, 1.0, -1.0]  # a rotation's mirror image in the x-z plane
-        sign = float(np.sign(mirrored @ jacobians[1]))
-        if np.abs(jacobians[1] - sign * mirrored).max() > PARALLEL_TOLERANCE:
-            names = self.model.names[left], self.model.names[right]
-            raise RobotError(f"robot {self.robot.name}: {names[0]!r} and {names[1]!r} are not mirror images of each other")
+        model, frame = self.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        axes = [pin.getJointJacobian(model, self.data, j, frame)[3:, model.idx_vs[j]] for j in (left, right)]
+        mirrored = axes[0] * [-1.0, 1.0, -1.0]  # a rotation's mirror image in the x-z plane
+        sign = float(np.sign(mirrored @ axes[1]))
+        if np.abs(axes[1] - sign * mirrored).max() > PARALLEL_TOLERANCE:
+            raise RobotError(
+                f"robot {self.robot.name}: {model.names[left]!r} and {model.names[right]!r} are not mirror images of "
+                f"each other; their axes in the neutral pose are {axes[0].round(3)} and {axes[1].round(3)}"
+            )
         return sign
+
+    def pair_names(self, groups) -> list[str]:
+        """Left joints of the pairs of some groups, in the order of :meth:`symmetry_rows`."""
+        return [self.robot.joint_names[self.pairs[i][0] - 6] for g in groups for i in self.groups[g]]
 
     def symmetry_rows(self, groups=("hip", "knee", "ankle", "shoulder")) -> np.ndarray:
         """Rows (k, nv) with row @ theta'' = 0 for mirrored motion: right - sign * left, one row per joint pair.
@@ -226,43 +233,44 @@ class FullBody:
         momentum = A_h @ v
         velocity = momentum[:3] / self.mass
         H = pin.nonLinearEffects(model, data, q, v).copy()
-        M = np.triu(pin.crba(model, data, q))
-        M += np.triu(M, 1).T
-        spatial = (J * v) @ self._carries.T, (dJ * v) @ self._carries.T  # (6, bodies) velocity, drift of each body
-        inertia = self._inertia(J, *spatial, com, velocity, A_c, B_c)
-        feet = self._feet(J, *spatial, v, com, velocity, A_c, B_c)
-        return FullTerms(q, v, M, H, com, velocity, A_c, B_c, momentum, A_h, B_h, *inertia, *feet)
+        M = pin.crba(model, data, q) * self._upper  # Pinocchio leaves the lower triangle to chance
+        M += (M * self._above_diagonal).T
+        place = np.array([x.homogeneous for x in data.oMi])[1:]  # (bodies, 4, 4)
+        # linear and angular velocity, and both at theta'' = 0 differentiated, about the world origin, of each body
+        twist = (self._carries @ np.concatenate([J * v, dJ * v]).T).reshape(-1, 4, 3)
+        inertia = self._inertia(J, place, twist, com, velocity, A_c, B_c)
+        feet = self._feet(J, place, twist, v, com, velocity, A_c, B_c)
+        base = place[0, :3, :3]
+        return FullTerms(q, v, base, M, H, com, velocity, A_c, B_c, momentum, A_h, B_h, *inertia, *feet)
 
-    def _inertia(self, J, velocity, drift, com, com_velocity, A_c, B_c):
-        """rho, J_rho and its drift: with the integral D of [x; 1][x; 1]^T dm, rho is D_xx + D_zz - m (c_x^2 + c_z^2)."""
-        place = np.array([x.homogeneous for x in self.data.oMi])[1:]  # (n, 4, 4)
+    def _inertia(self, J, place, twist, com, com_velocity, A_c, B_c):
+        """rho, J_rho, drift. With D, the integral of [x; 1][x; 1]^T dm: rho = D_xx + D_zz - m (c_x^2 + c_z^2)."""
         D = place @ self._pseudo @ place.transpose(0, 2, 1)  # (n, 4, 4)
-        sub = (self._above.T @ D.reshape(-1, 16)).reshape(-1, 4, 4)  # of everything a joint carries
-        total, m, xz = sub[0], self.mass, [0, 2]
-        rho = total[0, 0] + total[2, 2] - m * (com[xz] @ com[xz])
-        g = np.zeros((6, len(sub)))  # gradient of D_xx + D_zz along a twist (linear, angular) about the origin
+        n, m, c, w = len(D), self.mass, com[::2], com_velocity[::2]  # x and z
+        sub = (self._above.T @ D.reshape(n, 16)).reshape(n, 4, 4)  # of everything a joint carries
+        rho = sub[0, 0, 0] + sub[0, 2, 2] - m * (c @ c)
+        g = np.zeros((6, n))  # gradient of D_xx + D_zz along a twist (linear, angular) about the origin
         g[0], g[2], g[3], g[5] = sub[:, 0, 3], sub[:, 2, 3], sub[:, 2, 1], -sub[:, 0, 1]
-        J_rho = 2 * np.einsum("ij,ij->j", J, g[:, self._column_joint]) - 2 * m * (com[xz] @ A_c[xz])  # (nv,)
-        spin = skew(velocity[3:].T)  # (n, 3, 3)
-        rate = np.concatenate([spin, velocity[:3].T[:, :, None]], 2)  # x' = rate [x; 1]
-        second = np.concatenate([skew(drift[3:].T), drift[:3].T[:, :, None]], 2) + spin @ rate  # x'' at theta'' = 0
-        twice = np.einsum("nij,nij->i", rate @ D, rate) + np.einsum("nij,nij->i", D[:, :3], second)
-        moving = com_velocity[xz] @ com_velocity[xz] + com[xz] @ B_c[xz]
-        drift_rho = 2 * (twice[0] + twice[2]) - 2 * m * moving
-        return rho, J_rho, drift_rho
+        J_rho = 2 * ((J * g[:, self._column_joint]).sum(0) - m * (c @ A_c[::2]))  # (nv,)
+        x = np.empty((n, 2, 3, 4))  # x' = x[:, 0] [x; 1], and at theta'' = 0 x'' = x[:, 1] [x; 1]
+        x[..., :3], x[..., 3] = skew(twist[:, 1::2]), twist[:, ::2]
+        rate, second = x[:, 0], x[:, 1]
+        second += rate[..., :3] @ rate
+        twice = ((rate @ D) * rate + D[:, :3] * second)[:, ::2].sum()
+        return rho, J_rho, 2 * (twice - m * (w @ w + c @ B_c[::2]))
 
-    def _feet(self, J, velocity, drift, v, com, com_velocity, A_c, B_c):
+    def _feet(self, J, place, twist, v, com, com_velocity, A_c, B_c):
         """Places, velocities, Jacobians and drifts of tiptoes, heels and soles, and p_rd = sole - CoM."""
         bodies = [j - 1 for j in self.foot_joints]
-        turn = np.array([self.data.oMi[j].rotation for j in self.foot_joints])
-        origin = np.array([self.data.oMi[j].translation for j in self.foot_joints])
-        points = self._points @ turn.transpose(0, 2, 1) + origin[:, None]  # (2, 3 points, 3)
+        at, moving = place[bodies, :3], twist[bodies]  # (2, 3, 4), (2, 4, 3)
+        turn, spin, drift, alpha = at[..., :3], moving[:, 1], moving[:, 2], moving[:, 3]
+        points = self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]  # (2, 3 points, 3)
         own = J * self._foot_carries[:, None]  # (2, 6, nv)
-        spin, alpha = velocity[3:, bodies].T, drift[3:, bodies].T  # (2, 3)
-        spin_x, at_x = skew(spin)[:, None], skew(points)  # (2, 1, 3, 3), (2, 3, 3, 3)
-        linear = own[:, None, :3] - at_x @ own[:, None, 3:]  # (2, 3 points, 3, nv)
+        linear = own[:, None, :3] - skew(points) @ own[:, None, 3:]  # (2, 3 points, 3, nv)
         speed = linear @ v  # (2, 3 points, 3)
-        bias = drift[:3, bodies].T[:, None] + (skew(alpha)[:, None] @ points[..., None] + spin_x @ speed[..., None])[..., 0]
+        spin_x = skew(moving[:, 1::2])[:, :, None]  # (2, spin and alpha, 1, 3, 3)
+        turning = spin_x[:, 1] @ points[..., None] + spin_x[:, 0] @ speed[..., None]  # (2, 3 points, 3, 1)
+        bias = drift[:, None] + turning[..., 0]  # (2, 3 points, 3)
         J_toe = np.concatenate([linear[:, 0], own[:, 3:]], 1)  # (2, 6, nv)
         drift_toe = np.concatenate([bias[:, 0], alpha], 1)  # (2, 6)
         sole = points[:, 2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -167,6 +167,16 @@ class Robot:
         model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
         return model
 
+    def under_gravity(self, gravity: float) -> Robot:
+        """The same robot whose :attr:`model` feels another gravity [m/s^2]; itself at 9.8."""
+        if gravity == GRAVITY:
+            return self
+        other = replace(self)
+        model = self.model.copy()
+        model.gravity.linear = np.array([0.0, 0.0, -gravity])
+        other.__dict__["model"] = model  # fills the cached property
+        return other
+
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints in Pinocchio's order (nv - 6 of them)."""
@@ -192,7 +202,7 @@ class Robot:
     @cached_property
     def sagittal(self) -> SagittalModel:
         """The symmetric five-link model of this robot."""
-        return reduce(self.model, self.joints, self.foot, self.actuators)
+        return reduce(self.model, self.joints, self.foot, self.actuators, self.urdf)
 
     @cached_property
     def total_mass(self) -> float:

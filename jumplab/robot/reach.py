@@ -134,7 +134,11 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     stance_rho = m.inertia.sum() + mass @ np.sum((links - com) ** 2, axis=1)
     start = np.array([np.arctan2(*from_sole), np.hypot(*from_sole), stance[3], np.sqrt(stance_rho / mass.sum())])
     half = -m.heel[0] / 2
-    return Reach((float(low), float(high)), grid, lower, upper, strongest, fastest, np.polyfit(grid, lower, 2),
-                 np.polyfit(grid, upper, 2), np.polyfit(grid, np.minimum(strongest, FORCE_CAP * strongest[0]), 3), np.polyfit(grid, fastest, 3),
-                 (float(lower.min()), float(upper.max())),
-                 float(m.inertia.sum()), (-half, half), TRUNK_RAD, start, float(mass.sum()))  # fmt: skip
+    capped = np.minimum(strongest, FORCE_CAP * strongest[0])
+    curves = ((lower, 2), (upper, 2), (capped, 3), (fastest, 3))
+    return Reach(
+        (float(low), float(high)), grid, lower, upper, strongest, fastest,
+        *(np.polyfit(grid, values, degree) for values, degree in curves),
+        (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
+        float(mass.sum()),
+    )  # fmt: skip

@@ -6,10 +6,14 @@ Left and right limbs are merged: masses and inertias add, and so do the torque l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
 
+from jumplab.errors import RobotError
+
+PITCH_AXIS = 0.999  # our choice: axes canted by less than 2.6 deg count as pitch
 SAGITTAL_LINKS = ("foot", "shank", "thigh", "trunk", "arm")
 SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 # hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)
@@ -101,14 +105,38 @@ def _members(model: pin.Model, joints: dict) -> list[list[int]]:
     return [[j for j in part if part[j] == name] for name in SAGITTAL_LINKS]
 
 
-def _axis_sign(model: pin.Model, data: pin.Data, name: str) -> float:
-    """+1 if the joint turns its limb about +y in the neutral pose, -1 if about -y: found by motion, not by name."""
-    joint = model.getJointId(name)
-    jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)  # (6, nv)
-    return float(np.sign(jacobian[4, model.idx_vs[joint]]))
+def _axis_sign(model: pin.Model, data: pin.Data, role: str, pair) -> float:
+    """+1 if the joints turn their limbs about +y in the neutral pose, -1 if about -y: found by motion, not by name."""
+    axes = []
+    for name in pair:
+        joint = model.getJointId(name)
+        jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)  # (6, nv)
+        axis = jacobian[3:, model.idx_vs[joint]]
+        if abs(axis[1]) < PITCH_AXIS:
+            raise RobotError(f"role {role}: joint {name!r} turns about {np.round(axis, 3)}, not about the pitch axis y")
+        axes.append(float(np.sign(axis[1])))
+    if axes[0] != axes[1]:
+        raise RobotError(f"role {role}: {pair[0]!r} turns about {axes[0]:+.0f} y, {pair[1]!r} about {axes[1]:+.0f} y; "
+                         f"give both the same direction in the URDF")  # fmt: skip
+    return axes[0]
 
 
-def reduce(model: pin.Model, joints: dict, foot, actuators: dict) -> SagittalModel:
+def _limb_tip(model: pin.Model, data: pin.Data, urdf: str, members: list[int], root, com) -> np.ndarray:
+    """(x, z) from ``root`` to a limb's far end: of its collision shapes; without any, at twice the CoM's distance."""
+    along = (com - root) / max(np.linalg.norm(com - root), 1e-9)
+    shapes = pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
+    reach = []
+    for shape in shapes.geometryObjects:
+        if shape.parentJoint in members:
+            shape.geometry.computeLocalAABB()
+            box = shape.geometry.aabb_local
+            corners = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
+            world = [(data.oMi[shape.parentJoint] * shape.placement).act(c)[[0, 2]] for c in corners]
+            reach.append(max((np.array(world) - root) @ along))
+    return along * (max(reach) if reach else 2 * np.linalg.norm(com - root))
+
+
+def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> SagittalModel:
     """Merge the full robot into its sagittal five-link model.
 
     Parameters
@@ -117,6 +145,9 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict) -> SagittalMod
     joints : role -> (left, right) joint names for hip_pitch, knee, ankle_pitch, shoulder_pitch.
     foot : object with ``frames`` (left, right), ``heel``, ``toe``, ``sole_z`` in the foot frame [m].
     actuators : name -> dict(lower, upper, speed, effort, corner_speed) for every joint.
+    urdf : the robot's XML, for its collision shapes.
+
+    Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or turn opposite ways.
     """
     data = model.createData()
     q = pin.neutral(model)
@@ -142,12 +173,12 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict) -> SagittalMod
     frame = data.oMf[model.getFrameId(foot.frames[0])]
     toe = frame.act(np.array([foot.toe, 0.0, foot.sole_z]))[[0, 2]]
     heel = frame.act(np.array([foot.heel, 0.0, foot.sole_z]))[[0, 2]]
-    hand = 2 * (com[4] - shoulder)  # a limb of even thickness ends at twice its CoM distance
+    hand = _limb_tip(model, data, urdf, parts[4], shoulder, com[4])
     lower_joint = np.array([toe, ankle, knee, hip, shoulder])
     span = np.array([ankle - toe, knee - ankle, hip - knee, shoulder - hip, hand])
     sign, limits = [], {key: [] for key in ("lower", "upper", "speed", "effort", "corner_speed")}
     for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
-        s = _axis_sign(model, data, joints[role][0])
+        s = _axis_sign(model, data, role, joints[role])
         sign.append(s)
         left = actuators[joints[role][0]]
         both = sorted((s * left["lower"], s * left["upper"]))

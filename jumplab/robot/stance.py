@@ -8,6 +8,9 @@ from scipy.optimize import brentq
 
 from jumplab.errors import RobotError
 from jumplab.robot.description import Robot
+from jumplab.robot.sagittal import SAGITTAL_JOINTS
+
+SHANK_LEAN_RAD = (-0.6, 1.4)  # our choice: generous lean of the shank, both ways
 
 
 def _rotate(angle, vector):
@@ -38,12 +41,20 @@ def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
         return com_from_toe(robot, angles(shank))[0] - robot.sagittal.sole_center[0]
 
     try:
-        return angles(brentq(offset, -0.6, 1.4))  # our choice: generous lean of the shank, both ways
+        found = angles(brentq(offset, *SHANK_LEAN_RAD))
     except ValueError:
         raise RobotError(
             f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank "
             f"brings the CoM above the middle of the sole; change [stance] in its configuration"
         ) from None
+    joints = robot.sagittal.joint_angles(found)
+    for name, angle, low, high in zip(SAGITTAL_JOINTS, joints, robot.sagittal.lower, robot.sagittal.upper, strict=True):
+        if not low <= angle <= high:
+            raise RobotError(
+                f"robot {robot.name}: standing with the knee at {knee:g} rad needs {name} at {angle:.3f} rad, outside "
+                f"its range {low:g} ... {high:g}; change [stance] in its configuration"
+            )
+    return found
 
 
 def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:

@@ -34,7 +34,7 @@ def _continuity(left: str, right: str) -> Term:
         scaled = ((a.q, b.q, "q"), (a.v, b.v, "v"), (a.a, b.a, "a"))
         return ca.vertcat(*((_with_foot(x) - _with_foot(y)) / SCALES[key] for x, y, key in scaled))
 
-    return Term(f"{left} to {right}", "WF-L1..L3", "scaled", "problem", jump)
+    return Term(f"{left} to {right}", "WF-L1..L3", "scaled", "problem", jump, identity=True)
 
 
 def _flat_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
@@ -68,7 +68,7 @@ def _ballistic(b: WholeBodyTerms) -> Term:
         s, c = b.state(ends["toe"].end), ends["flight"].start.c
         return ca.vertcat(s.com - ca.vertcat(c.com_x, c.com_z), s.com_velocity - ca.vertcat(c.vel_x, c.vel_z))
 
-    return Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff)
+    return Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff, identity=True)
 
 
 def _durations(weights: Weights) -> Term:

@@ -50,6 +50,10 @@ TABLE: dict[str, Row] = {
     "pelvis_width": Row(0.08, "m", "our choice: fits between the thighs"),
     "thigh_thickness": Row(0.09, "m", "our choice"),
     "shank_thickness": Row(0.07, "m", "our choice"),
+    "limb_gap": Row(0.04, "m", "our choice: boxes of thigh and shank keep this off hip and ankle"),
+    "thigh_knee_gap": Row(0.07, "m", "our choice: with shank_knee_gap and shank_forward the knee folds to 2.5 rad"),
+    "shank_knee_gap": Row(0.085, "m", "our choice: see thigh_knee_gap"),
+    "shank_forward": Row(0.03, "m", "our choice: see thigh_knee_gap; a shin stands ahead of its joint line"),
     "arm_thickness": Row(0.07, "m", "our choice"),
     # masses -----------------------------------------------------------------------------------------------------
     "thigh_mass": Row(5.0, "kg", "our choice: 12 % of the body, hip and knee drives inside"),
@@ -205,12 +209,14 @@ def _leg(root, side, sign):
     inward, outward = -sign * v("hip_roll_inward"), sign * v("hip_roll_outward")
     _joint(root, f"{side}_hip_roll", f"{side}_hip_yaw_link", f"{side}_hip_roll_link", (0, 0, 0), (1, 0, 0),
            min(inward, outward), max(inward, outward), v("hip_roll_effort"), v("hip_roll_speed"))  # fmt: skip
-    box = ((0, 0, -thigh / 2), (v("thigh_thickness"), v("thigh_thickness"), thigh - 0.08), True)
+    top, bottom = v("limb_gap"), thigh - v("thigh_knee_gap")
+    box = ((0, 0, -(top + bottom) / 2), (v("thigh_thickness"), v("thigh_thickness"), bottom - top), True)
     inertia = _box_inertia(v("thigh_mass"), v("thigh_thickness"), v("thigh_thickness"), thigh)
     _link(root, f"{side}_thigh", v("thigh_mass"), (0, 0, -v("thigh_com_below_hip")), inertia, [box])
     _joint(root, f"{side}_hip_pitch", f"{side}_hip_roll_link", f"{side}_thigh", (0, 0, 0), (0, 1, 0),
            v("hip_pitch_lower"), v("hip_pitch_upper"), v("hip_pitch_effort"), v("hip_pitch_speed"))  # fmt: skip
-    box = ((0, 0, -shank / 2), (thin, thin, shank - 0.08), True)
+    top, bottom = v("shank_knee_gap"), shank - v("limb_gap")
+    box = ((v("shank_forward"), 0, -(top + bottom) / 2), (thin, thin, bottom - top), True)
     inertia = _box_inertia(v("shank_mass"), thin, thin, shank)
     _link(root, f"{side}_shank", v("shank_mass"), (0, 0, -v("shank_com_below_knee")), inertia, [box])
     _joint(root, f"{side}_knee", f"{side}_thigh", f"{side}_shank", (0, 0, -thigh), (0, 1, 0),
