@@ -123,6 +123,14 @@ def test_wrench_map(body):
         np.testing.assert_allclose(x.A_c @ a + x.B_c, rate[:3] / body.mass, atol=1e-9)
 
 
+def test_gravity_can_be_another():
+    robot = load_robot()
+    moon, rest = FullBody(robot, gravity=1.62), np.zeros(robot.model.nv)
+    weight = moon.terms(stance_configuration(robot), rest).H[[0, 2]]
+    assert np.hypot(*weight) == pytest.approx(42 * 1.62) and moon.gravity == pytest.approx(1.62)
+    assert FullBody(robot).gravity == pytest.approx(9.8)
+
+
 def test_symmetry_signs_follow_from_motion(body):
     signs = {body.model.names[2 + left - 6]: sign for left, _, sign in body.pairs}
     pitch = {f"left_{n}": 1 for n in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")}

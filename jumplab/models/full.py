@@ -121,6 +121,10 @@ def force_target(mass: float, gravity: float, com_acceleration, momentum_rate) -
 class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
 
+    Parameters
+    ----------
+    robot : the robot.  gravity : [m/s^2], positive; the robot's own 9.8 by default.
+
     Attributes
     ----------
     robot, model : the robot and its Pinocchio model.
@@ -128,8 +132,11 @@ class FullBody:
     pairs : (left column, right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
     """
 
-    def __init__(self, robot: Robot):
+    def __init__(self, robot: Robot, gravity: float | None = None):
         self.robot, self.model = robot, robot.model
+        if gravity is not None:
+            self.model = robot.model.copy()
+            self.model.gravity.linear = np.array([0.0, 0.0, -gravity])
         self.data = self.model.createData()
         self.nq, self.nv = self.model.nq, self.model.nv
         self.mass = robot.total_mass

@@ -1,0 +1,35 @@
+"""Stage 2: mapping momentum and inertia to the joints with one QP per time step (Sec. IV of the paper).
+
+``map_to_joints(srmp_plan, robot)`` does it all. To look inside, :class:`JointMapper` hands out the quantities, targets
+and matrices of any step.
+"""
+
+from jumplab.joint_map.flight import FlightQp, FlightTarget
+from jumplab.joint_map.launch import LaunchQp, LaunchTarget
+from jumplab.joint_map.options import PRINTED, FlightWeights, Form, Gain, Gains, LaunchWeights, Limits, Options
+from jumplab.joint_map.problem import State, StepQp
+from jumplab.joint_map.rollout import JointMapper, JointPlan, Statistics, map_to_joints
+from jumplab.joint_map.solve import CvxpySolver, DirectSolver
+
+__all__ = [
+    "PRINTED",
+    "CvxpySolver",
+    "DirectSolver",
+    "FlightQp",
+    "FlightTarget",
+    "FlightWeights",
+    "Form",
+    "Gain",
+    "Gains",
+    "JointMapper",
+    "JointPlan",
+    "LaunchQp",
+    "LaunchTarget",
+    "LaunchWeights",
+    "Limits",
+    "Options",
+    "State",
+    "Statistics",
+    "StepQp",
+    "map_to_joints",
+]

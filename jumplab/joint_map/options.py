@@ -1,0 +1,140 @@
+"""Gains, weights, limits and readings of stage 2's QPs. The paper prints no number here: all are our choice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from jumplab.errors import InputError
+
+
+@dataclass(frozen=True)
+class Gain:
+    """PD feedback: stiffness [1/s^2] and damping [1/s] (for momentum: only damping)."""
+
+    stiffness: float
+    damping: float
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Feedback around the feed-forward references (Sec. IV-B: "PD controllers cooperating with feedforward").
+
+    All are critically damped. 20 rad/s where a reference is followed: a step of 10 ms carries 100 rad/s, and contact
+    gains of 50 rang with it. 5 to 10 rad/s where something is only suggested.
+    """
+
+    com: Gain = Gain(400.0, 40.0)
+    momentum: Gain = Gain(0.0, 20.0)
+    inertia: Gain = Gain(400.0, 40.0)
+    foot: Gain = Gain(400.0, 40.0)
+    posture: Gain = Gain(25.0, 10.0)
+    trunk: Gain = Gain(25.0, 10.0)
+    foot_level: Gain = Gain(100.0, 20.0)
+    contact: Gain = Gain(400.0, 40.0)  # Baumgarte: tiptoes, flat feet and the symmetry of left and right
+    momentum_drift: Gain = Gain(100.0, 20.0)  # Baumgarte in flight: CoM and momentum back to their ballistic values
+    ground: Gain = Gain(400.0, 40.0)  # barrier of heel and toe above the ground
+
+
+@dataclass(frozen=True)
+class LaunchWeights:
+    """Weights of the launch QP's squared terms."""
+
+    com: float = 3.0  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
+    force: float = 3e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
+    moment: float = 1.0  # [cost] / [N m]^2, angular rows of A_f F - B_f
+    inertia: float = 1e-4  # [cost] / [kg m^2/s^2]^2; not printed: without it take-off inertia is left to chance
+    posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance
+    trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
+    wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
+    acceleration: float = 1e-5  # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
+
+
+@dataclass(frozen=True)
+class FlightWeights:
+    """Weights of the flight QP's squared terms."""
+
+    foot: float = 1.0  # [cost] / [m/s^2]^2, J_rd theta'' + drift - p''_rd
+    inertia: float = 1.0  # [cost] / [kg m^2/s^2]^2, J_rho theta'' + drift - rho''_ref where it is no hard row
+    foot_level: float = 1e-2  # [cost] / [rad/s^2]^2, sole parallel to the ground
+    posture: float = 1e-3  # [cost] / [rad/s^2]^2, joints towards the stance
+    trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
+    acceleration: float = 1e-6  # [cost] / [m/s^2, rad/s^2]^2, regulariser
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the motion may use of ground and joints. ``None`` switches a family of rows off."""
+
+    friction: float | None = 0.45  # below the lowest friction that the trials simulate (0.5)
+    cop_margin_m: float | None = 0.0  # inside the sole's edges
+    unilateral: bool = True  # F_z >= 0 at each foot
+    torque_share: float | None = 1.0  # of the peak torque, with the speed line of the actuator
+    speed_share: float | None = 1.0  # of the speed limit
+    range_margin_rad: float | None = 0.01  # to the joint stops
+    stop_rate: float = 20.0  # [1/s]: a stop is approached at most at this times the angle left, so it comes as no shock
+    stop_share: float = 0.5  # of the peak torque, with which a joint, moving alone in the stance, brakes before a stop
+    near_ground_m: float = 0.03  # below this height the heel (and in flight the toe) must not sink
+
+
+@dataclass(frozen=True)
+class Form:
+    """How the paper's QPs are read. The defaults are right; :data:`PRINTED` is the letter of the paper.
+
+    Attributes
+    ----------
+    base_rows : 6, or 3 for "top three rows", which leave the rotation free.
+    half : False minimises X^T W X + f X as printed, whose optimum sits at half of the target.
+    heel : "near" keeps the heel above the ground close to it; "always" forbids downward acceleration at any height.
+    contact : "consistent" ties the CoP to the foot: flat foot with the CoP inside the sole, or heel up with the CoP at
+        the toe; "free" is the printed tiptoe contact, where the heel may rise wherever the CoP is.
+    pairs : "all" mirrors every joint pair, "hips" only the three hip joints.
+    hip_rule : "mirror" uses difference or sum as the axes demand; "sum" is the printed sum for all three.
+    inertia : "row" makes the inertia a hard row of the flight QP as printed; "term" a weighted term.
+    """
+
+    base_rows: int = 6
+    half: bool = True
+    heel: str = "near"
+    contact: str = "consistent"
+    pairs: str = "all"
+    hip_rule: str = "mirror"
+    inertia: str = "term"
+
+    def __post_init__(self):
+        choices = {
+            "base_rows": (3, 6),
+            "half": (True, False),
+            "heel": ("near", "always"),
+            "contact": ("consistent", "free"),
+            "pairs": ("all", "hips"),
+            "hip_rule": ("mirror", "sum"),
+            "inertia": ("row", "term"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(f"form: {name} = {getattr(self, name)!r}, must be one of {allowed}")
+
+
+PRINTED = Form(base_rows=3, half=False, heel="always", contact="free", pairs="hips", hip_rule="sum", inertia="row")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything adjustable about stage 2.
+
+    Attributes
+    ----------
+    toe_s : length of the toe phase before take-off [s]; None takes it from the plan's ``toe_s``, and if it has none,
+        from where the reference's CoP stays at the toe.
+    """
+
+    gains: Gains = Gains()
+    launch: LaunchWeights = LaunchWeights()
+    flight: FlightWeights = FlightWeights()
+    limits: Limits = Limits()
+    form: Form = Form()
+    toe_s: float | None = None
+
+    def with_form(self, **changes) -> Options:
+        """A copy with some readings changed, e.g. ``options.with_form(base_rows=3)``."""
+        return replace(self, form=replace(self.form, **changes))

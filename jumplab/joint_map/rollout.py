@@ -1,0 +1,253 @@
+"""Roll-out of the QPs over launch and flight: every step solved, checked and integrated (JL-I1)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import InputError
+from jumplab.joint_map.audit import audit, tracking
+from jumplab.joint_map.flight import FlightQp
+from jumplab.joint_map.launch import WRENCH, LaunchQp
+from jumplab.joint_map.options import Options
+from jumplab.joint_map.problem import State
+from jumplab.joint_map.reference import FlightReference, LaunchReference
+from jumplab.joint_map.solve import solver_class
+from jumplab.models.full import FullBody, FullTerms
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+
+# our choice: shares of a misprediction that the next guess takes over; two more solves at most, the second one damped
+CORRECTIONS = (1.0, 0.5, 0.0)
+PREDICTED_RATE = 0.4  # our choice: [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
+LONGEST_STEP_S = 0.02  # our choice: the feedback (damping 40 1/s) would ring with longer steps
+SHORTEST_STEP_S = 0.0005  # our choice: half the control cycle; shorter steps are a typing error
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What the roll-out cost: steps, solver iterations, and time [s] for building, in the solver, and in all."""
+
+    method: str
+    steps: int
+    iterations: int
+    build_s: float
+    solve_s: float
+    total_s: float
+    worst_residual: float
+
+
+@dataclass(frozen=True)
+class JointPlan:
+    """Result of stage 2 at the nodes of launch and flight; the instant of take-off appears once per phase.
+
+    Attributes
+    ----------
+    t : (N,) [s].  phase : (N,) "launch" or "flight".  contact : (N,) "flat", "toe" or "air".
+    q, v : (N, nq), (N, nv) Pinocchio configuration and rates.
+    a : (N, nv) accelerations held from this node to the next; the last node of a phase repeats the one before.
+    f : (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of ``contact_frames``, in the
+        middle of the step that begins at the node.  tau : (N, nv - 6) joint torques there [N m].
+    actual, reference : name -> (N, ...) com [m], com_velocity [m/s], L [kg m^2/s], rho [kg m^2], and in flight foot_com
+        [m] (mean of both soles relative to the CoM), of this motion and of stage 1; com relative to the pivot.
+    tracking : summary of errors, see :func:`jumplab.joint_map.audit.tracking`.
+    residuals : name -> largest violation, re-evaluated by Pinocchio, see :func:`jumplab.joint_map.audit.audit`.
+    statistics : what it cost.
+    """
+
+    t: np.ndarray
+    phase: np.ndarray
+    contact: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    f: np.ndarray
+    tau: np.ndarray
+    joint_names: tuple[str, ...]
+    contact_frames: tuple[str, ...]
+    actual: dict
+    reference: dict
+    tracking: dict
+    residuals: dict
+    statistics: Statistics
+
+    def rows(self, phase: str) -> slice:
+        """Rows of one phase."""
+        inside = np.flatnonzero(self.phase == phase)
+        return slice(int(inside[0]), int(inside[-1]) + 1)
+
+    def state(self, k: int) -> State:
+        """State at row ``k``, as :meth:`JointMapper.problem` wants it."""
+        return State(self.q[k], self.v[k], self.a[k])
+
+
+class JointMapper:
+    """Both QPs of one jump, ready to be rolled out, or looked at one step at a time.
+
+    Parameters
+    ----------
+    srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
+    step_s : step of the roll-out [s], at most; each phase is divided evenly.
+    options : gains, weights, limits, form.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
+    """
+
+    def __init__(self, srmp_plan, robot: Robot, step_s: float = 0.01, options: Options | None = None, q0=None):
+        if not (isinstance(step_s, int | float) and SHORTEST_STEP_S <= step_s <= LONGEST_STEP_S):
+            limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
+            raise InputError(f"stage 2: step_s = {step_s!r} s, must be a number between {limits}")
+        self.robot, self.options = robot, options or Options()
+        self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
+        self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
+        if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
+            raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
+        self.flight_reference = FlightReference.sample(srmp_plan, step_s)
+        toe_s = self.options.toe_s
+        toe_s = getattr(srmp_plan, "toe_s", None) if toe_s is None else toe_s
+        self.launch = LaunchQp(self.body, self.q0, LaunchReference.sample(srmp_plan, step_s), self.options, toe_s)
+
+    def flight_from(self, takeoff: State) -> FlightQp:
+        """The flight's QPs, beginning at a take-off state."""
+        ground = float(self.launch.toe0[:, 2].mean())
+        start = self.body.terms(takeoff.q, takeoff.v)
+        return FlightQp(self.body, self.q0, start, self.flight_reference, self.options, ground)
+
+    def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
+        """Quantities in the middle of a step, predicted with a guess of its accelerations (nv,).
+
+        The QP's matrices are taken there (midpoint rule), so that a step's drift is of third order.
+        """
+        q = pin.integrate(self.body.model, start.q, start.v * (h / 2) + guess * (h * h / 8))
+        return self.body.terms(q, start.v + guess * (h / 2))
+
+    def problem(self, qp, k: int, start: State):
+        """Quantities in the middle of step ``k`` of a phase, target, and the matrices of its QP, to look at.
+
+        ``qp`` is :attr:`launch` or one from :meth:`flight_from`; ``start.a`` guesses the step's accelerations. With
+        ``start = plan.state(row)`` it is the QP that made the plan, up to what its prediction missed.
+        """
+        target = qp.target(k, self.body.terms(start.q, start.v))
+        terms = self.middle(start, start.a, qp.step)
+        return terms, target, qp.matrices(terms, target, start)
+
+    def roll(self, qp, solver_type, state: State) -> dict:
+        """Solve and integrate all steps of one phase; lists by name, and where the time went."""
+        h, first, clock = qp.step, WRENCH if qp is self.launch else 0, time.perf_counter
+        out = {"states": [state], "nodes": [], "steps": [], "F": [], "answers": []}
+        solver, build_s, solve_s, before = None, 0.0, 0.0, state.a
+        for k in range(len(qp.t) - 1):
+            began = clock()
+            node = self.body.terms(state.q, state.v)
+            target = qp.target(k, node)
+            guess = 2 * state.a - before
+            for share in CORRECTIONS:
+                terms = self.middle(state, guess, h)
+                matrices = qp.matrices(terms, target, state)
+                solver = solver or solver_type(matrices)
+                built = clock()
+                answer = solver.solve(matrices, qp.name, qp.t[k])
+                build_s, solve_s, began = build_s + built - began, solve_s + clock() - built, clock()
+                a = answer.x[first:]
+                if np.abs(a - guess).max() * h / 2 < PREDICTED_RATE:
+                    break
+                guess = guess + share * (a - guess)
+            q = pin.integrate(self.body.model, state.q, state.v * h + a * (h * h / 2))
+            before, state = state.a, State(q, state.v + a * h, a)
+            values = (state, node, terms, answer.x[:first], answer)
+            for name, value in zip(out, values, strict=True):
+                out[name].append(value)
+        out["nodes"].append(self.body.terms(state.q, state.v))
+        return {**out, "build_s": build_s, "solve_s": solve_s}
+
+    def run(self, method: str = "cvxpy") -> JointPlan:
+        """Roll out launch and flight with "cvxpy" or "direct"."""
+        solver_type = solver_class(method)
+        began = time.perf_counter()
+        rest = np.zeros(self.body.nv)
+        launch = self.roll(self.launch, solver_type, State(self.q0, rest, rest))
+        takeoff = launch["states"][-1]
+        flight = self.roll(self.flight_from(takeoff), solver_type, takeoff)
+        total = time.perf_counter() - began
+        answers = launch["answers"] + flight["answers"]
+        stats = Statistics(
+            method, len(answers), sum(x.iterations for x in answers), launch["build_s"] + flight["build_s"],
+            launch["solve_s"] + flight["solve_s"], total, max(x.residual for x in answers))  # fmt: skip
+        return self._plan(launch, flight, stats)
+
+    def _plan(self, launch, flight, statistics) -> JointPlan:
+        """Put both phases together, look at them again, and freeze them."""
+        n, m = len(launch["steps"]), len(flight["steps"])
+        states, steps, nodes = (launch[k] + flight[k] for k in ("states", "steps", "nodes"))
+        held = np.r_[0:n, n - 1, n : n + m, n + m - 1]  # node -> step that begins there; the last of a phase repeats
+        a = np.array([x.a for x in launch["states"][1:] + flight["states"][1:]])  # (n + m, nv)
+        F = np.zeros((n + m, 2, 6))
+        F[:n] = np.array(launch["F"]).reshape(n, 2, 6)
+        tau = np.array([(x.M @ ai + x.H - x.J.T @ Fi.ravel())[6:] for x, ai, Fi in zip(steps, a, F, strict=True)])
+        contact = np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])
+        data = {
+            "t": np.concatenate([self.launch.t, self.launch.t[-1] + self.flight_reference.t]),
+            "phase": np.array(["launch"] * (n + 1) + ["flight"] * (m + 1)),
+            "contact": contact[held],
+            "q": np.array([x.q for x in states]),
+            "v": np.array([x.v for x in states]),
+            "a": a[held],
+            "tau": tau[held],
+            "f": self._at_origins(steps, F)[held],
+        }
+        actual, reference = self._series(nodes, n + 1)
+        errors = tracking(actual, reference, n + 1)
+        residuals = audit(self, data, held, nodes, steps)
+        for x in (*data.values(), *actual.values(), *reference.values()):
+            x.setflags(write=False)
+        names = {"joint_names": self.robot.joint_names, "contact_frames": self.robot.foot.frames}
+        seen = {"actual": actual, "reference": reference, "tracking": errors, "residuals": residuals}
+        return JointPlan(**data, **names, **seen, statistics=statistics)
+
+    def _at_origins(self, terms, F) -> np.ndarray:
+        """Wrenches moved from the tiptoes to the origins of the foot frames."""
+        foot = self.robot.foot
+        offset = np.array([foot.toe, 0.0, foot.sole_z])
+        arm = np.array([x.foot_rotation @ offset for x in terms])  # origin to tiptoe (N, 2, 3)
+        out = F.copy()
+        out[..., 3:] += np.cross(arm, F[..., :3])
+        return out
+
+    def _series(self, terms, n):
+        """What the motion does and what stage 1 asked for, by name."""
+        pivot, launch, flight = self.launch.pivot, self.launch.reference, self.flight_reference
+        actual = {
+            "com": np.array([x.com - pivot for x in terms]),
+            "com_velocity": np.array([x.com_velocity for x in terms]),
+            "L": np.array([x.momentum[4] for x in terms]),
+            "rho": np.array([x.rho for x in terms]),
+            "foot_com": np.array([x.foot_com.mean(0) for x in terms[n:]]),
+        }
+        reference = {
+            "com": np.concatenate([launch.com.value, flight.com.value]),
+            "com_velocity": np.concatenate([launch.com.rate, flight.com.rate]),
+            "L": np.concatenate([launch.momentum.rate, np.full(len(terms) - n, flight.L)]),
+            "rho": np.concatenate([launch.inertia.value, flight.inertia.value]),
+            "foot_com": flight.foot.value,
+        }
+        return actual, reference
+
+
+def map_to_joints(srmp_plan, robot: Robot, step_s: float = 0.01, method: str = "cvxpy", options: Options | None = None,
+                  q0=None) -> JointPlan:  # fmt: skip
+    """Map stage 1's momentum and inertia trajectories to the joints of the full robot (Sec. IV).
+
+    Parameters
+    ----------
+    srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
+    robot : the robot.  step_s : step of the roll-out [s].
+    method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
+    options : gains, weights, limits, form.  q0 : (nq,) start at rest; the robot's stance by default.
+
+    Raises
+    ------
+    InputError : the reference has gaps, NaN or wrong lengths, or an option is unknown.
+    SolverError : a QP has no trustworthy answer; names phase, time and the rows that conflict.
+    """
+    return JointMapper(srmp_plan, robot, step_s, options, q0).run(method)
