@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.joint_map.options import Options
-from jumplab.joint_map.problem import SIDES, JointRows, Layout, State, StepQp, accelerations
+from jumplab.joint_map.problem import SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
 from jumplab.joint_map.reference import LaunchReference
 from jumplab.models.full import FullBody, FullTerms, force_target
 
@@ -56,7 +56,8 @@ class LaunchQp:
     name = "launch"
 
     def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
-        self.body, self.reference, self.options, self.nominal = body, reference, options, q0
+        self.body, self.reference, self.options = body, reference, options
+        self.nominal = swung_arms(body, q0, options.arm_rad)
         self.t = reference.t
         self.step = float(self.t[1])
         start = body.terms(q0, np.zeros(body.nv))

@@ -43,7 +43,7 @@ class LaunchWeights:
     force: float = 3e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
     moment: float = 1.0  # [cost] / [N m]^2, angular rows of A_f F - B_f
     inertia: float = 1e-4  # [cost] / [kg m^2/s^2]^2; not printed: without it take-off inertia is left to chance
-    posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance
+    posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
     acceleration: float = 1e-5  # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
@@ -124,6 +124,8 @@ class Options:
 
     Attributes
     ----------
+    arm_rad : shoulder angle of the posture that the joints lean towards [rad], forward negative. Our choice: arms swing
+        forward and up, as people's do; with hanging arms stage 3 often ends in a costlier local solution.
     toe_s : length of the toe phase before take-off [s]; None takes it from the plan's ``toe_s``, and if it has none,
         from where the reference's CoP stays at the toe.
     """
@@ -134,6 +136,7 @@ class Options:
     limits: Limits = Limits()
     form: Form = Form()
     toe_s: float | None = None
+    arm_rad: float = -1.5
 
     def with_form(self, **changes) -> Options:
         """A copy with some readings changed, e.g. ``options.with_form(base_rows=3)``."""

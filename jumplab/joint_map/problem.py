@@ -159,6 +159,14 @@ class JointRows:
         return [("torque", names), ("speed and range", names)]
 
 
+def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
+    """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
+    robot, q = body.robot, q0.copy()
+    for name in robot.joints["shoulder_pitch"]:
+        q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * robot.sagittal.sign[3]
+    return q
+
+
 def accelerations(terms: FullTerms, nominal: np.ndarray, posture: Gain, trunk: Gain) -> tuple[np.ndarray, np.ndarray]:
     """PD accelerations of the joints (nv - 6,) towards ``nominal`` (nq,), and of the trunk (3,), in base axes."""
     joints = posture.stiffness * (nominal[7:] - terms.q[7:]) - posture.damping * terms.v[6:]

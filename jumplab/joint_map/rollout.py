@@ -112,7 +112,7 @@ class JointMapper:
         """The flight's QPs, beginning at a take-off state."""
         ground = float(self.launch.toe0[:, 2].mean())
         start = self.body.terms(takeoff.q, takeoff.v)
-        return FlightQp(self.body, self.q0, start, self.flight_reference, self.options, ground)
+        return FlightQp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
 
     def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
         """Quantities in the middle of a step, predicted with a guess of its accelerations (nv,).

@@ -25,6 +25,11 @@ TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; 
 COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
 FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
 MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
+FLAT_COM_X_M = (-0.02, 0.13)  # our choice: where the CoM is while the feet are flat
+TOE_COM_X_M = (0.05, 0.25)  # our choice: where the CoM is while the heels are up
+TOE_HEEL_UP_RAD = 0.9  # our choice: as stage 3 allows
+EASY_ARM_RAD = 1.0  # our choice: arms that swing but do not reach
+LOW_COM_QUANTILE = 0.003  # our choice: not the deepest squat that exists
 FORCE_CAP = 1.5  # our choice: nearly straight legs carry any load; the fit shall not chase that
 SPEED_QUANTILE = 0.98  # our choice: as for the force; a good posture for extending the leg fast
 
@@ -40,6 +45,9 @@ class Reach:
         [kg m^2], vertical force at which a leg joint saturates [N], rate of phi at which a leg joint reaches its speed
         limit while the trunk does not turn [m/s].
     inertia_low_fit, inertia_high_fit, force_fit, speed_fit : polynomial coefficients over phi, highest power first.
+    usual_flat_fit, usual_toe_fit : quadratic coefficients of the inertia that flat-footed and heel-up postures usually
+        have at phi.
+    low_com_fit : (slope, offset) of the lowest easy CoM height over its x with flat feet [m].
     inertia : overall (lower, upper) of the pitch inertia, in any reachable posture [kg m^2].
     internal_inertia : constant part rho_I [kg m^2].
     cop : (heel, toe) from the middle of the sole [m].
@@ -58,6 +66,9 @@ class Reach:
     inertia_high_fit: np.ndarray
     force_fit: np.ndarray
     speed_fit: np.ndarray
+    usual_flat_fit: np.ndarray
+    usual_toe_fit: np.ndarray
+    low_com_fit: np.ndarray
     inertia: tuple[float, float]
     internal_inertia: float
     cop: tuple[float, float]
@@ -71,11 +82,14 @@ def _turned(angle, vector):
     return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
 
 
-def postures(robot: Robot, count: int = SAMPLES) -> dict[str, np.ndarray]:
-    """Sampled postures within joint ranges, toe on the ground: angles (n, 5), com (n, 2) from mid-sole, rho, force."""
+def postures(robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RAD, com_x_m=COM_X_M) -> dict:
+    """Sampled postures within joint ranges, toe on the ground, heel up by at most ``heel_up_rad``.
+
+    Returns arrays angles (n, 5), com (n, 2) from mid-sole, shoulder, rho, force, speed.
+    """
     m = robot.sagittal
     unit = qmc.Sobol(5, scramble=False).random(count)
-    foot, trunk = unit[:, 0] * HEEL_UP_RAD, TRUNK_RAD[0] + unit[:, 1] * (TRUNK_RAD[1] - TRUNK_RAD[0])
+    foot, trunk = unit[:, 0] * heel_up_rad, TRUNK_RAD[0] + unit[:, 1] * (TRUNK_RAD[1] - TRUNK_RAD[0])
     joints = m.lower + unit[:, 2:][:, [0, 1, 1, 2]] * (m.upper - m.lower)
     hip, knee, shoulder = joints[:, 0], joints[:, 1], joints[:, 3]
     angles = np.stack([foot, trunk + hip + knee, trunk + hip, trunk, trunk + shoulder], -1)  # (n, 5)
@@ -85,11 +99,26 @@ def postures(robot: Robot, count: int = SAMPLES) -> dict[str, np.ndarray]:
     com = np.einsum("i,nik->nk", mass, links) / mass.sum()
     rho = m.inertia.sum() + np.einsum("i,nik->n", mass, (links - com[:, None]) ** 2)
     from_sole = com - m.sole_center
-    ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > COM_X_M[0]) & (from_sole[:, 0] < COM_X_M[1])
+    ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > com_x_m[0]) & (from_sole[:, 0] < com_x_m[1])
     ok &= from_sole[:, 1] > 0.15  # our choice: lower than this the robot sits
     force = _static_force(m, angles, com)
     speed = _extension_speed(m, angles, from_sole)
-    return {"angles": angles[ok], "com": from_sole[ok], "rho": rho[ok], "force": force[ok], "speed": speed[ok]}
+    columns = {"angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force, "speed": speed}
+    return {name: x[ok] for name, x in columns.items()}
+
+
+def _usual_inertia(p: dict) -> np.ndarray:
+    """Quadratic fit of rho over phi through postures with easy arms."""
+    easy = np.abs(p["shoulder"]) < EASY_ARM_RAD
+    return np.polyfit(np.linalg.norm(p["com"][easy], axis=1), p["rho"][easy], 2)
+
+
+def _lowest_com(p: dict) -> np.ndarray:
+    """Straight line z = a x + b below which the CoM is hardly reachable with flat feet, highest power first."""
+    x, z = p["com"].T
+    edges = np.linspace(*FLAT_COM_X_M, 9)  # our choice: about 2 cm each
+    low = [np.quantile(z[(x >= a) & (x < b)], LOW_COM_QUANTILE) for a, b in pairwise(edges)]
+    return np.polyfit((edges[1:] + edges[:-1]) / 2, low, 1)
 
 
 def _static_force(m, angles, com):
@@ -134,11 +163,13 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     stance_rho = m.inertia.sum() + mass @ np.sum((links - com) ** 2, axis=1)
     start = np.array([np.arctan2(*from_sole), np.hypot(*from_sole), stance[3], np.sqrt(stance_rho / mass.sum())])
     half = -m.heel[0] / 2
+    flat, toe = postures(robot, count, 0.0, FLAT_COM_X_M), postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M)
     capped = np.minimum(strongest, FORCE_CAP * strongest[0])
     curves = ((lower, 2), (upper, 2), (capped, 3), (fastest, 3))
     return Reach(
         (float(low), float(high)), grid, lower, upper, strongest, fastest,
         *(np.polyfit(grid, values, degree) for values, degree in curves),
+        _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat),
         (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
         float(mass.sum()),
     )  # fmt: skip

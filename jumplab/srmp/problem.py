@@ -6,7 +6,7 @@ from jumplab.models.srmp import COORDINATES
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.srmp.settings import SrmpSettings
-from jumplab.srmp.terms import cop_term, flight_terms, joining_terms, launch_terms, takeoff_terms
+from jumplab.srmp.terms import cop_term, flight_terms, joining_terms, launch_terms, reach_terms, takeoff_terms
 from jumplab.terms import Bound, Phase, Problem
 
 COM_BOX_M = (-1.5, 2.5)  # our choice: the CoM at take-off, seen from the pivot
@@ -34,8 +34,16 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
     heel, toe, margin = *reach.cop, s.cop_margin_m
     along = launch_terms(mass, reach, s)
     inside, edge = cop_term(mass, heel + margin, toe - margin), cop_term(mass, toe - TOE_BAND_M, toe)
-    flat = Phase("flat", COORDINATES, s.intervals[0], s.flat_s, (*along, inside), bounds, scales=SCALES)
-    tip_terms = (*along, edge, *takeoff_terms(mass, reach, s))
+    flat = Phase(
+        "flat",
+        COORDINATES,
+        s.intervals[0],
+        s.flat_s,
+        (*along, *reach_terms(mass, reach, s, False), inside),
+        bounds,
+        scales=SCALES,
+    )
+    tip_terms = (*along, *reach_terms(mass, reach, s, True), edge, *takeoff_terms(mass, reach, s))
     tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip_terms, (box,), scales=SCALES)
     return flat, tip
 
@@ -57,7 +65,8 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
     leg = (shortest, s.touchdown_length[1] * stance, 1.0)
     constants = {"L": (*s.momentum, 10.0), "com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0),
                  "vel_x": (*SPEED_BOX_M_S, 1.0), "vel_z": (*SPEED_BOX_M_S, 1.0), "leg": leg}  # fmt: skip
-    return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), tuple(flight_terms(s)), bounds, states=("theta",),
+    terms = tuple(flight_terms(s, reach))
+    return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), terms, bounds, states=("theta",),
                  constants=constants, scales=FLIGHT_SCALES)  # fmt: skip
 
 

@@ -34,6 +34,8 @@ class SrmpSettings:
     w_velocity: float = 2.0  # SL-J2
     w_momentum_end: float = 0.01  # SL-J3
     w_momentum_rate: float = 2e-3  # SL-J3
+    w_usual_inertia: float = 20.0  # ours: inertia that postures of this leg length usually have
+    touchdown_inertia: tuple[float, float] = (-0.3, 0.5)  # around the usual inertia at the touchdown leg length
     w_turn: float = 0.5  # SL-J4
     w_time: float = 0.5  # SL-J5
     w_inertia_accel: float = 1e-4  # SF-J1

@@ -65,6 +65,24 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     ]  # fmt: skip
 
 
+def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
+    """What keeps the pendulum among the robot's postures: usual inertia, and with flat feet a CoM not too low."""
+    fit = ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
+    slope, offset = reach.low_com_fit
+
+    def unusual(p):
+        return srmp_state(p, mass).inertia - ca.polyval(fit, p.q[1])
+
+    def height(p):
+        com = srmp_state(p, mass).com
+        return com[1] - slope * com[0] - offset
+
+    rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
+    if not heel_up:
+        rows.append(Term("CoM not too low", "ours: flat feet", "m", "node", height, lower=0.0, upper=np.inf, scale=0.1))
+    return rows
+
+
 def cop_term(mass: float, low: float, high: float) -> Term:
     """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0."""
 
@@ -103,8 +121,11 @@ def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     ]
 
 
-def flight_terms(s: SrmpSettings) -> list[Term]:
-    """Costs and constraints of the flight, SF-* (Sec. III-B); coordinate rho = rho_R + rho_I, state theta."""
+def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
+    """Costs and constraints of the flight, SF-* (Sec. III-B); coordinate rho = rho_R + rho_I, state theta.
+
+    With ``reach``, also the inertia at touchdown is one that the robot usually has at that leg length.
+    """
 
     def rotation(left, right, step):
         total = 0
@@ -114,7 +135,15 @@ def flight_terms(s: SrmpSettings) -> list[Term]:
             total += weight * left.c.L / rho
         return right.z - left.z - step * total
 
+    def usual(p):
+        return p.q - ca.polyval(ca.DM(reach.usual_toe_fit), p.c.leg)
+
+    low, high = s.touchdown_inertia
+    landing = [] if reach is None else [
+        Term("inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", usual, lower=low, upper=high)
+    ]  # fmt: skip
     return [
+        *landing,
         Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", lambda p: p.a, weight=s.w_inertia_accel),
         Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", lambda p: p.j, weight=s.w_inertia_jerk),
         Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),

@@ -1,0 +1,86 @@
+"""Small tables for notebooks: rows of plain data, shown as HTML in a notebook and as text anywhere else."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Table:
+    """A finished table of texts; make one with :func:`table`.
+
+    Attributes
+    ----------
+    columns : headings.
+    rows : texts, one tuple per row.
+    right : which columns are numbers, set flush right.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    right: tuple[bool, ...]
+
+    def __str__(self) -> str:
+        widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
+
+        def line(cells):
+            pairs = zip(cells, widths, self.right, strict=True)
+            return "  ".join(c.rjust(w) if right else c.ljust(w) for c, w, right in pairs).rstrip()
+
+        return "\n".join([line(self.columns), line(["-" * w for w in widths]), *map(line, self.rows)])
+
+    def _repr_html_(self) -> str:
+        def row(cells, tag):
+            sides = ("right" if right else "left" for right in self.right)
+            texts = (
+                f'<{tag} style="text-align:{side}">{html.escape(c)}</{tag}>'
+                for c, side in zip(cells, sides, strict=True)
+            )
+            return f"<tr>{''.join(texts)}</tr>"
+
+        head, body = row(self.columns, "th"), "".join(row(r, "td") for r in self.rows)
+        return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
+
+    __repr__ = __str__
+
+
+def table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | Mapping[str, str] | None = None, *,
+          digits: int = 4) -> Table:  # fmt: skip
+    """Rows of named values as a :class:`Table`.
+
+    Parameters
+    ----------
+    rows : mappings with the same keys (a missing one is left blank).
+    columns : which keys, in which order; a mapping also renames them ("key": "heading"); None takes those of the first
+        row.
+    digits : significant digits of numbers.
+    """
+    rows = [dict(r) for r in rows]
+    if columns is None:
+        columns = list(rows[0]) if rows else []
+    names = dict(columns) if isinstance(columns, Mapping) else {c: c for c in columns}
+    cells = [tuple(_text(r.get(key), digits) for key in names) for r in rows]
+    right = tuple(bool(rows) and all(_number(r.get(key)) or r.get(key) is None for r in rows) for key in names)
+    return Table(tuple(names.values()), tuple(cells), right)
+
+
+def _number(x: Any) -> bool:
+    return isinstance(x, int | float | np.integer | np.floating) and not isinstance(x, bool)
+
+
+def _text(x: Any, digits: int) -> str:
+    if x is None:
+        return ""
+    if isinstance(x, bool | np.bool_):
+        return "yes" if x else "no"
+    if isinstance(x, int | np.integer):
+        return str(int(x))
+    if _number(x):
+        return f"{float(x):.{digits}g}" if math.isfinite(x) else "—"
+    return str(x)
