@@ -33,17 +33,17 @@ SAMPLE_S = 0.005  # our choice: a hundred samples and more over the landing
 class LandingSettings:
     """Weights and bounds of the landing; the paper prints none, all are our choice."""
 
-    intervals: int = 36  # steps of about 25 ms; twice as many change the CoM by less than a millimetre
+    intervals: int = 32  # steps of about 27 ms; halved, the CoM changes by less than a millimetre
     duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
-    press_share: float = 0.4  # of the weight, least vertical force: soles that are hardly loaded slip and tip
+    press_share: float = 0.7  # of the weight, least vertical force: soles that are hardly loaded slip and tip
     force_gain: float = 1.0 / FORCE_SHARE  # a landing may use the whole peak torque, it lasts a tenth of a second
-    w_jerk: float = 3e-2  # share of the launch's: the catch has to be quick
-    w_momentum_rate: float = 2e-3  # [1 / (N m)^2 / s], as in the launch
-    w_acceleration: float = 5e-3  # [1 / (m/s^2)^2 / s] of the CoM
-    w_cop: float = 20.0  # [1 / m^2 / s] distance from the middle of the sole
-    w_posture: float = 2.0  # [1 / rad^2 / s] trunk against its pitch in the stance
-    w_time: float = 0.5  # [1 / s^2]
+    w_jerk: float = 0.03  # [1], of the launch's weighted jerk: the catch has to be quick
+    w_momentum_rate: float = 5e-4  # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
+    w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low
+    w_cop: float = 20.0  # [1 / m^2 / s] distance from the middle of the sole: room for the controller
+    w_posture: float = 50.0  # [1 / rad^2 / s] trunk against its pitch in the stance; ties L to the trunk's way back
+    w_time: float = 0.1  # [1 / s^2]
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,9 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     weights = {"jerk": settings.w_jerk, "L rate": settings.w_momentum_rate}
     shared = [replace(t, weight=weights.get(t.name, t.weight)) if t.is_cost else t for t in shared]
     # what is measured at touchdown is a fact: constraints that its fixed part alone decides begin one node later
-    shared = [replace(t, skip=(1, 0)) if t.name in ("trunk range", "inertia envelope", "L range") else t for t in shared]
+    shared = [
+        replace(t, skip=(1, 0)) if t.name in ("trunk range", "inertia envelope", "L range") else t for t in shared
+    ]
     press = settings.press_share * mass * GRAVITY
     shared = [replace(t, lower=press) if t.name == "unilateral" else t for t in shared]
     heel, toe = envelope.cop
@@ -180,7 +182,9 @@ class LandingPlanner:
         along, across = np.array([np.sin(lean), np.cos(lean)]), np.array([np.cos(lean), -np.sin(lean)])
         low, high = (np.polyval(f, length) for f in (self.reach.inertia_low_fit, self.reach.inertia_high_fit))
         inside = 2 * self._margin * (high - low)
-        rho = np.clip(touchdown.rho, low + inside, high - inside)  # the envelope is sampled, the robot may be just outside
+        rho = np.clip(
+            touchdown.rho, low + inside, high - inside
+        )  # the envelope is sampled, the robot may be just outside
         start = np.array([lean, length, touchdown.trunk_pitch - lean, np.sqrt(rho / self._mass)])
         return dict(start=start, rates=np.array([dx, dz]) @ np.array([across / length, along]).T, L=touchdown.L)
 

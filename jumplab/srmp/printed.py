@@ -154,7 +154,7 @@ def build_printed_launch(robot: Robot, settings: SrmpSettings, envelope: Reach, 
     )
     time = Term("launch time", "SL-J5", "s", "end", lambda p: p.duration, weight=settings.w_time)
     terms = [*_pick(launch_terms(mass, envelope, settings), PRINTED_COSTS), *_launch_only_terms(mass, envelope),
-             *takeoff_terms(mass, settings), time]  # fmt: skip
+             *(t for t in takeoff_terms(mass, envelope, settings) if t.name != "take-off length"), time]  # fmt: skip
     constants = {}
     if window:
         terms += _window_terms(mass, envelope, settings)

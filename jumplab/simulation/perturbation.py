@@ -1,0 +1,136 @@
+"""How the simulated robot differs from the planned one; the paper's own differs "slightly" too (Sec. VI-B)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from jumplab.errors import InputError
+from jumplab.robot import Robot
+
+FRICTION = 0.8  # our choice: rubber sole on dry floor; the ground has 1, and Bullet multiplies the two
+LIGHT_KG = 0.01  # links below this are the massless dummies of multi-axis joints and are left alone
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Half-widths of the uniform draws of :meth:`Perturbation.draw`; every link is drawn by itself."""
+
+    mass: float = 0.05  # [1], relative
+    com_m: float = 0.015  # [m], each axis
+    inertia: float = 0.10  # [1], relative
+    friction: tuple[float, float] = (0.5, 1.0)  # [1], from ... to
+    delay_s: tuple[float, float] = (0.0, 0.004)  # [s], from ... to
+    motor_gain: float = 0.05  # [1], relative error of every torque; our choice: typical of current-controlled drives
+
+
+# our choice: a "slight" difference, about a fifth of a workshop's uncertainty
+SLIGHT = Ranges(0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations of white noise on what the landing controller is told; zero means exact.
+
+    Our choice for :meth:`typical`: 16-bit encoders, a mid-range inertial unit, leg odometry.
+    """
+
+    joint_rad: float = 0.0
+    joint_rate: float = 0.0  # [rad/s]
+    tilt_rad: float = 0.0
+    gyro: float = 0.0  # [rad/s]
+    velocity: float = 0.0  # [m/s], base
+    force: float = 0.0  # [N], each axis of a foot sensor
+
+    @classmethod
+    def typical(cls) -> SensorNoise:
+        """Encoders 0.5 mrad and 0.05 rad/s, tilt 5 mrad, gyro 0.02 rad/s, base velocity 0.02 m/s, force 3 N."""
+        return cls(5e-4, 0.05, 5e-3, 0.02, 0.02, 3.0)
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """One robot of the population: factors and shifts by link or joint name; what is not named is as planned.
+
+    Attributes
+    ----------
+    seed : of the draw, also seeds the sensor noise.
+    mass, inertia : link -> factor [1].
+    com : link -> (x, y, z) shift in the link frame [m].
+    friction : lateral friction coefficient of the whole robot against ground of 1 [1].
+    delay_s : age of a command when it reaches the motors [s], rounded to milliseconds.
+    motor_gain : joint -> torque delivered per torque commanded [1].
+    noise : on measurements.
+    """
+
+    seed: int = 0
+    mass: dict[str, float] = field(default_factory=dict)
+    inertia: dict[str, float] = field(default_factory=dict)
+    com: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    friction: float = FRICTION
+    delay_s: float = 0.0
+    motor_gain: dict[str, float] = field(default_factory=dict)
+    noise: SensorNoise = SensorNoise()
+
+    def __post_init__(self):
+        if not 0 < self.friction <= 2:
+            raise InputError(f"friction = {self.friction:g} is outside 0 ... 2")
+        if not 0 <= self.delay_s <= 0.02:
+            raise InputError(f"delay = {self.delay_s:g} s is outside 0 ... 0.02 s")
+
+    @classmethod
+    def draw(
+        cls, robot: Robot, seed: int, ranges: Ranges = Ranges(), noise: SensorNoise = SensorNoise()
+    ) -> Perturbation:
+        """Draw every number uniformly and independently from ``ranges``; the same seed gives the same robot."""
+        rng = np.random.default_rng(seed)
+        names = [link.get("name") for link in ET.fromstring(robot.urdf).iter("link") if _mass(link) > LIGHT_KG]
+
+        def around(half_width, size=None):
+            return rng.uniform(-half_width, half_width, size)
+
+        return cls(
+            seed,
+            {name: 1 + float(around(ranges.mass)) for name in names},
+            {name: 1 + float(around(ranges.inertia)) for name in names},
+            {name: tuple(around(ranges.com_m, 3).tolist()) for name in names},
+            float(rng.uniform(*ranges.friction)),
+            float(rng.uniform(*ranges.delay_s)),
+            {name: 1 + float(around(ranges.motor_gain)) for name in robot.joint_names},
+            noise,
+        )
+
+    def robot(self, robot: Robot) -> Robot:
+        """The robot as it really is: ``robot`` with its masses, inertias and centres of mass changed."""
+        if not (self.mass or self.inertia or self.com):
+            return robot
+        root = ET.fromstring(robot.urdf)
+        for link in root.iter("link"):
+            name, inertial = link.get("name"), link.find("inertial")
+            if inertial is None:
+                continue
+            factor = self.mass.get(name, 1.0)
+            _scale(inertial.find("mass"), ("value",), factor)
+            # a heavier link of the same shape has more inertia too; the further factor is a change of shape
+            moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+            _scale(inertial.find("inertia"), moments, factor * self.inertia.get(name, 1.0))
+            origin = inertial.find("origin")
+            xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
+            origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
+        return Robot.from_text(ET.tostring(root, encoding="unicode"), robot.config_text)
+
+    def to_json(self) -> dict:
+        """All numbers as plain data."""
+        return asdict(self)
+
+
+def _mass(link: ET.Element) -> float:
+    mass = link.find("inertial/mass")
+    return 0.0 if mass is None else float(mass.get("value"))
+
+
+def _scale(element: ET.Element, attributes: tuple[str, ...], factor: float) -> None:
+    for key in attributes:
+        element.set(key, f"{float(element.get(key)) * factor:.12g}")

@@ -1,0 +1,85 @@
+"""Optional in-flight correction: legs aimed at the ground whatever the trunk does. Off for the paper's claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.robot import Robot
+from jumplab.simulation.scene import Scene
+from jumplab.simulation.world import STEP_S
+from jumplab.trajectory import Tape
+
+START_HEIGHT_M = 0.30  # our choice: soles this far above the ground; earlier, the correction fights the swing itself
+RATE = 6.0  # [rad/s] our choice: 0.4 rad within the last 0.2 m at 3 m/s, a third of the hip's speed limit
+LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
+CAPTURE_S = 0.13  # our choice: metres of foothold per m/s of forward speed, as in the plan's capture window
+NEWTON_STEPS = 2  # two equations, nearly linear
+PROBE_RAD = 1e-4  # of the finite differences
+
+
+class Reaim:
+    """Turns hips and ankles so that the soles meet the ground flat, and as far ahead of the CoM as the speed asks for.
+
+    The posture at touchdown is predicted as the tape's last one, with the trunk as far off its planned pitch as it is
+    now. Without any error the correction is zero.
+    """
+
+    def __init__(self, robot: Robot, tape: Tape, scene: Scene):
+        self._model, self._data, self._foot = robot.model, robot.model.createData(), robot.foot
+        self._scene = scene
+        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        roles = ("hip_pitch", "ankle_pitch")
+        self._rows = [[7 + robot.joint_names.index(name) for name in robot.joints[role]] for role in roles]
+        self._end = tape.q[-1].copy()
+        self._ahead, self._tilt = self._aim(self._end)
+        self._speed = float(self._com_velocity(tape.q[-1], tape.v[-1])[0])
+        self._now = np.zeros(len(robot.joint_names))
+
+    def _com_velocity(self, q, v) -> np.ndarray:
+        pin.centerOfMass(self._model, self._data, q, v)
+        return self._data.vcom[0]
+
+    def _sole_middle(self, q) -> np.ndarray:
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return np.mean([self._data.oMf[frame].act(self._foot.center) for frame in self._frames], axis=0)
+
+    def _aim(self, q) -> np.ndarray:
+        """Middle of the soles ahead of the CoM [m], and the soles' pitch [rad]."""
+        ahead = self._sole_middle(q)[0] - pin.centerOfMass(self._model, self._data, q, False)[0]
+        feet = [self._data.oMf[frame].rotation for frame in self._frames]
+        return np.array([ahead, np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])])
+
+    def correction(self, q: np.ndarray, v: np.ndarray, planned_pitch: float) -> np.ndarray:
+        """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
+
+        Parameters
+        ----------
+        q, v : measured state.
+        planned_pitch : of the trunk, now [rad].
+        """
+        middle = self._sole_middle(q)
+        if middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M:
+            x, y, z, w = q[3:7]
+            error = np.arctan2(2 * (w * y + x * z), 1 - 2 * (y * y + x * x)) - planned_pitch
+            error = np.arctan2(np.sin(error), np.cos(error))
+            most = RATE * STEP_S
+            self._now = self._now + np.clip(self._wish(q, v, error) - self._now, -most, most)
+        return self._now
+
+    def _wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
+        """Correction (nv - 6,) with which the predicted touchdown has the soles flat and well placed."""
+        goal = np.array([self._ahead + CAPTURE_S * (self._com_velocity(q, v)[0] - self._speed), self._tilt])
+        guess = self._end.copy()
+        turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch_error, 0.0))
+        guess[3:7] = (turn * pin.Quaternion(guess[6], guess[3], guess[4], guess[5])).coeffs()
+        for _ in range(NEWTON_STEPS):
+            here = self._aim(guess)
+            slope = np.empty((2, 2))
+            for column, rows in enumerate(self._rows):
+                probe = guess.copy()
+                probe[rows] += PROBE_RAD
+                slope[:, column] = (self._aim(probe) - here) / PROBE_RAD
+            for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here), strict=True):
+                guess[rows] += angle
+        return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles

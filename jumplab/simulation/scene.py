@@ -1,0 +1,54 @@
+"""What the robot stands and lands on: boxes with flat tops and real edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jumplab.errors import InputError
+
+REACH_M = 20.0  # our choice: half-size of "endless" ground, far beyond any jump
+THICKNESS_M = 1.0  # our choice: deeper than any contact can push a foot in one step
+
+
+@dataclass(frozen=True)
+class Block:
+    """One box: from ``x_from`` to ``x_to`` along the jump, as wide as the world, flat ``top`` [m]."""
+
+    x_from: float
+    x_to: float
+    top: float = 0.0
+    thickness: float = THICKNESS_M
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A named list of blocks. The robot starts with the middle of its soles at x = 0 on a top at z = 0."""
+
+    name: str
+    blocks: tuple[Block, ...]
+
+    @classmethod
+    def flat(cls) -> Scene:
+        """Endless ground."""
+        return cls("flat", (Block(-REACH_M, REACH_M),))
+
+    @classmethod
+    def ditch(cls, x_from: float, x_to: float, depth: float = 1.0) -> Scene:
+        """Two grounds with a gap between ``x_from`` and ``x_to`` [m]; a floor ``depth`` below catches a fall."""
+        if not 0 < x_from < x_to:
+            raise InputError(f"ditch from {x_from:g} to {x_to:g} m: it must begin ahead of the robot and have a width")
+        if depth <= 0:
+            raise InputError(f"ditch of depth {depth:g} m: the depth must be positive")
+        sides = Block(-REACH_M, x_from, 0.0, depth), Block(x_to, REACH_M, 0.0, depth)
+        return cls("ditch", (*sides, Block(-REACH_M, REACH_M, -depth)))
+
+    @classmethod
+    def platform(cls, x_from: float, height: float) -> Scene:
+        """Ground and a platform of ``height`` whose front edge is at ``x_from`` [m]."""
+        if x_from <= 0 or height <= 0:
+            raise InputError(f"platform at {x_from:g} m, {height:g} m high: both numbers must be positive")
+        return cls("platform", (Block(-REACH_M, REACH_M), Block(x_from, REACH_M, height, height)))
+
+    def top_at(self, x: float) -> float:
+        """Height of the highest surface at ``x`` [m]."""
+        return max((b.top for b in self.blocks if b.x_from <= x <= b.x_to), default=-REACH_M)
