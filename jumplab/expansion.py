@@ -11,6 +11,7 @@ from jumplab.robot.stance import configuration
 from jumplab.solver import PhaseSolution
 from jumplab.trajectory import RATE_HZ, Tape
 
+SHORTEST_STEP = 0.05  # our choice: share of a sample; a shorter last step is joined to the one before
 _EVALUATORS: dict = {}
 
 
@@ -45,7 +46,7 @@ def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot
     t_launch = launch_s - np.arange(steps, -1, -1) / RATE_HZ
     parts = [_launch_sample(flat, toe, max(t, 0.0)) for t in t_launch]
     q, v, a = (np.array([p[i] for p in parts]) for i in range(3))
-    t_flight = np.append(np.arange(0, flight.duration - 0.25 / RATE_HZ, 1 / RATE_HZ), flight.duration)
+    t_flight = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
     qf, vf, af = flight.sample(t_flight)
     c = flight.constants
     com = np.stack([c["com_x"] + c["vel_x"] * t_flight,
