@@ -25,6 +25,7 @@ from jumplab.plotting.bodies import (
     strobe,
 )
 from jumplab.plotting.diagrams import framework, link_models, pendulum_diagram
+from jumplab.plotting.joint_map import guess_comparison, mapped_snapshots, mapped_tracking
 from jumplab.plotting.landing import landing_reference
 from jumplab.plotting.limits import contact_comparison, ground_reaction, margins
 from jumplab.plotting.simulation import jump_strobe, momentum
@@ -96,6 +97,7 @@ __all__ = [
     "flight_shaping",
     "framework",
     "ground_reaction",
+    "guess_comparison",
     "inertia_and_momentum",
     "inverted_pendulum",
     "joint_trajectories",
@@ -103,6 +105,8 @@ __all__ = [
     "landing_reference",
     "launch_strobe",
     "legend_above",
+    "mapped_snapshots",
+    "mapped_tracking",
     "link_models",
     "margins",
     "mark_time",

@@ -69,7 +69,7 @@ def inverted_pendulum(plan: SrmpPlan) -> Figure:
 
 
 def _degrees(angle) -> str:
-    return f"${np.degrees(angle):.0f}$°"
+    return f"${round(np.degrees(angle)):d}$°"
 
 
 def _velocity(ax: Axes, com, v, align):

@@ -53,7 +53,7 @@ class LandingGains:
     trunk_rate: float = 7.0
     foot_rate: float = 25.0
     posture_rate: float = 8.0
-    com_weight: tuple[float, float, float] = (30.0, 10.0, 10.0)
+    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
     momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
     trunk_weight: float = 0.5
     foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning

@@ -82,8 +82,9 @@ def farthest(can: Capability, task: JumpTask) -> float:
     For every lean at take-off (CoM at x = phi sin(lean)) and horizontal speed v_x that satisfy
 
     * extension speed:  v_z cos(lean) + v_x sin(lean) <= speed;
-    * falling forward about the trailing edge X of the sole, weight first, then push:
-      v_x cos(lean) - v_z sin(lean) <= sqrt(g / phi) (x + |X|) + |X| (v_z + dip) / phi;
+    * falling forward about the trailing edge X of the sole, weight first, then push, and what the flight's own turn
+      L = rho_max (lean + touchdown lean) / t_f  leaves:
+      v_x cos(lean) - v_z sin(lean) <= sqrt(g / phi) (x + |X|) + |X| (v_z + dip) / phi + L / (m phi);
     * friction, the CoM starting behind the pivot by |X| at most:  v_x <= mu (v_z + dip) + sqrt(2 mu g (x + |X|)), and
       over the longest launch T  v_x <= mu (v_z + g T),
 
@@ -97,14 +98,16 @@ def farthest(can: Capability, task: JumpTask) -> float:
     v_x = np.linspace(0.0, 2 * can.speed, GRID[1])[None, :]
     x, edge = can.takeoff_length * np.sin(lean), _trailing_edge(can, ahead)
     fits = v_z * np.cos(lean) + v_x * np.sin(lean) <= can.speed
-    fall = math.sqrt(g / can.takeoff_length) * (x + edge) + edge * (v_z + DIP_M_S) / can.takeoff_length
-    fits &= v_x * np.cos(lean) - v_z * np.sin(lean) <= fall
     fits &= v_x <= s.friction * (v_z + DIP_M_S) + np.sqrt(2 * s.friction * g * (x + edge))
     fits &= v_x <= s.friction * (v_z + g * (s.flat_s[1] + s.toe_s[1]))
     lead = _lead(can, v_x, ahead)
     drop = can.takeoff_length * np.cos(lean) - task.platform_m - _landing_height(can, task.platform_m, lead)
     left = v_z**2 + 2 * g * drop
     t_f = (v_z + np.sqrt(np.maximum(left, 0.0))) / g
+    turn = lean + np.arcsin(np.minimum(lead / can.takeoff_length, 1.0))
+    fall = math.sqrt(g / can.takeoff_length) * (x + edge) + edge * (v_z + DIP_M_S) / can.takeoff_length
+    fall = fall + can.envelope.inertia[1] * turn / (t_f * can.mass * can.takeoff_length)
+    fits &= v_x * np.cos(lean) - v_z * np.sin(lean) <= fall
     return max(float(np.max(np.where(fits & (left >= 0), x + v_x * t_f + lead, 0.0))), 0.0)
 
 

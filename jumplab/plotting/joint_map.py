@@ -1,0 +1,157 @@
+"""Stage 2 in pictures: snapshots (Fig. 7), tracking of stage 1, and what stage 3 gains from different starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jumplab.joint_map import JointPlan
+from jumplab.plotting.bodies import Silhouette, draw_ground, film_strip, strobe
+from jumplab.plotting.style import (
+    FLIGHT,
+    INK,
+    LAUNCH,
+    LIMIT_STYLE,
+    PAGE_IN,
+    PURPLE,
+    REFERENCE_STYLE,
+    bare,
+    by_phase,
+    legend_above,
+    mark_time,
+    new_figure,
+    phase_handles,
+    shade,
+    styled,
+    tint,
+)
+from jumplab.robot import Robot
+
+FRAMES_LAUNCH, FRAMES_FLIGHT = 6, 5
+PITCH_M = 0.62  # our choice: how far the frames of a launch are moved apart
+EDGE_M = 0.05  # a platform begins this far behind the landing heel, as in stage 3's limits
+TEXT_M = 0.22  # room for the frames' times below the ground
+START_COLORS = (LAUNCH, FLIGHT, PURPLE)
+
+
+# Fig. 7 ---------------------------------------------------------------------------------------------------------
+@styled
+def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> Figure:
+    """F-7: the launch with its frames moved apart, then the flight as it is, with the CoM's path; one scale.
+
+    Parameters
+    ----------
+    platform_m : height of the landing surface [m].
+    """
+    fig = new_figure(PAGE_IN, 2.55)
+    ax = fig.subplots()
+    body, launch, flight = Silhouette(robot), plan.rows("launch"), plan.rows("flight")
+    rows = np.linspace(launch.start, launch.stop - 1, FRAMES_LAUNCH).astype(int)
+    film_strip(ax, body, plan.q[rows], plan.t[rows], LAUNCH, pitch_m=PITCH_M)
+    first, width = -0.3, PITCH_M * FRAMES_LAUNCH
+    draw_ground(ax, first, width - 0.25)
+    right = _flight(ax, body, plan.q[flight], width + 0.45, platform_m)
+    ax.text(first, -TEXT_M, "launch, frames moved apart", ha="left", va="top", color=LAUNCH)
+    ax.text(right, -TEXT_M, "flight, as it is", ha="right", va="top", color=shade(FLIGHT, 0.8))
+    ax.set(xlim=(first - 0.05, right + 0.05))
+    bare(ax)
+    return fig
+
+
+def _flight(ax: Axes, body: Silhouette, q: np.ndarray, shift: float, height: float) -> float:
+    """Frames of the flight ``q`` (n, nq) in their true places, moved by ``shift``; returns the ground's right end."""
+    rows = np.linspace(0, len(q) - 1, FRAMES_FLIGHT).astype(int)
+    strobe(ax, body, q[rows], [FLIGHT] * len(rows), shift=shift)
+    com = np.array([body.com(x) for x in q]) + [shift, 0.0]
+    ax.plot(*com.T, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=4)
+    ax.plot(*com[rows].T, linestyle="none", marker="o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
+    ankle = body.robot.joints["ankle_pitch"][0]
+    start, end = (body.joints(q[k])[ankle][0] + shift for k in (0, -1))
+    foot = body.robot.foot
+    edge = end + foot.heel - EDGE_M if abs(height) > 1e-3 else None
+    low, high = sorted((start + foot.heel, end + foot.heel))
+    draw_ground(ax, low - 0.2, high + 0.55, edge=edge, height=height)
+    return high + 0.55
+
+
+# tracking -------------------------------------------------------------------------------------------------------
+@styled
+def mapped_tracking(plan: JointPlan) -> Figure:
+    """CoM, angular momentum, inertia and foot distance with stage 1's dashed, and below their differences."""
+    fig = new_figure(PAGE_IN, 3.2)
+    axes = fig.subplots(2, 4, sharex=True)
+    flight = plan.phase == "flight"
+    takeoff = plan.t[plan.rows("flight").start]
+    for column, (title, unit, scale, every, got, want) in zip(axes.T, _tracked(plan), strict=True):
+        rows = np.ones(len(plan.t), bool) if every else flight
+        t, phase = plan.t[rows], plan.phase[rows]
+        for y, reference in zip(got.T, want.T, strict=True):
+            by_phase(column[0], t, y, phase)
+            column[0].plot(t, reference, **REFERENCE_STYLE)
+        miss = np.linalg.norm(got - want, axis=1) if got.shape[1] > 1 else (got - want)[:, 0]
+        column[1].axhline(0.0, **LIMIT_STYLE)
+        by_phase(column[1], t, scale * miss, phase)
+        column[0].set_title(title)
+        column[0].set_ylabel(f"[{unit}]")
+        column[1].set_ylabel("difference [mm]" if scale > 1 else f"difference [{unit}]")
+        column[1].set_xlabel("time [s]")
+        for ax in column:
+            mark_time(ax, [takeoff])
+    legend_above(fig, phase_handles("launch", "flight", reference="stage 1, the reference"))
+    return fig
+
+
+def _tracked(plan: JointPlan):
+    """(title, unit, scale of the difference, whole jump or flight only, actual (n, k), reference (n, k)) per column."""
+    a, r, planar = plan.actual, plan.reference, [0, 2]
+    length = [np.linalg.norm(x["foot_com"][:, planar], axis=1)[:, None] for x in (a, r)]
+    return (
+        ("CoM, $x$ and $z$", "m", 1000.0, True, a["com"][:, planar], r["com"][:, planar]),
+        ("angular momentum $L$", "kg m$^2$/s", 1.0, True, a["L"][:, None], r["L"][:, None]),
+        ("inertia $\\rho$", "kg m$^2$", 1.0, True, a["rho"][:, None], r["rho"][:, None]),
+        ("sole to CoM", "m", 1000.0, False, *length),
+    )
+
+
+# starts of stage 3 ----------------------------------------------------------------------------------------------
+@styled
+def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> Figure:
+    """One panel per quantity, one column of dots per start, a thin line per target, a bar at the median.
+
+    Parameters
+    ----------
+    rows : one mapping per target and start: "target", "start", the quantities (NaN or None without a solution).
+    quantities : key -> axis label with unit.
+    """
+    rows = list(rows)
+    starts, targets = (list(dict.fromkeys(r[k] for r in rows)) for k in ("start", "target"))
+    fig = new_figure(PAGE_IN, 2.5)
+    axes = fig.subplots(1, len(quantities), squeeze=False)[0]
+    for ax, (key, label) in zip(axes, quantities.items(), strict=True):
+        found = {(r["target"], r["start"]): np.nan if r[key] is None else float(r[key]) for r in rows}
+        table = np.array([[found.get((target, start), np.nan) for start in starts] for target in targets])
+        _dots(ax, table)
+        ax.set_ylabel(label)
+        ax.set_xticks(range(len(starts)), starts)
+        ax.set_xlim(-0.5, len(starts) - 0.5)
+        ax.set_ylim(bottom=0)
+    medians = Line2D([], [], color=INK, linewidth=2.0, label="median")
+    legend_above(fig, [medians, Line2D([], [], color="#999999", linewidth=0.6, label="one target")])
+    return fig
+
+
+def _dots(ax: Axes, table: np.ndarray) -> None:
+    """Values (targets, starts): lines of targets, dots of starts, medians."""
+    for line in table:
+        ax.plot(line, color="#BBBBBB", linewidth=0.6, zorder=1)
+    for k, values in enumerate(table.T):
+        color = START_COLORS[k % len(START_COLORS)]
+        ax.plot(np.full(len(values), k), values, linestyle="none", marker="o", markersize=4, color=color,
+                markerfacecolor=tint(color, 0.5), zorder=2)  # fmt: skip
+        if np.isfinite(values).any():
+            middle = np.nanmedian(values)
+            ax.plot([k - 0.25, k + 0.25], [middle, middle], color=INK, linewidth=2.0, zorder=3)
