@@ -11,12 +11,14 @@ from jumplab.errors import InputError
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.robot import Robot
+from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan, SrmpPlanner
+from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
 from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
-from jumplab.whole_body.planner import platform_edge_m
+from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 
@@ -111,6 +113,7 @@ class Planner:
     def _stage(self, name: str):
         if name not in self._stages:
             build = {
+                "reach": lambda: reach(self.robot),
                 "srmp": lambda: SrmpPlanner(self.robot),
                 "whole body": lambda: WholeBodyPlanner(self.robot),
                 "direct": lambda: WholeBodyPlanner(self.robot, tracking=False),
@@ -133,7 +136,9 @@ class Planner:
         """
         if method not in METHODS:
             raise InputError(f"method {method!r}: choose one of {', '.join(METHODS)}")
+        check_platform(task, self.robot)
         if method == "direct":
+            check_reachable(task, self._stage("reach"), self.robot)
             planner = self._stage("direct")
             body = planner.plan(task)
             rows = (_row("direct", body.solution.statistics),)

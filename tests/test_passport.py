@@ -503,7 +503,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
         ("plan.npz", "PK not a zip", "not a readable plan"),
         ("robot.urdf", None, "cannot be read"),
         ("robot.urdf", "<robot", "Pinocchio cannot read the URDF"),
-        ("robot.toml", "name = ", "no robot configuration"),
+        ("robot.toml", "name = ", "not a TOML file"),
         ("summary.json", "{", "not a JSON file"),
         ("summary.json", "[]", "must hold a JSON object"),
         ("summary.json", '{"target": {"distance_m": 99, "height_m": 0.5}}', "distance = 99 m is outside"),

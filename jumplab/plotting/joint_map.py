@@ -10,13 +10,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jumplab.joint_map import JointPlan
-from jumplab.plotting.bodies import Silhouette, draw_ground, film_strip, strobe
+from jumplab.plotting.bodies import Silhouette, draw_ground, draw_robot, equal_scales
 from jumplab.plotting.style import (
     FLIGHT,
     INK,
     LAUNCH,
     LIMIT_STYLE,
     PAGE_IN,
+    PHASE_COLORS,
     PURPLE,
     REFERENCE_STYLE,
     bare,
@@ -32,50 +33,49 @@ from jumplab.plotting.style import (
 from jumplab.robot import Robot
 
 FRAMES_LAUNCH, FRAMES_FLIGHT = 6, 5
-PITCH_M = 0.62  # our choice: how far the frames of a launch are moved apart
-EDGE_M = 0.05  # a platform begins this far behind the landing heel, as in stage 3's limits
-TEXT_M = 0.22  # room for the frames' times below the ground
+PITCH_M = 0.66  # our choice: how far the frames are apart
+GAP_M = 0.12  # our choice: between launch and flight
+LEVEL_M = 1e-3  # a platform lower than this is none
+TEXT_M = 0.24  # room for the frames' times below the ground
+ALIKE = 0.9  # our choice: values closer than this ratio are drawn on an axis of their own instead of from zero
 START_COLORS = (LAUNCH, FLIGHT, PURPLE)
 
 
 # Fig. 7 ---------------------------------------------------------------------------------------------------------
 @styled
 def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> Figure:
-    """F-7: the launch with its frames moved apart, then the flight as it is, with the CoM's path; one scale.
+    """F-7: launch and flight in frames, moved apart so that every posture shows; heights are as they are.
 
     Parameters
     ----------
     platform_m : height of the landing surface [m].
     """
-    fig = new_figure(PAGE_IN, 2.55)
+    fig = new_figure(PAGE_IN, 2.6)
     ax = fig.subplots()
-    body, launch, flight = Silhouette(robot), plan.rows("launch"), plan.rows("flight")
-    rows = np.linspace(launch.start, launch.stop - 1, FRAMES_LAUNCH).astype(int)
-    film_strip(ax, body, plan.q[rows], plan.t[rows], LAUNCH, pitch_m=PITCH_M)
-    first, width = -0.3, PITCH_M * FRAMES_LAUNCH
-    draw_ground(ax, first, width - 0.25)
-    right = _flight(ax, body, plan.q[flight], width + 0.45, platform_m)
-    ax.text(first, -TEXT_M, "launch, frames moved apart", ha="left", va="top", color=LAUNCH)
-    ax.text(right, -TEXT_M, "flight, as it is", ha="right", va="top", color=shade(FLIGHT, 0.8))
-    ax.set(xlim=(first - 0.05, right + 0.05))
+    body, place = Silhouette(robot), 0.0
+    for phase, count in (("launch", FRAMES_LAUNCH), ("flight", FRAMES_FLIGHT)):
+        color, rows = PHASE_COLORS[phase], plan.rows(phase)
+        left = place - PITCH_M / 2
+        for k in np.linspace(rows.start, rows.stop - 1, count).astype(int):
+            _frame(ax, body, plan.q[k], place, color, text=f"{plan.t[k]:.2f} s")
+            place += PITCH_M
+        right = place - PITCH_M / 2
+        edge = right - PITCH_M if phase == "flight" and abs(platform_m) > LEVEL_M else None
+        draw_ground(ax, left, right, edge=edge, height=platform_m if edge else 0.0)
+        ax.text(left, min(platform_m, 0.0) - TEXT_M, phase, ha="left", va="top", color=shade(color, 0.8))
+        place += GAP_M
+    ax.set(xlim=(-PITCH_M / 2 - 0.05, right + 0.05))
     bare(ax)
     return fig
 
 
-def _flight(ax: Axes, body: Silhouette, q: np.ndarray, shift: float, height: float) -> float:
-    """Frames of the flight ``q`` (n, nq) in their true places, moved by ``shift``; returns the ground's right end."""
-    rows = np.linspace(0, len(q) - 1, FRAMES_FLIGHT).astype(int)
-    strobe(ax, body, q[rows], [FLIGHT] * len(rows), shift=shift)
-    com = np.array([body.com(x) for x in q]) + [shift, 0.0]
-    ax.plot(*com.T, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=4)
-    ax.plot(*com[rows].T, linestyle="none", marker="o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
-    ankle = body.robot.joints["ankle_pitch"][0]
-    start, end = (body.joints(q[k])[ankle][0] + shift for k in (0, -1))
-    foot = body.robot.foot
-    edge = end + foot.heel - EDGE_M if abs(height) > 1e-3 else None
-    low, high = sorted((start + foot.heel, end + foot.heel))
-    draw_ground(ax, low - 0.2, high + 0.55, edge=edge, height=height)
-    return high + 0.55
+def _frame(ax: Axes, body: Silhouette, q: np.ndarray, place: float, color: str, *, text: str) -> None:
+    """One frame with its CoM at the horizontal ``place`` [m], and a text below the ground."""
+    com = body.com(q)
+    draw_robot(ax, body, q, color, shift=place - com[0])
+    ax.plot(place, com[1], marker="o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
+    ax.text(place, -0.06, text, ha="center", va="top", fontsize=7)
+    equal_scales(ax)
 
 
 # tracking -------------------------------------------------------------------------------------------------------
@@ -138,10 +138,18 @@ def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> 
         ax.set_ylabel(label)
         ax.set_xticks(range(len(starts)), starts)
         ax.set_xlim(-0.5, len(starts) - 0.5)
-        ax.set_ylim(bottom=0)
+        ax.set_ylim(**_limits(table))
     medians = Line2D([], [], color=INK, linewidth=2.0, label="median")
     legend_above(fig, [medians, Line2D([], [], color="#999999", linewidth=0.6, label="one target")])
     return fig
+
+
+def _limits(table: np.ndarray) -> dict[str, float]:
+    """Limits of an axis: from zero, or around values that hardly differ."""
+    values = table[np.isfinite(table)]
+    if len(values) and values.min() > ALIKE * values.max():
+        return {"bottom": ALIKE * values.min(), "top": (2 - ALIKE) * values.max()}
+    return {"bottom": 0.0}
 
 
 def _dots(ax: Axes, table: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from jumplab.simulation.world import STEP_S
 from jumplab.trajectory import Tape
 
 START_HEIGHT_M = 0.30  # our choice: soles this far above the ground; earlier, the correction fights the swing itself
-RATE = 6.0  # [rad/s] our choice: 0.4 rad within the last 0.2 m at 3 m/s, a third of the hip's speed limit
+RATE = 12.0  # [rad/s] our choice: 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
 LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
 CAPTURE_S = 0.13  # our choice: metres of foothold per m/s of forward speed, as in the plan's capture window
 NEWTON_STEPS = 2  # two equations, nearly linear

@@ -19,7 +19,7 @@ from jumplab.robot.reach import FORCE_SHARE, Reach, reach
 from jumplab.solver import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.srmp.planner import launch_function
 from jumplab.srmp.settings import SrmpSettings
-from jumplab.srmp.terms import cop_term, launch_terms, srmp_state
+from jumplab.srmp.terms import cop_terms, launch_terms, srmp_state
 from jumplab.srmp.touchdown import Touchdown
 from jumplab.task import GRAVITY
 from jumplab.terms import Bound, Phase, Point, Problem, Term
@@ -126,7 +126,7 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
     press = settings.press_share * mass * GRAVITY
     shared = [replace(t, lower=press) if t.name == "unilateral" else t for t in shared]
     heel, toe = envelope.cop
-    sole = cop_term(mass, heel + settings.cop_margin_m, toe - settings.cop_margin_m)
+    sole = cop_terms(mass, heel + settings.cop_margin_m, toe - settings.cop_margin_m)
     low, high = envelope.length
     unset = np.inf
 

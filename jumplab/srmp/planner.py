@@ -13,6 +13,7 @@ from jumplab.solver import Nlp, PhaseGuess, Solution
 from jumplab.srmp.plan import SrmpFlight, SrmpLaunch, SrmpPlan
 from jumplab.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.srmp.settings import SrmpSettings
+from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 
 
@@ -54,7 +55,16 @@ class SrmpPlanner:
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options)
 
     def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF) -> SrmpPlan:
-        """Solve for a target; raises :class:`SolverError` with the violated terms if there is no solution."""
+        """Solve for a target.
+
+        Raises
+        ------
+        InfeasibleError
+            Before solving, if closed forms already say that the robot cannot do it.
+        SolverError
+            If there is no solution; names the violated terms.
+        """
+        check_reachable(task, self.reach, self.robot, self.settings)
         guess = guess or naive_guess(task, self.reach, self.settings)
         solution = self.nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off)
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)

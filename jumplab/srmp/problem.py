@@ -6,7 +6,7 @@ from jumplab.models.srmp import COORDINATES
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.srmp.settings import SrmpSettings
-from jumplab.srmp.terms import cop_term, flight_terms, joining_terms, launch_terms, reach_terms, takeoff_terms
+from jumplab.srmp.terms import cop_terms, flight_terms, joining_terms, launch_terms, reach_terms, takeoff_terms
 from jumplab.terms import Bound, Phase, Problem
 
 COM_BOX_M = (-1.5, 2.5)  # our choice: the CoM at take-off, seen from the pivot
@@ -33,17 +33,17 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
     )
     heel, toe, margin = *reach.cop, s.cop_margin_m
     along = launch_terms(mass, reach, s)
-    inside, edge = cop_term(mass, heel + margin, toe - margin), cop_term(mass, toe - TOE_BAND_M, toe)
+    inside, edge = cop_terms(mass, heel + margin, toe), cop_terms(mass, toe - TOE_BAND_M, toe)
     flat = Phase(
         "flat",
         COORDINATES,
         s.intervals[0],
         s.flat_s,
-        (*along, *reach_terms(mass, reach, s, False), inside),
+        (*along, *reach_terms(mass, reach, s, False), *inside),
         bounds,
         scales=SCALES,
     )
-    tip_terms = (*along, *reach_terms(mass, reach, s, True), edge, *takeoff_terms(mass, reach, s))
+    tip_terms = (*along, *reach_terms(mass, reach, s, True), *edge, *takeoff_terms(mass, reach, s))
     tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip_terms, (box,), scales=SCALES)
     return flat, tip
 

@@ -11,9 +11,9 @@ class SrmpSettings:
 
     intervals: tuple[int, int, int] = (28, 12, 40)  # flat foot, toe, flight
     friction: float = 0.45  # as in stage 3
-    cop_margin_m: float = 0.015  # inside the sole's edges
+    cop_margin_m: float = 0.015  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot part of the launch, as in stage 3
-    toe_s: tuple[float, float] = (0.10, 0.15)  # duration of its toe part (heel up, CoP at the toe), as in stage 3
+    toe_s: tuple[float, float] = (0.12, 0.12)  # of its toe part (heel up); fixed, since the cost hardly feels it
     posture_end: tuple[float, float] = (0.2, 0.8)  # trunk at take-off [rad]: leaning into the jump, so it bends first
     speed_share: float = 0.95  # of the extension speed: the foot's own rotation, not counted there, helps
     corner_speed: float = 0.5  # share of the extension speed up to which the full leg force is there

@@ -83,15 +83,18 @@ def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> li
     return rows
 
 
-def cop_term(mass: float, low: float, high: float) -> Term:
+def cop_terms(mass: float, low: float, high: float) -> list[Term]:
     """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0."""
 
     def room(p):
         f, torque = srmp_state(p, mass).ground_force, srmp_state(p, mass).pivot_torque
         return ca.vertcat(-torque - low * f[1], high * f[1] + torque)
 
-    return Term("CoP", "SL-P2, times F_z", "N m", "node", room, lower=0.0, upper=np.inf, scale=0.1 * mass * GRAVITY,
-                skip=(0, 1))  # fmt: skip
+    scale = 0.1 * mass * GRAVITY
+    return [
+        Term("CoP", "SL-P2, times F_z", "N m", "node", room, lower=0.0, upper=np.inf, scale=scale, skip=(0, 1)),
+        Term("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, lower=0.0, upper=np.inf, scale=scale),
+    ]
 
 
 def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:

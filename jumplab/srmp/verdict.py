@@ -21,7 +21,7 @@ from jumplab.task import JumpTask
 SWING_GAIN = 1.06  # our choice: the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
 DIP_M_S = 1.0  # our choice: downward speed in the crouch that a push may start from; 0.64 was seen to matter
 STROKE_POINTS = 200  # our choice: the push's quadrature is exact to 1e-3 m/s
-GRID = (41, 61)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 1 %
+GRID = (41, 121)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 1 %
 CHECK_STEP_M = 0.01  # our choice: nearest numbers are told in steps of a centimetre
 
 
@@ -82,9 +82,9 @@ def farthest(can: Capability, task: JumpTask) -> float:
     For every lean at take-off (CoM at x = phi sin(lean)) and horizontal speed v_x that satisfy
 
     * extension speed:  v_z cos(lean) + v_x sin(lean) <= speed;
-    * falling forward about the trailing edge X of the sole, weight first, then push, and what the flight's own turn
-      L = rho_max (lean + touchdown lean) / t_f  leaves:
-      v_x cos(lean) - v_z sin(lean) <= sqrt(g / phi) (x + |X|) + |X| (v_z + dip) / phi + L / (m phi);
+    * falling over the trailing edge X of the sole, plus what the flight's own turn  L = rho_max (lean + touchdown lean)
+      / t_f  leaves, plus, only backward, where the last push is on that edge too, the push's lever:
+      v_x cos(lean) - v_z sin(lean) <= sqrt(g / phi) (x + |X|) + L / (m phi) + (|X| (v_z + dip) / phi);
     * friction, the CoM starting behind the pivot by |X| at most:  v_x <= mu (v_z + dip) + sqrt(2 mu g (x + |X|)), and
       over the longest launch T  v_x <= mu (v_z + g T),
 
@@ -105,8 +105,10 @@ def farthest(can: Capability, task: JumpTask) -> float:
     left = v_z**2 + 2 * g * drop
     t_f = (v_z + np.sqrt(np.maximum(left, 0.0))) / g
     turn = lean + np.arcsin(np.minimum(lead / can.takeoff_length, 1.0))
-    fall = math.sqrt(g / can.takeoff_length) * (x + edge) + edge * (v_z + DIP_M_S) / can.takeoff_length
+    fall = math.sqrt(g / can.takeoff_length) * (x + edge)
     fall = fall + can.envelope.inertia[1] * turn / (t_f * can.mass * can.takeoff_length)
+    if not ahead:
+        fall = fall + edge * (v_z + DIP_M_S) / can.takeoff_length
     fits &= v_x * np.cos(lean) - v_z * np.sin(lean) <= fall
     return max(float(np.max(np.where(fits & (left >= 0), x + v_x * t_f + lead, 0.0))), 0.0)
 
@@ -183,6 +185,11 @@ def check_reachable(task: JumpTask, envelope: Reach, robot: Robot, settings: Srm
 
 def _check_height(task: JumpTask, can: Capability, name: str) -> None:
     limit = highest(can)
+    if limit < CHECK_STEP_M:
+        raise InfeasibleError(
+            f"height = {task.height_m:g} m: {name} cannot leave the ground, its legs give {can.mean_force:.0f} N on "
+            f"average for a weight of {can.mass * can.gravity:.0f} N; give it stronger joints or less gravity"
+        )
     if task.height_m > limit:
         raise InfeasibleError(
             f"height = {task.height_m:g} m: take-off at {task.takeoff_speed:.2f} m/s, on average "

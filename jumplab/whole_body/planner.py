@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jumplab.errors import InfeasibleError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
 from jumplab.solver import Nlp, PhaseGuess, Solution
@@ -50,6 +51,18 @@ def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> 
     return task.distance_m + robot.sagittal.heel[0] - limits.edge_before_heel_m
 
 
+def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> None:
+    """Refuse a step up or down that the launching or the landing sole would stand across (:class:`InfeasibleError`)."""
+    if task.platform_m == 0:
+        return
+    least = 2 * limits.edge_before_heel_m - robot.sagittal.heel[0]
+    if task.distance_m < least:
+        raise InfeasibleError(
+            f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet under "
+            f"a sole of {robot.name}; ask for a distance of {least:.2f} m or more (backward jumps only on the level)"
+        )
+
+
 class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target."""
 
@@ -68,7 +81,8 @@ class WholeBodyPlanner:
         return WholeBodyPlan(task, self.nlp.solve(parameters, guess, references=references, weights=weights, off=off))
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
-        """Parameter values of the problem for a target."""
+        """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
+        check_platform(task, self.robot, self.limits)
         edge = platform_edge_m(task, self.robot, self.limits) - np.sign(task.platform_m) * self.limits.edge_step_m
         values = dict(stance=self.stance, distance=task.distance_m, platform=task.platform_m, edge=edge,
                       takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip

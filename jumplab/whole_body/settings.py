@@ -12,7 +12,7 @@ class Limits:
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
     friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
-    cop_margin_m: float = 0.01  # inside the sole's edges while the foot is flat
+    cop_margin_m: float = 0.01  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     range_margin_rad: float = 0.03  # to the joint stops
     hand_clearance_m: float = 0.05  # above the ground in launch
     edge_clearance_m: float = 0.07  # of hand, mid-arm and knee before a platform's edge

@@ -132,7 +132,7 @@ class WholeBodyTerms:
 
         def cop(p):
             f = self.wrench(p)
-            return ca.vertcat(f[2] - margin * f[1], (-heel - margin) * f[1] - f[2])
+            return ca.vertcat(f[2], (-heel - margin) * f[1] - f[2])  # CoP behind the toe, ahead of the heel
 
         rows = []
         for at in ("node", "mid"):
