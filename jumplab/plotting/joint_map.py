@@ -55,8 +55,8 @@ def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> 
     body, place = Silhouette(robot), 0.0
     for phase, count in (("launch", FRAMES_LAUNCH), ("flight", FRAMES_FLIGHT)):
         color, rows = PHASE_COLORS[phase], plan.rows(phase)
-        left = place - PITCH_M / 2
-        for k in np.linspace(rows.start, rows.stop - 1, count).astype(int):
+        left, again = place - PITCH_M / 2, int(phase == "flight")  # the launch has shown take-off already
+        for k in np.linspace(rows.start, rows.stop - 1, count + again).astype(int)[again:]:
             _frame(ax, body, plan.q[k], place, color, text=f"{plan.t[k]:.2f} s")
             place += PITCH_M
         right = place - PITCH_M / 2

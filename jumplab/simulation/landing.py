@@ -24,8 +24,9 @@ WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns a
 CONTACT_FORCE_N = 10.0  # our choice: a foot stands if it carries more than 2.5 % of the weight ...
 CONTACT_HOLD_S = 0.008  # ... and for so long after it last did; flicker of the flag makes robots fall
 NEAR_GROUND_M = 0.02  # our choice: a foot that bounced less than this is pressed down again, not swung
-SOLE_SHARE = 0.95, 0.5  # our choice: share of the sole's length and width for the wished CoP; two feet far apart need no
-# more width, and with 0.95 a perturbed robot rolls onto the edges of its soles and falls aside in 7 % of the trials
+# our choice: share of the sole's length and width for the wished CoP. All of the length, for the disturbed landings;
+# half of the width: two feet far apart need no more, and 0.95 lets perturbed robots roll onto an edge (7 % fell)
+SOLE_SHARE = 0.95, 0.5
 PLANNED_FRICTION = 0.45  # our choice: below the lowest floor friction of the perturbed trials, 0.5
 NOMINAL_INERTIA = 5.0  # [kg m^2] our choice: pitch inertia of the landed robot, turns a momentum rate into rad/s^2
 STOP_MARGIN_RAD = 0.05  # our choice: a stop is respected this far before it
@@ -53,7 +54,7 @@ class LandingGains:
     trunk_rate: float = 7.0
     foot_rate: float = 25.0
     posture_rate: float = 8.0
-    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
+    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)  # z: a late push meets the end of the knee's stroke
     momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
     trunk_weight: float = 0.5
     foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning

@@ -146,7 +146,7 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
         Bound("at rest (acceleration)", "standing", "1/s^2", "a", 0.0, 0.0, "end"),
     )  # fmt: skip
     phase = Phase("landing", COORDINATES, settings.intervals, settings.duration_s,
-                  (*shared, sole, *_own_terms(mass, envelope, settings)), bounds, scales=SCALES)  # fmt: skip
+                  (*shared, *sole, *_own_terms(mass, envelope, settings)), bounds, scales=SCALES)  # fmt: skip
     return Problem("landing", (phase,), (), dict(start=4, rates=2, L=1, gravity=1))
 
 
