@@ -16,12 +16,13 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.srmp.settings import SrmpSettings
-from jumplab.task import JumpTask
+from jumplab.task import MAX_HEIGHT_M, JumpTask
 
 SWING_GAIN = 1.06  # our choice: the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
 DIP_M_S = 1.0  # our choice: downward speed in the crouch that a push may start from; 0.64 was seen to matter
 STROKE_POINTS = 200  # our choice: the push's quadrature is exact to 1e-3 m/s
 GRID = (41, 121)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 1 %
+LOWEST_M = 0.02  # least CoM rise that a task may ask for
 CHECK_STEP_M = 0.01  # our choice: nearest numbers are told in steps of a centimetre
 
 
@@ -124,7 +125,7 @@ def highest_platform(can: Capability, height_m: float, distance_m: float) -> flo
     v_x = (abs(distance_m) + _trailing_edge(can, ahead)) / (rise_s + can.settings.capture_slope_s)
     lead = _lead(can, v_x, ahead)
     grid = np.linspace(0.0, can.takeoff_length + height_m, 400)  # our choice: steps of a few millimetres
-    room = can.takeoff_length + height_m - grid - np.array([_landing_height(can, p, lead) for p in grid])
+    room = can.takeoff_length + height_m - grid - _landing_height(can, grid, lead)
     return float(grid[room >= 0].max(initial=0.0))
 
 
@@ -143,7 +144,7 @@ def _lead(can: Capability, v_x, ahead: bool):
 def _landing_height(can: Capability, platform_m: float, lead):
     """Lowest CoM over the sole at touchdown [m]."""
     s = can.settings
-    leg = (s.touchdown_length[0] - s.touchdown_fold_per_m * max(0.0, platform_m)) * can.envelope.start[1]
+    leg = (s.touchdown_length[0] - s.touchdown_fold_per_m * np.maximum(0.0, platform_m)) * can.envelope.start[1]
     return np.sqrt(np.maximum(leg**2 - np.asarray(lead) ** 2, 0.0))
 
 
@@ -202,7 +203,7 @@ def _check_platform(task: JumpTask, can: Capability, name: str) -> None:
     limit = highest_platform(can, task.height_m, task.distance_m)
     if task.platform_m <= limit:
         return
-    heights = np.arange(task.height_m, highest(can), CHECK_STEP_M)
+    heights = _heights(can, task.height_m)
     enough = [h for h in heights if highest_platform(can, h, task.distance_m) >= task.platform_m]
     higher = f", or for a height of {_above(enough[0])} m" if enough else ""
     raise InfeasibleError(
@@ -216,7 +217,7 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     limit = farthest(can, task)
     if abs(task.distance_m) <= limit:
         return
-    heights = [h for h in np.arange(0.02, highest(can), CHECK_STEP_M) if task.platform_m <= highest_platform(can, h, 0)]
+    heights = [h for h in _heights(can, LOWEST_M) if task.platform_m <= highest_platform(can, h, task.distance_m)]
     best = max(((farthest(can, _at(task, h)), h) for h in heights), default=(0.0, task.height_m))
     more = (
         f"; farthest is {_below(best[0])} m, at a height of {best[1]:.2f} m" if best[0] > limit + CHECK_STEP_M else ""
@@ -229,6 +230,11 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     )
 
 
+def _heights(can: Capability, first: float) -> np.ndarray:
+    """CoM rises to look for a better number among [m]."""
+    return np.arange(first, min(highest(can), MAX_HEIGHT_M), CHECK_STEP_M)
+
+
 def _at(task: JumpTask, height_m: float) -> JumpTask:
     return replace(task, height_m=float(height_m))
 
@@ -239,7 +245,7 @@ def _check_rotation(task: JumpTask, can: Capability, name: str) -> None:
     if needed <= box:
         return
     heights = [
-        h for h in np.arange(task.height_m, highest(can), CHECK_STEP_M) if least_momentum(can, _at(task, h)) <= box
+        h for h in _heights(can, task.height_m) if least_momentum(can, _at(task, h)) <= box
     ]
     advice = f"ask for a height of {_above(heights[0])} m" if heights else "ask for fewer turns"
     raise InfeasibleError(
