@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import nbformat
@@ -197,7 +198,10 @@ def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
         f"sys.exit(main(['run', '-p', 'n=2']))"
     )
     env = os.environ | {"PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=env)
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore Ctrl-C
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, env=env, preexec_fn=heed
+    )
     try:
         wait_for(lambda: process.poll() is not None or (pid_file.exists() and pid_file.read_text()))
         process.send_signal(number)
@@ -291,7 +295,8 @@ def test_chain_runs_and_publishes(chain):
     assert len(tape.t) > 500 and summary["stages"]
     figures = [p for p in chain.figures.rglob("*") if p.is_file()]
     assert {p.suffix for p in figures} >= {".png", ".pdf"}
-    assert all(p.stat().st_size > 500 for p in figures)
+    least = {".png": 500, ".pdf": 500, ".txt": 40}  # bytes: a caption is a sentence
+    assert all(p.stat().st_size > least[p.suffix] for p in figures)
 
 
 def test_chain_lands_where_it_should(chain):

@@ -33,7 +33,7 @@ SAMPLE_S = 0.005  # our choice: a hundred samples and more over the landing
 class LandingSettings:
     """Weights and bounds of the landing; the paper prints none, all are our choice."""
 
-    intervals: int = 32  # steps of about 27 ms; halved, the CoM changes by less than a millimetre
+    intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by 2 cm at most (a slower rise)
     duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     press_share: float = 0.7  # of the weight, least vertical force: soles that are hardly loaded slip and tip
@@ -83,6 +83,16 @@ class LandingPlan:
             np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
         )
         return np.array([x, z]), np.array([dx, dz]), float(momentum)
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) [m/s^2] and dL/dt [N m] at ``time`` since touchdown; zero once the robot stands.
+
+        A controller that follows only :meth:`at` pushes with little more than the weight until it lags behind.
+        """
+        if time >= self.duration_s:
+            return np.zeros(2), 0.0
+        x, z, rate = (np.interp(time, self.t, column) for column in (*self.com_acceleration.T, self.L_rate))
+        return np.array([x, z]), float(rate)
 
 
 def _own_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:
@@ -189,7 +199,7 @@ class LandingPlanner:
         return dict(start=start, rates=np.array([dx, dz]) @ np.array([across / length, along]).T, L=touchdown.L)
 
     def _guess(self, data: dict) -> PhaseGuess:
-        """Sink and rise: Hermite curve of the leg length with the given speed, everything else straight to the stance."""
+        """Sink and rise: leg length and lean with the given speeds, everything else straight to the stance."""
         n, first, last = self.settings.intervals, data["start"], self.reach.start
         duration = 0.8  # our choice
         s = np.linspace(0, 1, n + 1)[:, None]

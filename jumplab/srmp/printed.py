@@ -51,7 +51,7 @@ class PrintedResult:
     task : the target.
     launch, flight : the solutions, or None; the flight is not tried if the launch failed.
     launch_status, flight_status : what the solver said; "not tried".
-    friction_used : greatest \\|F_x\\| / F_z of the launch where the ground pushes with a tenth of the weight or more [1].
+    friction_used : greatest |F_x / F_z| of the launch where the ground carries a tenth of the weight or more [1].
     lowest_force_n : least vertical ground force of the launch before take-off [N]; negative pulls on the ground.
     envelope_excess : greatest distance of the launch's inertia outside rho(phi) of the robot [kg m^2], 0 if inside.
     """
@@ -225,8 +225,8 @@ class PrintedSequence:
         """
         if task.platform_m:
             raise InputError(
-                f"platform = {task.platform_m:g} m: the printed t_f = 2 v/g knows only level ground; ask for 0 m, or use "
-                f"the joint problem"
+                f"platform = {task.platform_m:g} m: the printed t_f = 2 v/g knows only level ground; ask for 0 m, or "
+                f"use the joint problem"
             )
         t_f = task.flight_time()
         data = dict(start=self.reach.start, distance=task.distance_m, takeoff_speed=task.takeoff_speed, flight_time=t_f,

@@ -1,8 +1,8 @@
 """The state in which a landing begins: CoM, velocity and angular momentum right after the feet have met the ground.
 
 The impact is inelastic: both soles stop at once and stay, the joints exert no impulse. What is left of the velocity
-follows from the robot's mass matrix alone (no contact stiffness, no time step): of 3.3 m/s downward about a quarter goes
-with the feet and shanks, and the angular momentum jumps too. A reference that kept the CoM velocity of the flight
+follows from the robot's mass matrix alone (no contact stiffness, no time step): of 3.3 m/s downward about a quarter
+goes with the feet and shanks, and the angular momentum jumps too. A reference that kept the CoM velocity of the flight
 would be ahead of the robot by that much from its first instant on.
 """
 

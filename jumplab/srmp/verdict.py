@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError
+from jumplab.errors import InfeasibleError
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.srmp.settings import SrmpSettings
@@ -21,7 +21,7 @@ from jumplab.task import MAX_HEIGHT_M, JumpTask
 SWING_GAIN = 1.06  # our choice: the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
 DIP_M_S = 1.0  # our choice: downward speed in the crouch that a push may start from; 0.64 was seen to matter
 STROKE_POINTS = 200  # our choice: the push's quadrature is exact to 1e-3 m/s
-GRID = (41, 121)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 1 %
+GRID = (41, 121)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 2 %
 LOWEST_M = 0.02  # least CoM rise that a task may ask for
 CHECK_STEP_M = 0.01  # our choice: nearest numbers are told in steps of a centimetre
 
@@ -32,8 +32,8 @@ class Capability:
 
     Attributes
     ----------
-    speed : greatest speed along the leg at take-off [m/s]:  max over phi of min(v(phi), share S(phi)), times the swing's
-        gain, where m v dv = (min(F, F (S - v) / ((1 - corner) S)) - m g) dphi from rest in the deepest crouch.
+    speed : greatest speed along the leg at take-off [m/s]:  max over phi of min(v(phi), share S(phi)), times the
+        swing's gain, where  m v dv = (min(F, F (S - v) / ((1 - corner) S)) - m g) dphi  from rest in a deep crouch.
     stroke : leg stroke of the push, deepest crouch to longest leg at take-off [m].
     mean_force : average of F over the stroke [N].
     takeoff_length : longest leg at take-off [m].
@@ -117,9 +117,9 @@ def farthest(can: Capability, task: JumpTask) -> float:
 def highest_platform(can: Capability, height_m: float, distance_m: float) -> float:
     """Highest surface [m] that a CoM rise of ``height_m`` can land on.
 
-    Apex >= CoM over the bent landing leg:  phi + h >= platform + sqrt(leg(platform)^2 - a^2),  a the lead of the sole at
-    a speed of at most  v_x = (l + |X|) / (v_z / g + slope),  since  l = x + v_x t_f + a  with the CoM leaving the ground at
-    x not behind the trailing edge X of the sole.
+    Apex >= CoM over the bent landing leg:  phi + h >= platform + sqrt(leg(platform)^2 - a^2),  a the lead of the sole
+    at a speed of at most  v_x = (l + |X|) / (v_z / g + slope),  since  l = x + v_x t_f + a  with the CoM leaving the
+    ground at x not behind the trailing edge X of the sole.
     """
     rise_s, ahead = math.sqrt(2 * height_m / can.gravity), distance_m >= 0
     v_x = (abs(distance_m) + _trailing_edge(can, ahead)) / (rise_s + can.settings.capture_slope_s)
@@ -222,11 +222,11 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     more = (
         f"; farthest is {_below(best[0])} m, at a height of {best[1]:.2f} m" if best[0] > limit + CHECK_STEP_M else ""
     )
-    sign = "-" if task.distance_m < 0 else ""
+    way, sign = ("forward", "") if task.distance_m >= 0 else ("backward", "-")
     raise InfeasibleError(
         f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, {name} "
-        f"covers at most {sign}{_below(limit)} m (legs {can.speed:.2f} m/s along the lean at take-off, friction "
-        f"{can.settings.friction:g}); ask for {sign}{_below(limit)} m or less{more}"
+        f"covers at most {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at take-off, friction "
+        f"{can.settings.friction:g}); ask for {sign}{_below(limit)} m{more}"
     )
 
 
@@ -244,13 +244,12 @@ def _check_rotation(task: JumpTask, can: Capability, name: str) -> None:
     needed = least_momentum(can, task)
     if needed <= box:
         return
-    heights = [
-        h for h in _heights(can, task.height_m) if least_momentum(can, _at(task, h)) <= box
-    ]
+    heights = [h for h in _heights(can, task.height_m) if least_momentum(can, _at(task, h)) <= box]
     advice = f"ask for a height of {_above(heights[0])} m" if heights else "ask for fewer turns"
     raise InfeasibleError(
         f"rotation = {math.degrees(task.rotation_rad):g} deg: {_airtime(can, task):.2f} s in the air need an angular "
-        f"momentum of at least {needed:.0f} kg m^2/s even with all limbs drawn in; stage 1 allows {name} {box:g}; {advice}"
+        f"momentum of at least {needed:.0f} kg m^2/s even with all limbs drawn in; stage 1 allows {name} {box:g}; "
+        f"{advice}"
     )
 
 
