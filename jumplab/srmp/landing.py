@@ -33,7 +33,7 @@ SAMPLE_S = 0.005  # our choice: a hundred samples and more over the landing
 class LandingSettings:
     """Weights and bounds of the landing; the paper prints none, all are our choice."""
 
-    intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by 2 cm at most (a slower rise)
+    intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by less than 5 mm
     duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     press_share: float = 0.7  # of the weight, least vertical force: soles that are hardly loaded slip and tip

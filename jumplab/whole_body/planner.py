@@ -58,8 +58,9 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
     least = 2 * limits.edge_before_heel_m - robot.sagittal.heel[0]
     if task.distance_m < least:
         raise InfeasibleError(
-            f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet under "
-            f"a sole of {robot.name}; ask for a distance of {least:.2f} m or more (backward jumps only on the level)"
+            f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
+            f"under a sole of {robot.name}; ask for a distance of {least:.2f} m or more (backward jumps only on the "
+            f"level)"
         )
 
 
