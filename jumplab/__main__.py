@@ -50,7 +50,9 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="execute all notebooks: plan, audit, simulation, figures",
                               parents=[common, target])  # fmt: skip
     run.add_argument("--out", metavar="DIR", help="results and executed notebooks (default: executed/ in the checkout)")
-    run.add_argument("--figures", metavar="DIR", help="figures (default: figures/ in the checkout)")
+    run.add_argument(
+        "--figures", metavar="DIR", help="figures (default: DIR/figures with --out, else figures/ in the checkout)"
+    )
     run.add_argument("-p", "--parameter", action="append", default=[], metavar="NAME=VALUE",
                      help="any further parameter that a notebook declares; may be repeated")  # fmt: skip
     run.set_defaults(work=_run)

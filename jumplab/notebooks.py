@@ -154,7 +154,8 @@ def run_notebooks(
     ----------
     parameters : name -> value, for instance ``{"distance_m": 0.8}``.
     out : result folder; ``executed`` in the checkout if None.
-    figures : folder of the figures; if None, ``figures`` in the checkout, or in ``out`` where that is read-only.
+    figures : folder of the figures; if None, ``figures`` in ``out`` if that is given, else in the checkout (or in its
+        result folder where the checkout is read-only).
     notebooks : which ones; all of the package's if None.
     progress : show a bar per notebook on stderr.
 
@@ -170,7 +171,10 @@ def run_notebooks(
     declared = {n: declared_parameters(n) for n in notebooks}
     values = _checked(dict(parameters or {}), set().union(*declared.values()))
     root = notebooks[0].parent.parent
-    out = store.ensure_writable(root / "executed" if out is None else out).resolve()
+    asked = out is not None
+    out = store.ensure_writable(out if asked else root / "executed").resolve()
+    if figures is None and asked:
+        figures = out / "figures"
     figures = _figures_folder(figures, root, out)
     with _workshop(out) as work:
         for i, notebook in enumerate(notebooks, start=1):

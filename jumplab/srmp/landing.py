@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from jumplab.errors import SolverError
 from jumplab.models.srmp import COORDINATES
 from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach
@@ -20,7 +21,7 @@ from jumplab.solver import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.srmp.planner import launch_function
 from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.terms import cop_terms, launch_terms, srmp_state
-from jumplab.srmp.touchdown import Touchdown
+from jumplab.srmp.touchdown import Touchdown, touchdown_of_state
 from jumplab.task import GRAVITY
 from jumplab.terms import Bound, Phase, Point, Problem, Term
 
@@ -185,6 +186,13 @@ class LandingPlanner:
         solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": guess or self._guess(data)})
         phase = solution.phases["landing"]
         return _sample(phase, touchdown, solution.statistics, self._mass, gravity)
+
+    def catch(self, q: np.ndarray, v: np.ndarray) -> LandingPlan | None:
+        """Landing from a state of the full robot at the first touch, None if there is none; see :meth:`plan`."""
+        try:
+            return self.plan(touchdown_of_state(self.robot, q, v))
+        except SolverError:
+            return None
 
     def _parameters(self, touchdown: Touchdown) -> dict:
         (x, z), (dx, dz) = touchdown.com, touchdown.com_velocity
