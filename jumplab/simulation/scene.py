@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from jumplab.errors import InputError
+from jumplab.robot import Robot
 
 REACH_M = 20.0  # our choice: half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # our choice: deeper than any contact can push a foot in one step
@@ -48,6 +51,15 @@ class Scene:
         if x_from <= 0 or height <= 0:
             raise InputError(f"platform at {x_from:g} m, {height:g} m high: both numbers must be positive")
         return cls("platform", (Block(-REACH_M, REACH_M), Block(x_from, REACH_M, height, height)))
+
+    @classmethod
+    def of_plan(cls, summary: Mapping[str, Any], robot: Robot) -> Scene:
+        """The ground that a plan was made for, from its ``summary``: flat, or two levels that meet at the edge."""
+        top = summary["target"]["platform_m"]
+        if top == 0:
+            return cls.flat()
+        edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
+        return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)))
 
     def top_at(self, x: float) -> float:
         """Height of the highest surface at ``x`` [m]."""

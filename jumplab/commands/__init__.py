@@ -1,0 +1,8 @@
+"""One module per command of the command line; each declares its options in ``add`` and does its work.
+
+A command imports the heavy libraries only once its input has been read, so that a mistake is told at once.
+"""
+
+from jumplab.commands import audit, plan, run, simulate
+
+COMMANDS = (run, plan, simulate, audit)  # in the order of ``jumplab --help``
