@@ -24,6 +24,7 @@ class SrmpSettings:
     inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
     inertia_accel: float = 600.0  # box on d^2 rho/dt^2
     touchdown_inertia_rate: float = 8.0  # the limbs come nearly to rest before touchdown
+    touchdown_lean: float = 1.0  # [rad] at most, either way; plans have 0.4; without it one landed on its head
     touchdown_length: tuple[float, float] = (0.92, 0.97)  # share of the standing phi: knees bent by about 0.7 rad
     touchdown_fold_per_m: float = 0.35  # lower share per metre of platform: legs folded to reach it
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown, offset + slope v_x, as in stage 3
@@ -38,5 +39,5 @@ class SrmpSettings:
     touchdown_inertia: tuple[float, float] = (-0.3, 0.5)  # around the usual inertia at the touchdown leg length
     w_turn: float = 0.5  # SL-J4
     w_time: float = 0.5  # SL-J5
-    w_inertia_accel: float = 1e-4  # SF-J1
+    w_inertia_accel: float = 5e-4  # SF-J1; less leaves L undecided: 1e-4 lets it wander by 0.3 % with the mesh
     w_inertia_jerk: float = 1e-7  # SF-J1

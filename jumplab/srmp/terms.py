@@ -10,7 +10,9 @@ from jumplab.robot.reach import Reach
 from jumplab.srmp.settings import SrmpSettings
 from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
+from jumplab.transcription import chain
 
+QUARTERS = (0.25, 0.5, 0.75)
 GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
 
 
@@ -77,18 +79,27 @@ def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> li
         com = srmp_state(p, mass).com
         return com[1] - slope * com[0] - offset
 
+    def between(left, right, step):
+        # the CoM only touches this limit, at the bottom of the crouch: with nodes alone it would pass between two
+        inside = [chain(left.q, left.v, left.a, left.j, share * step)[0] for share in QUARTERS]
+        return ca.vertcat(*(q[1] * (ca.cos(q[0]) - slope * ca.sin(q[0])) - offset for q in inside))
+
     rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
     if not heel_up:
-        rows.append(Term("CoM not too low", "ours: flat feet", "m", "node", height, lower=0.0, upper=np.inf, scale=0.1))
+        for name, at, room in (("CoM not too low", "node", height), ("CoM not too low (between)", "interval", between)):
+            rows.append(Term(name, "ours: flat feet", "m", at, room, lower=0.0, upper=np.inf, scale=0.1))
     return rows
 
 
-def cop_terms(mass: float, low: float, high: float) -> list[Term]:
-    """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0."""
+def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[Term]:
+    """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0.
+
+    ``slack`` [N m] is allowed on either side; it matters only where F_z vanishes.
+    """
 
     def room(p):
         f, torque = srmp_state(p, mass).ground_force, srmp_state(p, mass).pivot_torque
-        return ca.vertcat(-torque - low * f[1], high * f[1] + torque)
+        return ca.vertcat(slack - torque - low * f[1], slack + high * f[1] + torque)
 
     scale = 0.1 * mass * GRAVITY
     return [
@@ -133,9 +144,7 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
     def rotation(left, right, step):
         total = 0
         for share, weight in GAUSS:
-            h = share * step
-            rho = left.q + h * left.v + h**2 / 2 * left.a + h**3 / 6 * left.j
-            total += weight * left.c.L / rho
+            total += weight * left.c.L / chain(left.q, left.v, left.a, left.j, share * step)[0]
         return right.z - left.z - step * total
 
     def usual(p):
@@ -153,6 +162,10 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
         Term("inertia rate at touchdown", "ours", "kg m^2/s", "end", lambda p: p.v, lower=-s.touchdown_inertia_rate,
              upper=s.touchdown_inertia_rate, scale=10.0),
         Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", _touchdown_height),
+        Term("falling at touchdown", "ours: not on the way up", "m/s", "end",
+             lambda p: p.c.vel_z - p.p.gravity * p.duration, lower=-np.inf, upper=0.0),
+        Term("lean at touchdown", "ours: foot below the CoM", "rad", "end", lambda p: p.z[0] - p.p.rotation,
+             lower=-s.touchdown_lean, upper=s.touchdown_lean),
     ]  # fmt: skip
 
 
