@@ -207,7 +207,8 @@ class Nlp:
 
     # solving ----------------------------------------------------------------------------------------------------
     def solve(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], *, references: Mapping | None = None,
-              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> Solution:  # fmt: skip
+              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
+              explain: bool = True) -> Solution:  # fmt: skip
         """Solve for one target.
 
         Parameters
@@ -217,6 +218,7 @@ class Nlp:
         references : phase name -> reference name -> (size, N + 1).
         weights : term name (or "phase/name") -> weight, instead of the term's own.
         off : names of terms and bounds to leave out.
+        explain : look for the terms in conflict if there is no solution; it costs about as much as the solve.
 
         Raises
         ------
@@ -240,7 +242,7 @@ class Nlp:
         residual = float(np.max(beyond, initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         status = stats["return_status"]
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            self._fail(status, stats["iter_count"], x0, p, (low, high), (row_low, row_high))
+            self._fail(status, stats["iter_count"], x0, p, (low, high), (row_low, row_high) if explain else None)
         statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
                                 float(answer["f"]), residual)  # fmt: skip
         return Solution(self.problem, self._unpack(x), statistics, self._cost_shares(x, p),
@@ -271,6 +273,9 @@ class Nlp:
 
     def _fail(self, status, iterations, x0, p, box, rows):
         """Re-solve with every row softened, and say which terms cannot be met together, where and by how much."""
+        if rows is None:
+            raise SolverError(f"{self.problem.name}: no plan ({status} after {iterations} iterations)",
+                              stage=self.problem.name, status=status)  # fmt: skip
         x, beyond = least_violation(self.assembled, x0, p, box, rows)
         worst: dict[tuple, tuple] = {}
         phases = self._unpack(x)

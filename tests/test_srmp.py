@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fixtures_core import pendulum, srmp_planner
 
-from jumplab.errors import InfeasibleError, InputError
+from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot.reach import reach
 from jumplab.srmp import SYMMETRY_OFF, SrmpPlanner, SrmpSettings, build_problem
 from jumplab.srmp.terms import GAUSS, flight_terms
@@ -328,3 +328,10 @@ def test_platform_above_the_apex_is_refused_before_solving():
     """A rise of 0.3 m cannot land on 0.9 m, whatever the legs do: refused, with the height that would do."""
     with pytest.raises(InfeasibleError, match=r"a height of 0\.\d+ m"):
         srmp_planner().plan(JumpTask(0.6, 0.3, 0.9))
+
+
+@pytest.mark.slow
+def test_just_beyond_the_robot_is_refused_with_a_target_that_has_a_plan():
+    words = r"take-off speed by .*; the same target with a height of 0\.63 m can be planned$"
+    with pytest.raises(SolverError, match=words):
+        srmp_planner().plan(JumpTask(0.53, 0.67, -0.17))

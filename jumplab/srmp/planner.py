@@ -6,10 +6,12 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
+from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.solver import Nlp, PhaseGuess, Solution
+from jumplab.srmp.nearest import nearest
 from jumplab.srmp.plan import SrmpFlight, SrmpLaunch, SrmpPlan
 from jumplab.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.srmp.settings import SrmpSettings
@@ -63,11 +65,17 @@ class SrmpPlanner:
         InfeasibleError
             Before solving, if closed forms already say that the robot cannot do it.
         SolverError
-            If there is no solution; names the violated terms.
+            If there is no solution; names the violated terms, and a target close by that has one.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
+        try:
+            return self._solve(task, guess, weights, off)
+        except SolverError as failure:
+            raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
+
+    def _solve(self, task: JumpTask, guess, weights, off, explain=True) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
-        solution = self.nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off)
+        solution = self.nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off, explain=explain)
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
 
 
