@@ -21,6 +21,7 @@ from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
+GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
 
 
 @dataclass(frozen=True)
@@ -141,19 +142,23 @@ class Planner:
             check_reachable(task, self._stage("reach"), self.robot)
             planner = self._stage("direct")
             body = planner.plan(task)
-            rows = (_row("direct", body.solution.statistics),)
+            rows = _body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         first, last = self._stage("srmp"), self._stage("whole body")
         srmp = first.plan(task)
         joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
-        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints),
-                _row("3 whole body", body.solution.statistics))  # fmt: skip
+        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *_body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
 
 
 def _row(stage: str, s: Statistics) -> StageRow:
     return StageRow(stage, s.iterations, s.build_s, s.solve_s)
+
+
+def _body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+    fine = _row(stage, body.solution.statistics)
+    return (fine,) if body.coarse is None else (_row(f"{stage}, coarse", body.coarse), fine)
 
 
 def _joint_row(joints: JointPlan) -> StageRow:
@@ -172,6 +177,8 @@ def guess_from_joints(
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles."""
     robot = planner.robot
     angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)
+    for values in (angles, rates, accels):
+        values[:, -1] *= GUESS_ARM_SHARE
     takeoff = int(np.argmax(joints.phase == "flight"))
     rel = planar_quantities(robot, angles, rates, accels, np.zeros((len(angles), 2)), task.gravity)
     return planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s,

@@ -22,6 +22,19 @@ class PhaseGuess:
     z: np.ndarray | None = None
     constants: dict = field(default_factory=dict)
 
+    def resampled(self, intervals: int) -> PhaseGuess:
+        """The same guess at the nodes of another mesh, by straight lines between its own."""
+        if len(self.q) == intervals + 1:
+            return self
+        old, new = np.linspace(0, 1, len(self.q)), np.linspace(0, 1, intervals + 1)
+
+        def at_nodes(x):
+            if x is None:
+                return None
+            return np.array([np.interp(new, old, column) for column in x.T]).reshape(x.shape[1], -1).T
+
+        return PhaseGuess(self.duration, *(at_nodes(x) for x in (self.q, self.v, self.a, self.z)), self.constants)
+
 
 @dataclass(frozen=True)
 class PhaseSolution:

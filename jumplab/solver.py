@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from copy import copy
 
 import casadi as ca
 import numpy as np
@@ -44,13 +45,22 @@ class Nlp:
 
     def __init__(self, problem: Problem, options: Mapping | None = None):
         began = time.perf_counter()
-        self.problem = problem
-        self.assembled = a = Assembled(problem)
-        ipopt = {**IPOPT, **(options or {})}
-        nlp = {"ipopt": ipopt, "print_time": False, "error_on_fail": False, "grad_f": a.grad_f, "jac_g": a.jac_g,
-               "hess_lag": a.hess_lag}  # fmt: skip
-        self._solver = ca.nlpsol("solver", "ipopt", a.nlp, nlp)
+        self.problem, self.assembled = problem, Assembled(problem)
+        self._solver = self._new_solver(options)
         self.build_s = time.perf_counter() - began
+
+    def with_options(self, options: Mapping) -> Nlp:
+        """The same problem, already built, under other options of ipopt."""
+        other = copy(self)
+        other._solver = self._new_solver(options)
+        return other
+
+    def _new_solver(self, options: Mapping | None):
+        a = self.assembled
+        return ca.nlpsol("solver", "ipopt", a.nlp, {
+            "ipopt": {**IPOPT, **(options or {})}, "print_time": False, "error_on_fail": False,
+            "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": a.hess_lag,
+        })  # fmt: skip
 
     def _check_weights(self, weights):
         costs = {name for owner, t in self.assembled.cost_terms for name in (t.name, f"{owner}/{t.name}")}

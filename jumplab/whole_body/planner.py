@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError
+from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
-from jumplab.solver import Nlp, PhaseGuess, Solution
+from jumplab.solver import Nlp, PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
 from jumplab.whole_body.problem import build_problem
@@ -22,12 +22,26 @@ POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0)
             "touchdown": (0.9, 0.15, 0.0, 0.2)}  # fmt: skip
 
 
+# our choice: the coarse solution is only a start, digits beyond these would be lost on the finer mesh
+COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
+# our choice: close to a solution, so keep to it; of three barriers the one with the fewest iterations
+WARM = {"mu_strategy": "monotone", "mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
+
+
 @dataclass(frozen=True)
 class WholeBodyPlan:
-    """Result of stage 3 or of the direct planner: the target and the solution (phases "flat", "toe", "flight")."""
+    """Result of stage 3 or of the direct planner.
+
+    Attributes
+    ----------
+    task : the target.
+    solution : on the planner's mesh; its phases are "flat", "toe" and "flight".
+    coarse : what the solve on the coarse mesh before it cost; None if there was none, or it found nothing.
+    """
 
     task: JumpTask
     solution: Solution
+    coarse: Statistics | None = None
 
     @property
     def launch_s(self) -> float:
@@ -65,21 +79,58 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
 
 
 class WholeBodyPlanner:
-    """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target."""
+    """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
+
+    A target is solved on a coarse mesh first and refined from there; ``refine=False`` solves on ``mesh`` at once.
+    """
 
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None):  # fmt: skip
+                 tracking: bool = True, options: Mapping | None = None, refine: bool = True):  # fmt: skip
         self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
         self.stance = stance_angles(robot)
-        self.nlp = Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), options)
+        options = dict(options or {})
+
+        def build(mesh: Mesh, extra: Mapping) -> Nlp:
+            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options})
+
+        self.nlp = build(mesh, {})
+        self._coarse = build(mesh.coarse(), COARSE) if refine else None
+        self._refined = self.nlp.with_options({**WARM, **options}) if refine else None
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
-        """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it. Raises :class:`SolverError`."""
-        references = self.references(srmp) if self.tracking else None
-        guess = guess or self.naive_guess(task)
-        parameters = self.parameters(task, srmp)
-        return WholeBodyPlan(task, self.nlp.solve(parameters, guess, references=references, weights=weights, off=off))
+        """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
+
+        Parameters
+        ----------
+        guess : start values on any mesh; those of :meth:`naive_guess` if None.
+        weights, off : as in :meth:`jumplab.solver.Nlp.solve`.
+
+        Raises
+        ------
+        SolverError
+            If there is no plan; names the terms in conflict.
+        """
+        how = {"weights": weights, "off": off}
+        guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
+        if self._coarse is not None:
+            try:
+                return self._refine(task, srmp, guess, parameters, how)
+            except SolverError:
+                pass  # the fine mesh has the last word, and the better explanation
+        start = {name: guess[name].resampled(n) for name, n in self.mesh.intervals().items()}
+        references = self.references(srmp, self.mesh)
+        return WholeBodyPlan(task, self.nlp.solve(parameters, start, references=references, **how))
+
+    def _refine(self, task, srmp, guess, parameters, how) -> WholeBodyPlan:
+        mesh = self.mesh.coarse()
+        start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
+        references = self.references(srmp, mesh)
+        first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
+        start = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
+        references = self.references(srmp, self.mesh)
+        solution = self._refined.solve(parameters, start, references=references, explain=False, **how)
+        return WholeBodyPlan(task, solution, first.statistics)
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
         """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
@@ -91,19 +142,21 @@ class WholeBodyPlanner:
             values |= dict(momentum=srmp.launch.L[-1], launch_s=[srmp.launch_s - srmp.toe_s, srmp.toe_s])
         return values
 
-    def references(self, srmp: SrmpPlan) -> dict[str, dict[str, np.ndarray]]:
-        """Stage 1's trajectories at this mesh's nodes, by share of each phase."""
+    def references(self, srmp: SrmpPlan | None, mesh: Mesh) -> dict[str, dict[str, np.ndarray]] | None:
+        """Stage 1's trajectories at a mesh's nodes, by share of each phase; None if they are not tracked."""
+        if not self.tracking:
+            return None
         launch, flight, split = srmp.launch, srmp.flight, srmp.launch_s - srmp.toe_s
         out = {}
         for name, first, last, n in (
-            ("flat", 0.0, split, self.mesh.flat),
-            ("toe", split, srmp.launch_s, self.mesh.toe),
+            ("flat", 0.0, split, mesh.flat),
+            ("toe", split, srmp.launch_s, mesh.toe),
         ):
             t = np.linspace(first, last, n + 1)
             columns = {k: np.interp(t, launch.t, getattr(launch, k))[None] for k in ("rho", "rho_rate", "L")}
             velocity = [np.interp(t, launch.t, launch.com_velocity[:, i]) for i in range(2)]
             out[name] = columns | {"velocity": np.array(velocity)}
-        t = np.linspace(0, srmp.flight_s, self.mesh.flight + 1)
+        t = np.linspace(0, srmp.flight_s, mesh.flight + 1)
         out["flight"] = {k: np.interp(t, flight.t, getattr(flight, k))[None] for k in ("rho", "rho_rate")}
         return out
 

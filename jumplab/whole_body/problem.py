@@ -49,8 +49,9 @@ def _flat_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
 
 
 def _toe_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
-    box = ANGLE_BOX_RAD
-    heel = Bound("heel not below ground", "WL-K2", "rad", "q", [0.0] + 4 * [-box], [limits.heel_up_rad] + 4 * [box])
+    # inner: at the first node the flat foot before it says so already, and a bound on top has multipliers without limit
+    low, high = [0.0] + 4 * [-ANGLE_BOX_RAD], [limits.heel_up_rad] + 4 * [ANGLE_BOX_RAD]
+    heel = Bound("heel not below ground", "WL-K2", "rad", "q", low, high, "inner")
     terms = b.smoothness(False) + b.limits_of_joints(False) + b.ground_contact() + b.toe_rows()
     return Phase("toe", LINKS, mesh.toe, limits.toe_s, tuple(terms), (heel,), scales=SCALES)
 

@@ -57,3 +57,11 @@ class Mesh:
     flat: int = 25
     toe: int = 20
     flight: int = 30
+
+    def intervals(self) -> dict[str, int]:
+        """By the names of the phases."""
+        return {"flat": self.flat, "toe": self.toe, "flight": self.flight}
+
+    def coarse(self) -> Mesh:
+        """Half as many intervals: where a solve begins before it is refined on this mesh."""
+        return Mesh(*(max(n // 2, 2) for n in (self.flat, self.toe, self.flight)))
