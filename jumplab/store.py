@@ -38,8 +38,10 @@ SCHEMA = "jumplab-result-1"
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 # Statements about one plan, which a new plan makes untrue and therefore removes.
-DERIVED = ("passport.json", "simulation.npz", "simulation.json", "plan.html", "jump.html")
-OF_SIMULATION = ("jump.html",)  # what a new simulation makes untrue
+OF_SIMULATION = ("jump.html", "simulated_joints.csv", "simulated_motion.npz", "simulated_motion_clip.npz",
+                 "simulated_replay")  # what a new simulation makes untrue  # fmt: skip
+DERIVED = ("passport.json", "simulation.npz", "simulation.json", "plan.html", "joints.csv", "motion.npz",
+           "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
 PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
 LOCK_WAIT_S = 20.0  # our choice: a write lasts well under a second, so a longer wait means that something hangs
 _STAGING, _COMMIT = ".staging", ".commit"
@@ -212,6 +214,8 @@ def _finish(folder: Path) -> None:
     if "simulation.npz" in names:
         stale |= set(OF_SIMULATION)
     for name in sorted(stale):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
         (folder / name).unlink(missing_ok=True)
     for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
         os.replace(commit / name, folder / name)
