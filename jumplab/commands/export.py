@@ -16,12 +16,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     export = commands.add_parser("export", help="a jump for other programs", parents=[common_options()])
     export.add_argument("dir", metavar="DIR", help="folder of a plan")
     export.add_argument("--format", choices=FORMATS, required=True,
-                        help="joint table at 1 kHz, plain arrays, clip for motion trackers, folder to replay")  # fmt: skip
+                        help="joint table at 1 kHz, arrays, clip for motion trackers, folder to replay")  # fmt: skip
     export.add_argument("--out", metavar="PATH", help="file, or folder of a urdf-replay (default: in DIR)")
     export.add_argument("--simulated", action="store_true", help="the simulated jump instead of the planned one")
     export.add_argument("--fps", default="50", metavar="N", help="frames per second of a motion-clip (default 50)")
     export.add_argument("--order", choices=ORDERS, default="depth-first",
-                        help="of joints and bodies in a motion-clip: MuJoCo's, or Isaac Lab's (breadth-first)")  # fmt: skip
+                        help="of joints and bodies in a clip: MuJoCo's, or Isaac Lab's (breadth-first)")  # fmt: skip
     export.set_defaults(work=_export)
 
 

@@ -29,15 +29,8 @@ def default_name(format_name: str, source: str) -> str:
     return FORMATS[format_name] if source == "plan" else f"simulated_{FORMATS[format_name]}"
 
 
-def write(
-    format_name: str,
-    motion: Motion,
-    robot: Robot,
-    path: str | Path,
-    *,
-    fps: float = CLIP_FPS,
-    order: str = "depth-first",
-) -> Path:
+def write(format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float = CLIP_FPS,
+          order: str = "depth-first") -> Path:  # fmt: skip
     """Write a motion in one of :data:`FORMATS`.
 
     Parameters
@@ -110,7 +103,8 @@ def plain_arrays(motion: Motion, robot: Robot, rate_hz: float = RATE_HZ) -> dict
 
 def _write_replay(motion: Motion, robot: Robot, path: Path) -> Path:
     """A folder with the URDF, the trajectory, and a script of ten lines that shows it."""
-    strangers = sorted(p.name for p in path.iterdir() if p.name not in REPLAY_FILES) if path.is_dir() else []
+    known = (*REPLAY_FILES, ".staging", ".commit")  # the last two are left by a writer that was killed
+    strangers = sorted(p.name for p in path.iterdir() if p.name not in known) if path.is_dir() else []
     if strangers:
         raise InputError(f"the folder {str(path)!r} already holds {strangers[0]!r}; choose a new or an empty one")
     script = (resources.files("jumplab.export") / "replay.py.txt").read_text(encoding="utf-8")
