@@ -8,7 +8,9 @@ turn, Isaac Lab level by level. Our clips carry the names as well, and either or
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, fields
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -98,34 +100,34 @@ def motion_clip(motion: Motion, robot: Robot, *, fps: float = 50.0, order: str =
 
 def body_names(robot: Robot, order: str = "depth-first") -> tuple[str, ...]:
     """Names of all links in one of :data:`ORDERS`; the base link first."""
-    model = robot.model
-    bodies = [i for i, frame in enumerate(model.frames) if frame.type == pin.FrameType.BODY]
-    return tuple(model.frames[i].name for i in _sorted(bodies, [_depth(robot, i) for i in bodies], order))
+    return tuple(link for link, _ in _walk(robot, order))
 
 
 def joint_order(robot: Robot, order: str = "depth-first") -> tuple[str, ...]:
     """Names of the actuated joints in one of :data:`ORDERS`."""
-    model = robot.model
-    frames = [model.getFrameId(name, pin.FrameType.JOINT) for name in robot.joint_names]
-    return tuple(model.frames[i].name for i in _sorted(frames, [_depth(robot, i) for i in frames], order))
+    return tuple(joint for _, joint in _walk(robot, order) if joint in robot.joint_names)
 
 
-def _sorted(frames: list[int], depth: list[int], order: str) -> list[int]:
-    """Pinocchio numbers frames depth first; level by level is the same list, sorted by depth alone."""
+def _walk(robot: Robot, order: str) -> list[tuple[str, str | None]]:
+    """Every link with the joint above it. Siblings come as the URDF lists them; Pinocchio sorts them by name."""
     if order not in ORDERS:
         raise InputError(f"order {order!r}: must be {' or '.join(ORDERS)}")
-    if order == "depth-first":
-        return frames
-    return [frames[i] for i in np.argsort(depth, kind="stable")]
-
-
-def _depth(robot: Robot, frame: int) -> int:
-    """How many links lie between a frame and the world."""
-    model, depth = robot.model, 0
-    while frame:
-        depth += model.frames[frame].type == pin.FrameType.BODY
-        frame = model.frames[frame].parentFrame
-    return depth
+    tree = ElementTree.fromstring(robot.urdf)
+    below: dict[str, list[tuple[str, str | None]]] = {}
+    for joint in tree.iterfind("joint"):
+        parent, child = joint.find("parent").get("link"), joint.find("child").get("link")
+        below.setdefault(parent, []).append((child, joint.get("name")))
+    children = {link for pairs in below.values() for link, _ in pairs}
+    waiting = deque((link.get("name"), None) for link in tree.iterfind("link") if link.get("name") not in children)
+    out = []
+    while waiting:
+        out.append(waiting.popleft())
+        found = below.get(out[-1][0], [])
+        if order == "depth-first":
+            waiting.extendleft(reversed(found))
+        else:
+            waiting.extend(found)
+    return out
 
 
 def _steady(quaternions: np.ndarray) -> np.ndarray:
