@@ -178,10 +178,10 @@ def plan(tmp_path_factory):
     """A plan on file, with a simulation that stands still."""
     folder, p = tmp_path_factory.mktemp("plan"), jump(1.0, 0.5)
     store.write_plan(folder, p.tape, p.robot, p.summary)
-    n, robot = 30, p.robot
+    n, nv = 30, p.robot.model.nv
     np.savez(folder / "simulation.npz", schema=np.array("jumplab-simulation-1"), t=np.arange(n) / 1000,
-             q=np.repeat(p.tape.q[:1], n, axis=0), v=np.zeros((n, robot.model.nv)), tau=np.ones((n, robot.model.nv - 6)),
-             phase=np.array(["landing"] * n), joint_names=np.array(robot.joint_names))  # fmt: skip
+             q=np.repeat(p.tape.q[:1], n, axis=0), v=np.zeros((n, nv)), tau=np.ones((n, nv - 6)),
+             phase=np.array(["landing"] * n), joint_names=np.array(p.robot.joint_names))  # fmt: skip
     return folder
 
 
