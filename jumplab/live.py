@@ -26,6 +26,7 @@ from jumplab.task import JumpTask
 T = TypeVar("T")
 SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that somebody has opened
 DISTANCE_M, HEIGHT_M, STEP_M = (-0.4, 1.2), (0.1, 0.6), 0.05  # our choice: what the sliders offer, mostly within reach
+WIDE = {"description_width": "initial"}  # names are shown in full
 TURNS = {"backflip": -2 * math.pi, "none": 0.0, "front flip": 2 * math.pi}
 
 
@@ -76,11 +77,13 @@ def explore_stage1(planner: SrmpPlanner, task: JumpTask) -> Any:
     def slider(text: str, value: float, limits: tuple[float, float]) -> widgets.FloatSlider:
         low, high = min(limits[0], value), max(limits[1], value)
         return widgets.FloatSlider(
-            value=value, min=low, max=high, step=STEP_M, description=text, continuous_update=False, readout_format=".2f"
+            value=value, min=low, max=high, step=STEP_M, description=text, style=WIDE, continuous_update=False
         )
 
     distance, height = slider("distance [m]", task.distance_m, DISTANCE_M), slider("rise [m]", task.height_m, HEIGHT_M)
-    turn = widgets.SelectionSlider(options=list(TURNS), value="none", description="rotation", continuous_update=False)
+    turn = widgets.SelectionSlider(
+        options=list(TURNS), value="none", description="rotation", style=WIDE, continuous_update=False
+    )
 
     def show(distance_m: float, height_m: float, rotation: str) -> None:
         picture = _picture_or_refusal(planner, JumpTask(distance_m, height_m, rotation_rad=TURNS[rotation]))

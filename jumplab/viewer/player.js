@@ -82,6 +82,7 @@ const middle = [(facts.view.x[0] + facts.view.x[1]) / 2, (facts.view.z[0] + fact
 const size = [facts.view.x[1] - facts.view.x[0], facts.view.z[1] - facts.view.z[0], facts.view.width];
 const opening = (24 * Math.PI) / 180;
 function look() {
+  if (!innerWidth || !innerHeight) return; // a frame that is not on the page yet
   const aspect = innerWidth / innerHeight, free = Math.max(0.3, 1 - 150 / innerHeight); // below the title, above the bar
   const [yaw, pitch] = { side: [0, 0.1], corner: [-0.75, 0.3], front: [Math.PI / 2, 0.15] }[byId("view").value];
   const [c, s] = [Math.abs(Math.cos(yaw)), Math.abs(Math.sin(yaw))];
