@@ -46,13 +46,26 @@ def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterat
     total : how many there are, where ``len(items)`` does not tell.
     """
     if watched():
-        from tqdm.notebook import tqdm
+        yield from _notebook_bar(items, label, total)
     elif sys.stderr is not None and sys.stderr.isatty():
         from tqdm import tqdm
+
+        yield from tqdm(items, desc=label, total=total, leave=False)
     else:
         yield from items
-        return
-    yield from tqdm(items, desc=label, total=total, leave=False)
+
+
+def _notebook_bar(items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
+    """A bar of the browser; at the end its place in the notebook is empty, not a bar that stands still."""
+    from IPython.display import display
+    from tqdm.notebook import tqdm
+
+    bar = tqdm(items, desc=label, total=total, leave=False, display=False)
+    place = display(bar.container, display_id=True)
+    try:
+        yield from bar
+    finally:
+        place.update({"text/plain": ""}, raw=True)
 
 
 def _picture_or_refusal(planner: SrmpPlanner, task: JumpTask) -> Picture | None:

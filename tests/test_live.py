@@ -1,6 +1,9 @@
 """Bars and sliders: there while somebody looks, and not a trace of them otherwise."""
 
+import contextlib
+import gc
 import sys
+import types
 
 import pytest
 
@@ -35,16 +38,25 @@ def test_nobody_looks(unwatched, capfd, monkeypatch):
     assert not live.watched()
 
 
-def test_somebody_looks(watched, monkeypatch):
-    seen = []
+@pytest.mark.parametrize("failing", [False, True])
+def test_somebody_looks(watched, monkeypatch, failing):
+    """A bar counts, and its place is empty afterwards, even if the work fails on the way."""
+    shown = []
 
-    def bar(items, **options):
-        seen.append(options)
-        return items
+    def display(thing, display_id=False):
+        shown.append(thing)
+        return types.SimpleNamespace(update=lambda data, raw: shown.append(data))
 
-    monkeypatch.setattr("tqdm.notebook.tqdm", bar)
-    assert live.watched() and list(live.progress(iter("ab"), "letters", total=2)) == ["a", "b"]
-    assert seen == [{"desc": "letters", "total": 2, "leave": False}]
+    monkeypatch.setattr("IPython.display.display", display)
+    assert live.watched()
+    done = []
+    with contextlib.suppress(ZeroDivisionError):
+        for letter in live.progress(iter("ab"), "letters", total=2):
+            assert shown[0].children[1].max == 2 and "letters" in shown[0].children[0].value
+            done.append(letter)
+            assert not failing or 1 / 0
+    gc.collect()  # where the loop broke off, the generator ends when it is collected
+    assert done == (["a"] if failing else ["a", "b"]) and shown[1:] == [{"text/plain": ""}]
 
 
 def test_a_terminal_has_a_plain_bar(unwatched, monkeypatch, capsys):
