@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
 from jumplab.robot import Robot
+from jumplab.simulation.result import SCHEMA as SIMULATION_SCHEMA
 
-SIMULATION_NAME, SIMULATION_SCHEMA = "simulation.npz", "jumplab-simulation-1"
+SIMULATION_NAME = "simulation.npz"
 MAX_RATE_HZ = 10_000.0  # our choice: ten times the rate of the logs; more than that is a typing error
 END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample in spite of rounding
 # what reading a cut, altered or foreign file may raise
