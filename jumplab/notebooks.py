@@ -276,6 +276,7 @@ def _kernel_manager(scratch: Path) -> type:
         "IPYTHONDIR": str(scratch / "ipython"),
         "JUPYTER_RUNTIME_DIR": str(scratch),
         "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+        "JPY_SESSION_NAME": "",  # nobody looks, even if the runner was started from an open notebook
     }
 
     class ThisInterpreter(KernelSpecManager):

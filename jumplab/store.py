@@ -38,7 +38,10 @@ SCHEMA = "jumplab-result-1"
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 # Statements about one plan, which a new plan makes untrue and therefore removes.
-DERIVED = ("passport.json", "simulation.npz", "simulation.json")
+OF_SIMULATION = ("jump.html", "simulated_joints.csv", "simulated_motion.npz", "simulated_motion_clip.npz",
+                 "simulated_replay")  # what a new simulation makes untrue  # fmt: skip
+DERIVED = ("passport.json", "simulation.npz", "simulation.json", "plan.html", "joints.csv", "motion.npz",
+           "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
 PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
 LOCK_WAIT_S = 20.0  # our choice: a write lasts well under a second, so a longer wait means that something hangs
 _STAGING, _COMMIT = ".staging", ".commit"
@@ -208,11 +211,32 @@ def _finish(folder: Path) -> None:
     stale = {n for n in names if n.endswith(".json")}
     if PLAN in names:
         stale |= {SUMMARY, *DERIVED}
+    if "simulation.npz" in names:
+        stale |= set(OF_SIMULATION)
     for name in sorted(stale):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
         (folder / name).unlink(missing_ok=True)
     for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
         os.replace(commit / name, folder / name)
     commit.rmdir()
+
+
+def write_file(path: str | Path, content: bytes) -> Path:
+    """Write one file, whole or not at all, and make its folder; raises :class:`InputError` if that cannot be."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{str(path)!r} is a folder; name a file")
+    with _explained(path.parent), contextlib.ExitStack() as undo:
+        undo.callback(_unmake, _make(path.parent))
+        handle, half = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
+        undo.callback(Path(half).unlink, missing_ok=True)
+        with os.fdopen(handle, "wb") as file:
+            os.fchmod(file.fileno(), 0o644)  # readable by all; temporary files are private by default
+            file.write(content)
+        os.replace(half, path)
+        undo.pop_all()
+    return path
 
 
 def write_plan(

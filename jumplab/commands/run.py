@@ -52,4 +52,6 @@ def _run(args: argparse.Namespace) -> None:
     print_summary(store.read_plan(report.out)[2])
     print_simulation(store.read_json(report.out / "simulation.json"))
     print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
+    if (report.out / "jump.html").is_file():
+        print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")
     print(f"whole run: {report.wall_s:.1f} s")

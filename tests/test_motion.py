@@ -1,0 +1,106 @@
+"""Motions between their samples, and simulations read back from files."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_core import jump
+from scipy.spatial.transform import Rotation
+
+from jumplab.errors import InputError
+from jumplab.motion import Motion
+
+
+def spinning(times, rate=(0.3, -7.0, 1.1), joints=2):
+    """A base that turns at a constant rate and climbs at a constant speed, joints that do too."""
+    times = np.asarray(times, float)
+    quat = Rotation.from_rotvec(times[:, None] * np.array(rate)).as_quat()
+    quat[1::2] *= -1  # the same attitudes, with signs that jump
+    line = np.outer(times, np.arange(1.0, joints + 1))
+    q = np.column_stack([times, 0 * times, 2 * times, quat, line])
+    v = np.zeros((len(times), 6 + joints))
+    phase = np.where(times < 0.5, "launch", "flight")
+    return Motion(times, q, v, line, phase, "plan")
+
+
+def test_constant_rates_are_met_exactly_between_samples():
+    motion = spinning(np.arange(0, 1.0001, 0.1))
+    times = np.random.default_rng(3).uniform(0, 1, 200)
+    x = motion.at(np.sort(times))
+    expected = Rotation.from_rotvec(np.sort(times)[:, None] * np.array([0.3, -7.0, 1.1]))
+    assert (expected.inv() * Rotation.from_quat(x.q[:, 3:7])).magnitude().max() < 1e-12
+    assert np.abs(np.linalg.norm(x.q[:, 3:7], axis=1) - 1).max() < 1e-12
+    assert np.abs(x.q[:, [0, 2]] - np.sort(times)[:, None] * [1, 2]).max() < 1e-12
+    assert np.abs(x.tau - np.sort(times)[:, None] * [1, 2]).max() < 1e-12
+    assert (np.sum(x.q[1:, 3:7] * x.q[:-1, 3:7], axis=1) > 0).all()
+
+
+def test_an_instant_that_stands_twice_gives_its_later_sample():
+    motion = spinning([0.0, 0.1, 0.1, 0.2, 0.2])
+    tau = np.array([[0.0], [1.0], [5.0], [6.0], [9.0]])
+    motion = Motion(motion.t, motion.q, motion.v, tau, np.array(["launch"] * 2 + ["flight"] * 2 + ["landing"]), "plan")
+    x = motion.at([0.05, 0.1, 0.15, 0.2])
+    assert x.tau[:, 0] == pytest.approx([0.5, 5.0, 5.5, 9.0])
+    assert list(x.phase) == ["launch", "flight", "flight", "landing"]
+
+
+def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
+    tape = jump(1.0, 0.5).tape
+    x = Motion.of(tape).every(1000.0)
+    keep = np.concatenate([np.diff(tape.t) > 0, [True]])
+    keep &= np.abs(tape.t * 1000 - np.round(tape.t * 1000)) < 1e-6  # the end is no whole millisecond
+    assert keep.sum() == len(x.t) and len(x.t) < len(tape.t)
+    assert np.diff(x.t) == pytest.approx(0.001, abs=1e-12)
+    for name in ("q", "v", "tau"):
+        assert np.abs(getattr(x, name) - getattr(tape, name)[keep]).max() < 1e-6, name
+    assert list(x.phase) == list(tape.phase[keep])
+    assert Motion.of(tape).source == "plan" and Motion.of(tape).duration == tape.t[-1]
+
+
+def test_velocities_are_those_of_the_resampled_motion(bhr):
+    """Pinocchio's difference over time agrees with the mean of v, up to a trapezoid's error of second order."""
+    motion, worst = Motion.of(jump(1.0, 0.5).tape), []
+    for hz in (240.0, 480.0):
+        x = motion.every(hz)
+        rate = [pin.difference(bhr.model, a, b) * hz for a, b in zip(x.q[:-1], x.q[1:], strict=True)]
+        worst.append(np.abs(np.array(rate) - (x.v[:-1] + x.v[1:]) / 2).max())
+    assert worst[0] < 0.05 and worst[1] < worst[0] / 3
+
+
+@pytest.mark.parametrize("rate", [0.0, -50.0, np.nan, np.inf, 1e9])
+def test_impossible_rates(rate):
+    with pytest.raises(InputError, match=r"per second must lie above 0 and not above 10000$"):
+        spinning([0, 1]).every(rate)
+
+
+def test_times_outside():
+    with pytest.raises(InputError, match=r"^times -0.1 ... 0.5 s leave the motion, 0 ... 1 s$"):
+        spinning([0, 1]).at([-0.1, 0.5])
+
+
+def write(folder, **changes):
+    arrays = {"schema": np.array("jumplab-simulation-1"), "t": np.arange(3.0), "q": np.zeros((3, 21)),
+              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3)}  # fmt: skip
+    np.savez(folder / "simulation.npz", **(arrays | changes))
+
+
+def test_simulation_file(bhr, tmp_path):
+    with pytest.raises(InputError, match=r"holds no simulation; run 'jumplab simulate .*' first$"):
+        Motion.of_simulation_file(tmp_path, bhr)
+    names = np.array(bhr.joint_names)
+    write(tmp_path, joint_names=names)
+    assert Motion.of_simulation_file(tmp_path, bhr).source == "simulation"
+    other = r"not a simulation of this folder's robot; simulate the plan again$"
+    for change in ({"schema": np.array("x")}, {"q": np.zeros((3, 20))}, {"tau": np.zeros((2, 14))}):
+        write(tmp_path, joint_names=names, **change)
+        with pytest.raises(InputError, match=other):
+            Motion.of_simulation_file(tmp_path, bhr)
+    write(tmp_path, joint_names=names[::-1])
+    with pytest.raises(InputError, match=other):
+        Motion.of_simulation_file(tmp_path, bhr)
+    write(tmp_path)
+    with pytest.raises(InputError, match=r"not a readable simulation \(KeyError\)"):
+        Motion.of_simulation_file(tmp_path, bhr)
+    path = tmp_path / "simulation.npz"
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"not a readable simulation"):
+        Motion.of_simulation_file(tmp_path, bhr)

@@ -1,0 +1,263 @@
+"""Pages of a jump: nothing outside them is needed, they move as Pinocchio says, and a real browser shows them."""
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.colors as mcolors
+import matplotlib.image
+import numpy as np
+import pinocchio as pin
+import pytest
+import umsgpack
+from fixtures_core import jump
+from test_cli import one_sentence, run
+from test_store import names
+
+from jumplab import store, viewer
+from jumplab.errors import InputError
+from jumplab.motion import Motion
+from jumplab.plotting.style import PHASE_COLORS
+from jumplab.robot import Robot
+from jumplab.simulation import Scene, simulate_jump
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
+    "--window-size=1280,720 --virtual-time-budget=4000 --enable-logging=stderr"
+).split()
+browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    p = jump(1.0, 0.5)
+    return simulate_jump(p.tape, p.robot)
+
+
+@pytest.fixture(scope="module")
+def page(simulation):
+    """The page of the default jump, planned and simulated."""
+    p = jump(1.0, 0.5)
+    return viewer.page(p.robot, plan=p.tape, simulation=simulation, task=p.task)
+
+
+def facts_of(page):
+    return json.loads(re.search(r"^const facts = (.*);$", page.html, re.M)[1])
+
+
+def commands_of(page):
+    blobs = json.loads(re.search(r"^const commands = (.*);$", page.html, re.M)[1])
+    return [umsgpack.unpackb(base64.b64decode(b)) for b in blobs]
+
+
+# the file -------------------------------------------------------------------------------------------------------
+class Outside(HTMLParser):
+    """Collects everything by which a page could ask for something outside itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.found, self.tags = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.found += [(tag, k, v) for k, v in attrs if k in ("src", "href", "srcset", "data", "action", "background")]
+
+
+def test_page_needs_nothing_outside_itself(page):
+    parser = Outside()
+    parser.feed(page.html)
+    assert parser.found == [] and not {"link", "iframe", "img", "base", "object", "embed"} & set(parser.tags)
+    assert set(re.findall(r"https?://[^\s\"'`<>\\]+", page.html)) == {"http://www.w3.org/1999/xhtml"}  # a name space
+    assert "@import" not in page.html and "cdn" not in page.html.lower().replace("cdnumber", "")
+    assert page.html.count("</script>") == 2 and len(page.html) < 3e6
+
+
+def test_pages_are_alike_and_start_no_server(page, simulation, monkeypatch):
+    """The same jump gives the same bytes; meshcat's server is never asked for."""
+    import meshcat.visualizer
+
+    monkeypatch.setattr(meshcat.visualizer, "start_zmq_server_as_subprocess", None)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    p = jump(1.0, 0.5)
+    again = viewer.page(p.robot, plan=p.tape, simulation=simulation, task=p.task)
+    assert again.html == page.html
+
+
+def test_page_in_a_notebook_stands_in_a_frame_of_its_own(page):
+    text = page._repr_html_()
+    parser = Outside()
+    parser.feed(text)
+    assert parser.found == [] and parser.tags.count("iframe") == 1 and "script" not in parser.tags
+    assert 'sandbox="allow-scripts"' in text and text.count("<") < 10  # the page itself is escaped
+
+
+def test_poses_are_those_of_the_log(page, simulation, bhr):
+    model, data, facts = bhr.model, bhr.model.createData(), facts_of(page)
+    assert facts["fps"] == 50 and [c["name"] for c in facts["clips"]] == ["simulation", "plan"]
+    for clip, record in zip(facts["clips"], (simulation, jump(1.0, 0.5).tape), strict=True):
+        poses = np.frombuffer(base64.b64decode(clip["poses"]), "<f4").reshape(clip["frames"], clip["bodies"], 7)
+        assert clip["frames"] == int(record.t[-1] * 50 + 1e-6) + 1
+        for k in range(0, clip["frames"], 7):
+            row = int(np.argmin(np.abs(record.t - k / 50)))
+            pin.framesForwardKinematics(model, data, record.q[row])
+            for j in range(1, model.njoints):
+                frame = data.oMf[model.getFrameId(model.names[j])]
+                assert poses[k, j - 1, :3] == pytest.approx(frame.translation, abs=1e-4)
+                turn = pin.Quaternion(poses[k, j - 1, 3:].astype(float)).normalized().toRotationMatrix()
+                assert turn == pytest.approx(frame.rotation, abs=1e-3)
+    starts = {name: t for t, name in facts["clips"][0]["phases"]}
+    assert list(starts) == ["launch", "flight", "landing"] and starts["launch"] == 0
+    assert starts["flight"] == pytest.approx(simulation.metrics.liftoff_s, abs=0.021)
+    assert starts["landing"] == pytest.approx(simulation.metrics.touchdown_s, abs=0.021)
+
+
+@pytest.mark.parametrize(
+    ("scene", "tops"),
+    [
+        (Scene.flat(), {0.0}),
+        (Scene.platform(0.5, 0.3), {0.0, 0.3}),
+        (Scene.ditch(0.3, 0.8, 0.6), {0.0, -0.6}),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_ground_of_the_scene(bhr, scene, tops):
+    page = viewer.page(bhr, plan=jump(1.0, 0.5).tape, scene=scene)
+    drawn = {}
+    for c in commands_of(page):
+        if re.fullmatch(r"/meshcat/jump/ground/\d/top", c["path"]):
+            key = "size" if c["type"] == "set_object" else "place"
+            drawn.setdefault(c["path"], {})[key] = c["object"]["geometries"][0] if key == "size" else c["matrix"]
+    assert {round(d["place"][14] + d["size"]["depth"] / 2, 6) for d in drawn.values()} == tops
+    for d in drawn.values():  # every slab lies where the scene has that height
+        left = d["place"][12] - d["size"]["width"] / 2
+        middles = left + d["size"]["width"] * np.linspace(0.02, 0.98, 49)
+        heights = [b.top for x in middles for b in scene.blocks if b.x_from <= x <= b.x_to]
+        assert round(d["place"][14] + d["size"]["depth"] / 2, 6) in heights
+
+
+def test_robot_whose_shapes_are_lost_keeps_its_skeleton(bhr):
+    """A mesh file does not travel with the robot's text."""
+    mesh = '<mesh filename="package://elsewhere/thigh.stl"/>'
+    robot = Robot.from_text(re.sub(r"<box [^>]*/>", mesh, bhr.urdf), bhr.config_text)
+    paths = {c["path"] for c in commands_of(viewer.page(robot, plan=jump(1.0, 0.5).tape)) if c["type"] == "set_object"}
+    moved = {p for p in paths if p.startswith("/meshcat/jump/plan/") and "trail" not in p}
+    assert moved and all("/rest/" in p for p in moved)
+
+
+def test_nothing_to_show(bhr):
+    with pytest.raises(InputError, match=r"^a page needs a plan or a simulation to show$"):
+        viewer.page(bhr)
+    with pytest.raises(InputError, match=r"^rate = 0 per second must lie above 0"):
+        viewer.page(bhr, plan=jump(1.0, 0.5).tape, fps=0)
+
+
+# the command ----------------------------------------------------------------------------------------------------
+@pytest.fixture
+def plan(tmp_path):
+    p = jump(1.0, 0.5)
+    store.write_plan(tmp_path / "plan", p.tape, p.robot, p.summary)
+    return tmp_path / "plan"
+
+
+def test_command(capsys, plan, odd_folder, simulation):
+    code, said, err = run(capsys, "view", plan, "--out", odd_folder / "new" / "x.html")
+    assert (code, err) == (0, "") and "1.00 m forward, CoM rise 0.50 m: plan: " in said
+    assert names(odd_folder / "new") == ["x.html"] and not (plan / "jump.html").exists()
+    store.write_simulation(plan, simulation, store.read_plan(plan)[2])
+    assert run(capsys, "view", plan)[0] == 0
+    clips = facts_of(viewer.Page((plan / "jump.html").read_text(), ""))["clips"]
+    assert [c["name"] for c in clips] == ["simulation", "plan"]
+    store.write_simulation(plan, simulation, store.read_plan(plan)[2])  # a new simulation: the page is no longer true
+    assert not (plan / "jump.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "sentence"),
+    [
+        ("x.pdf", "--out must name a file that ends in .html, got 'x.pdf'"),
+        ("/dev/null/x.html", "'/dev/null' is a file; choose a folder"),
+        ("d.html", "'d.html' is a folder; name a file"),
+    ],
+)
+def test_refusals(capsys, plan, tmp_path, monkeypatch, out, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "d.html").mkdir()
+    before = names(plan)
+    said = one_sentence(*run(capsys, "view", plan, "--out", out))
+    assert said == sentence or said == "the folder '/dev/null' cannot be written (Not a directory); choose another one"
+    assert names(tmp_path) == ["d.html", "plan"] and names(plan) == before and names(tmp_path / "d.html") == []
+
+
+def test_damaged_simulation_is_told(capsys, plan):
+    (plan / "simulation.npz").write_bytes(b"half")
+    said = one_sentence(*run(capsys, "view", plan))
+    assert said.endswith("simulation.npz: not a readable simulation (ValueError); simulate the plan again")
+    assert not (plan / "jump.html").exists()
+
+
+# the browser ----------------------------------------------------------------------------------------------------
+def picture(url, folder):
+    """Screenshot (720, 1280, 3) as 0 ... 1; the browser's profile is new and goes with the folder."""
+    shot = folder / "shot.png"
+    with tempfile.TemporaryDirectory(dir=folder) as profile:
+        command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", f"--screenshot={shot}", url]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=180, cwd=folder,
+                              env=os.environ | {"HOME": str(folder)})  # fmt: skip
+    assert shot.is_file(), done.stderr[-2000:]
+    assert "Uncaught" not in done.stderr, [line for line in done.stderr.splitlines() if "Uncaught" in line]
+    image = matplotlib.image.imread(shot)[:, :, :3]
+    shot.unlink()
+    return image
+
+
+def count(image, phase):
+    """Pixels of the phase's hue, light or dark, above the controls."""
+    hsv = mcolors.rgb_to_hsv(image[80:640])
+    hue = mcolors.rgb_to_hsv(mcolors.to_rgb(PHASE_COLORS[phase]))[0]
+    return int(((np.abs(hsv[:, :, 0] - hue) < 0.03) & (hsv[:, :, 1] > 0.3) & (hsv[:, :, 2] > 0.3)).sum())
+
+
+def rows_of(image, phase):
+    """Mean height of those pixels [pixels from the top]."""
+    hsv = mcolors.rgb_to_hsv(image[80:640])
+    hue = mcolors.rgb_to_hsv(mcolors.to_rgb(PHASE_COLORS[phase]))[0]
+    return float(np.nonzero((np.abs(hsv[:, :, 0] - hue) < 0.03) & (hsv[:, :, 1] > 0.3))[0].mean())
+
+
+@browser
+@pytest.mark.slow
+def test_browser_shows_launch_flight_and_landing(page, tmp_path):
+    """The robot is painted in its phase's colour, and higher in flight than before and after."""
+    url = Path(page.save(tmp_path / "jump.html")).as_uri()
+    seen = {"launch": picture(f"{url}#t=0.4", tmp_path), "flight": picture(f"{url}#t=1.1", tmp_path),
+            "landing": picture(f"{url}#t=3.5&view=corner", tmp_path)}  # fmt: skip
+    for phase, image in seen.items():
+        others = [count(image, p) for p in PHASE_COLORS if p != phase]
+        assert count(image, phase) > 6000 and max(others) < 1500, (phase, count(image, phase), others)
+    assert rows_of(seen["flight"], "flight") < rows_of(seen["launch"], "launch") - 60
+    assert np.abs(seen["launch"] - seen["flight"]).max(axis=2).mean() > 0.01
+
+
+@browser
+@pytest.mark.slow
+def test_browser_shows_the_frame_of_a_notebook(page, tmp_path):
+    """As the output of a cell the page plays by itself, in its sandbox."""
+    (tmp_path / "cell.html").write_text(f"<!DOCTYPE html><meta charset='utf-8'>{page._repr_html_()}", encoding="utf-8")
+    image = picture((tmp_path / "cell.html").as_uri(), tmp_path)
+    assert sum(count(image, phase) for phase in PHASE_COLORS) > 3000
+
+
+@browser
+@pytest.mark.slow
+def test_browser_shows_a_plan_alone(tmp_path, bhr):
+    page = viewer.page(bhr, plan=Motion.of(jump(1.0, 0.5).tape))
+    image = picture(f"{page.save(tmp_path / 'plan.html').as_uri()}#t=1.0", tmp_path)
+    assert count(image, "flight") > 6000
