@@ -166,7 +166,7 @@ def flight_shaping(plan: SrmpPlan) -> Figure:
     axes[1].plot(f.t, rigid, **REFERENCE_STYLE)
     axes[2].plot(f.t, np.degrees(f.lean), color=FLIGHT, label="inertia shaped")
     axes[2].plot(f.t, np.degrees(f.lean[0] + rigid * f.t), **REFERENCE_STYLE, label="$\\rho$ as at take-off")
-    _end_angles(axes[2], f.t, f.lean)
+    _end_angles(axes[2], f.t, f.lean, away_from=f.lean[0] + rigid[-1] * f.t[-1])
     axes[2].legend(loc="best")
     for ax, label in zip(axes, ("$\\rho$ [kg m$^2$]", "$\\omega = L/\\rho$ [rad/s]", "$\\theta$ [deg]"), strict=True):
         ax.set_ylabel(label)
@@ -177,12 +177,14 @@ def flight_shaping(plan: SrmpPlan) -> Figure:
     return fig
 
 
-def _end_angles(ax: Axes, t: np.ndarray, angle: np.ndarray) -> None:
-    """The first and last value of a curve of angles [rad], written where the curve is not."""
+def _end_angles(ax: Axes, t: np.ndarray, angle: np.ndarray, away_from: float | None = None) -> None:
+    """The first and last value of a curve of angles [rad], where neither it nor one that ends at ``away_from`` is."""
     up = 1 if angle[-1] > angle[0] else -1
-    for row, side, ha in ((0, -up, "left"), (-1, up, "right")):
-        ax.annotate(_degrees(angle[row]), (t[row], np.degrees(angle[row])), (0, 3 * side), textcoords="offset points",
-                    fontsize=7, va="bottom" if side > 0 else "top", ha=ha)  # fmt: skip
+    last = up if away_from is None else int(np.sign(angle[-1] - away_from)) or up
+    for row, side, ha in ((0, -up, "left"), (-1, last, "right")):
+        gap = 3 if row == 0 or last == up else 11  # points; beside a slope more room is needed
+        ax.annotate(_degrees(angle[row]), (t[row], np.degrees(angle[row])), (0, gap * side), fontsize=7, ha=ha,
+                    textcoords="offset points", va="bottom" if side > 0 else "top")  # fmt: skip
 
 
 @styled
