@@ -62,9 +62,11 @@ def open_log(folder: str | Path) -> Iterator[TrialLog]:
         raise InputError(f"{path}: cannot be written ({e.strerror}); choose a writable folder") from e
     try:
         _lock(descriptor, path)
-        yield TrialLog(descriptor)
-        if os.fstat(descriptor).st_size == 0:
-            path.unlink(missing_ok=True)
+        try:
+            yield TrialLog(descriptor)
+        finally:
+            if os.fstat(descriptor).st_size == 0:
+                path.unlink(missing_ok=True)
     except OSError as e:
         raise InputError(f"{path}: cannot be written ({e.strerror}); free some space, or choose another folder") from e
     finally:

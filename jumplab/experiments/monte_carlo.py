@@ -6,9 +6,12 @@ is stopped therefore goes on where it was, and gives what it would have given un
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -28,6 +31,7 @@ from jumplab.simulation import Scene
 
 LARGEST = 100_000  # our choice: two days of one core; more is surely a typo
 CONFIDENCE = 0.95
+LOOK_S = 0.5  # our choice: how often a worker looks whether its parent still lives
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
@@ -159,13 +163,21 @@ def run_trials(
 
 
 def _in_parallel(work: Iterable[tuple[Callable, tuple, dict]], jobs: int) -> Iterable[Trial]:
-    """Results as they come, in any order. Ctrl-C is this process's affair: its workers are told by it."""
-    options = {} if jobs == 1 else {"backend": "loky", "initializer": _ignore_interrupt}
+    """Results as they come, in any order."""
+    options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
     return joblib.Parallel(jobs, return_as="generator_unordered", max_nbytes=None, **options)(work)
 
 
-def _ignore_interrupt() -> None:
+def _serve(parent: int) -> None:
+    """A worker's habits: Ctrl-C is its parent's affair, and without the parent there is nothing left to do."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+
+
+def _leave_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK_S)
+    os._exit(1)
 
 
 def _check(n: int, seed: int, jobs: int | None) -> None:
