@@ -8,6 +8,9 @@ import time
 from jumplab.commands.common import common_options
 from jumplab.errors import InputError
 
+LARGEST = 100_000  # our choice: two days of one core; more is surely a typo
+INTERRUPTED = "interrupted; finished trials are kept, and the same command goes on from there"
+
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Declare ``jumplab trials``."""
@@ -27,7 +30,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def _trials(args: argparse.Namespace) -> None:
     start = time.perf_counter()
-    n, seed = _whole("--n", args.n, 1), _whole("--seed", args.seed, 0)
+    n, seed = _whole("--n", args.n, 1, LARGEST), _whole("--seed", args.seed, 0)
     jobs = None if args.jobs is None else _whole("--jobs", args.jobs, 1)
 
     from jumplab import store
@@ -43,7 +46,7 @@ def _trials(args: argparse.Namespace) -> None:
     try:
         report = run_trials(args.dir, n, seed, settings, jobs=jobs)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("interrupted; finished trials are kept, and the same command goes on from there") from None
+        raise KeyboardInterrupt(INTERRUPTED) from None
     low, high = report.interval
     print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
     for reason, count in report.reasons.items():
@@ -56,7 +59,7 @@ def _trials(args: argparse.Namespace) -> None:
           f"whole run: {time.perf_counter() - start:.1f} s")  # fmt: skip
 
 
-def _whole(option: str, text: str, least: int) -> int:
+def _whole(option: str, text: str, least: int, most: int | None = None) -> int:
     """The whole number that an option was given."""
     try:
         value = int(text)
@@ -64,4 +67,6 @@ def _whole(option: str, text: str, least: int) -> int:
         raise InputError(f"{option} must be a whole number, got {text!r}") from None
     if value < least:
         raise InputError(f"{option} must be at least {least}, got {value}")
+    if most is not None and value > most:
+        raise InputError(f"{option} must be at most {most}, got {value}")
     return value

@@ -1,4 +1,4 @@
-"""What a laboratory could know of a jump: computed from simulated, noisy sensors with the model of the planned robot."""
+"""What a laboratory could know of a jump: computed from simulated, noisy sensors with the planned robot's model."""
 
 from __future__ import annotations
 

@@ -29,7 +29,6 @@ from jumplab.experiments.log import open_log
 from jumplab.experiments.trial import SCHEMA, Trial, TrialKey, TrialSettings, plan_hash, run_trial
 from jumplab.simulation import Scene
 
-LARGEST = 100_000  # our choice: two days of one core; more is surely a typo
 CONFIDENCE = 0.95
 LOOK_S = 0.5  # our choice: how often a worker looks whether its parent still lives
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
@@ -186,8 +185,6 @@ def _check(n: int, seed: int, jobs: int | None) -> None:
             raise InputError(f"{name} must be a whole number, got {value!r}")
         if value < least:
             raise InputError(f"{name} = {value} is too small; it must be at least {least}")
-    if n > LARGEST:
-        raise InputError(f"n = {n} trials are more than the largest number, {LARGEST}")
 
 
 def _spread(values: np.ndarray) -> dict[str, float] | None:

@@ -14,7 +14,7 @@ def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]
     rows = [
         ("travel of the feet [m]", task.distance_m, lambda r: r.metrics.foot_distance_m),
         ("rise of the CoM in flight [m]", task.height_m, lambda r: r.metrics.com_rise_m),
-        ("CoM, end above start [m]", task.platform_m, lambda r: float(r.com[-1, 2] - r.com[0, 2])),
+        ("CoM, end above start [m]", task.platform_m, lambda r: round(float(r.com[-1, 2] - r.com[0, 2]), 3) + 0.0),
         ("on its feet after touchdown [s]", STAND_S, lambda r: r.metrics.standing_s),
         ("torque / limit before touchdown", 1.0, lambda r: r.metrics.max_torque_ratio_before_touchdown),
         ("speed / limit before touchdown", 1.0, lambda r: r.metrics.max_speed_ratio_before_touchdown),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,8 @@ class TrialSettings:
 
     mode: str = "position"
     reaim: bool = True
-    noise: SensorNoise = SensorNoise()
-    ranges: Ranges = Ranges()
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    ranges: Ranges = field(default_factory=Ranges)
 
     def __post_init__(self):
         if self.mode not in MODES:

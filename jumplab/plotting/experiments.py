@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.experiments.measurement import Measurement
     from jumplab.simulation import Scene, SimulationResult
 
-APART_M = 0.95  # our choice: how far start and end are moved away from the jump
+APART_M = 1.2  # our choice: how far start and end are moved away from the jump
 DITCH_SHOWN_M = 0.25  # our choice: a ditch that nobody falls into is cut off at this depth
 GROUND_SHOWN_M = 0.04
 LABEL_ROOM_M = 0.14  # our choice: for a frame's time above a head
@@ -73,8 +73,8 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
     place.
     """
     frames = _strobe_rows(result)
-    body = Silhouette(robot)
-    outlines = [[(part, o + [shift, 0.0]) for part, o in body.outlines(result.q[row])] for row, shift in frames]
+    body, halo = Silhouette(robot), withStroke(linewidth=2, foreground="white")
+    outlines = [[(part, np.add(o, [shift, 0.0])) for part, o in body.outlines(result.q[row])] for row, shift in frames]
     corners = np.vstack([o for frame in outlines for _, o in frame])
     (left, low), (right, high) = corners.min(axis=0) - 0.1, corners.max(axis=0)
     right += 0.1
@@ -90,8 +90,7 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
         trunk = np.vstack([o for part, o in frame if part == "trunk"])
         x, z = trunk[np.argmax(trunk[:, 1])]
         ax.text(x, z + 0.02, f"{result.t[row]:.2f} s", ha=LABEL_SIDES[phase] if shift == 0 else "center", va="bottom",
-                fontsize=7, color=shade(color, 0.8), zorder=6, path_effects=[withStroke(linewidth=2, foreground="white")],
-                )  # fmt: skip
+                fontsize=7, color=shade(color, 0.8), zorder=6, path_effects=[halo])  # fmt: skip
     flight = result.phase == "flight"
     ax.plot(result.com[flight, 0], result.com[flight, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=5)
     _draw_scene(ax, scene, left, right, bottom)
@@ -223,4 +222,3 @@ def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
             start, end = values[part].min(), values[part].max()
             ax.fill_between([start, end], low, high, color=tint(INK, 0.15), linewidth=0, zorder=1)
             ax.plot([start, end], [landed[part].mean()] * 2, color=INK, linewidth=1.2, zorder=2)
-
