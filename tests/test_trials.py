@@ -160,6 +160,15 @@ def test_a_stopped_series_goes_on_to_the_same_end(folder, coins, monkeypatch, st
     assert third.resumed == 12 and content(folder) == wanted
 
 
+def test_a_bar_only_where_it_is_wanted(folder, coins, capsys):
+    report = run_trials(folder, 3, jobs=1)
+    assert capsys.readouterr().err == ""  # not a terminal
+    run_trials(folder, 4, jobs=1, progress=True)
+    said = capsys.readouterr().err
+    assert "4/4" in said and "3/4" in said  # the first three are there already
+    assert report.count == 3
+
+
 def test_a_longer_series_begins_with_the_shorter_one(folder, coins):
     short, long = run_trials(folder, 5, jobs=1), run_trials(folder, 9, jobs=1)
     assert long.resumed == 5 and long.trials[:5] == short.trials
