@@ -96,7 +96,7 @@ class TrialReport:
             "landed_metrics": {name: _spread(self.values(name)) for name in ("foot_distance_m", "com_rise_m")},
             "target": self.target,
             "seed": self.seed,
-            "settings": {**asdict(self.settings), "hash": self.settings.hash},
+            "settings": {**asdict(self.settings), "hash": self.trials[0].key.settings},
             "plan": self.plan,
             "versions": store.versions(),
         }
@@ -143,7 +143,8 @@ def run_trials(
     tape, robot, summary = store.read_plan(folder)
     store.ensure_writable(folder)
     scene, plan = Scene.of_plan(summary, robot), plan_hash(summary)
-    keys = [TrialKey(seed, index, settings.hash, plan) for index in range(n)]
+    settings_hash = settings.hash
+    keys = [TrialKey(seed, index, settings_hash, plan) for index in range(n)]
     with open_log(folder) as log:
         done = {key: log.trials[key] for key in keys if key in log.trials}
         resumed = len(done)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab import simulation, store
+from jumplab import store
 from jumplab.errors import InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
@@ -21,7 +21,8 @@ from jumplab.simulation.playback import MODES
 from jumplab.trajectory import Tape
 
 SCHEMA = "jumplab-trials-1"
-SHAPING = ("jumplab", "numpy", "pin", "proxsuite", "pybullet")  # packages whose version decides a trial's outcome
+SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")  # whose versions decide a trial's outcome
+LOOKING = ("commands", "notebooks.py", "plotting", "viewer")  # rooms of the package that decide nothing about a jump
 HASH_DIGITS = 16  # 64 bits: enough to tell settings apart
 LEG_ROLES = ("hip_pitch", "knee", "ankle_pitch")
 
@@ -49,7 +50,7 @@ class TrialSettings:
 
     @property
     def hash(self) -> str:
-        """Short hash of these settings, of the simulation's own code and of the packages that shape an outcome."""
+        """Short hash of these settings, of the package's own code and of the packages that shape an outcome."""
         known = store.versions()
         return _hash([SCHEMA, asdict(self), _code(), {name: known[name] for name in SHAPING}])
 
@@ -156,9 +157,10 @@ def _com(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def _code() -> str:
-    """Hash of the simulation's source: trials of other code are not these trials."""
-    files = sorted(Path(simulation.__file__).parent.glob("*.py"))
-    return _hash([[f.name, hashlib.sha256(f.read_bytes()).hexdigest()] for f in files])
+    """Hash of the package's source: trials of other code are not these trials."""
+    root = Path(store.__file__).parent
+    files = sorted(f for f in root.rglob("*.py") if f.relative_to(root).parts[0] not in LOOKING)
+    return _hash([[str(f.relative_to(root)), hashlib.sha256(f.read_bytes()).hexdigest()] for f in files])
 
 
 def _hash(data: Any) -> str:
