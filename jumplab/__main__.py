@@ -90,8 +90,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except JumplabError as e:
         _complain(str(e), debug)
         return e.exit_code
-    except KeyboardInterrupt:
-        _complain("interrupted; what was there before is unchanged", debug)
+    except KeyboardInterrupt as e:
+        _complain(str(e) or "interrupted; what was there before is unchanged", debug)
         return INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -49,7 +49,7 @@ def here(tmp_path, monkeypatch):
 
 
 REFUSALS = [
-    ("", "choose a command: run, plan, simulate, audit, view or export; " + HELP),
+    ("", "choose a command: run, plan, audit, simulate, trials, view or export; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
     ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
     ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),
@@ -81,6 +81,22 @@ REFUSALS = [
     ("simulate", "the following arguments are required: DIR; 'jumplab simulate --help' shows what is possible"),
     ("simulate nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
     ("simulate .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
+    ("trials", "the following arguments are required: DIR; 'jumplab trials --help' shows what is possible"),
+    ("trials nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
+    ("trials .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
+    ("trials . --n 0", "--n must be at least 1, got 0"),
+    ("trials . --n -3", "--n must be at least 1, got -3"),
+    ("trials . --n 2.5", "--n must be a whole number, got '2.5'"),
+    ("trials . --n many", "--n must be a whole number, got 'many'"),
+    ("trials . --n 1000000", "--n must be at most 100000, got 1000000"),
+    ("trials . --seed -1", "--seed must be at least 0, got -1"),
+    ("trials . --jobs 0", "--jobs must be at least 1, got 0"),
+    (
+        "trials . --mode fast",
+        "argument --mode: invalid choice: 'fast' (choose from 'position', 'pd'); "
+        "'jumplab trials --help' shows what is possible",
+    ),
+    ("trials . --reaim yes", "unrecognized arguments: yes; " + HELP),
     ("audit nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
     ("run --distance-m nan", "distance must be finite, got nan"),
     ("run --parameter fast", "--parameter must be NAME=VALUE, got 'fast'"),
@@ -119,10 +135,10 @@ def test_seeded_random_bad_inputs(capsys, here):
             2: ["plan", "--out", "x", "--rotation-deg", rng.choice([*bad, "90", "-361", "720.5"])],
             3: ["plan", "--out", "x", "--robot", f"{junk}?"],
             4: ["plan", "--out", f"/dev/null/{junk}"],
-            5: [rng.choice(["simulate", "audit"]), f"no {junk}"],
+            5: [rng.choice(["simulate", "audit", "trials"]), f"no {junk}"],
             6: ["run", "--distance-m", rng.choice(bad)],
             7: ["run", "-p", f"no_such{rng.randint(0, 99)}={junk}"],
-            8: [rng.choice(["plan", "run", "simulate", "audit"]), f"--{junk}", "x"],
+            8: [rng.choice(["plan", "run", "simulate", "audit", "trials"]), f"--{junk}", "x"],
             9: [f"{junk}!"],
         }[rng.randrange(10)]
         code, out, err = run(capsys, *argv)
@@ -250,7 +266,7 @@ def test_help_is_quick_and_complete():
         "print(sorted({'numpy', 'casadi', 'pinocchio', 'pybullet', 'papermill'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert all(word in done.stdout for word in ("run", "plan", "simulate", "audit", "--debug"))
+    assert all(word in done.stdout for word in ("run", "plan", "simulate", "trials", "audit", "--debug"))
     assert done.stdout.splitlines()[-1] == "[]" and done.stderr == ""
 
 

@@ -163,10 +163,11 @@ class Renderer:
         self._add(bullet.GEOM_BOX, place, halfExtents=half, rgbaColor=(*color, 1.0))
 
     def _lay_ground(self, scene: Scene, marks: Sequence[float]) -> None:
+        lowest = min((block.top for block in scene.blocks), default=0.0)
         for block in scene.blocks:
             start, end = max(block.x_from, SEEN_M[0]), min(block.x_to, SEEN_M[1])
             cuts = [start, *np.arange(np.floor(start / STRIPE_M) + 1, np.ceil(end / STRIPE_M)) * STRIPE_M, end]
-            depth = 0.05 if block.top <= 0 else block.top
+            depth = block.top - lowest or 0.05  # walls of ditches and platforms reach down to the lowest ground
             for a, b in itertools.pairwise(cuts):
                 if b - a > 1e-9:
                     grey = GREYS[int(np.floor((a + b) / 2 / STRIPE_M)) % 2]

@@ -40,58 +40,54 @@ from jumplab.task import GRAVITY, JumpTask
 from jumplab.trajectory import Tape
 
 if TYPE_CHECKING:  # pictures of a plan need no simulator
-    from jumplab.simulation import Metrics, Scene, SimulationResult
+    from jumplab.simulation import Metrics, SimulationResult
 
-APART_M = 0.92  # our choice: how far frames of launch and landing are moved apart
 AFTER_TOUCHDOWN_S = 0.25  # our choice: how much of the landing is shown
 STANDING_UP_S = 1.0  # our choice: how much is shown where the landing itself is the subject
 SMOOTHING_S = 0.02  # our choice: longer than an impact's ringing, shorter than the landing's push of 0.2 s
-FLIGHT_FRAMES = ((0.22, 0.4), (0.5, 1.0), (0.8, 0.5))  # our choice: share of the flight, strength of the colour
+FLIGHT_SHARES = (0.25, 0.5, 0.75)  # our choice: when frames of the flight are shown
+STRIP_M = 0.72  # our choice: from frame to frame, just more than a robot with its arms stretched out
 
 
 @styled
-def jump_strobe(result: SimulationResult, robot: Robot, *, scene: Scene | None = None) -> Figure:
+def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
     """F-1: the simulated jump in one picture, launch, flight and landing in their colours, with the CoM's path.
 
-    From take-off to touchdown everything is where it happened. Launch and landing happen on the spot: their frames are
-    moved apart, outwards.
+    Heights are true; sideways the frames are evenly spaced, so that none hides another. A jump where it happened is
+    :func:`jumplab.plotting.experiments.scene_strobe`.
     """
+    rows = _strip_rows(result)
     fig = new_figure(PAGE_IN, 2.6)
     ax = fig.subplots()
     body = Silhouette(robot)
-    for row, shift, strength in _frames(result):
-        color = PHASE_COLORS[str(result.phase[row])]
-        draw_robot(ax, body, result.q[row], color, strength=strength, shift=shift, zorder=2 + strength)
-        if result.phase[row] != "flight":
-            x = body.com(result.q[row])[0] + shift
-            ax.text(x, -0.07, f"{result.t[row]:.2f} s", ha="center", va="top", fontsize=7, color=shade(color, 0.8))
+    places = STRIP_M * np.arange(len(rows))
+    for row, place in zip(rows, places, strict=True):
+        color, com = PHASE_COLORS[str(result.phase[row])], body.com(result.q[row])
+        draw_robot(ax, body, result.q[row], color, shift=place - com[0])
+        ax.text(place, -0.07, f"{result.t[row]:.2f} s", ha="center", va="top", fontsize=7, color=shade(color, 0.8))
     equal_scales(ax)
-    flight = result.phase == "flight"
-    ax.plot(result.com[flight, 0], result.com[flight, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=5)
+    air = (result.phase == "flight") & (result.t >= result.t[rows[0]])
+    path = np.interp(result.t[air], result.t[rows], places)  # linear in time between take-off and touchdown
+    ax.plot(path, result.com[air, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=5)
     left, right = ax.get_xlim()
-    blocks = [(left, right, 0.0)] if scene is None else [(b.x_from, b.x_to, b.top) for b in scene.blocks]
-    for start, end, top in blocks:
-        if start < right and end > left:
-            draw_ground(ax, max(left, start), min(right, end), level=top)
+    draw_ground(ax, left, right)
     ax.set_xlim(left, right)
     legend_above(fig, phase_handles("launch", "flight", "landing"))
     bare(ax)
     return fig
 
 
-def _frames(result: SimulationResult) -> list[tuple[int, float, float]]:
-    """(row, shift, strength) of the frames to draw: three of the launch, some of the flight, three of the landing."""
+def _strip_rows(result: SimulationResult) -> np.ndarray:
+    """Rows of the frames: start, crouch, lift-off, some of the flight, touchdown, deepest, end."""
     flight = np.flatnonzero(result.phase == "flight")
     if not len(flight):  # it never left the ground
-        return [(int(r), k * APART_M, 1.0) for k, r in enumerate(np.linspace(0, len(result.t) - 1, 5))]
+        return np.linspace(0, len(result.t) - 1, 5).astype(int)
     off, on = int(flight[0]), int(flight[-1])
-    crouch = int(np.argmin(result.com[:off, 2])) if off else 0
-    out = [(0, -2 * APART_M, 1.0), (crouch, -APART_M, 1.0), (max(off - 1, 0), 0.0, 1.0)]
-    out += [(int(off + share * (on - off)), 0.0, strength) for share, strength in FLIGHT_FRAMES]
+    rows = [0, int(np.argmin(result.com[:off, 2])), off - 1] if off else []
+    rows += [off + int(share * (on - off)) for share in FLIGHT_SHARES]
     if on + 1 < len(result.t):
-        deepest = on + 1 + int(np.argmin(result.com[on + 1 :, 2]))
-        out += [(on + 1, 0.0, 1.0), (deepest, APART_M, 1.0), (len(result.t) - 1, 2 * APART_M, 1.0)]
-    return out
+        rows += [on + 1, on + 1 + int(np.argmin(result.com[on + 1 :, 2])), len(result.t) - 1]
+    return np.array(rows)
 
 
 def frame_rows(result: SimulationResult) -> np.ndarray:
@@ -172,7 +168,7 @@ def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     force.axhline(weight, **LIMIT_STYLE)
     place = dict(xytext=(0, 2), textcoords="offset points", ha="right")
     force.annotate("weight", (t[-1], weight), fontsize=7, color="#666666", **place)
-    force.set(xlabel="time [s]", ylabel=f"vertical force, {1000 * SMOOTHING_S:.0f} ms mean [kN]")
+    force.set(xlabel="time [s]", ylabel="mean vertical force [kN]")
     _torque_shares(bars, result, robot)
     panel_letters((pitch, force, bars))
     legend_above(fig, phase_handles("launch", "flight", "landing", reference="plan", limit="weight, torque limit"))

@@ -1,0 +1,72 @@
+"""``jumplab trials``: many perturbed robots jump a plan, and the share that lands."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from jumplab.commands.common import common_options
+from jumplab.errors import InputError
+
+LARGEST = 100_000  # our choice: two days of one core; more is surely a typo
+INTERRUPTED = "interrupted; finished trials are kept, and the same command goes on from there"
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Declare ``jumplab trials``."""
+    trials = commands.add_parser("trials", help="let many perturbed robots jump a plan", parents=[common_options()])
+    trials.add_argument("dir", metavar="DIR", help="folder of a plan; trials.jsonl and trials.json are written there")
+    trials.add_argument("--n", default="200", metavar="N", help="number of robots (default 200)")
+    trials.add_argument("--seed", default="0", metavar="S", help="seed of the series (default 0)")
+    trials.add_argument("--mode", choices=("position", "pd"), default="position",
+                        help="how the joints follow the plan up to touchdown")  # fmt: skip
+    trials.add_argument("--reaim", action=argparse.BooleanOptionalAction, default=True,
+                        help="turn the legs in the air against the trunk's pitch error")  # fmt: skip
+    trials.add_argument("--noise", action=argparse.BooleanOptionalAction, default=False,
+                        help="tell the controllers noisy measurements instead of the truth")  # fmt: skip
+    trials.add_argument("--jobs", metavar="J", help="processes (default: one per core)")
+    trials.set_defaults(work=_trials)
+
+
+def _trials(args: argparse.Namespace) -> None:
+    start = time.perf_counter()
+    n, seed = _whole("--n", args.n, 1, LARGEST), _whole("--seed", args.seed, 0)
+    jobs = None if args.jobs is None else _whole("--jobs", args.jobs, 1)
+
+    from jumplab import store
+
+    store.read_plan(args.dir)  # refuses a damaged folder before the heavy libraries are there
+    store.ensure_writable(args.dir)
+
+    from jumplab.experiments import TrialSettings, run_trials
+    from jumplab.simulation import SensorNoise
+
+    noise = SensorNoise.typical() if args.noise else SensorNoise()
+    settings = TrialSettings(args.mode, args.reaim, noise)
+    try:
+        report = run_trials(args.dir, n, seed, settings, jobs=jobs)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(INTERRUPTED) from None
+    low, high = report.interval
+    print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
+    for reason, count in report.reasons.items():
+        print(f"{count:>5} failed: {reason}")
+    for name, unit in (("distance", "foot_distance_m"), ("rise", "com_rise_m")):
+        values = report.values(unit)
+        if len(values):
+            print(f"{name} of those that landed: {values.min():.3f} ... {values.max():.3f} m")
+    print(f"trials.json in {args.dir}, {report.resumed} trials from an earlier run, "
+          f"whole run: {time.perf_counter() - start:.1f} s")  # fmt: skip
+
+
+def _whole(option: str, text: str, least: int, most: int | None = None) -> int:
+    """The whole number that an option was given."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise InputError(f"{option} must be a whole number, got {text!r}") from None
+    if value < least:
+        raise InputError(f"{option} must be at least {least}, got {value}")
+    if most is not None and value > most:
+        raise InputError(f"{option} must be at most {most}, got {value}")
+    return value

@@ -1,0 +1,22 @@
+"""What one does with a simulation: correct the goal, let many robots try, read their sensors."""
+
+from jumplab.experiments.goal_bias import BiasedJump, GoalBias, reach_goal
+from jumplab.experiments.measurement import Measurement, measure
+from jumplab.experiments.monte_carlo import TrialReport, run_trials, wilson
+from jumplab.experiments.outcome import outcomes
+from jumplab.experiments.trial import Trial, TrialKey, TrialSettings
+
+__all__ = [
+    "BiasedJump",
+    "GoalBias",
+    "Measurement",
+    "Trial",
+    "TrialKey",
+    "TrialReport",
+    "TrialSettings",
+    "measure",
+    "outcomes",
+    "reach_goal",
+    "run_trials",
+    "wilson",
+]

@@ -1,0 +1,145 @@
+"""Pictures of the experiments: what lies where in a scene, what sensors say, and what the map of trials counts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+
+from jumplab.experiments import Trial, TrialKey, measure, wilson
+from jumplab.plotting import experiments as pictures
+from jumplab.plotting import render
+from jumplab.plotting.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
+from jumplab.simulation import Scene, SensorNoise, simulate_jump
+
+DITCH = Scene.ditch(0.3, 0.75)
+SHORT_S = 0.3  # of standing: enough for a picture
+
+
+@pytest.fixture(scope="module")
+def tape():
+    return jump(1.0, 0.5).tape
+
+
+@pytest.fixture(scope="module")
+def result(tape, bhr):
+    return simulate_jump(tape, bhr, scene=DITCH, stand_s=SHORT_S)
+
+
+@pytest.fixture(autouse=True)
+def no_simulation(result, monkeypatch):
+    """No picture may simulate."""
+    monkeypatch.setattr(render.bullet, "stepSimulation", None)
+
+
+def smallest_font(fig) -> float:
+    return min(t.get_fontsize() for t in fig.findobj(Text) if t.get_text() and t.get_visible())
+
+
+def grounds(fig):
+    rectangles = [p for p in fig.axes[0].patches if isinstance(p, Rectangle)]
+    return [(p.get_x(), p.get_x() + p.get_width(), p.get_y() + p.get_height()) for p in rectangles]
+
+
+# ------------------------------------------------------------------------------------------ scenes
+
+
+def test_a_ditch_is_a_gap_between_two_grounds(result, bhr):
+    fig = pictures.scene_strobe(result, bhr, DITCH)
+    (_, left_end, left_top), (right_start, _, right_top) = grounds(fig)  # the floor lies below the picture
+    assert (left_end, left_top, right_start, right_top) == pytest.approx((0.3, 0.0, 0.75, 0.0))
+    labels = [t.get_text() for t in fig.axes[0].texts]
+    assert len(labels) == 5 and labels[0] == "0.00 s" and labels == sorted(labels)
+    path = fig.axes[0].lines[0].get_xydata()
+    assert path == pytest.approx(result.com[result.phase == "flight"][:, [0, 2]])
+    assert smallest_font(fig) >= MIN_FONT_PT and fig.get_size_inches()[0] == PAGE_IN
+
+
+def test_a_platform_has_its_height_and_edge(result, bhr):
+    fig = pictures.scene_strobe(result, bhr, Scene.platform(0.5, 0.4))
+    tops = {round(top, 6): start for start, _, top in grounds(fig)}
+    assert tops[0.4] == pytest.approx(0.5) and 0.0 in tops
+
+
+def test_a_jump_that_never_left_the_ground_is_shown_too(result, bhr):
+    lazy = replace(result, phase=np.full(len(result.t), "launch"))
+    assert len(pictures.scene_strobe(lazy, bhr, Scene.flat()).axes[0].texts) == 2
+
+
+def test_rendered_frames_name_their_experiment(result, bhr):
+    fig = pictures.experiment_frames([("A: ditch", result, DITCH), ("B: clean", result, Scene.flat())], bhr)
+    assert len(fig.axes) == 12 and all(len(ax.images) == 1 and not ax.axison for ax in fig.axes)
+    titles = [ax.get_title() for ax in fig.axes[:6]]
+    assert titles[0] == "launch, 0.00 s"
+    assert [t.split(",")[0] for t in titles] == ["launch"] * 3 + ["flight"] + ["landing"] * 2
+    assert [t.get_text() for ax in fig.axes for t in ax.texts] == ["A: ditch", "B: clean"]
+    assert smallest_font(fig) >= MIN_FONT_PT
+    clean, gap = (np.asarray(fig.axes[k].images[0].get_array()) for k in (9, 3))
+    ground = [(p[-20:] < 0.99).any(axis=(0, 2)).mean() for p in (clean, gap)]
+    gap_share = 0.45 / pictures.WIDE_FRAME_M
+    assert ground == pytest.approx([1.0, 1.0 - gap_share], abs=0.05)
+
+
+# ------------------------------------------------------------------------------------------ sensors
+
+
+def test_exact_sensors_tell_the_truth(result, bhr, tape):
+    """Without noise and with the right model: L and rho to rounding, the CoM as far as the toes stand still."""
+    exact = measure(result, bhr, SensorNoise())
+    n = len(exact.t)
+    assert set(exact.phase) == {"launch", "flight"} and n == int((result.phase != "landing").sum())
+    assert exact.L == pytest.approx(result.L[:n], abs=1e-9) and exact.rho == pytest.approx(result.rho[:n], abs=1e-9)
+    launch = exact.phase == "launch"
+    assert np.abs(exact.com - result.com[:n][:, [0, 2]])[launch].max() < 2e-3
+    assert np.isnan(exact.com[~launch]).all()
+    fig = pictures.measured_jump(exact, tape, bhr)
+    assert len(fig.axes) == 4 and smallest_font(fig) >= MIN_FONT_PT
+    shown = np.concatenate([line.get_ydata() for line in fig.axes[3].lines[:2]])
+    assert shown == pytest.approx(exact.rho)
+
+
+def test_noise_is_seeded_and_of_its_size(result, bhr):
+    one, same, other = (measure(result, bhr, seed=s) for s in (1, 1, 2))
+    assert np.array_equal(one.L, same.L) and not np.array_equal(one.L, other.L)
+    error = one.L - result.L[: len(one.t)]
+    assert abs(error.mean()) < 0.02 and 0.02 < error.std() < 0.3
+
+
+# ------------------------------------------------------------------------------------------ many robots
+
+
+def made_up(count, falls_below):
+    """Robots that fall if and only if their friction is low."""
+    rng, out = np.random.default_rng(4), []
+    for k in range(count):
+        draw = dict(zip((name for name, *_ in pictures.FEATURES), rng.uniform(0.5, 1.0, 6), strict=True))
+        out.append(Trial(TrialKey(0, k, "", ""), {}, draw, draw["friction"] > falls_below, "", None))
+    return out
+
+
+@pytest.mark.parametrize(("count", "bins"), [(1, 1), (8, 1), (40, 4), (300, 5)])
+def test_map_counts_every_robot_once(count, bins):
+    trials = made_up(count, 0.6)
+    fig = pictures.trial_map(trials)
+    landed = sum(t.landed for t in trials)
+    for ax in fig.axes:
+        points = {line.get_color(): len(line.get_xdata()) for line in ax.lines if line.get_linestyle() == "None"}
+        assert points == {LANDING: landed, VERMILION: count - landed}
+        assert len(ax.collections) == bins
+    assert smallest_font(fig) >= MIN_FONT_PT
+
+
+def test_map_shows_what_decides():
+    trials = made_up(100, 0.75)
+    friction, delay = pictures.trial_map(trials).axes[:2]
+    rates = [[line.get_ydata()[0] for line in ax.lines if line.get_linestyle() == "-"] for ax in (friction, delay)]
+    assert rates[0][0] == 0 and rates[0][-1] == 1 and 0.2 < min(rates[1]) and max(rates[1]) < 0.9
+    low, high = wilson(0, 20)
+    box = friction.collections[0].get_paths()[0].vertices[:, 1]
+    assert (box.min(), box.max()) == pytest.approx((low, high))
+
+
+def test_map_of_nothing():
+    assert len(pictures.trial_map([]).axes) == 6

@@ -1,0 +1,301 @@
+"""Monte Carlo: a trial is decided by its key alone, and neither kill nor order changes a series."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+from test_store import make_tape, names
+
+from jumplab import experiments, store
+from jumplab.errors import InputError, SolverError
+from jumplab.experiments import Trial, TrialKey, TrialSettings, monte_carlo, run_trials, wilson
+from jumplab.experiments import trial as single
+from jumplab.experiments.log import open_log
+from jumplab.simulation import Perturbation, Scene, SensorNoise
+
+ROOT = Path(__file__).resolve().parent.parent
+# the QP library sums in an order that depends on where memory happens to lie: the last bits of a torque may differ
+SAME = 1e-6
+
+
+@pytest.fixture
+def folder(bhr, tmp_path):
+    """A small real plan on file."""
+    plan = jump(0.6, 0.3, method="direct")
+    store.write_plan(tmp_path / "plan", plan.tape, bhr, plan.summary)
+    return tmp_path / "plan"
+
+
+def play(tape, robot, scene, settings, key):
+    """Stands in for a trial: lands by a coin that the key tosses."""
+    toss = np.random.default_rng(key.robot_seed).uniform()
+    drawn = Perturbation.draw(robot, key.robot_seed)
+    reason = "stood" if toss < 0.7 else f"left_arm touched the ground {toss:.2f} s after touchdown"
+    return Trial(key, {}, single.features(drawn, robot), toss < 0.7, reason, None)
+
+
+@pytest.fixture
+def coins(monkeypatch):
+    monkeypatch.setattr(monte_carlo, "run_trial", play)
+    monkeypatch.setattr(monte_carlo.TrialReport, "values", lambda self, name: np.zeros(0))
+
+
+def content(folder):
+    return (folder / "trials.json").read_bytes()
+
+
+# ------------------------------------------------------------------------------------------ one trial
+
+
+def test_a_trial_is_the_simulation_it_says(folder, bhr):
+    tape, robot, summary = store.read_plan(folder)
+    settings = TrialSettings("pd", True, SensorNoise.typical())
+    key = TrialKey(3, 5, settings.hash, single.plan_hash(summary))
+    trial = single.run_trial(tape, robot, Scene.flat(), settings, key)
+    drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
+    assert trial.perturbation == json.loads(json.dumps(drawn.to_json()))
+    assert trial.metrics.landed == trial.landed and trial.metrics.com_rise_m == pytest.approx(0.3, abs=0.05)
+    assert Trial.from_line(trial.line()) == trial and trial.line().count("\n") == 1
+    f = trial.features
+    assert (f["friction"], f["delay_s"]) == (drawn.friction, drawn.delay_s)
+    assert drawn.robot(robot).total_mass == pytest.approx(robot.total_mass * (1 + f["mass"]))
+
+
+def test_features_of_a_shift_of_every_link(bhr):
+    """All links' centres of mass moved alike, nothing turned but the legs: the whole robot's moves as its trunk's."""
+    links = Perturbation.draw(bhr, 0).com
+    shifted = single.features(Perturbation(com=dict.fromkeys(links, (0.0, 0.01, 0.0))), bhr)
+    assert shifted["com_y_m"] == pytest.approx(0.01, rel=1e-3) and shifted["mass"] == 0
+    weak = Perturbation(motor_gain=dict.fromkeys(bhr.joint_names, 0.97))
+    assert single.features(weak, bhr)["leg_motors"] == pytest.approx(-0.03)
+
+
+def test_a_lost_robot_is_a_failure(folder, monkeypatch):
+    def explode(*args, **options):
+        raise SolverError("PyBullet lost the robot")
+
+    monkeypatch.setattr(single, "simulate_jump", explode)
+    report = run_trials(folder, 2, jobs=1)
+    assert (report.landed, report.reasons) == (0, {"PyBullet lost the robot": 2})
+    assert store.read_json(folder / "trials.json")["landed_metrics"]["com_rise_m"] is None
+
+
+def test_keys_differ_in_everything_that_matters(folder, monkeypatch):
+    summary = store.read_plan(folder)[2]
+    base = TrialSettings()
+    others = [TrialSettings("pd"), TrialSettings(reaim=False), TrialSettings(noise=SensorNoise.typical()),
+              TrialSettings(ranges=replace(base.ranges, mass=0.06))]  # fmt: skip
+    assert len({s.hash for s in (base, *others)}) == 5 and TrialSettings().hash == base.hash
+    known = base.hash
+    monkeypatch.setattr(single, "_code", lambda: "another controller")
+    assert base.hash != known
+    plans = [summary, summary | {"platform_edge_m": 0.3}, summary | {"target": {"platform_m": 0.1}}]
+    assert len({single.plan_hash(s) for s in plans}) == 3
+    seeds = {TrialKey(s, k, "", "").robot_seed for s in range(20) for k in range(50)}
+    assert len(seeds) == 1000
+
+
+def test_bad_mode():
+    with pytest.raises(InputError, match=r"^mode 'velocity': must be one of position, pd$"):
+        TrialSettings("velocity")
+
+
+# ------------------------------------------------------------------------------------------ a series
+
+
+def test_report_counts(folder, coins):
+    report = run_trials(folder, 40, seed=2, jobs=1)
+    said = store.read_json(folder / "trials.json")
+    landed = sum(t.landed for t in report.trials)
+    assert said["counts"] == {"trials": 40, "landed": landed, "failed": 40 - landed} and 20 < landed < 36
+    assert said["success_rate"] == landed / 40 and said["success_interval"] == list(wilson(landed, 40))
+    assert said["reasons"] == {"arm touched the ground ... s after touchdown": 40 - landed}
+    assert set(said["failed"]) == {str(t.key.index) for t in report.trials if not t.landed}
+    assert said["settings"]["mode"] == "position" and said["settings"]["reaim"] and said["seed"] == 2
+    assert [t.key.index for t in report.trials] == list(range(40))
+    lines = (folder / "trials.jsonl").read_text().splitlines()
+    assert {Trial.from_line(line).key for line in lines} == {t.key for t in report.trials}
+
+
+def test_wilson_is_its_formula():
+    z = 1.959963984540054
+    for k, n in ((0, 8), (5, 8), (190, 200), (200, 200)):
+        middle, half = (k + z * z / 2) / (n + z * z), z / (n + z * z) * np.sqrt(k * (n - k) / n + z * z / 4)
+        assert wilson(k, n) == pytest.approx((max(0, middle - half), min(1, middle + half)), abs=1e-9)
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, MemoryError])
+def test_a_stopped_series_goes_on_to_the_same_end(folder, coins, monkeypatch, stop):
+    whole = run_trials(folder, 12, jobs=1)
+    wanted = content(folder)
+    (folder / "trials.json").unlink()
+    (folder / "trials.jsonl").unlink()
+    calls = []
+
+    def stopping(*args):
+        if len(calls) == 5:
+            raise stop
+        calls.append(args)
+        return play(*args)
+
+    monkeypatch.setattr(monte_carlo, "run_trial", stopping)
+    with pytest.raises(stop):
+        run_trials(folder, 12, jobs=1)
+    assert "trials.json" not in names(folder)
+    with open(folder / "trials.jsonl", "ab") as file:  # killed in the middle of a line
+        file.write(whole.trials[7].line().encode()[:100])
+    monkeypatch.setattr(monte_carlo, "run_trial", play)
+    again = run_trials(folder, 12, jobs=1)
+    assert again.resumed == 5 and again.trials == whole.trials and content(folder) == wanted
+    third = run_trials(folder, 12, jobs=1)
+    assert third.resumed == 12 and content(folder) == wanted
+
+
+def test_a_bar_only_where_it_is_wanted(folder, coins, capsys):
+    report = run_trials(folder, 3, jobs=1)
+    assert capsys.readouterr().err == ""  # not a terminal
+    run_trials(folder, 4, jobs=1, progress=True)
+    said = capsys.readouterr().err
+    assert "4/4" in said and "3/4" in said  # the first three are there already
+    assert report.count == 3
+
+
+def test_a_longer_series_begins_with_the_shorter_one(folder, coins):
+    short, long = run_trials(folder, 5, jobs=1), run_trials(folder, 9, jobs=1)
+    assert long.resumed == 5 and long.trials[:5] == short.trials
+    assert run_trials(folder, 3, jobs=1).trials == short.trials[:3]
+
+
+def test_other_settings_seeds_and_plans_do_not_mix(folder, bhr, coins):
+    first = run_trials(folder, 4, jobs=1)
+    for options in ({"seed": 1}, {"settings": TrialSettings("pd")}, {"settings": TrialSettings(reaim=False)}):
+        assert run_trials(folder, 4, jobs=1, **options).resumed == 0
+    assert run_trials(folder, 4, jobs=1).resumed == 4  # all four series share the file
+    kept = (folder / "trials.jsonl").read_bytes()
+    store.write_plan(folder, make_tape(bhr), bhr, store.read_plan(folder)[2])
+    assert not {"trials.json", "trials.jsonl"} & set(names(folder))
+    (folder / "trials.jsonl").write_bytes(kept)  # even if somebody puts it back
+    other = run_trials(folder, 4, jobs=1)
+    assert other.resumed == 0 and other.plan != first.plan
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [b"", b"\n\n", b"\xff\xfe{", b"[1, 2]\n", b"{}\n", b'{"schema": "jumplab-trials-0"}\n', b"null\n", b"[" * 5000],
+)
+def test_a_log_with_junk_is_read_around(folder, coins, junk):
+    (folder / "trials.jsonl").write_bytes(junk)
+    run_trials(folder, 3, jobs=1)
+    with open_log(folder) as log:
+        assert len(log.trials) == 3
+    assert (folder / "trials.jsonl").read_bytes().startswith(junk)
+
+
+def test_two_runs_at_once_are_refused(folder, coins):
+    with open_log(folder), pytest.raises(InputError, match=r"trials\.jsonl: another 'jumplab trials' is writing it"):
+        run_trials(folder, 3, jobs=1)
+
+
+def test_a_plan_that_is_replaced_meanwhile_keeps_its_own_folder(folder, bhr, coins, monkeypatch):
+    def replacing(*args):
+        store.write_plan(folder, make_tape(bhr), bhr, store.read_plan(folder)[2])
+        return play(*args)
+
+    monkeypatch.setattr(monte_carlo, "run_trial", replacing)
+    with pytest.raises(InputError, match="has been planned again in the meantime"):
+        run_trials(folder, 1, jobs=1)
+    assert not {"trials.json", "trials.jsonl"} & set(names(folder))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((0,), "n = 0 is too small; it must be at least 1"),
+        ((2.0,), "n must be a whole number, got 2.0"),
+        ((True,), "n must be a whole number, got True"),
+        ((2, -1), "seed = -1 is too small; it must be at least 0"),
+    ],
+)
+def test_bad_numbers(folder, arguments, sentence):
+    before = names(folder)
+    with pytest.raises(InputError) as e:
+        run_trials(folder, *arguments)
+    assert str(e.value) == sentence and names(folder) == before
+
+
+@pytest.mark.parametrize("damage", ["truncated", "other robot", "older schema", "summary"])
+def test_damaged_plans_are_refused_in_one_sentence(folder, damage):
+    if damage == "truncated":
+        (folder / "plan.npz").write_bytes((folder / "plan.npz").read_bytes()[:2000])
+    elif damage == "other robot":
+        (folder / "robot.urdf").write_text((folder / "robot.urdf").read_text().replace("0.5", "0.51"))
+    elif damage == "older schema":
+        text = (folder / "summary.json").read_text()
+        (folder / "summary.json").write_text(text.replace(store.SCHEMA, "jumplab-result-0"))
+    else:
+        (folder / "summary.json").write_text((folder / "summary.json").read_text()[:300])
+    before = names(folder)
+    with pytest.raises(InputError) as e:
+        run_trials(folder, 2, jobs=1)
+    assert "\n" not in str(e.value) and str(folder) in str(e.value) and names(folder) == before
+
+
+# ------------------------------------------------------------------------------------------ the real thing
+
+
+def close(one, other):
+    """Equal draws and verdicts, and metrics equal but for the last bits."""
+    assert [(t.key, t.perturbation, t.features, t.landed) for t in one] == [
+        (t.key, t.perturbation, t.features, t.landed) for t in other
+    ]
+    for a, b in zip(one, other, strict=True):
+        for name, value in asdict(a.metrics).items():
+            if isinstance(value, float) and name in ("foot_distance_m", "com_rise_m", "liftoff_s", "touchdown_s"):
+                assert getattr(b.metrics, name) == pytest.approx(value, abs=SAME), name
+
+
+def read(folder):
+    with open_log(folder) as log:
+        return sorted(log.trials.values(), key=lambda t: t.key.index)
+
+
+@pytest.mark.slow
+def test_killed_in_parallel_and_resumed_equals_serial(folder, tmp_path):
+    """Ctrl-C, then a kill, of real runs on two workers; what remains is what one process finds undisturbed."""
+    serial = run_trials(folder, 4, jobs=1)
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in (*store.HASHED, store.SUMMARY):
+        (other / name).write_bytes((folder / name).read_bytes())
+    command = [sys.executable, "-m", "jumplab", "trials", str(other), "--n", "4", "--jobs", "2"]
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # background jobs ignore Ctrl-C
+    for number, lines in ((signal.SIGINT, 1), (signal.SIGKILL, 2)):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+                                   env=os.environ | {"PYTHONPATH": str(ROOT)}, preexec_fn=heed)  # fmt: skip
+        deadline = time.monotonic() + 120
+        log = other / "trials.jsonl"
+        while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= lines):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+        if number == signal.SIGINT and process.returncode:
+            assert process.returncode == 130
+            assert said == "jumplab: interrupted; finished trials are kept, and the same command goes on from there\n"
+    last = run_trials(other, 4, jobs=2)
+    assert last.resumed >= 1
+    close(last.trials, serial.trials)
+    close(read(other), read(folder))
+
+
+def test_package_exports():
+    assert set(experiments.__all__) <= set(dir(experiments))
