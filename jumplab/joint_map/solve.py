@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cvxpy as cp
 import numpy as np
 from proxsuite import proxqp
+from scipy.linalg import LinAlgError, lu_factor, lu_solve
 
 from jumplab.errors import InputError, SolverError
 from jumplab.joint_map.problem import StepQp
@@ -24,6 +25,9 @@ PROXQP_ITERATIONS = 1000  # our choice: a step takes about ten; more than this i
 ROW_TOLERANCE = (
     1e-6  # our choice: re-evaluated row error, relative to the row's size, above which no answer is believed
 )
+POLISH_SOFTNESS = 1e-9  # our choice: of the binding rows, relative to their size, so that dependent ones do no harm
+POLISH_ROUNDS = 3  # our choice: each takes back the softness' error by about its size; the third finds only round-off
+POLISH_REACH = 1e-6  # our choice: relative; an optimum is polished, not replaced
 CONFLICT_SHARE = 1e-3  # our choice: rows that give way by less than this share of the worst are not named
 MAX_NAMED = 5
 
@@ -138,10 +142,39 @@ class CvxpySolver:
         return checked_answer(qp, self.x.value, iterations, status, status in GOOD_CVXPY, phase, t)
 
 
-class DirectSolver:
-    """ProxQP's dense solver, set up once and updated at every step.
+def polished(hessian, linear, equal, right, rows, low, high, x, multipliers) -> np.ndarray:
+    """The optimum (n,) from the rows that bind at ``x``: minimise 1/2 x' H x + g' x with those rows as equalities.
 
-    On the 171 QPs of one jump it took 9 ms, PIQP 20 ms, both to the same 1e-9.
+    ProxQP's vectorised builds sum in an order that depends on where memory happens to lie, so the last digits of its
+    answer differ from run to run, and stage 3 makes 1e-9 of them. Which rows bind does not: solved again from these
+    alone, the answer is the same to the last bit. ``multipliers`` are those of ``rows``, positive at the upper side.
+    """
+    value = rows @ x
+    top, bottom = multipliers > high - value, -multipliers > value - low
+    C = np.concatenate([equal, rows[top], rows[bottom]])
+    d = np.concatenate([right, high[top], low[bottom]])
+    n, m = len(x), len(d)
+    size = np.maximum(np.abs(C).max(axis=1, initial=0.0), 1e-9)
+    C, d = C / size[:, None], d / size
+    kkt = np.zeros((n + m, n + m))
+    kkt[:n, :n], kkt[:n, n:], kkt[n:, :n] = hessian, C.T, C
+    want, answer = np.concatenate([-linear, d]), np.zeros(n + m)
+    soft = kkt.copy()
+    soft[range(n, n + m), range(n, n + m)] = -POLISH_SOFTNESS
+    try:
+        factors = lu_factor(soft, check_finite=False)
+    except (LinAlgError, ValueError):
+        return x
+    for _ in range(POLISH_ROUNDS):
+        answer += lu_solve(factors, want - kkt @ answer, check_finite=False)
+    moved = np.abs(answer[:n] - x).max(initial=0.0)
+    return answer[:n] if moved <= POLISH_REACH * max(1.0, np.abs(x).max(initial=0.0)) else x
+
+
+class DirectSolver:
+    """ProxQP's dense solver, set up once and updated at every step; its answer is polished, see :func:`polished`.
+
+    On the 171 QPs of one jump it took 9 ms, PIQP 20 ms, both to the same 1e-9; polishing adds 0.1 ms to each.
     """
 
     name = "direct"
@@ -163,8 +196,9 @@ class DirectSolver:
         self.solver.solve()
         result = self.solver.results
         status = result.info.status
-        x = np.array(result.x)
-        return checked_answer(qp, x, int(result.info.iter), status.name, status in GOOD_PROXQP, phase, t)
+        x, good = np.array(result.x), status in GOOD_PROXQP
+        x = polished(*data, x, np.array(result.z)) if good else x
+        return checked_answer(qp, x, int(result.info.iter), status.name, good, phase, t)
 
 
 SOLVERS = {"cvxpy": CvxpySolver, "direct": DirectSolver}
