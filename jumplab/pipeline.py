@@ -9,7 +9,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.expansion import expand, planar_motion, planar_quantities
-from jumplab.joint_map import JointPlan, map_to_joints
+from jumplab.joint_map import JointPlan, Options, map_to_joints
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
@@ -21,6 +21,8 @@ from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
+QP = Options()  # of stage 2, as every plan uses them
+NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
 @dataclass(frozen=True)
@@ -69,11 +71,22 @@ class JumpPlan:
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
-        """Cost weights of the nonlinear stages, as solved: stage -> "phase/term" -> weight."""
-        stages = {"whole body": self.whole_body.solution}
+        """Cost weights of the stages, as solved: stage -> "phase/term" -> weight."""
+        found = {"whole body": _weights(self.whole_body.solution)}
         if self.srmp is not None:
-            stages = {"SRMP": self.srmp.solution, **stages}
-        return {name: _weights(solution) for name, solution in stages.items()}
+            qps = {f"{phase}/{k}": w for phase in ("launch", "flight") for k, w in vars(getattr(QP, phase)).items()}
+            found = {"SRMP": _weights(self.srmp.solution), "joint map": qps, **found}
+        return found
+
+    @property
+    def solvers(self) -> dict[str, dict]:
+        """What the solvers said: stage -> status, iterations, size, cost, worst re-evaluated residual (scaled)."""
+        found = {} if self.srmp is None else {"SRMP": _solver(self.srmp.solution.statistics)}
+        if self.joints is not None:
+            s = self.joints.statistics
+            found["joint map"] = {"solver": s.method, "problems": s.steps, "iterations": s.iterations,
+                                  "residual": s.worst_residual}  # fmt: skip
+        return {**found, "whole body": _solver(self.whole_body.solution.statistics)}
 
     @property
     def summary(self) -> dict:
@@ -91,8 +104,13 @@ class JumpPlan:
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],
-            "manifest": {"weights": self.weights},
+            "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
         }
+
+
+def _solver(s: Statistics) -> dict:
+    times = ("build_s", "solve_s")  # these stand in the table of stages
+    return {"solver": "ipopt", **{k: v for k, v in vars(s).items() if k not in times}}
 
 
 def _weights(solution: Solution) -> dict[str, float]:
@@ -145,7 +163,7 @@ class Planner:
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         first, last = self._stage("srmp"), self._stage("whole body")
         srmp = first.plan(task)
-        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
+        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints),
                 _row("3 whole body", body.solution.statistics))  # fmt: skip
