@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, Options, map_to_joints
 from jumplab.robot import Robot
@@ -22,6 +23,7 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 QP = Options()  # of stage 2, as every plan uses them
+SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal of stage 2, half a second each
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -163,11 +165,29 @@ class Planner:
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         first, last = self._stage("srmp"), self._stage("whole body")
         srmp = first.plan(task)
-        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+        joints = self._map(srmp)
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints),
                 _row("3 whole body", body.solution.statistics))  # fmt: skip
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+
+    def _map(self, srmp: SrmpPlan) -> JointPlan:
+        """Stage 2; where it refuses, the nearest of a few shorter jumps that gets past it is named as well."""
+        robot = self.robot.under_gravity(srmp.task.gravity)
+        try:
+            return map_to_joints(srmp, robot, method="direct", options=QP)
+        except SolverError as e:
+            text = f"{e}{self._shorter(srmp.task, robot)}"
+            raise SolverError(text, stage=e.stage, status=e.status, violations=e.violations) from e
+
+    def _shorter(self, task: JumpTask, robot: Robot) -> str:
+        """Words about the first of a few shorter jumps that stage 2 can follow, if there is one."""
+        for share in SHORTER if task.distance_m else ():
+            less = replace(task, distance_m=round(share * task.distance_m, 2))
+            with contextlib.suppress(InfeasibleError, SolverError):
+                map_to_joints(self._stage("srmp").plan(less), robot, method="direct", options=QP)
+                return f"; at this height, stage 2 can follow a jump of {less.distance_m:g} m"
+        return ""
 
 
 def _row(stage: str, s: Statistics) -> StageRow:

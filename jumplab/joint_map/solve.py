@@ -14,6 +14,7 @@ from proxsuite import proxqp
 from scipy.linalg import LinAlgError, lu_factor, lu_solve
 
 from jumplab.errors import InputError, SolverError
+from jumplab.joint_map.explain import ADVICE, conflict, lines, row_scale, sentence
 from jumplab.joint_map.problem import StepQp
 
 GOOD_CVXPY = ("optimal",)
@@ -28,8 +29,6 @@ ROW_TOLERANCE = (
 POLISH_SOFTNESS = 1e-9  # our choice: of the binding rows, relative to their size, so that dependent ones do no harm
 POLISH_ROUNDS = 3  # our choice: each takes back the softness' error by about its size; the third finds only round-off
 POLISH_REACH = 1e-6  # our choice: relative; an optimum is polished, not replaced
-CONFLICT_SHARE = 1e-3  # our choice: rows that give way by less than this share of the worst are not named
-MAX_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -39,37 +38,6 @@ class Answer:
     x: np.ndarray
     iterations: int
     residual: float
-
-
-def row_scale(qp: StepQp) -> dict[str, np.ndarray]:
-    """Size of every row of E, G and R: largest coefficient times 1, or the right side if larger; at least 1."""
-    sides = {"E": np.abs(qp.e), "G": np.abs(qp.h), "R": np.minimum(np.abs(qp.lower), np.abs(qp.upper))}
-    return {k: np.maximum(1.0, np.maximum(np.abs(getattr(qp, k)).max(axis=1, initial=0.0), sides[k])) for k in "EGR"}
-
-
-def conflicts(qp: StepQp) -> tuple[str, ...]:
-    """Rows that must give way if the QP is infeasible: those with slack in the least total (scaled) relaxation."""
-    x = cp.Variable(qp.A.shape[1])
-    scale = row_scale(qp)
-    give = {k: cp.Variable(len(scale[k]), nonneg=True) for k in "EGR" if len(scale[k])}
-    zero = np.zeros(0)
-    g = {k: cp.multiply(scale[k], give[k]) if k in give else zero for k in "EGR"}
-    rows = [cp.abs(qp.E @ x - qp.e) <= g["E"], qp.R @ x <= qp.upper + g["R"], qp.R @ x >= qp.lower - g["R"]]
-    rows += [qp.G @ x <= qp.h + g["G"]]
-    problem = cp.Problem(cp.Minimize(sum(cp.sum(v) for v in give.values())), rows)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # only names are wanted
-            problem.solve(solver=cp.CLARABEL)
-    except cp.SolverError:
-        return ()
-    if problem.status not in ("optimal", "optimal_inaccurate"):
-        return ()
-    found = [(float(v), float(s), name) for k in give
-             for v, s, name in zip(give[k].value, scale[k], qp.layout.labels[k], strict=True)]  # fmt: skip
-    worst = max(v for v, _, _ in found)
-    named = sorted((f for f in found if f[0] > max(CONFLICT_SHARE * worst, 1e-7)), reverse=True)
-    return tuple(f"{name}: off by {v * s:.3g}" for v, s, name in named[:MAX_NAMED])
 
 
 def checked_answer(qp: StepQp, x, iterations: int, status: str, good: bool, phase: str, t: float) -> Answer:
@@ -86,17 +54,15 @@ def checked_answer(qp: StepQp, x, iterations: int, status: str, good: bool, phas
         worst = qp.layout.labels[k][int(np.argmax(broken[k]))]
     if good and residual <= ROW_TOLERANCE:
         return Answer(x, iterations, residual)
-    rows = conflicts(qp)
-    if rows:
-        reason = f"these rows conflict: {'; '.join(rows)}"
-    elif np.isfinite(residual):
-        reason = f"the rows are compatible, but the answer misses '{worst}' by {residual:.2g} of its size"
+    found = conflict(qp)
+    if found:
+        text = sentence(found, phase, t)
     else:
-        reason = "the rows are compatible, but there is no finite answer"
-    raise SolverError(
-        f"stage 2, {phase} QP at t = {t:.3f} s: {status}; {reason}; relax those limits or ask for an easier jump",
-        stage="joint_map", status=status, violations=rows,
-    )  # fmt: skip
+        missed = f"misses '{worst}' by {residual:.2g} of its size" if np.isfinite(residual) else "is not a finite one"
+        text = (f"stage 2: at t = {t:.3f} s of the {phase} the search for a joint motion did not settle ({status}): "
+                f"one exists, but the answer {missed}; {ADVICE}")  # fmt: skip
+    violations = lines(found, phase) if found else ()
+    raise SolverError(text, stage="joint_map", status=status, violations=violations)
 
 
 class CvxpySolver:

@@ -15,10 +15,10 @@ ENERGY_PERCENT = 0.5  # of the range of the mechanical energy
 MASS_PERCENT = 0.5  # of the URDF's mass, against the mass that the ground force moves
 
 # the tape itself --------------------------------------------------------------------------------------------------
-STEP_MS = 1.0 + 1e-6  # the control cycle is 1 ms; touchdown falls between two cycles, so one step may be shorter
+STEP_MS = 1.05 + 1e-6  # the control cycle is 1 ms; touchdown falls between two, and a sliver joins the last step
 QUATERNION = 1e-6  # deviation from unit length that integration cannot have caused
 STEP_RATE = 0.01  # [m/s, rad/s] positions against rates, step by step: 0.1 % of the fastest joint
-STEP_ACCELERATION = 2.0  # [m/s^2, rad/s^2] rates against accelerations: a jerk step of 8,000 rad/s^3 inside one step
+STEP_ACCELERATION = 4.0  # [m/s^2, rad/s^2] rates against accelerations: a jerk step of 32,000 rad/s^3 inside one step
 DRIFT_POSITION = 1.0  # [mm, mrad] after re-integrating a whole phase
 DRIFT_RATE = 0.01  # [m/s, rad/s] after re-integrating a whole phase
 SWITCH_POSITION = 0.1  # [mm, mrad] jump between the two samples of take-off: a tenth of the slip allowed
