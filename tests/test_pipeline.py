@@ -1,6 +1,7 @@
 """The stages in order: what a finished plan says, what is refused, and that a failed stage feeds nothing."""
 
 import json
+import re
 from dataclasses import FrozenInstanceError
 
 import numpy as np
@@ -194,3 +195,32 @@ def test_another_gravity_is_planned_or_refused():
         residual = np.abs(Replay(plan).residual)
         assert residual[:, :6].max() < 0.005 * 42.0 * 7.0
         assert residual[:, 6:].max() < 1e-6
+
+
+@pytest.mark.slow
+def test_refusal_of_stage_two_is_one_sentence_with_a_way_out():
+    """One backward metre: phase, time, what is missed and by how much, what holds it back, and what can be had."""
+    with pytest.raises(SolverError) as e:
+        planner().plan(JumpTask(-1.0, 0.5))
+    said = (
+        r"^stage 2: at t = \d\.\d{3} s of the (launch|flight) no joint motion follows stage 1; the nearest one misses "
+        r"'.+' by [\d.e+-]+ .+ \(.+\), held back by .+; ask for another distance, height or fewer turns, or plan it by "
+        r"the method 'direct'; at this height, stage 2 can follow a jump of -(0\.\d+) m$"
+    )
+    match = re.match(said, str(e.value))
+    assert match, str(e.value)
+    assert e.value.stage == "joint_map" and e.value.violations and e.value.exit_code == 3
+    assert planner().plan(JumpTask(-float(match[2]), 0.5)).joints is not None
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_manifest_says_how_the_plan_came_about(method):
+    """Weights and solver statistics of every stage, and that there is no seed to be told."""
+    found = jump(1.0, 0.5, 0.0, method).summary["manifest"]
+    stages = {"three-step": ["SRMP", "joint map", "whole body"], "direct": ["whole body"]}[method]
+    assert list(found["weights"]) == list(found["solvers"]) == stages
+    assert all(w >= 0 for stage in found["weights"].values() for w in stage.values())
+    for name, told in found["solvers"].items():
+        assert told["iterations"] > 0 and 0 <= told["residual"] < 1e-4
+        assert name == "joint map" or (told["status"] == "Solve_Succeeded" and told["variables"] > 100)
+    assert found["seeds"].startswith("none")
