@@ -177,8 +177,10 @@ class Planner:
         try:
             return map_to_joints(srmp, robot, method="direct", options=QP)
         except SolverError as e:
-            text = f"{e}{self._shorter(srmp.task, robot)}"
-            raise SolverError(text, stage=e.stage, status=e.status, violations=e.violations) from e
+            nearest = self._shorter(srmp.task, robot)
+            if not nearest:
+                raise
+            raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
 
     def _shorter(self, task: JumpTask, robot: Robot) -> str:
         """Words about the first of a few shorter jumps that stage 2 can follow, if there is one."""
