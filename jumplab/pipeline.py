@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.errors import InfeasibleError, InputError, SolverError, needs, said
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, Options, map_to_joints
 from jumplab.robot import Robot
@@ -127,6 +127,7 @@ class Planner:
     """All stages for one robot, built on first use and kept for further targets."""
 
     def __init__(self, robot: Robot):
+        needs(robot, Robot, "the robot to plan for")
         self.robot = robot
         self._stages: dict = {}
 
@@ -154,8 +155,9 @@ class Planner:
         InputError, InfeasibleError, SolverError
             If a stage refuses or fails; no later stage is run.
         """
-        if method not in METHODS:
-            raise InputError(f"method {method!r}: choose one of {', '.join(METHODS)}")
+        needs(task, JumpTask, "the target")
+        if not isinstance(method, str) or method not in METHODS:
+            raise InputError(f"method {said(method)}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
         if method == "direct":
             check_reachable(task, self._stage("reach"), self.robot)

@@ -29,7 +29,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path, needs
 from jumplab.robot import Robot
 from jumplab.trajectory import Tape
 
@@ -85,7 +85,7 @@ def ensure_writable(folder: str | Path) -> Path:
     InputError
         If ``folder`` is a file, or cannot be made, or cannot be written.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     with _explained(folder):
         made = _make(folder)
         try:
@@ -171,7 +171,7 @@ def transaction(folder: str | Path) -> Iterator[Path]:
     InputError
         If ``folder`` cannot be written.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     with _explained(folder):
         made = _make(folder)
         staging = folder / _STAGING
@@ -233,6 +233,9 @@ def write_plan(
     -------
     What ``complete`` returned.
     """
+    needs(tape, Tape, "the tape to write")
+    needs(robot, Robot, "its robot")
+    needs(summary, Mapping, "the summary")
     with transaction(folder) as staging:
         tape.save(staging / PLAN)
         (staging / URDF).write_bytes(robot.urdf.encode())
@@ -262,9 +265,13 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
     InputError
         If the folder cannot be written, or has come to hold another plan.
     """
+    needs(summary, Mapping, "the summary")
+    if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
+        raise InputError("the summary is not one that a plan was read with; take it from store.read_plan")
+    folder = as_path(folder, "a result folder")
     planned = {name: summary[name] for name in ("planned_distance_m", "planned_rise_m")}
     with transaction(folder) as staging:
-        if read_summary(Path(folder))["manifest"]["files"] != summary["manifest"]["files"]:
+        if read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
             raise InputError(f"{str(folder)!r} has been planned again in the meantime; simulate the new plan")
         result.save(staging, extra=planned)
 
@@ -301,7 +308,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
     InputError
         If the folder holds no finished plan, or if a file is damaged or not the one that the summary speaks of.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     try:
         if not folder.is_dir():
             raise InputError(f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first")

@@ -202,7 +202,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
         ("plan.npz", None, "no such plan"),
         ("plan.npz", "PK not a zip", "not a readable plan"),
         ("robot.urdf", None, "cannot be read"),
-        ("robot.urdf", "<robot", "Pinocchio cannot read the URDF"),
+        ("robot.urdf", "<robot", "the URDF is no well-formed XML"),
         ("robot.toml", "name = ", "not a TOML file"),
         ("summary.json", "{", "not a JSON file"),
         ("summary.json", "[]", "must hold a JSON object"),

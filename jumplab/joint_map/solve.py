@@ -172,6 +172,6 @@ SOLVERS = {"cvxpy": CvxpySolver, "direct": DirectSolver}
 
 def solver_class(method: str):
     """The solver class of a method's name."""
-    if method not in SOLVERS:
+    if not isinstance(method, str) or method not in SOLVERS:
         raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")
     return SOLVERS[method]

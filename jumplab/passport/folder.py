@@ -12,7 +12,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path
 from jumplab.passport.audit import audit
 from jumplab.passport.report import Passport
 from jumplab.robot import Robot
@@ -102,7 +102,7 @@ def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport
     InputError
         If a file is missing or damaged, or the folder cannot be written to.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     tape = Tape.load(folder / "plan.npz")
     robot = read_robot(folder)
     summary = read_summary(folder)
