@@ -1,5 +1,6 @@
 """Result folders: whole or not at all, whoever kills, races or damages them."""
 
+import ast
 import itertools
 import json
 import os
@@ -248,3 +249,22 @@ def test_damaged_summary_is_refused(bhr, tmp_path, how):
     damage(tmp_path, "summary.json", how)
     with pytest.raises(InputError, match=r"summary\.json"):
         store.read_plan(tmp_path)
+
+
+def test_nothing_in_the_package_unpickles():
+    """Neither pickle nor its relatives are imported, and no array file is read as if it might hold objects."""
+    kin = {"pickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal", "joblib"}
+    sources = sorted((ROOT / "jumplab").rglob("*.py"))
+    assert len(sources) > 50
+    for path in sources:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                assert not kin & {a.name.split(".")[0] for a in node.names}, path
+            elif isinstance(node, ast.ImportFrom):
+                given = {a.name for a in node.names} if node.module == "joblib" else set()
+                assert node.module == "joblib" and given <= {"Parallel", "delayed"} or not kin & {str(node.module)}, (
+                    path
+                )
+            elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("np.load", "numpy.load"):
+                said = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                assert said.get("allow_pickle") == "False", path

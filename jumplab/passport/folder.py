@@ -87,8 +87,8 @@ def write_atomically(path: Path, text: str) -> None:
                 os.unlink(temporary)
 
 
-def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport:
-    """Audit the plan in a result folder and write ``passport.json`` beside it.
+def write_passport(folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None) -> Passport:
+    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another folder).
 
     Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest, ``summary.json``.
 
@@ -96,6 +96,7 @@ def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport
     ----------
     folder : result folder of a plan.
     task : what was asked; by default the target in ``summary.json``.
+    into : where the file goes; the folder itself if None.
 
     Raises
     ------
@@ -109,5 +110,6 @@ def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport
     passport = audit(tape, robot, task or task_of(summary), edge_m=edge_of(summary) if task is None else None)
     digest = hashlib.sha256((folder / "plan.npz").read_bytes()).hexdigest()
     passport = dataclasses.replace(passport, manifest={**passport.manifest, "plan_sha256": digest, "planner": summary})
-    write_atomically(folder / PASSPORT_NAME, passport.to_json())
+    place = folder if into is None else as_path(into, "the passport's folder")
+    write_atomically(place / PASSPORT_NAME, passport.to_json())
     return passport
