@@ -6,6 +6,7 @@ import random
 import string
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 
