@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import json
 import math
 from collections.abc import Mapping
@@ -80,23 +81,26 @@ def declared_parameters(notebook: Path) -> tuple[str, ...]:
 
 
 def declared_kinds(notebook: Path) -> dict[str, type | range]:
-    """What the notebook's own ``check_parameters`` asks of its further parameters, read without running it."""
+    """What the notebook's own ``check_parameters`` asks of its further parameters, read without running it.
+
+    What cannot be read that way is left out: the notebook itself will still refuse it.
+    """
     cells = (c["source"] for c in json.loads(notebook.read_bytes())["cells"] if c["cell_type"] == "code")
     found: dict[str, type | range] = {}
     for source in ("".join(c) for c in cells):
-        if "check_parameters(" not in source:
-            continue
-        for call in (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Call)):
-            if getattr(call.func, "id", "") == "check_parameters":
-                found |= {k.arg: _kind(k.value) for k in call.keywords if k.arg}
+        with contextlib.suppress(SyntaxError, ValueError, TypeError):  # a cell with magics, or a range of variables
+            calls = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Call)]
+            for call in (c for c in calls if getattr(c.func, "id", "") == "check_parameters"):
+                kinds = {k.arg: _kind(k.value) for k in call.keywords if k.arg}
+                found |= {name: kind for name, kind in kinds.items() if kind is not None}
     return found
 
 
-def _kind(node: ast.expr) -> type | range:
-    """``int``, ``bool``, ``float``, ``str``, or ``range(a, b)``, as it stands in a notebook."""
+def _kind(node: ast.expr) -> type | range | None:
+    """``int``, ``bool``, ``float``, ``str``, or ``range(a, b)``, as it stands in a notebook; None for anything else."""
     if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "range":
         return range(*(ast.literal_eval(x) for x in node.args))
-    return {k.__name__: k for k in (int, bool, float, str)}[node.id]
+    return {k.__name__: k for k in (int, bool, float, str)}.get(getattr(node, "id", ""))
 
 
 def literal(path: Path) -> str:
