@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -23,7 +22,7 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 QP = Options()  # of stage 2, as every plan uses them
-SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal of stage 2, half a second each
+SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -165,32 +164,40 @@ class Planner:
             body = planner.plan(task)
             rows = (_row("direct", body.solution.statistics),)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
-        first, last = self._stage("srmp"), self._stage("whole body")
-        srmp = first.plan(task)
-        joints = self._map(srmp)
+        srmp, joints = self._first_two(task)
+        last = self._stage("whole body")
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints),
                 _row("3 whole body", body.solution.statistics))  # fmt: skip
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
 
-    def _map(self, srmp: SrmpPlan) -> JointPlan:
-        """Stage 2; where it refuses, the nearest of a few shorter jumps that gets past it is named as well."""
-        robot = self.robot.under_gravity(srmp.task.gravity)
+    def _first_two(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
+        """Stages 1 and 2; where one refuses, the nearest of a few shorter jumps that passes both is named as well."""
         try:
-            return map_to_joints(srmp, robot, method="direct", options=QP)
+            return self._pass(task)
         except SolverError as e:
-            nearest = self._shorter(srmp.task, robot)
+            nearest = self._nearest(task)
             if not nearest:
                 raise
             raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
 
-    def _shorter(self, task: JumpTask, robot: Robot) -> str:
-        """Words about the first of a few shorter jumps that stage 2 can follow, if there is one."""
+    def _pass(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
+        srmp = self._stage("srmp").plan(task)
+        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+
+    def _nearest(self, task: JumpTask) -> str:
+        """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
         for share in SHORTER if task.distance_m else ():
             less = replace(task, distance_m=round(share * task.distance_m, 2))
-            with contextlib.suppress(InfeasibleError, SolverError):
-                map_to_joints(self._stage("srmp").plan(less), robot, method="direct", options=QP)
-                return f"; at this height, stage 2 can follow a jump of {less.distance_m:g} m"
+            try:
+                self._pass(less)
+            except InfeasibleError:
+                continue
+            except SolverError as e:
+                if e.stage != "joint_map":
+                    break
+            else:
+                return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
         return ""
 
 
