@@ -4,6 +4,14 @@ A message says what is wrong, where, the value, the limit and what to do. The co
 exits with ``exit_code``.
 """
 
+import os
+import reprlib
+from pathlib import Path
+from typing import Any
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 60  # our choice: enough to recognise what one has typed
+
 
 class JumplabError(Exception):
     """Root of all deliberate errors of the package."""
@@ -45,3 +53,21 @@ class SolverError(JumplabError):
     def __init__(self, message: str, *, stage: str = "", status: str = "", violations: tuple[str, ...] = ()):
         super().__init__(message)
         self.stage, self.status, self.violations = stage, status, violations
+
+
+def said(value: Any) -> str:
+    """A value as a message may quote it: one line, not long, whatever it is."""
+    return " ".join(_SHORT.repr(value).split())
+
+
+def needs(value: Any, kind: type, what: str) -> None:
+    """Refuse (:class:`InputError`) a value of another type, before it fails somewhere inside."""
+    if not isinstance(value, kind):
+        raise InputError(f"{what} must be a {kind.__name__}, got {said(value)}")
+
+
+def as_path(value: Any, what: str) -> Path:
+    """A path from what the caller gave; refuses (:class:`InputError`) what names no file."""
+    if isinstance(value, str | os.PathLike) and value != "" and isinstance(os.fspath(value), str):
+        return Path(value)
+    raise InputError(f"{what} must be a path, got {said(value)}")

@@ -7,10 +7,8 @@ to their folder. A chain that fails leaves all of them as they were, and the not
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import inspect
-import math
 import os
 import re
 import shutil
@@ -24,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from jumplab import errors, store
-from jumplab.errors import InputError, JumplabError
+from jumplab.errors import InputError, JumplabError, as_path, needs
+from jumplab.parameters import STANDARD, check_parameters, check_value, declared_kinds, declared_parameters, literal
 from jumplab.robot import load_robot
 from jumplab.task import JumpTask
 
+__all__ = ["STANDARD", "RunReport", "check_parameters", "declared_parameters", "find_notebooks", "run_notebooks"]
 PATTERN = "[0-9][0-9]_*.ipynb"
-STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
-INJECTED = "# Parameters\n"  # how the cell begins that papermill adds
 _PACKAGE_PARENT = Path(__file__).resolve().parent.parent
 
 
@@ -52,55 +50,6 @@ class RunReport:
     wall_s: float
 
 
-# ---------------------------------------------------------------------------------------------- inside a notebook
-
-
-def check_parameters(namespace: Mapping[str, Any], **extra: type) -> None:
-    """Refuse injected parameters that a notebook does not know, and values that cannot be meant.
-
-    papermill merely warns of an unknown name and then runs with the default. Call this in the cell after the
-    parameters: ``check_parameters(globals(), samples=int)``.
-
-    Parameters
-    ----------
-    namespace : the notebook's ``globals()``.
-    extra : further parameters of this notebook and their types; those of ``STANDARD`` are always known.
-
-    Raises
-    ------
-    InputError
-        Naming the parameter, its value and what it should be.
-    """
-    known = {**STANDARD, **extra}
-    for name in _injected(namespace):
-        if name not in known:
-            raise InputError(f"unknown notebook parameter {name!r}; this notebook knows {', '.join(known)}")
-    for name, kind in known.items():
-        if name in namespace:
-            _check_value(name, namespace[name], kind)
-    if "distance_m" in namespace or "height_m" in namespace:
-        JumpTask(namespace.get("distance_m", 0.0), namespace.get("height_m", 0.5))
-
-
-def _injected(namespace: Mapping[str, Any]) -> list[str]:
-    """Names assigned by the cell that papermill added, from IPython's list of what has been executed."""
-    cells = [source for source in namespace.get("In", []) if source.startswith(INJECTED)]
-    names = [t.id for c in cells for node in ast.walk(ast.parse(c)) if isinstance(node, ast.Assign)
-             for t in node.targets if isinstance(t, ast.Name)]  # fmt: skip
-    return list(dict.fromkeys(names))
-
-
-def _check_value(name: str, value: Any, kind: type) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    good = number if kind is float else isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
-    if not good:
-        raise InputError(f"parameter {name} must be of type {kind.__name__}, got {value!r}")
-    if kind is float and not math.isfinite(value):
-        raise InputError(f"parameter {name} must be finite, got {value}")
-    if kind is str and (not value or "\0" in value):
-        raise InputError(f"parameter {name} must be a name or a path, got {value!r}")
-
-
 # ---------------------------------------------------------------------------------------------- finding them
 
 
@@ -120,21 +69,6 @@ def find_notebooks() -> list[Path]:
     raise InputError(
         f"no notebooks in {' nor in '.join(repr(str(p)) for p in places)}; run this in a clone of the repository"
     )
-
-
-def declared_parameters(notebook: Path) -> tuple[str, ...]:
-    """Names that the notebook's ``parameters`` cell declares."""
-    from papermill import inspect_notebook
-
-    try:
-        return tuple(inspect_notebook(_literal(notebook)))
-    except Exception as e:  # nbformat raises a whole zoo
-        raise InputError(f"{notebook}: not a readable notebook ({type(e).__name__})") from e
-
-
-def _literal(path: Path) -> str:
-    """Path for papermill, which would otherwise fill in what stands between braces."""
-    return str(path).replace("{", "{{").replace("}", "}}")
 
 
 # ---------------------------------------------------------------------------------------------- running them
@@ -167,9 +101,12 @@ def run_notebooks(
         If a cell fails: of the class that the cell raised, if that is one of the package's.
     """
     start = time.perf_counter()
-    notebooks = [Path(n).resolve() for n in notebooks or find_notebooks()]
+    if parameters is not None:
+        needs(parameters, Mapping, "the notebooks' parameters")
+    notebooks = [as_path(n, "a notebook").resolve() for n in notebooks or find_notebooks()]
     declared = {n: declared_parameters(n) for n in notebooks}
-    values = _checked(dict(parameters or {}), set().union(*declared.values()))
+    kinds = {k: v for n in notebooks for k, v in declared_kinds(n).items()}
+    values = _checked(dict(parameters or {}), set().union(*declared.values()), kinds)
     root = notebooks[0].parent.parent
     asked = out is not None
     out = store.ensure_writable(out if asked else root / "executed").resolve()
@@ -185,14 +122,15 @@ def run_notebooks(
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
 
 
-def _checked(values: dict[str, Any], known: set[str]) -> dict[str, Any]:
+def _checked(values: dict[str, Any], known: set[str], kinds: Mapping[str, type | range]) -> dict[str, Any]:
+    kinds = {**kinds, **STANDARD}
     for name, value in values.items():
         if name in ("out", "figures"):
             raise InputError(f"the parameter {name!r} is set by the runner; use its own argument {name}")
         if name not in known:
             raise InputError(f"unknown notebook parameter {name!r}; the notebooks know {', '.join(sorted(known))}")
-        if name in STANDARD:
-            _check_value(name, value, STANDARD[name])
+        if name in kinds:
+            check_value(name, value, kinds[name])
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
     if "robot" in values:
         load_robot(values["robot"])
@@ -239,7 +177,7 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | Non
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
         try:
             papermill.execute_notebook(
-                _literal(notebook), _literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
+                literal(notebook), literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
                 progress_bar={"desc": label} if label else False, kernel_manager_class=_kernel_manager(Path(scratch)),
             )  # fmt: skip
         except PapermillExecutionError as e:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InfeasibleError, InputError, SolverError, needs, said
 from jumplab.expansion import expand, planar_motion, planar_quantities
-from jumplab.joint_map import JointPlan, map_to_joints
+from jumplab.joint_map import JointPlan, Options, map_to_joints
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
@@ -22,6 +22,9 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
+QP = Options()  # of stage 2, as every plan uses them
+SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
+NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
 @dataclass(frozen=True)
@@ -70,11 +73,22 @@ class JumpPlan:
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
-        """Cost weights of the nonlinear stages, as solved: stage -> "phase/term" -> weight."""
-        stages = {"whole body": self.whole_body.solution}
+        """Cost weights of the stages, as solved: stage -> "phase/term" -> weight."""
+        found = {"whole body": _weights(self.whole_body.solution)}
         if self.srmp is not None:
-            stages = {"SRMP": self.srmp.solution, **stages}
-        return {name: _weights(solution) for name, solution in stages.items()}
+            qps = {f"{phase}/{k}": w for phase in ("launch", "flight") for k, w in vars(getattr(QP, phase)).items()}
+            found = {"SRMP": _weights(self.srmp.solution), "joint map": qps, **found}
+        return found
+
+    @property
+    def solvers(self) -> dict[str, dict]:
+        """What the solvers said: stage -> status, iterations, size, cost, worst re-evaluated residual (scaled)."""
+        found = {} if self.srmp is None else {"SRMP": _solver(self.srmp.solution.statistics)}
+        if self.joints is not None:
+            s = self.joints.statistics
+            found["joint map"] = {"solver": s.method, "problems": s.steps, "iterations": s.iterations,
+                                  "residual": s.worst_residual}  # fmt: skip
+        return {**found, "whole body": _solver(self.whole_body.solution.statistics)}
 
     @property
     def summary(self) -> dict:
@@ -92,8 +106,13 @@ class JumpPlan:
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],
-            "manifest": {"weights": self.weights},
+            "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
         }
+
+
+def _solver(s: Statistics) -> dict:
+    times = ("build_s", "solve_s")  # these stand in the table of stages
+    return {"solver": "ipopt", **{k: v for k, v in vars(s).items() if k not in times}}
 
 
 def _weights(solution: Solution) -> dict[str, float]:
@@ -108,6 +127,7 @@ class Planner:
     """All stages for one robot, built on first use and kept for further targets."""
 
     def __init__(self, robot: Robot):
+        needs(robot, Robot, "the robot to plan for")
         self.robot = robot
         self._stages: dict = {}
 
@@ -135,8 +155,9 @@ class Planner:
         InputError, InfeasibleError, SolverError
             If a stage refuses or fails; no later stage is run.
         """
-        if method not in METHODS:
-            raise InputError(f"method {method!r}: choose one of {', '.join(METHODS)}")
+        needs(task, JumpTask, "the target")
+        if not isinstance(method, str) or method not in METHODS:
+            raise InputError(f"method {said(method)}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
         if method == "direct":
             check_reachable(task, self._stage("reach"), self.robot)
@@ -144,12 +165,40 @@ class Planner:
             body = planner.plan(task)
             rows = _body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
-        first, last = self._stage("srmp"), self._stage("whole body")
-        srmp = first.plan(task)
-        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
+        srmp, joints = self._first_two(task)
+        last = self._stage("whole body")
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *_body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+
+    def _first_two(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
+        """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
+        try:
+            return self._pass(task)
+        except SolverError as e:
+            nearest = self._nearest(task) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
+            if not nearest:
+                raise
+            raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
+
+    def _pass(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
+        srmp = self._stage("srmp").plan(task)
+        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+
+    def _nearest(self, task: JumpTask) -> str:
+        """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
+        for share in SHORTER if task.distance_m else ():
+            less = replace(task, distance_m=round(share * task.distance_m, 2))
+            try:
+                self._pass(less)
+            except InfeasibleError:
+                continue
+            except SolverError as e:
+                if e.stage != "joint_map":
+                    break
+            else:
+                return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
+        return ""
 
 
 def _row(stage: str, s: Statistics) -> StageRow:

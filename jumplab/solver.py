@@ -59,6 +59,7 @@ class Nlp:
         a = self.assembled
         return ca.nlpsol("solver", "ipopt", a.nlp, {
             "ipopt": {**IPOPT, **(options or {})}, "print_time": False, "error_on_fail": False,
+            "show_eval_warnings": False, "calc_lam_p": False,
             "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": a.hess_lag,
         })  # fmt: skip
 
@@ -252,7 +253,11 @@ class Nlp:
         residual = float(np.max(beyond, initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         status = stats["return_status"]
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            self._fail(status, stats["iter_count"], x0, p, (low, high), (row_low, row_high) if explain else None)
+            said = f"{self.problem.name}: no plan ({status} after {int(stats['iter_count'])} iterations)"
+            self._refuse_no_numbers({"initial guess": x0, "last iterate": x}, p, said, status)
+            if not explain:
+                raise SolverError(said, stage=self.problem.name, status=status)
+            self._fail(said, status, x0, p, (low, high), (row_low, row_high))
         statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
                                 float(answer["f"]), residual)  # fmt: skip
         return Solution(self.problem, self._unpack(x), statistics, self._cost_shares(x, p),
@@ -281,11 +286,36 @@ class Nlp:
                                  value=float(value * scale), slack=float(slack * scale))  # fmt: skip
         return tuple(best.values())
 
-    def _fail(self, status, iterations, x0, p, box, rows):
+    def _refuse_no_numbers(self, points, p, said, status):
+        """Name the terms that are no number, or have no slope, at one of the points; ipopt says only that some are."""
+        for where, x in points.items():
+            lost = self._without_number(x, p)
+            if lost:
+                reason = f"no finite value or slope at the {where} has {' or '.join(lost[:4])}"
+                advice = "keep its arguments where it is defined, or start from another guess"
+                raise SolverError(f"{said}: {reason}; {advice}", stage=self.problem.name, status=status,
+                                  violations=tuple(lost))  # fmt: skip
+
+    def _without_number(self, x, p) -> list[str]:
+        """Terms with a value or slope at ``x`` that is not finite: "phase/term at node k, t = ... s of the phase"."""
+        a, phases, named = self.assembled, self._unpack(x), {}
+        slope = a.jac_g(x, p)[1]
+        bad = ~np.isfinite(a.nlp(x, p)[1].full().ravel())
+        bad[np.array(slope.sparsity().row(), int)[~np.isfinite(np.array(slope.nonzeros()))]] = True
+        for row in (a.rows[i] for i in np.flatnonzero(bad)):
+            when = f", t = {phases[row.owner].t[row.node]:.3f} s of the phase" if row.owner in phases else ""
+            named.setdefault((row.owner, row.term.name), f" at node {row.node}{when}")
+        parts = a.cost_parts(x, p).full().ravel()
+        lost = ~np.isfinite(parts)
+        if not lost.any():  # slopes only then: a value that is no number spoils the slopes of its neighbours
+            lost = ~np.isfinite(a.cost_parts.jacobian()(x, p, 0)[0].full()).all(axis=1)
+        for i in np.flatnonzero(lost):
+            owner, term = a.cost_terms[i]
+            named.setdefault((owner, term.name), "")
+        return [f"{owner}/{name}{place}" for (owner, name), place in named.items()]
+
+    def _fail(self, said, status, x0, p, box, rows):
         """Re-solve with every row softened, and say which terms cannot be met together, where and by how much."""
-        if rows is None:
-            raise SolverError(f"{self.problem.name}: no plan ({status} after {iterations} iterations)",
-                              stage=self.problem.name, status=status)  # fmt: skip
         x, beyond = least_violation(self.assembled, x0, p, box, rows)
         worst: dict[tuple, tuple] = {}
         phases = self._unpack(x)
@@ -305,5 +335,4 @@ class Nlp:
             reason += "; ask for less, or give these terms more room"
         else:
             reason = "a motion that meets every constraint exists, but the search did not settle; try another guess"
-        raise SolverError(f"{self.problem.name}: no plan ({status} after {iterations} iterations): {reason}",
-                          stage=self.problem.name, status=status, violations=lines)  # fmt: skip
+        raise SolverError(f"{said}: {reason}", stage=self.problem.name, status=status, violations=lines)

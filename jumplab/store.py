@@ -29,7 +29,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path, needs
 from jumplab.robot import Robot
 from jumplab.trajectory import Tape
 
@@ -88,7 +88,7 @@ def ensure_writable(folder: str | Path) -> Path:
     InputError
         If ``folder`` is a file, or cannot be made, or cannot be written.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     with _explained(folder):
         made = _make(folder)
         try:
@@ -174,7 +174,7 @@ def transaction(folder: str | Path) -> Iterator[Path]:
     InputError
         If ``folder`` cannot be written.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     with _explained(folder):
         made = _make(folder)
         staging = folder / _STAGING
@@ -257,6 +257,9 @@ def write_plan(
     -------
     What ``complete`` returned.
     """
+    needs(tape, Tape, "the tape to write")
+    needs(robot, Robot, "its robot")
+    needs(summary, Mapping, "the summary")
     with transaction(folder) as staging:
         tape.save(staging / PLAN)
         (staging / URDF).write_bytes(robot.urdf.encode())
@@ -286,9 +289,13 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
     InputError
         If the folder cannot be written, or has come to hold another plan.
     """
+    needs(summary, Mapping, "the summary")
+    if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
+        raise InputError("the summary is not one that a plan was read with; take it from store.read_plan")
+    folder = as_path(folder, "a result folder")
     planned = {name: summary[name] for name in ("planned_distance_m", "planned_rise_m")}
     with transaction(folder) as staging:
-        _same_plan(Path(folder), summary)
+        _same_plan(folder, summary)
         result.save(staging, extra=planned)
 
 
@@ -336,7 +343,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
     InputError
         If the folder holds no finished plan, or if a file is damaged or not the one that the summary speaks of.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     try:
         if not folder.is_dir():
             raise InputError(f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first")

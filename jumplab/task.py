@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, said
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
 MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
@@ -15,9 +15,9 @@ MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump
 
 def _number(name: str, value, low: float, high: float, unit: str) -> float:
     try:
-        x = float(value)
+        x = float("" if isinstance(value, bool) else value)  # True is no number of metres
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must be a number in {unit}, got {value!r}") from None
+        raise InputError(f"{name} must be a number in {unit}, got {said(value)}") from None
     if not math.isfinite(x):
         raise InputError(f"{name} must be finite, got {x}")
     if not low <= x <= high:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
@@ -56,6 +56,10 @@ class Tape:
         for name in ("q", "v", "a", "tau", "phase", "f"):
             if len(getattr(self, name)) != n:
                 raise InputError(f"tape: {name} has {len(getattr(self, name))} rows, t has {n}")
+        for name in ("t", "q", "v", "a", "tau", "f"):
+            kind = np.asarray(getattr(self, name)).dtype.kind
+            if kind not in "fiu":
+                raise InputError(f"tape: {name} holds no real numbers (kind {kind!r})")
         for x in (*(getattr(self, name) for name in _DIMENSIONS), *self.extra.values()):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
@@ -82,10 +86,10 @@ class Tape:
     @classmethod
     def load(cls, path: str | Path) -> Tape:
         """Read ``plan.npz``; raises :class:`InputError` if it is missing, damaged or of another schema."""
-        path = Path(path)
-        if not path.is_file():
-            raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
+        path = as_path(path, "a plan's file")
         try:
+            if not path.is_file():
+                raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in file.files}
         except _DAMAGE as e:

@@ -9,6 +9,7 @@ from test_joint_map import followable, mapped
 
 from jumplab.errors import InputError, SolverError
 from jumplab.joint_map import CvxpySolver, DirectSolver, Form, Limits, Options, map_to_joints
+from jumplab.joint_map.explain import conflict
 from jumplab.joint_map.problem import Layout, StepQp
 from jumplab.joint_map.reference import Track, hermite
 from jumplab.robot import load_robot
@@ -73,9 +74,15 @@ def test_unknown_words():
 @pytest.mark.parametrize("method", ["direct", "cvxpy"])
 def test_hopeless_limits_name_phase_time_and_rows(method):
     weak = Options(limits=Limits(torque_share=0.05))
-    with pytest.raises(SolverError, match=r"stage 2, launch QP at t = 0\.\d+ s: .*conflict: .*off by") as error:
+    said = (
+        r"^stage 2: at t = 0\.\d+ s of the launch no joint motion follows stage 1; the nearest one misses '.+' by "
+        r"\d.* (N|m/s\^2|N m|rad/s\^2) \(.+\), held back by .+ \(.+_.+\); ask for another distance, "
+    )
+    with pytest.raises(SolverError, match=said) as error:
         map_to_joints(followable(), load_robot(), method=method, options=weak)
-    assert error.value.exit_code == 3 and error.value.violations
+    assert error.value.exit_code == 3 and error.value.violations and "\n" not in str(error.value)
+    words = ("PROXQP", "QP", "infeasible", "solver", "row", "slack")  # of the solver, not of the jump
+    assert error.value.status and not [w for w in words if w in str(error.value)]
 
 
 def small_qp(**changes):
@@ -90,18 +97,26 @@ def test_a_small_qp_and_its_conflict(solver):
     answer = solver(small_qp()).solve(small_qp(), "test", 0.0)
     np.testing.assert_allclose(answer.x, [0.2, 0.8], atol=1e-7)
     bad = small_qp(e=np.array([3.0]))
-    with pytest.raises(SolverError, match=r"test QP at t = 1\.500 s: .*these rows conflict: (sum|cap|box)"):
+    with pytest.raises(SolverError, match=r"at t = 1\.500 s of the test .* misses '(sum|cap|box)' by .* \("):
         solver(bad).solve(bad, "test", 1.5)
+
+
+def test_the_conflict_is_told_from_the_bystanders():
+    """x + y = 3 with x <= 0.2 and y <= 1: the sum gives way by 1.8; the lower sides of the box have no part in it."""
+    found = conflict(small_qp(e=np.array([3.0])))
+    assert [g[:2] for g in found.gives] == [("sum", "x + y")] and found.gives[0][2] == pytest.approx(1.8, abs=1e-5)
+    assert set(found.limits) == {("cap", "x"), ("box", "y")}
+    assert conflict(small_qp()) is None
 
 
 def test_a_wrong_answer_is_refused_whatever_the_status():
     from jumplab.joint_map.solve import checked_answer
 
     with pytest.raises(
-        SolverError, match=r"optimal; the rows are compatible, but the answer misses 'sum x \+ y' by 0\.5"
+        SolverError, match=r"did not settle \(optimal\): one exists, but the answer misses 'sum x \+ y' by 0\.5"
     ):
         checked_answer(small_qp(), np.array([0.2, 0.3]), 3, "optimal", True, "test", 0.0)
-    with pytest.raises(SolverError, match="no finite answer"):
+    with pytest.raises(SolverError, match="is not a finite one"):
         checked_answer(small_qp(), None, 0, "user_limit", False, "test", 0.0)
 
 

@@ -252,6 +252,20 @@ def test_check_parameters_accepts_what_is_meant():
     notebooks.check_parameters({"fast": True, "In": ["# Parameters\nfast = True"]}, fast=bool)
 
 
+def test_what_a_notebook_asks_is_known_before_it_runs(tmp_path):
+    """Types and ranges of the further parameters stand in the notebook; what cannot be read there is left to it."""
+    from jumplab.parameters import declared_kinds
+
+    asked = {p.name[:2]: declared_kinds(p) for p in SOURCES}
+    assert {"samples": range(1, 10_001)}.items() <= asked["01"].items() and asked["05"]["fast"] is bool
+    chain = [make_notebook(tmp_path, "00_x", "check_parameters(globals(), n=range(2, 5), m=kinds['m'])")]
+    assert declared_kinds(chain[0]) == {"n": range(2, 5)}
+    for value, said in ((5, "parameter n must be 2 ... 4, got 5"), (2.5, "parameter n must be of type int, got 2.5")):
+        with pytest.raises(InputError) as e:
+            notebooks.run_notebooks({"n": value}, notebooks=chain, progress=False)
+        assert str(e.value) == said and names(tmp_path) == ["notebooks"]
+
+
 def test_plain_papermill_with_an_unknown_parameter_fails(tmp_path):
     import papermill
 

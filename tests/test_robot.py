@@ -451,7 +451,7 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
         load_robot(str(config))
     assert str(e.value) == f"{config}: its URDF 'bhr.urdf' cannot be read as text (FileNotFoundError)"
     (tmp_path / "bhr.urdf").write_text("<robot")
-    with pytest.raises(RobotError, match=r"^robot bhr: Pinocchio cannot read the URDF: "):
+    with pytest.raises(RobotError, match=r"^robot bhr: the URDF is no well-formed XML: "):
         load_robot(str(config))
     (tmp_path / "bhr.urdf").write_text(bhr.urdf)
     assert load_robot(str(config)).hash == bhr.hash

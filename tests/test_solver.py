@@ -232,6 +232,24 @@ def test_too_few_iterations_is_not_an_answer():
     assert "exists, but the search did not settle" in str(e.value)
 
 
+@pytest.mark.parametrize(
+    ("term", "named"),
+    [
+        (Term("root", "-", "m", "node", lambda p: ca.sqrt(p.q - 2), lower=0.0, upper=9.0),
+         ("go/root at node 0, t = 0.000 s of the phase",)),
+        (Term("tip", "-", "m", "end", lambda p: ca.sqrt(p.q), lower=-np.inf, upper=9.0),
+         (f"go/tip at node {N}, t = 1.000 s of the phase",)),
+        (Term("log", "-", "m", "mid", lambda p: ca.log(p.q - 1), weight=1.0), ("go/log",)),
+    ],
+)  # fmt: skip
+def test_a_term_that_is_no_number_is_named(capfd, term, named):
+    """Or whose slope is none; CasADi itself knows only row and column."""
+    with pytest.raises(SolverError, match="no finite value or slope at the initial guess has go/") as e:
+        Nlp(move(term)).solve({"goal": 1.0}, flat_guess())
+    assert e.value.violations == named and e.value.status == "Invalid_Number_Detected"
+    assert capfd.readouterr().err == ""
+
+
 class Pretender:
     """A solver that says what it is told to say."""
 

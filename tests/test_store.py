@@ -1,5 +1,6 @@
 """Result folders: whole or not at all, whoever kills, races or damages them."""
 
+import ast
 import itertools
 import json
 import os
@@ -248,3 +249,21 @@ def test_damaged_summary_is_refused(bhr, tmp_path, how):
     damage(tmp_path, "summary.json", how)
     with pytest.raises(InputError, match=r"summary\.json"):
         store.read_plan(tmp_path)
+
+
+def test_nothing_in_the_package_unpickles():
+    """Neither pickle nor its relatives are imported, and no array file is read as if it might hold objects."""
+    kin = {"pickle", "_pickle", "dill", "cloudpickle", "shelve", "marshal"}
+    sources = sorted((ROOT / "jumplab").rglob("*.py"))
+    assert len(sources) > 50
+    for path in sources:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                assert not kin & {a.name.split(".")[0] for a in node.names}, path
+            elif isinstance(node, ast.ImportFrom):
+                assert not kin & {str(node.module)} and "Memory" not in {a.name for a in node.names}, path
+            elif isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                assert name not in ("joblib.load", "joblib.Memory"), path
+                if name in ("np.load", "numpy.load"):
+                    assert {k.arg: ast.unparse(k.value) for k in node.keywords}.get("allow_pickle") == "False", path

@@ -22,7 +22,7 @@ def _audit(args: argparse.Namespace) -> None:
 
     from jumplab import passport
 
-    with store.locked(folder):
-        audit = passport.write_passport(folder)
+    with store.transaction(folder) as staging:
+        audit = passport.write_passport(folder, into=staging)
     print(audit.table())
     judge(audit, args.dir)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from importlib import metadata
 
+from jumplab.errors import InputError, needs, said
 from jumplab.passport import collision, contact, description, dynamics, joints, kinematics, target
 from jumplab.passport.replay import open_tape, replay
 from jumplab.passport.report import Passport
@@ -54,6 +56,13 @@ def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: flo
     InputError
         If the tape belongs to another robot (joints, sizes or contact frames differ).
     """
+    needs(tape, Tape, "the tape to audit")
+    needs(robot, Robot, "its robot")
+    if task is not None:
+        needs(task, JumpTask, "the target")
+    number = isinstance(edge_m, int | float) and not isinstance(edge_m, bool)
+    if edge_m is not None and not (number and math.isfinite(edge_m)):
+        raise InputError(f"edge_m must be a finite number of metres, got {said(edge_m)}")
     open_tape(tape, robot, task)
     checks = kinematics.form(tape)
     if all(c.passed for c in checks):

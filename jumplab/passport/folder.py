@@ -12,7 +12,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, as_path
 from jumplab.passport.audit import audit
 from jumplab.passport.report import Passport
 from jumplab.robot import Robot
@@ -87,8 +87,8 @@ def write_atomically(path: Path, text: str) -> None:
                 os.unlink(temporary)
 
 
-def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport:
-    """Audit the plan in a result folder and write ``passport.json`` beside it.
+def write_passport(folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None) -> Passport:
+    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another folder).
 
     Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest, ``summary.json``.
 
@@ -96,18 +96,20 @@ def write_passport(folder: str | Path, task: JumpTask | None = None) -> Passport
     ----------
     folder : result folder of a plan.
     task : what was asked; by default the target in ``summary.json``.
+    into : where the file goes; the folder itself if None.
 
     Raises
     ------
     InputError
         If a file is missing or damaged, or the folder cannot be written to.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "a result folder")
     tape = Tape.load(folder / "plan.npz")
     robot = read_robot(folder)
     summary = read_summary(folder)
     passport = audit(tape, robot, task or task_of(summary), edge_m=edge_of(summary) if task is None else None)
     digest = hashlib.sha256((folder / "plan.npz").read_bytes()).hexdigest()
     passport = dataclasses.replace(passport, manifest={**passport.manifest, "plan_sha256": digest, "planner": summary})
-    write_atomically(folder / PASSPORT_NAME, passport.to_json())
+    place = folder if into is None else as_path(into, "the passport's folder")
+    write_atomically(place / PASSPORT_NAME, passport.to_json())
     return passport

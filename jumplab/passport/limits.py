@@ -15,10 +15,10 @@ ENERGY_PERCENT = 0.5  # of the range of the mechanical energy
 MASS_PERCENT = 0.5  # of the URDF's mass, against the mass that the ground force moves
 
 # the tape itself --------------------------------------------------------------------------------------------------
-STEP_MS = 1.25 + 1e-6  # the control cycle is 1 ms; touchdown falls between two cycles, so the last step may be longer
+STEP_MS = 1.05 + 1e-6  # the control cycle is 1 ms; touchdown falls between two, and a sliver joins the last step
 QUATERNION = 1e-6  # deviation from unit length that integration cannot have caused
 STEP_RATE = 0.01  # [m/s, rad/s] positions against rates, step by step: 0.1 % of the fastest joint
-STEP_ACCELERATION = 5.0  # [m/s^2, rad/s^2] rates against accelerations: a jerk step of 40,000 rad/s^3 inside one step
+STEP_ACCELERATION = 4.0  # [m/s^2, rad/s^2] rates against accelerations: a jerk step of 32,000 rad/s^3 inside one step
 DRIFT_POSITION = 1.0  # [mm, mrad] after re-integrating a whole phase
 DRIFT_RATE = 0.01  # [m/s, rad/s] after re-integrating a whole phase
 SWITCH_POSITION = 0.1  # [mm, mrad] jump between the two samples of take-off: a tenth of the slip allowed
@@ -30,7 +30,7 @@ SLIP_MM = 1.0  # of the toe edge over the whole launch
 HOVER_MM = 1.0  # of the toe edge above or below the ground while it is said to push
 PENETRATION_MM = 1.0  # of any sole point below the surface under it
 CLEARANCE_MM = 20.0  # of the sole in mid-flight: rough floor and tracking error of the playback
-MID_FLIGHT = (1 / 3, 2 / 3)  # share of the flight: outside, the sole is on its way from or to a surface
+MID_FLIGHT = (0.3, 0.7)  # share of the flight: outside, the sole is on its way from or to a surface
 BODY_CLEARANCE_MM = 10.0  # of everything but the feet above ground and platform
 COP_MIN_FORCE_N = 50.0  # per foot (100 N in all): below, the CoP is a quotient of two small numbers
 COP_OUTSIDE_MM = 10.0  # beyond the sole's edge between the planner's nodes

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import tomllib
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError
+from jumplab.errors import RobotError, said
 from jumplab.robot.sagittal import SagittalModel, reduce
 
 GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
@@ -93,6 +95,8 @@ class Robot:
     @classmethod
     def load(cls, name_or_config: str | Path = "bhr") -> Robot:
         """Load a shipped robot by name, or any robot by the path of its TOML file."""
+        if not isinstance(name_or_config, str | os.PathLike):
+            raise RobotError(f"a robot must be a name or the path of a TOML file, got {said(name_or_config)}")
         path = SHIPPED.get(str(name_or_config)) or Path(name_or_config)
         known = ", ".join(SHIPPED)
         try:
@@ -157,9 +161,25 @@ class Robot:
                     f"{a['effort']:g} N m, speed {a['speed']:g} rad/s; all must be finite, positive and in order"
                 )
 
+    def _check_xml(self) -> None:
+        """Refuse what the URDF parser would complain of on stderr, in lines of its own."""
+        try:
+            root = ET.fromstring(self.urdf)
+        except (ET.ParseError, ValueError) as e:
+            raise RobotError(f"robot {self.name}: the URDF is no well-formed XML: {e}") from e
+        for joint in root.iter("joint"):
+            limit = joint.find("limit")
+            for key, text in limit.items() if limit is not None else ():
+                try:
+                    float(text)
+                except ValueError:
+                    where = f"robot {self.name}: joint {joint.get('name')!r}"
+                    raise RobotError(f"{where}: the limit {key!r} must be a number, got {said(text)}") from None
+
     @cached_property
     def model(self) -> pin.Model:
         """Pinocchio model with a free-flyer base and g = 9.8. Call ``model.createData()`` for each user."""
+        self._check_xml()
         try:
             model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
         except ValueError as e:

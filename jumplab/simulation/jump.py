@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, needs, said
 from jumplab.robot import Robot
 from jumplab.simulation.actuation import Delay
 from jumplab.simulation.landing import PERIOD_STEPS, LandingController, Reference
@@ -160,9 +160,25 @@ def simulate_landing(
     return _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s, disturbance)
 
 
+def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
+    needs(tape, Tape, "the tape to play")
+    needs(robot, Robot, "the robot to simulate")
+    for value, kind, what in ((perturbation, Perturbation, "the perturbation"), (scene, Scene, "the scene")):
+        if value is not None:
+            needs(value, kind, what)
+    if not (reference is None or callable(reference) or callable(getattr(reference, "at", None))):
+        raise InputError(f"the landing's reference must be one, or a function that plans one, got {said(reference)}")
+    if not (isinstance(stand_s, int | float) and not isinstance(stand_s, bool) and 0 < stand_s <= 60):
+        raise InputError(f"stand_s = {said(stand_s)} s is outside 0 ... 60 s")
+    for name in ("t", "q", "v", "tau"):
+        if not np.all(np.isfinite(getattr(tape, name))):
+            raise InputError(f"the tape's {name} has entries that are no number; plan the jump again")
+    if not np.any(tape.phase == "flight") or not np.any(tape.phase == "launch"):
+        raise InputError("the tape must have a launch and a flight; plan the jump again")
+
+
 def _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s, disturbance=None) -> SimulationResult:
-    if not 0 < stand_s <= 60:
-        raise InputError(f"stand_s = {stand_s:g} s is outside 0 ... 60 s")
+    _check(tape, robot, perturbation, scene, reference, stand_s)
     perturbation, scene = perturbation or Perturbation(), scene or Scene.flat()
     real = perturbation.robot(robot)
     pilot = _Pilot(tape, robot, mode, scene, reference, reaim)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, said
 from jumplab.robot import Robot
 from jumplab.simulation.actuation import Actuators
 from jumplab.simulation.world import STEP_S, World
@@ -49,8 +49,8 @@ class Playback:
     """
 
     def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):
-        if mode not in MODES:
-            raise InputError(f"mode {mode!r}: must be one of {', '.join(MODES)}")
+        if not isinstance(mode, str) or mode not in MODES:
+            raise InputError(f"mode {said(mode)}: must be one of {', '.join(MODES)}")
         names = tuple(str(n) for n in tape.joint_names)
         if names != robot.joint_names:
             raise InputError(f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}")

@@ -19,7 +19,7 @@ class Limits:
     edge_smoothing_m: float = 0.015  # a platform's edge is a step smoothed over about twice this
     edge_before_heel_m: float = 0.05  # a platform begins this far before the landing heel
     edge_step_m: float = 0.08  # and for clearance it counts as beginning this much earlier still
-    clearance_m: float = 0.03  # of the sole over the ground in mid-flight
+    clearance_m: float = 0.035  # of the sole over the ground in mid-flight: 2 cm from 30 to 70 % of it
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase

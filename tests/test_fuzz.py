@@ -1,0 +1,315 @@
+"""Seeded random bad input to the API and to the notebooks' parameters: one sentence, quickly, and nothing left behind.
+
+The command line's own is in test_cli.py. Nothing here is plausible: every call must be refused.
+"""
+
+import dataclasses
+import math
+import os
+import random
+import time
+from functools import cache
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from fixtures_core import pendulum, planner
+from papermill.iorw import load_notebook_node
+from papermill.parameterize import parameterize_notebook
+from test_store import make_summary, make_tape
+
+from jumplab import notebooks, store
+from jumplab.errors import InputError, JumplabError
+from jumplab.joint_map import map_to_joints
+from jumplab.passport import audit, write_passport
+from jumplab.pipeline import METHODS, Planner, plan_jump
+from jumplab.robot import Robot, load_robot
+from jumplab.simulation import Scene, simulate_jump
+from jumplab.task import JumpTask
+from jumplab.trajectory import Tape
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
+SLOWEST_S = 10.0
+FEW, ALL = 60, 500  # cases per door: in the everyday run, and in the slow one (API and notebooks make a thousand)
+ROBOT = load_robot()
+SILLY = [None, True, "far", "", "\0", b"x", float("nan"), math.inf, -math.inf, 1e9, 10**400, 1j, [], {}, [1.0, 2.0],
+         np.array([1.0, 2.0]), object(), print, "x" * 5000, "1,0", "½", "--", ("a",), {"a": 1}]  # fmt: skip
+
+
+@cache
+def good_tape() -> Tape:
+    """A tape of the right shape that is no jump."""
+    return make_tape(ROBOT)
+
+
+def junk(rng: random.Random) -> str:
+    return "".join(chr(rng.choice([*range(33, 127), 228, 8364, 128512])) for _ in range(rng.randint(1, 12)))
+
+
+# ------------------------------------------------------------------------------------------ doors of the API
+# each takes a generator and an empty folder, and returns a call that must be refused
+
+
+def target(rng, folder):
+    field = rng.choice(["distance_m", "height_m", "platform_m", "rotation_rad", "gravity"])
+    bad = rng.choice([*SILLY, rng.choice([-1, 1]) * 10 ** rng.uniform(2, 300)])
+    return lambda: JumpTask(**{"distance_m": 1.0, "height_m": 0.5, field: bad})
+
+
+def robot_name(rng, folder):
+    bad = rng.choice([None, 3, True, b"bhr", [], {}, 1.5, "", ".", "/", "/dev/null", "a\0b", junk(rng) + "?", "x" * 999,
+                      str(folder), Path("nowhere.toml"), "BHR", "bhr "])  # fmt: skip
+    return lambda: load_robot(bad)
+
+
+def robot_text(rng, folder):
+    """The default robot's own files with one needed thing gone or senseless."""
+    urdf, config = ROBOT.urdf, ROBOT.config_text
+    kind = rng.randrange(6)
+    if kind == 0:  # cut somewhere
+        urdf = urdf[: rng.randrange(len(urdf) - 20)]
+    elif kind == 1:
+        lines = config.splitlines()
+        entries = [i for i, x in enumerate(lines) if "=" in x and not x.startswith("#") and "urdf" not in x]
+        del lines[rng.choice(entries)]
+        config = "\n".join(lines)
+    elif kind == 2:
+        config = config.replace(rng.choice(["knee", "left_foot", "corner_speed_ratio", "sole_x_m"]), junk(rng) + "-", 1)
+    elif kind == 3:
+        name = rng.choice(["effort", "velocity"])
+        urdf = urdf.replace(f' {name}="', f' {name}="{rng.choice(["-", "nan", "x", "0e"])}', 1)
+    elif kind == 4:
+        urdf, config = rng.choice([(config, urdf), ("", config), (urdf, ""), (junk(rng), config), (urdf, "= =")])
+    else:
+        config = config.replace("corner_speed_ratio = ", f"corner_speed_ratio = {rng.choice(['1', '-', 'nan #'])}", 1)
+    if (urdf, config) == (ROBOT.urdf, ROBOT.config_text):
+        return robot_text(rng, folder)
+    return lambda: Robot.from_text(urdf, config)
+
+
+def plan_options(rng, folder):
+    task, bad = JumpTask(1.0, 0.5), rng.choice(SILLY)
+    return rng.choice([
+        lambda: plan_jump(task, ROBOT, method=bad),
+        lambda: plan_jump(bad, ROBOT),
+        lambda: plan_jump(task, bad),
+        lambda: Planner("bhr" if bad is None else bad),
+        lambda: map_to_joints(bad, ROBOT),
+        lambda: map_to_joints(pendulum(0.3, 0.2), ROBOT, method=bad),
+        lambda: planner().plan(JumpTask(rng.choice([-1, 1]) * rng.uniform(2.8, 3.0), rng.uniform(0.02, 0.1))),
+        lambda: planner().plan(JumpTask(0.5, rng.uniform(1.2, 1.5)), rng.choice(METHODS)),
+    ])  # fmt: skip
+
+
+def tape_arrays(rng, folder):
+    good = {f.name: getattr(good_tape(), f.name) for f in dataclasses.fields(Tape) if f.name != "extra"}
+    name = rng.choice([n for n in good if n not in ("contact_frames", "joint_names")])
+    x = good[name]
+    bad = rng.choice(
+        [x[:-1], x[None], np.array(3.0), None, [], "far", x.astype(object) if x.dtype.kind == "f" else None]
+    )
+    return lambda: Tape(**{**good, name: bad})
+
+
+def tape_file(rng, folder):
+    path = folder / "plan.npz"
+    kind = rng.randrange(4)
+    if kind == 0:
+        bad = rng.choice(
+            [None, 3, True, b"plan.npz", [], folder / "none.npz", folder, "/dev/null", "a\0b", junk(rng) + "?"]
+        )
+        return lambda: Tape.load(bad)
+    good_tape().save(path)
+    whole = path.read_bytes()
+    if kind == 1:
+        path.write_bytes(whole[: rng.randrange(len(whole))])
+    elif kind == 2:
+        path.write_bytes(rng.randbytes(rng.randint(0, 500)))
+    else:
+        arrays = good_tape().arrays()
+        del arrays[rng.choice(["schema", "t", "q", "f", "phase", "joint_names"])]
+        np.savez(path, **arrays)
+    return lambda: (Tape.load(path), None)[1]
+
+
+def result_folder(rng, folder):
+    place = rng.choice([None, 3, True, b"x", [], "", "/dev/null/x", "a\0b", "/proc/x", "x" * 300, str(folder / "none")])
+    bad = rng.choice([None, 3, "tape", [], {}])
+    here = folder / "new"
+    calls = [
+        lambda: store.read_plan(place),
+        lambda: write_passport(place),
+        lambda: store.write_simulation(place, None, make_summary() | {"manifest": {}}),
+        lambda: store.write_simulation(here, None, bad),
+        lambda: store.write_plan(here, bad, ROBOT, {}),
+        lambda: store.write_plan(here, good_tape(), bad, {}),
+        lambda: store.write_plan(here, good_tape(), ROBOT, None if isinstance(bad, dict) else bad),
+    ]
+    if not str(place).startswith(str(folder)):
+        calls += [lambda: store.ensure_writable(place), lambda: store.write_plan(place, good_tape(), ROBOT, {})]
+    return rng.choice(calls)
+
+
+def simulation(rng, folder):
+    tape, bad = good_tape(), rng.choice([x for x in SILLY if not callable(x)])
+    name = rng.choice(["t", "q", "v", "tau"])
+    gap = np.array(getattr(tape, name))
+    gap[rng.randrange(len(gap))] = rng.choice([math.nan, math.inf])
+    return rng.choice([
+        lambda: simulate_jump(tape, ROBOT, mode=bad),
+        lambda: simulate_jump(bad, ROBOT),
+        lambda: simulate_jump(tape, bad),
+        lambda: simulate_jump(tape, ROBOT, stand_s=bad),
+        lambda: simulate_jump(tape, ROBOT, scene=bad if bad is not None else 3),
+        lambda: simulate_jump(tape, ROBOT, perturbation=bad if bad is not None else 3),
+        lambda: simulate_jump(tape, ROBOT, reference=bad if bad is not None else 3),
+        lambda: simulate_jump(dataclasses.replace(tape, **{name: gap}), ROBOT),
+        lambda: simulate_jump(dataclasses.replace(tape, joint_names=tape.joint_names[::-1]), ROBOT),
+        lambda: Scene.platform(0.5, -rng.random()),
+    ])  # fmt: skip
+
+
+def audited(rng, folder):
+    """A tape that is none must be refused, or get a passport that fails."""
+    tape, task = good_tape(), JumpTask(1.0, 0.5)
+    bad = rng.choice([x for x in SILLY if x is not None])
+
+    def failing(**changes):
+        passport = audit(dataclasses.replace(tape, **changes), ROBOT, task)
+        assert not passport.passed
+        raise InputError("a failed passport is a refusal")
+
+    edge = rng.choice([math.nan, math.inf, "far", [], True])
+    return rng.choice([
+        lambda: audit(bad, ROBOT, task),
+        lambda: audit(tape, bad, task),
+        lambda: audit(tape, ROBOT, bad),
+        lambda: audit(tape, ROBOT, task, edge_m=edge),
+        lambda: audit(dataclasses.replace(tape, q=tape.q[:, :-1]), ROBOT, task),
+        lambda: audit(dataclasses.replace(tape, contact_frames=np.array([junk(rng), "left_foot"])), ROBOT, task),
+        lambda: failing(q=np.full_like(tape.q, math.nan)),
+        lambda: failing(phase=tape.phase[::-1]),
+        lambda: failing(t=np.arange(len(tape.t)) / -1000.0),
+    ])  # fmt: skip
+
+
+def runner(rng, folder):
+    """``run_notebooks`` itself, over the package's notebooks."""
+    name, bad = rng.choice([
+        ("distance_m", rng.choice([None, True, "far", math.nan, 1e9, [], -3.01])),
+        ("height_m", rng.choice([0, -1, "0.5", math.inf, 1.51, 1j])),
+        ("robot", rng.choice(["", "asimo", None, 3, "a\0b", junk(rng) + "?"])),
+        ("grid", rng.choice([0, 1, -3, 1.5, True, "6", 10**9, None])),
+        ("samples", rng.choice([0, -1, 10**9, "many", 2.0])),
+        ("targets", rng.choice([0, 201, -1, 1.5, None])),
+        ("fast", rng.choice([0, 1, "yes", None])),
+        (rng.choice(["out", "figures"]), "x"),
+        ("no_such_" + str(rng.randrange(99)), 1),
+    ])  # fmt: skip
+    return rng.choice([
+        *[lambda: run({name: bad})] * 6,
+        lambda: run({}, out=rng.choice(["/dev/null/x", "/proc/x", "x\0", ""])),
+        lambda: run({}, figures="/dev/null/x"),
+        lambda: run(rng.choice([3, "distance_m=1", [1]])),
+        lambda: notebooks.run_notebooks({}, notebooks=[folder / "none.ipynb"], out=folder / "o", progress=False),
+    ])  # fmt: skip
+
+
+def run(parameters, **folders):
+    return notebooks.run_notebooks(parameters, notebooks=SOURCES, progress=False, **folders)
+
+
+API = [target, robot_name, robot_text, plan_options, tape_arrays, tape_file, result_folder, simulation, audited, runner]
+
+
+# ------------------------------------------------------------------------------------------ injected into a notebook
+
+
+@cache
+def source(path: Path):
+    return load_notebook_node(str(path))
+
+
+def injected(rng, folder):
+    """What papermill would do: add a cell after the parameters, then run up to the cell that checks them."""
+    path = rng.choice(SOURCES)
+    own = {"01": ("samples", [0, -5, 1.5, "200", True, 10**7]), "02": ("grid", [0, 1, "6", 6.0, None, 999]),
+           "03": ("targets", [0, 201, "6", None, 2.5]), "05": ("fast", [0, 1, "yes", None])}  # fmt: skip
+    choices = [
+        ("distance_m", [None, True, "1.0", "far", math.nan, -math.inf, 1e9, 3.2, [1.0], {}]),
+        ("height_m", [None, False, "0.5", math.nan, 0.0, -0.3, 1.6, [0.5]]),
+        ("robot", [None, 3, "", "asimo", "BHR", "a\0b", ["bhr"], f"{junk(rng)}?", "x" * 300]),
+        (rng.choice(["out", "figures"]), [None, 3, "", True, ["x"], "a\0b"]),
+        (rng.choice(["distance", "Distance_m", "height", "robots", "n", "seed", "task", "plotting"]), [1, "x", None]),
+    ]
+    choices += [own[path.name[:2]]] * 2 if path.name[:2] in own else []
+    name, values = rng.choice(choices)
+    bad = rng.choice(values)
+
+    def execute():
+        given = parameterize_notebook(source(path), {name: bad}, report_mode=False)
+        namespace = {"In": [""]}
+        for cell in (c for c in given.cells if c.cell_type == "code"):
+            namespace["In"].append(cell.source)
+            exec(compile(cell.source, path.name, "exec"), namespace)
+            if "check_parameters(" in cell.source:
+                return
+
+    return execute
+
+
+# ------------------------------------------------------------------------------------------ the tests
+
+
+def refuse(doors, count, seed, folder, monkeypatch, capfd=None):
+    """Draw ``count`` cases; only one-line JumplabErrors, no file, no word on stderr, none slow; the slowest [s]."""
+    rng, slowest, elsewhere = random.Random(seed), 0.0, folder / "here"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    checkout = tracked()
+    for i in range(count):
+        door = doors[i % len(doors)]
+        case = folder / f"case{i}"
+        case.mkdir()
+        call = door(rng, case)
+        before, began = sorted(p.name for p in case.rglob("*")), time.monotonic()
+        try:
+            with matplotlib.rc_context():
+                answer = call()
+        except JumplabError as e:
+            assert "\n" not in str(e) and 10 < len(str(e)) < 6000, (door.__name__, i, e)
+        except Exception as e:
+            raise AssertionError(f"{door.__name__}, case {i} of seed {seed}: {type(e).__name__}: {e}") from e
+        else:
+            raise AssertionError(f"{door.__name__}, case {i} of seed {seed}: accepted, gave {answer!r:.200}")
+        slowest = max(slowest, time.monotonic() - began)
+        assert slowest < SLOWEST_S, (door.__name__, i)
+        assert sorted(p.name for p in case.rglob("*")) == before, (door.__name__, i)
+    assert os.listdir(elsewhere) == [] and tracked() == checkout
+    assert capfd is None or capfd.readouterr() == ("", "")
+    return slowest
+
+
+def tracked() -> list[str]:
+    """What stands in the checkout itself, where a run without --out would write."""
+    return sorted(p.name for p in ROOT.iterdir() if p.name != ".pytest_cache")
+
+
+@pytest.mark.parametrize("door", API, ids=lambda d: d.__name__)
+def test_api_refuses(door, tmp_path, monkeypatch, capfd):
+    refuse([door], FEW if door is not runner else FEW // 6, 17, tmp_path, monkeypatch, capfd)
+
+
+def test_notebooks_refuse(tmp_path, monkeypatch, capfd):
+    refuse([injected], 2 * FEW, 19, tmp_path, monkeypatch, capfd)
+
+
+@pytest.mark.slow
+def test_a_thousand_bad_inputs(tmp_path, monkeypatch, capfd):
+    """Half over the API, half as notebook parameters; with other seeds than the quick tests."""
+    for seed, doors in ((23, API), (29, [injected])):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        refuse(doors, ALL, seed, folder, monkeypatch, capfd)

@@ -1,0 +1,143 @@
+"""Real commands killed, terminated and interrupted: the folder then holds the old result or the new one, whole.
+
+JUMPLAB_KILLS=25 sets how many processes are shot per test; the everyday run makes do with a few.
+"""
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+
+from jumplab import passport, store
+
+ROOT = Path(__file__).resolve().parent.parent
+KILLS = int(os.environ.get("JUMPLAB_KILLS", "4"))
+SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
+PLAN = {"passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"}
+SIMULATION = {"simulation.npz", "simulation.json"}
+OLD, NEW = 0.5, 0.45  # rise asked of the plan that is there, and of those that are shot
+
+
+def names(folder):
+    return {p.name for p in folder.iterdir()}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A finished plan of the old target, with its passport and a simulation."""
+    plan = jump(1.0, OLD)
+    store.write_plan(tmp_path, plan.tape, plan.robot, plan.summary, passport.write_passport)
+    command(["simulate", str(tmp_path)], tmp_path).communicate(timeout=120)
+    assert names(tmp_path) == PLAN | SIMULATION
+    return tmp_path
+
+
+def command(arguments, folder):
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore Ctrl-C
+    return subprocess.Popen([sys.executable, "-m", "jumplab", *arguments], cwd=ROOT, stdout=subprocess.DEVNULL,
+                            stderr=subprocess.PIPE, text=True, preexec_fn=heed,
+                            env=os.environ | {"OMP_NUM_THREADS": "1"})  # fmt: skip
+
+
+def shoot(arguments, folder, rng, kind, aimed_s):
+    """Start a command and end it: after a random time or, aimed, ``aimed_s`` after its first write at the latest.
+
+    Returns what it said on stderr, and its exit code.
+    """
+    process = command(arguments, folder)
+    deadline = time.monotonic() + (120.0 if aimed_s else rng.uniform(0.3, 6.0))
+    writing = [folder / ".staging", folder / ".commit"]
+    while time.monotonic() < deadline and process.poll() is None:
+        if aimed_s and any(p.exists() for p in writing):
+            time.sleep(rng.uniform(0.0, aimed_s))
+            break
+        time.sleep(0.0005)
+    process.send_signal(kind)
+    return process.communicate(timeout=60)[1], process.returncode
+
+
+def restore(folder, files):
+    """The old result again, and only it."""
+    shutil.rmtree(folder)
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+
+
+def check(folder):
+    """Everything in the folder speaks of one and the same plan; returns its target's rise."""
+    tape, _, summary = store.read_plan(folder)  # checks the hashes of plan and robot
+    seal = store.read_json(folder / "passport.json")["manifest"]
+    assert seal["plan_sha256"] == summary["manifest"]["files"]["plan.npz"]
+    assert seal["target"] == summary["target"]
+    com = tape.extra["planar_com"][tape.takeoff_index :, 1]
+    assert com.max() - com[0] == pytest.approx(summary["target"]["height_m"], abs=2e-3)
+    found = names(folder) & SIMULATION
+    if found:
+        assert found == SIMULATION
+        told = store.read_json(folder / "simulation.json")
+        assert told["planned_rise_m"] == summary["planned_rise_m"]
+        with np.load(folder / "simulation.npz", allow_pickle=False) as file:
+            assert all(np.size(file[k]) for k in file.files)
+    return summary["target"]["height_m"], bool(found)
+
+
+def quiet(said, code, kind):
+    """Once the command has begun it leaves one sentence at most, and its exit code; before, Python itself speaks."""
+    if (
+        kind == signal.SIGINT
+        and "KeyboardInterrupt" in said
+        and not re.search(r'jumplab/__main__\.py", line \d+, in main\n', said)
+    ):
+        return  # shot while Python was still starting
+    assert "Traceback" not in said and said.count("\n") <= 1, said
+    answered = {signal.SIGKILL: {-9}, signal.SIGTERM: {143, -15}, signal.SIGINT: {130, -2}}[kind]
+    assert code in {0, *answered}
+
+
+@pytest.mark.slow
+def test_plans_shot_at_random_moments(folder):
+    rng, seen = random.Random(5), []
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    for k in range(KILLS):
+        arguments = ["plan", "--height-m", str(NEW), "--out", str(folder)]
+        kind = SIGNALS[k % 3]
+        said, code = shoot(arguments, folder, rng, kind, aimed_s=(2.0, None)[k % 2])  # the audit takes about a second
+        quiet(said, code, kind)
+        rise, simulated = check(folder)
+        assert (rise, simulated) in ((OLD, True), (NEW, False))
+        seen.append(rise)
+        if rise == NEW:  # the next one finds the old result again
+            restore(folder, before)
+    print(f"{KILLS} plans shot: {seen.count(OLD)} left the old result, {seen.count(NEW)} the new one")
+    said = command(["plan", "--height-m", str(NEW), "--out", str(folder)], folder).communicate(timeout=120)[1]
+    assert said == "" and names(folder) == PLAN and check(folder) == (NEW, False)
+
+
+@pytest.mark.slow
+def test_simulations_shot_at_random_moments(folder):
+    rng, seen = random.Random(6), []
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    for k in range(KILLS):
+        kind = SIGNALS[k % 3]
+        arguments = ["simulate", str(folder), "--mode", "pd"]
+        said, code = shoot(
+            arguments, folder, rng, kind, aimed_s=(0.5, None)[k % 2]
+        )  # two tenths of a second of writing
+        quiet(said, code, kind)
+        assert check(folder) == (OLD, True)
+        mode = store.read_json(folder / "simulation.json")["settings"]["mode"]
+        assert mode in ("position", "pd") and all((folder / n).read_bytes() == before[n] for n in PLAN)
+        seen.append(mode)
+        restore(folder, before)
+    print(f"{KILLS} simulations shot: {seen.count('position')} left the old result, {seen.count('pd')} the new one")

@@ -1,0 +1,95 @@
+"""A plan made twice is the same plan, whatever the process, the planner or its memory did before."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures_core import planner
+
+from jumplab.joint_map import solve
+from jumplab.pipeline import plan_jump
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+
+ROOT = Path(__file__).resolve().parent.parent
+TARGETS = [(1.0, 0.5), (0.3, 0.2), (0.6, 0.5, 0.3), (-0.2, 0.3), (1.1, 0.5)]
+SAME = 1e-9  # on every number of the tape, in its own SI unit
+
+
+def digest(arrays):
+    return hashlib.sha256(b"".join(np.ascontiguousarray(arrays[k]).tobytes() for k in sorted(arrays))).hexdigest()
+
+
+def worst_difference(a, b):
+    assert set(a) == set(b)
+    numbers = [k for k in a if a[k].dtype.kind == "f"]
+    assert all(a[k].shape == b[k].shape for k in numbers) and len(numbers) > 20
+    return max(float(np.nanmax(np.abs(a[k] - b[k]), initial=0.0)) for k in numbers)
+
+
+ELSEWHERE = """
+import sys
+sys.path[:0] = [{root!r}, {tests!r}]
+import numpy as np
+from test_repeatable import TARGETS, JumpTask, planner
+litter = [np.empty(n) for n in range(1, 3000, 7)]  # another layout of the memory
+for i, target in enumerate(TARGETS):
+    planner().plan(JumpTask(*target)).tape.save({folder!r} + f"/{{i}}.npz")
+"""
+
+
+@pytest.mark.slow
+def test_a_plan_made_three_times_is_the_same(tmp_path):
+    """Five targets, by planners that planned others before, in two processes and two orders; and from scratch."""
+    from jumplab.trajectory import Tape
+
+    code = ELSEWHERE.format(root=str(ROOT), tests=str(ROOT / "tests"), folder=str(tmp_path))
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    for i, target in reversed(list(enumerate(TARGETS))):
+        here = planner().plan(JumpTask(*target)).tape.arrays()
+        assert worst_difference(here, Tape.load(tmp_path / f"{i}.npz").arrays()) <= SAME, target
+        if i < 2:
+            assert worst_difference(here, plan_jump(JumpTask(*target), load_robot()).tape.arrays()) <= SAME, target
+
+
+def test_joint_map_is_the_same_to_the_last_bit():
+    """Stage 3 multiplies what differs here by a thousand; memory is laid out anew each time."""
+    from fixtures_core import pendulum
+
+    from jumplab.joint_map import map_to_joints
+
+    rng, seen, litter = np.random.default_rng(3), set(), []
+    for _ in range(6):
+        litter.append([np.empty(n) for n in rng.integers(1, 500, 200)])
+        plan = map_to_joints(pendulum(0.3, 0.2), load_robot(), method="direct")
+        seen.add(digest({k: getattr(plan, k) for k in ("q", "v", "a", "f", "tau")}))
+    assert len(seen) == 1
+
+
+# ------------------------------------------------------------------------------------------ the polishing behind it
+
+
+def small_problem(twice: bool):
+    """min |x - (2, 2, 2)|^2 / 2 with x_0 + x_1 = 1 and x_2 <= 1 (said twice if asked): x = (1/2, 1/2, 1)."""
+    rows = np.array([[0.0, 0.0, 1.0]] * (2 if twice else 1) + [[1.0, 0.0, 0.0]])
+    low, high = np.full(len(rows), -np.inf), np.r_[np.ones(len(rows) - 1), 7.0]
+    multipliers = np.r_[np.full(len(rows) - 1, 1.0 / (len(rows) - 1)), 0.0]
+    return (np.eye(3), -2 * np.ones(3), np.array([[1.0, 1.0, 0.0]]), np.ones(1), rows, low, high), multipliers
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_polishing_finds_the_closed_form(twice):
+    """From 1e-8 off to round-off, dependent rows or not."""
+    data, multipliers = small_problem(twice)
+    rough = np.array([0.5 + 1e-8, 0.5 - 1e-8, 1.0 + 2e-8])
+    np.testing.assert_allclose(solve.polished(*data, rough, multipliers), [0.5, 0.5, 1.0], rtol=0, atol=1e-15)
+
+
+def test_polishing_never_replaces_an_answer():
+    """Wrong multipliers let the row go; what comes out is far off, and the solver's answer is kept."""
+    data, multipliers = small_problem(False)
+    x = np.array([0.5, 0.5, 1.0])
+    assert solve.polished(*data, x, 0 * multipliers) is x
