@@ -60,14 +60,13 @@ class Reaim:
         """
         middle = self._sole_middle(q)
         if middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M:
-            x, y, z, w = q[3:7]
-            error = np.arctan2(2 * (w * y + x * z), 1 - 2 * (y * y + x * x)) - planned_pitch
+            error = pitch_of(q) - planned_pitch
             error = np.arctan2(np.sin(error), np.cos(error))
             most = RATE * STEP_S
-            self._now = self._now + np.clip(self._wish(q, v, error) - self._now, -most, most)
+            self._now = self._now + np.clip(self.wish(q, v, error) - self._now, -most, most)
         return self._now
 
-    def _wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
+    def wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
         """Correction (nv - 6,) with which the predicted touchdown has the soles flat and well placed."""
         goal = np.array([self._ahead + CAPTURE_S * (self._com_velocity(q, v)[0] - self._speed), self._tilt])
         guess = self._end.copy()
@@ -83,3 +82,9 @@ class Reaim:
             for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here), strict=True):
                 guess[rows] += angle
         return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles
+
+
+def pitch_of(q: np.ndarray) -> float:
+    """Pitch of the trunk in configuration ``q`` [rad]."""
+    x, y, z, w = q[3:7]
+    return float(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
