@@ -10,6 +10,7 @@ import pinocchio as pin
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.simulation.actuation import Delay
+from jumplab.simulation.estimator import Perception
 from jumplab.simulation.perturbation import Perturbation
 from jumplab.simulation.pilot import Pilot
 from jumplab.simulation.playback import Motors
@@ -17,7 +18,6 @@ from jumplab.simulation.recorder import STAND_S, Recorder
 from jumplab.simulation.reference import LandingSource
 from jumplab.simulation.result import SimulationResult
 from jumplab.simulation.scene import Scene
-from jumplab.simulation.sensors import Sensors
 from jumplab.simulation.world import STEP_S, World
 from jumplab.trajectory import Tape
 
@@ -125,16 +125,16 @@ def _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stan
     perturbation, scene = perturbation or Perturbation(), scene or Scene.flat()
     real = perturbation.robot(robot)
     pilot = Pilot(tape, robot, mode, scene, landing, reference, reaim)
-    sensors, motors = Sensors(perturbation.noise, perturbation.seed), Motors(robot, perturbation.motor_gain)
-    delay = Delay(round(perturbation.delay_s / STEP_S))
+    motors, delay = Motors(robot, perturbation.motor_gain), Delay(round(perturbation.delay_s / STEP_S))
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
+    perceive = Perception(robot, q, v, perturbation.noise, perturbation.seed)
     with World(real, q, v, scene=scene, friction=perturbation.friction) as world:
         recorder = Recorder(real, tape.q[-1], world.links)
         contacts, end = world.contacts(), pilot.last_step
         while step < end:
             q, v = world.state()
             was_flying = pilot.touchdown is None
-            told = delay(pilot.command(step, *sensors.state(q, v), sensors.vertical_forces(contacts.wrench)))
+            told = delay(pilot.command(step, *perceive(q, v, contacts.wrench)))
             if was_flying and pilot.touchdown is not None:
                 end = step + round((stand_s + EXTRA_S) / STEP_S)
             tau = motors.apply(world, told, v[6:])
@@ -146,7 +146,7 @@ def _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stan
             step += 1
         friction = world.friction
     settings = {
-        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(),
+        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(), "perception": perceive.to_json(),
         "stand_s": stand_s, "step_s": STEP_S, "robot": robot.name, "robot_hash": robot.hash,
         "friction_read_back": min(friction[name] for name in robot.foot.frames),
         "perturbation": perturbation.to_json(),
