@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError
 from jumplab.robot import Robot
+from jumplab.simulation import honesty
 from jumplab.simulation.actuation import Delay
 from jumplab.simulation.estimator import Perception
 from jumplab.simulation.perturbation import Perturbation
@@ -144,12 +145,13 @@ def _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stan
             if pilot.touchdown is not None and recorder.fallen_steps * STEP_S > AFTER_FALL_S:
                 break
             step += 1
-        friction = world.friction
+        engine = world.read_back()
     settings = {
         "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(), "perception": perceive.to_json(),
         "stand_s": stand_s, "step_s": STEP_S, "robot": robot.name, "robot_hash": robot.hash,
-        "friction_read_back": min(friction[name] for name in robot.foot.frames),
+        "friction_read_back": min(engine["friction"]), "engine": engine,
         "perturbation": perturbation.to_json(),
         "disturbance": None if disturbance is None else asdict(disturbance),
     }  # fmt: skip
-    return recorder.result(pilot.solves, settings)
+    result = recorder.result(pilot.solves, settings)
+    return replace(result, honesty=honesty.check(result, real))
