@@ -56,7 +56,7 @@ def test_standing_feet_stop_a_drift_that_the_inertial_unit_alone_would_have(bhr)
     """Half a degree per second and 5 mg: five seconds of standing."""
     noise = SensorNoise(gyro=0.01, gyro_bias=0.01, accel=0.1, accel_bias=0.05, joint_rad=5e-4)
     q, v = stance_configuration(bhr), np.zeros(20)
-    loads = {"standing": STILL + [0, 0, 206, 0, 0, 0], "hanging": STILL}
+    loads = {"standing": np.tile([0.0, 0, 206, 0, 0, 0], (2, 1)), "hanging": STILL}
     error = {}
     for name, wrench in loads.items():
         perceived = Sensors(noise, 4)
@@ -111,4 +111,6 @@ def test_a_jump_lands_on_estimates(bhr, tape):
     run = simulate_jump(tape, bhr, perturbation=noisy, reaim=True)
     assert run.landed and run.honest
     said = run.settings["perception"]
-    assert said["state"] == "estimated" and 0 < said["worst_tilt_error_rad"] < 0.03 and said["worst_velocity_error"] < 0.1
+    assert (
+        said["state"] == "estimated" and 0 < said["worst_tilt_error_rad"] < 0.03 and said["worst_velocity_error"] < 0.1
+    )

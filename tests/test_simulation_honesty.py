@@ -45,8 +45,10 @@ def test_the_flight_is_where_the_cheats_expect_it(tape):
     assert tape.takeoff_time < IN_FLIGHT / 1000 - 0.05 and tape.t[-1] > IN_FLIGHT / 1000 + 0.05
 
 
-@pytest.mark.parametrize("options", [
-    {"mode": "position"}, {"mode": "pd"}, {"perturbation": Perturbation(friction=0.5, delay_s=0.003), "reaim": True}])  # fmt: skip
+LATE = Perturbation(friction=0.5, delay_s=0.003)
+
+
+@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}])
 def test_an_honest_jump_passes(bhr, tape, options, capsys):
     result = simulate_jump(tape, bhr, **options)
     assert result.landed and result.honest and failed(result) == set()
@@ -128,16 +130,16 @@ def test_a_place_set_in_mid_run(bhr, tape, monkeypatch):
 def test_a_velocity_set_in_mid_run(bhr, tape, monkeypatch):
     def push(world):
         linear, angular = bullet.getBaseVelocity(world._body, physicsClientId=world._client)
-        bullet.resetBaseVelocity(world._body, np.array(linear) + [0.1, 0, 0], angular, physicsClientId=world._client)
+        bullet.resetBaseVelocity(world._body, np.add(linear, (0.1, 0, 0)), angular, physicsClientId=world._client)
 
     at_step(monkeypatch, IN_FLIGHT, push)
     assert "unexplained force on the body" in failed(simulate_jump(tape, bhr, stand_s=SHORT_S))
 
 
 def test_oversized_feet(bhr, tape, monkeypatch):
-    honest, sole = World._load, '<box size="0.24 0.1 0.03"/>'
+    honest, sole = World._load, '<box size="0.24 0.1 0.03" />'
     assert sole in bhr.urdf
-    monkeypatch.setattr(World, "_load", lambda w, urdf: honest(w, urdf.replace(sole, '<box size="0.27 0.1 0.03"/>')))
+    monkeypatch.setattr(World, "_load", lambda w, urdf: honest(w, urdf.replace(sole, '<box size="0.27 0.1 0.03" />')))
     result = simulate_jump(tape, bhr, stand_s=SHORT_S)
     assert "contact points outside the sole" in failed(result)
     assert result.settings["engine"]["beyond_sole_m"] == pytest.approx(0.015, abs=0.001)
@@ -153,7 +155,11 @@ def test_feet_that_press_beyond_their_sole(bhr, tape):
 
 def test_sticky_feet(bhr, tape, monkeypatch):
     """Stated 0.2, really 2: read back, and seen in the forces."""
-    monkeypatch.setattr(jump, "World", lambda robot, q, v, **options: World(robot, q, v, **{**options, "friction": 2.0}))
+
+    def sticky(robot, q, v, **options):
+        return World(robot, q, v, **{**options, "friction": 2.0})
+
+    monkeypatch.setattr(jump, "World", sticky)
     result = simulate_jump(tape, bhr, perturbation=Perturbation(friction=0.2), stand_s=SHORT_S)
     assert failed(result) == {"friction used, of the stated coefficient", "friction read back, less the stated"}
 

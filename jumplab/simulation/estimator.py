@@ -1,8 +1,8 @@
-"""Where the robot is and how it moves, from its own sensors: an error-state Kalman filter on inertial unit and legs.
+"""Where the robot is and how it moves, from its own sensors: an error-state Kalman filter, inertial unit and legs.
 
 Attitude, velocity and place of the trunk are integrated from gyro and accelerometer, which is all there is in flight.
 While a foot carries weight, the point it stands on does not move: the legs' angles then tell where the trunk is, and
-through gravity also how it is tilted. The idea of feet as part of the state is that of Bloesch et al., "State estimation
+through gravity also how it is tilted. That feet are part of the state is an idea of Bloesch et al., "State estimation
 for legged robots" (2012).
 """
 
@@ -47,7 +47,7 @@ class Estimator:
         self._attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
         self._place, self._velocity = q[:3].copy(), self._attitude @ v[:3]
         self._gyro_bias, self._accel_bias = np.zeros(3), np.zeros(3)
-        self._foot, self._end, self._standing = np.zeros((2, 3)), [0, 0], [0, 0]  # since when, in steps
+        self._foot, self._end, self._standing = np.zeros((2, 3)), [0, 0], [0, 0]  # toe or heel; for how many steps
         self._noise = SensorNoise(**{name: max(getattr(noise, name), floor) for name, floor in vars(FLOOR).items()})
         n = self._noise
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)

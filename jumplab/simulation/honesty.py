@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from jumplab.simulation.result import SimulationResult
 
 STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
-WINDOW = 20  # [steps] our choice: forces are averaged over 20 ms; within an impact's own step the engine's error is large
+WINDOW = (
+    20  # [steps] our choice: forces are averaged over 20 ms; within an impact's own step the engine's error is large
+)
 # our choice: two to four times the engine's own error in honest jumps (6 N, 2.2 N m and 1.5 N m were seen)
 UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 15.0, 8.0, 6.0
 NUMERIC = 1e-6  # [N m] rounding
@@ -158,7 +160,7 @@ def _engine(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
 
 
 def _landing(result: SimulationResult, robot: Robot) -> Finding:
-    """Seconds that a claimed landing falls short of standing on the feet alone, from touchdown to the end of the log."""
+    """Seconds that a claimed landing falls short of standing on the feet alone, from touchdown on."""
     down = np.flatnonzero(result.phase == "landing")
     feet = np.isin(result.link_names, robot.foot.frames)
     stood = 0.0

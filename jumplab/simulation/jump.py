@@ -120,7 +120,9 @@ def simulate_landing(
     return _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance)
 
 
-def _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance=None) -> SimulationResult:
+def _run(
+    tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance=None
+) -> SimulationResult:
     if not 0 < stand_s <= 60:
         raise InputError(f"stand_s = {stand_s:g} s is outside 0 ... 60 s")
     perturbation, scene = perturbation or Perturbation(), scene or Scene.flat()
@@ -147,8 +149,9 @@ def _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stan
             step += 1
         engine = world.read_back()
     settings = {
-        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(), "perception": perceive.to_json(),
-        "stand_s": stand_s, "step_s": STEP_S, "robot": robot.name, "robot_hash": robot.hash,
+        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(),
+        "perception": perceive.to_json(), "stand_s": stand_s, "step_s": STEP_S,
+        "robot": robot.name, "robot_hash": robot.hash,
         "friction_read_back": min(engine["friction"]), "engine": engine,
         "perturbation": perturbation.to_json(),
         "disturbance": None if disturbance is None else asdict(disturbance),

@@ -49,7 +49,7 @@ class SensorNoise:
 
     @classmethod
     def typical(cls) -> SensorNoise:
-        """Our choice: 16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest before the jump."""
+        """Our choice: 16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
         return cls(
             joint_rad=5e-4, joint_rate=0.05, encoder_step_rad=1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3,
             accel=0.2, accel_bias=0.05, force=3.0)  # fmt: skip

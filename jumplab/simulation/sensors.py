@@ -53,7 +53,7 @@ class Sensors:
         return self.noise == SensorNoise()
 
     def initial(self, q: np.ndarray) -> np.ndarray:
-        """Configuration (nq,) as it is known before the jump: tilted by an error of the levelling, yaw and place known."""
+        """Configuration (nq,) as it is believed to be before the jump: roll and pitch a little off."""
         error = self.noise.tilt_rad * self._rng.standard_normal(2)
         turn = pin.Quaternion(pin.exp3(np.array([*error, 0.0])))
         start = q.copy()
