@@ -95,12 +95,15 @@ class Pilot:
         return replace(command, share=YIELD_SHARE) if left <= YIELD_S else command
 
     def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
+        """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
         if self.ahead.source != "planned" or self.ahead.followed is not None:
             return
-        error = pitch_of(q) - self._playback.trunk_pitch(step)
-        error = float(np.arctan2(np.sin(error), np.cos(error)))
-        correction = None if self._reaim is None else self._reaim.wish(q, v, error)
-        there = self._forecast.state(q, v, error, correction)
+        there = q, v
+        if left > 0:
+            error = pitch_of(q) - self._playback.trunk_pitch(step)
+            error = float(np.arctan2(np.sin(error), np.cos(error)))
+            correction = None if self._reaim is None else self._reaim.wish(q, v, error)
+            there = self._forecast.state(q, v, error, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 
     def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
