@@ -6,8 +6,6 @@ The step is 1 ms, the paper's control cycle, without substeps. Everything outsid
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +13,7 @@ import pinocchio as pin
 
 from jumplab.errors import JumplabError, RobotError
 from jumplab.robot import Robot
-from jumplab.simulation.engine import bullet
+from jumplab.simulation.engine import bullet, load_urdf
 from jumplab.simulation.perturbation import FRICTION
 from jumplab.simulation.scene import REACH_M, Scene
 from jumplab.task import GRAVITY
@@ -134,16 +132,7 @@ class World:
         return body
 
     def _load(self, urdf: str) -> int:
-        handle, path = tempfile.mkstemp(suffix=".urdf")  # Bullet reads files only
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(urdf)
-            flags = bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_USE_SELF_COLLISION
-            return bullet.loadURDF(path, flags=flags, physicsClientId=self._client)
-        except bullet.error as e:
-            raise RobotError(f"robot {self.robot.name}: PyBullet cannot read the URDF: {e}") from e
-        finally:
-            os.remove(path)
+        return load_urdf(urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
 
     def _index_links(self) -> None:
         count = bullet.getNumJoints(self._body, physicsClientId=self._client)
