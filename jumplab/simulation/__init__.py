@@ -1,5 +1,7 @@
 """Simulation in PyBullet: playback of a tape, landing, and what came of it. Start at :func:`simulate_jump`."""
 
+from jumplab.simulation.estimator import Estimator
+from jumplab.simulation.honesty import Finding
 from jumplab.simulation.jump import Disturbance, simulate_jump, simulate_landing
 from jumplab.simulation.landing import LandingController, LandingGains
 from jumplab.simulation.perturbation import SLIGHT, Perturbation, Ranges, SensorNoise
@@ -12,6 +14,8 @@ __all__ = [
     "SLIGHT",
     "Block",
     "Disturbance",
+    "Estimator",
+    "Finding",
     "LandingController",
     "LandingGains",
     "LandingReference",

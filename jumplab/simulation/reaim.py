@@ -20,7 +20,11 @@ PROBE_RAD = 1e-4  # of the finite differences
 
 
 class Reaim:
-    """Turns hips and ankles so that the soles meet the ground flat, and as far ahead of the CoM as the speed asks for.
+    """Turns hips and ankles so that the soles meet the ground flat, and where they can catch the robot.
+
+    That is where the angular momentum about the soles' middle, L + m (z v_x + ahead v_z), is the planned one: an impact
+    under the soles does not change it, and what is left of it afterwards tips the robot over. A rule that knows the
+    forward speed alone puts the feet of a robot that is also pitched, low or turning too far ahead.
 
     The posture at touchdown is predicted as the tape's last one, with the trunk as far off its planned pitch as it is
     now. Without any error the correction is zero.
