@@ -63,6 +63,12 @@ def test_a_fall_is_honest_too(bhr, tape):
     assert not result.landed and result.honest
 
 
+def test_quick_legs_are_honest(bhr, tape):
+    """Re-aim swings the legs as fast as it may: the engine's own error is largest here."""
+    result = simulate_landing(tape, bhr, Disturbance(0.8, -0.17, 0.1), mode="pd", reaim=True, stand_s=SHORT_S)
+    assert failed(result) == set()
+
+
 def test_without_findings_nothing_is_honest(bhr, tape):
     result = simulate_jump(tape, bhr, stand_s=SHORT_S)
     assert result.honest and not replace(result, honesty=()).honest
