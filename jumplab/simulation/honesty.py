@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
 WINDOW = 100  # [steps] our choice: over 0.1 s the engine's error in quick swings and impacts, first order, cancels
-# our choice: at least 1.7 times the engine's own error in honest jumps (8.6 N, 3.1 N m and 0.6 N m were seen at re-aimed
-# legs; 25 N if averaged over 20 ms). What stays hidden is 4 % of the weight, or 0.04 m/s once
+# our choice: at least 1.7 times the engine's own error in honest jumps (8.6 N, 3.1 N m and 0.6 N m were seen with
+# re-aimed legs; 25 N if averaged over 20 ms). What can hide below is 4 % of the weight, or 0.04 m/s once
 UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 15.0, 6.0, 3.0
 NUMERIC = 1e-6  # [N m] rounding
 JUMP_M = 1e-4  # [m, rad] our choice: the engine's own step is kept to 1e-5

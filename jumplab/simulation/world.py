@@ -19,9 +19,7 @@ from jumplab.simulation.scene import REACH_M, Scene
 from jumplab.task import GRAVITY
 
 STEP_S = 0.001  # paper, Sec. VI-A: control cycle 1 ms
-SOLVER_ITERATIONS = (
-    1000  # our choice: with 200, what is left unsolved tips the robot sideways by 2.5 mrad in position mode
-)
+SOLVER_ITERATIONS = 1000  # our choice: with 200, what is left unsolved tips the robot sideways by 2.5 mrad
 CONTACT_ERP = 0.1  # our choice: a deep penetration fades in 10 ms; the default 0.2 makes feet bounce off an impact
 CONTACT_SLOP_M = 1e-4  # our choice: boxes rest this deep; at zero, rounding would break the contact of a light toe
 GROUND_FRICTION = 1.0  # friction combines as a product, so the robot's own coefficient is the effective one
