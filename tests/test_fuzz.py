@@ -236,7 +236,8 @@ def injected(rng, folder):
     """What papermill would do: add a cell after the parameters, then run up to the cell that checks them."""
     path = rng.choice(SOURCES)
     own = {"01": ("samples", [0, -5, 1.5, "200", True, 10**7]), "02": ("grid", [0, 1, "6", 6.0, None, 999]),
-           "03": ("targets", [0, 201, "6", None, 2.5]), "05": ("fast", [0, 1, "yes", None])}  # fmt: skip
+           "03": ("targets", [0, 201, "6", None, 2.5]), "04": ("targets", [0, 201, "6", None, 2.5]),
+           "06": ("trials", [0, -1, "8", None, 2.5, 10**6]), "05": ("fast", [0, 1, "yes", None])}  # fmt: skip
     choices = [
         ("distance_m", [None, True, "1.0", "far", math.nan, -math.inf, 1e9, 3.2, [1.0], {}]),
         ("height_m", [None, False, "0.5", math.nan, 0.0, -0.3, 1.6, [0.5]]),

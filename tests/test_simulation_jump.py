@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +15,10 @@ from jumplab.simulation import Disturbance, LandingReference, Perturbation, Scen
 from jumplab.simulation import simulate_jump as simulate
 from jumplab.simulation.actuation import Actuators
 from jumplab.simulation.recorder import Recorder, _events
+from jumplab.simulation.reference import Forecast
 from jumplab.simulation.world import STEP_S, Contacts
+from jumplab.srmp.landing import LandingPlanner
+from jumplab.srmp.touchdown import touchdown_of_state
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
 
@@ -168,8 +172,67 @@ def test_follows_a_landing_planned_at_touchdown(bhr, tape):
 
     run = simulate(tape, bhr, reference=plan)
     assert asked == [((21,), (20,))]
-    assert run.landed and run.settings["landing_reference"]
+    assert run.landed and run.settings["landing"]["followed"] == "given"
     assert run.com[-1, 2] == pytest.approx(0.7, abs=0.005)
+
+
+def test_the_landing_is_planned_in_flight(bhr, tape):
+    """By default stage 1's landing is followed, there in time, and needs less torque and force than spring-dampers."""
+    planned, spring = (simulate(tape, bhr, landing=name) for name in ("planned", "spring"))
+    said = planned.settings["landing"]
+    assert said["asked"] == said["followed"] == "planned" and said["reason"] is None
+    assert said["planned_at_s"] < planned.metrics.touchdown_s - 0.1
+    assert said["time_left_s"] == pytest.approx(planned.metrics.touchdown_s - said["planned_at_s"], abs=0.005)
+    assert 0 < said["solve_s"] < 1.0
+    assert spring.settings["landing"]["followed"] == "spring" and spring.settings["landing"]["solve_s"] is None
+
+    def loads(run):  # after the impact's first 20 ms
+        late = np.flatnonzero(run.phase == "landing")[20:]
+        return np.max(np.abs(run.tau[late]) / Actuators(bhr).effort), run.foot_wrench[late, :, 2].sum(axis=1).max()
+
+    (torque, force), (spring_torque, spring_force) = loads(planned), loads(spring)
+    assert torque < 0.95 * spring_torque and force < 0.8 * spring_force
+
+
+def test_no_limit_is_exceeded(jump):
+    assert max(jump.metrics.overspeed_s.values()) == 0
+    assert jump.metrics.max_torque_ratio < 0.9
+
+
+def test_without_a_planned_landing_it_springs_and_says_so(bhr, tape, monkeypatch):
+    def refuse(planner, touchdown):
+        raise SolverError("no landing: the CoP would have to leave the sole", stage="landing")
+
+    monkeypatch.setattr(LandingPlanner, "plan", refuse)
+    run = simulate(tape, bhr)
+    said = run.settings["landing"]
+    assert run.landed and (said["asked"], said["followed"]) == ("planned", "spring")
+    assert said["reason"] == "no landing: the CoP would have to leave the sole"
+
+
+def test_the_touchdown_is_foreseen(bhr, tape):
+    """From 0.15 s before it, in a jump that differs from the plan: CoM, velocity and momentum at the first contact."""
+    run = simulate(tape, bhr, perturbation=Perturbation(delay_s=0.002), stand_s=SHORT_S)
+    forecast = Forecast(bhr, tape, Scene.flat())
+    touch = int(np.argmax(run.phase == "landing"))
+    early = touch - 150
+    assert forecast.time_left(run.q[early], run.v[early]) == pytest.approx(0.15, abs=0.003)
+    there = touchdown_of_state(bhr, *forecast.state(run.q[early], run.v[early], 0.0), impact=False)
+    real = touchdown_of_state(bhr, run.q[touch], run.v[touch], impact=False)
+    assert there.com == pytest.approx(real.com, abs=0.01)
+    assert there.com_velocity == pytest.approx(real.com_velocity, abs=0.03)
+    assert there.L == pytest.approx(real.L, abs=0.05)
+    assert there.trunk_pitch == pytest.approx(real.trunk_pitch, abs=0.02)
+
+
+def test_references_without_feed_forward_push_nothing():
+    t, com = np.array([0.0, 1.0]), np.array([[0.0, 0.6], [0.0, 0.7]])
+    plain = LandingReference(t, com, np.zeros((2, 2)), np.zeros(2))
+    assert plain.feed_forward(0.5)[0].tolist() == [0, 0] and plain.feed_forward(0.5)[1] == 0
+    pushing = replace(plain, com_acceleration=np.array([[0.0, 4.0], [2.0, 0.0]]), L_rate=np.array([1.0, 3.0]))
+    push, twist = pushing.feed_forward(0.5)
+    assert push == pytest.approx([1, 2]) and twist == pytest.approx(2)
+    assert pushing.feed_forward(1.0)[0].tolist() == [0, 0] and pushing.feed_forward(1.0)[1] == 0
 
 
 def test_a_ditch_swallows_a_short_jump(bhr, tape):
@@ -232,6 +295,7 @@ def test_an_exploded_engine_is_an_error(bhr, tape):
     ("options", "words"),
     [
         ({"mode": "velocity"}, "mode 'velocity': must be one of position, pd"),
+        ({"landing": "soft"}, "landing 'soft': must be one of planned, spring"),
         ({"stand_s": 0}, r"stand_s = 0 s is outside 0 \.\.\. 60 s"),
         ({"stand_s": float("nan")}, "stand_s = nan s is outside"),
     ],

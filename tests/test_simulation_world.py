@@ -8,9 +8,8 @@ import pytest
 from jumplab.errors import InputError, JumplabError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import Perturbation, Scene, SensorNoise, World, base_from_bullet, base_to_bullet
+from jumplab.simulation import Perturbation, Scene, World, base_from_bullet, base_to_bullet
 from jumplab.simulation.actuation import Actuators, Delay
-from jumplab.simulation.sensors import Sensors
 from jumplab.simulation.world import STEP_S
 
 HOLD = dict(position_gain=0.1, velocity_gain=1.0)
@@ -258,20 +257,10 @@ def test_delay_line():
     assert [prompt(x) for x in "abc"] == ["a", "b", "c"]
 
 
-def test_sensors(bhr):
-    q, v = random_state(bhr, 0)
-    wrench = np.arange(12.0).reshape(2, 6)
-    exact = Sensors(SensorNoise(), 0)
-    assert exact.state(q, v) == (q, v)
-    assert exact.vertical_forces(wrench).tolist() == [2, 8]
-    noise = SensorNoise.typical()
-    sensors, twin = Sensors(noise, 3), Sensors(noise, 3)
-    rows = [sensors.state(q, v) for _ in range(500)]
-    told_q, told_v = np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
-    assert np.array_equal(twin.state(q, v)[0], told_q[0])
-    assert (told_q[:, 7:] - q[7:]).std() == pytest.approx(noise.joint_rad, rel=0.1)
-    assert (told_v[:, 6:] - v[6:]).std() == pytest.approx(noise.joint_rate, rel=0.1)
-    assert (told_v[:, :3] - v[:3]).std() == pytest.approx(noise.velocity, rel=0.1)
-    assert (told_v[:, 3:6] - v[3:6]).std() == pytest.approx(noise.gyro, rel=0.1)
-    assert np.linalg.norm(told_q[:, 3:7], axis=1) == pytest.approx(np.ones(500))
-    assert np.array_equal(told_q[:, :3], np.tile(q[:3], (500, 1)))
+def test_read_back_is_what_the_engine_has(bhr):
+    with World(bhr, stance_configuration(bhr), scene=Scene.platform(0.5, 0.2), friction=0.7) as world:
+        said = world.read_back()
+        assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
+        assert said["mass_kg"] == pytest.approx(42)
+        q, v = world.state()  # the probe of the self-collision has left nothing behind
+    assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()

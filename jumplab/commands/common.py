@@ -85,3 +85,9 @@ def print_simulation(metrics: Mapping[str, Any]) -> None:
     print(f"simulated: distance {distance}, rise {rise}")
     verdict = "stands" if metrics["landed"] else "FAILED"
     print(f"landing: {verdict}, {metrics['standing_s']:.2f} s on its feet after touchdown ({metrics['reason']})")
+    failed = [finding for finding in metrics["honesty"] if not finding["passed"]]
+    if not failed:
+        print(f"honesty: all {len(metrics['honesty'])} checks of the run passed")
+    for finding in failed:
+        value = f"{finding['value']:.4g} {finding['unit']}".rstrip()
+        print(f"NOT HONEST: {finding['name']} {value}, at most {finding['limit']:.4g}: {finding['catches']}")

@@ -11,10 +11,7 @@ is needed. Nothing here is simulated: a state is taken from a log, the robot is 
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -24,12 +21,11 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
 
-from jumplab.errors import RobotError
 from jumplab.plotting.simulation import frame_rows
 from jumplab.plotting.style import COLUMN_IN, PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation.engine import bullet
+from jumplab.simulation.engine import bullet, load_urdf
 from jumplab.simulation.scene import Scene
 from jumplab.simulation.world import base_to_bullet
 
@@ -107,7 +103,7 @@ class Renderer:
         self._client = bullet.connect(bullet.DIRECT)
         self._marks: list[tuple[int, int, pin.SE3]] = []  # shape, the joint that carries it, its place there
         try:
-            self._body = _load(robot, self._client)
+            self._body = load_urdf(robot.urdf, robot.name, self._client)
             self._lever = np.array(bullet.getDynamicsInfo(self._body, -1, physicsClientId=self._client)[3])
             count = bullet.getNumJoints(self._body, physicsClientId=self._client)
             info = [bullet.getJointInfo(self._body, i, physicsClientId=self._client) for i in range(count)]
@@ -201,19 +197,6 @@ class Renderer:
             place = self._data.oMi[joint] * at
             turn = pin.Quaternion(place.rotation).coeffs()
             bullet.resetBasePositionAndOrientation(shape, place.translation, turn, **client)
-
-
-def _load(robot: Robot, client: int) -> int:
-    handle, path = tempfile.mkstemp(suffix=".urdf")  # Bullet reads files only
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(robot.urdf)
-        return bullet.loadURDF(path, flags=bullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client)
-    except bullet.error as e:
-        raise RobotError(f"robot {robot.name}: PyBullet cannot read the URDF: {e}") from e
-    finally:
-        with contextlib.suppress(OSError):
-            os.remove(path)
 
 
 # Fig. 3b --------------------------------------------------------------------------------------------------------

@@ -1,9 +1,13 @@
-"""PyBullet, without the line that it prints when it is imported."""
+"""PyBullet, without the line that it prints when it is imported, and how a robot gets into it."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import tempfile
 from types import ModuleType
+
+from jumplab.errors import RobotError
 
 
 def _import_quietly() -> ModuleType:
@@ -25,3 +29,20 @@ def _import_quietly() -> ModuleType:
 
 
 bullet = _import_quietly()
+
+
+def load_urdf(urdf: str, name: str, client: int, flags: int = 0) -> int:
+    """Load the URDF text of robot ``name``, inertias as written there; returns the body's number.
+
+    Raises :class:`RobotError` if PyBullet cannot read it.
+    """
+    handle, path = tempfile.mkstemp(suffix=".urdf")  # Bullet reads files only
+    try:
+        with os.fdopen(handle, "w") as file:
+            file.write(urdf)
+        return bullet.loadURDF(path, flags=flags | bullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client)
+    except bullet.error as e:
+        raise RobotError(f"robot {name}: PyBullet cannot read the URDF: {e}") from e
+    finally:
+        with contextlib.suppress(OSError):
+            os.remove(path)

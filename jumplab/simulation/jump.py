@@ -2,73 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, needs, said
 from jumplab.robot import Robot
+from jumplab.simulation import honesty
 from jumplab.simulation.actuation import Delay
-from jumplab.simulation.landing import PERIOD_STEPS, LandingController, Reference
+from jumplab.simulation.estimator import Perception
 from jumplab.simulation.perturbation import Perturbation
-from jumplab.simulation.playback import Command, Motors, Playback
-from jumplab.simulation.reaim import Reaim
+from jumplab.simulation.pilot import Pilot
+from jumplab.simulation.playback import Motors
 from jumplab.simulation.recorder import STAND_S, Recorder
+from jumplab.simulation.reference import LandingSource
 from jumplab.simulation.result import SimulationResult
 from jumplab.simulation.scene import Scene
-from jumplab.simulation.sensors import Sensors
 from jumplab.simulation.world import STEP_S, World
 from jumplab.trajectory import Tape
 
 EXTRA_S = 0.05  # our choice: simulated beyond it, so that the last step is not decided by rounding
-WAIT_S = 0.5  # our choice: how long the robot may hang in the air after the tape's end before the run is given up
 AFTER_FALL_S = 0.5  # our choice: a fall is shown for this long
-TOUCHDOWN_FORCE_N = 30.0  # our choice: sum of both feet; 7 % of the weight, ten times the sensor noise
-EARLIEST_TOUCHDOWN = 0.5  # our choice: share of the planned flight before which a graze of the ground is no landing
-
-LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
-
-
-class _Pilot:
-    """Decides the command of each step: playback until touchdown, landing controller afterwards."""
-
-    def __init__(self, tape: Tape, robot: Robot, mode: str, scene: Scene, reference: LandingSource | None, reaim: bool):
-        self._playback = Playback(tape, robot, mode)
-        planned = callable(reference)
-        self._landing = LandingController(robot, reference=None if planned else reference)
-        self._plan_landing = reference if planned else None
-        self._reaim = Reaim(robot, tape, scene) if reaim else None
-        flight = tape.t[-1] - tape.takeoff_time
-        self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
-        self._none = np.zeros(len(robot.joint_names))
-        self._tau = self._none
-        self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
-        self.touchdown: int | None = None
-
-    @property
-    def solves(self) -> tuple[int, int]:
-        """QPs posed by the landing controller, and how many of them failed."""
-        return self._landing.solves, self._landing.failures
-
-    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
-        """Command at ``step`` from measured state and vertical foot forces."""
-        if self.touchdown is None and step >= self._earliest and force.sum() > TOUCHDOWN_FORCE_N:
-            self.touchdown = step
-            if self._plan_landing is not None:
-                self._landing.reference = self._plan_landing(q, v)
-        if self.touchdown is None:
-            return self._playback.command(step, q, v, self._correction(step, q, v))
-        since = step - self.touchdown
-        if since % PERIOD_STEPS == 0:
-            self._tau = self._landing.torque(since * STEP_S, q, v, force)
-        return Command(tau=self._tau)
-
-    def _correction(self, step: int, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        if self._reaim is None or step < self._earliest:
-            return self._none
-        return self._reaim.correction(q, v, self._playback.trunk_pitch(step))
 
 
 @dataclass(frozen=True)
@@ -111,6 +66,7 @@ def simulate_jump(
     perturbation: Perturbation | None = None,
     scene: Scene | None = None,
     reaim: bool = False,
+    landing: str = "planned",
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
 ) -> SimulationResult:
@@ -124,8 +80,11 @@ def simulate_jump(
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
     reaim : turn the legs in the air against the trunk's measured pitch error.
-    reference : landing to follow, or a function that plans one from the measured state (q, v) at touchdown (None: it
-        found none); None for spring-dampers to the stance.
+    landing : "planned" follows stage 1's landing, planned in flight from the measured state; "spring" leads to the
+        stance by spring-dampers alone, and so does "planned" where stage 1 finds no landing. The result's
+        ``settings["landing"]`` says what was followed, and what the plan's solve cost.
+    reference : overrides ``landing``: a landing to follow, or a function that plans one from the measured state (q, v)
+        at touchdown (None: it found none).
     stand_s : how long to watch after touchdown [s]; less than the default is never called a landing.
 
     Returns
@@ -138,7 +97,7 @@ def simulate_jump(
     InputError
         If the tape is not this robot's, or ``mode`` or ``stand_s`` make no sense.
     """
-    return _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s)
+    return _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s)
 
 
 def simulate_landing(
@@ -150,6 +109,7 @@ def simulate_landing(
     perturbation: Perturbation | None = None,
     scene: Scene | None = None,
     reaim: bool = False,
+    landing: str = "planned",
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
 ) -> SimulationResult:
@@ -157,7 +117,7 @@ def simulate_landing(
 
     Time, distance and rise of the result count from the apex.
     """
-    return _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s, disturbance)
+    return _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance)
 
 
 def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
@@ -177,21 +137,23 @@ def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
         raise InputError("the tape must have a launch and a flight; plan the jump again")
 
 
-def _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s, disturbance=None) -> SimulationResult:
+def _run(
+    tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance=None
+) -> SimulationResult:
     _check(tape, robot, perturbation, scene, reference, stand_s)
     perturbation, scene = perturbation or Perturbation(), scene or Scene.flat()
     real = perturbation.robot(robot)
-    pilot = _Pilot(tape, robot, mode, scene, reference, reaim)
-    sensors, motors = Sensors(perturbation.noise, perturbation.seed), Motors(robot, perturbation.motor_gain)
-    delay = Delay(round(perturbation.delay_s / STEP_S))
+    pilot = Pilot(tape, robot, mode, scene, landing, reference, reaim)
+    motors, delay = Motors(robot, perturbation.motor_gain), Delay(round(perturbation.delay_s / STEP_S))
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
+    perceive = Perception(robot, q, v, perturbation.noise, perturbation.seed)
     with World(real, q, v, scene=scene, friction=perturbation.friction) as world:
         recorder = Recorder(real, tape.q[-1], world.links)
         contacts, end = world.contacts(), pilot.last_step
         while step < end:
             q, v = world.state()
             was_flying = pilot.touchdown is None
-            told = delay(pilot.command(step, *sensors.state(q, v), sensors.vertical_forces(contacts.wrench)))
+            told = delay(pilot.command(step, *perceive(q, v, contacts.wrench)))
             if was_flying and pilot.touchdown is not None:
                 end = step + round((stand_s + EXTRA_S) / STEP_S)
             tau = motors.apply(world, told, v[6:])
@@ -201,12 +163,14 @@ def _run(tape, robot, mode, perturbation, scene, reaim, reference, stand_s, dist
             if pilot.touchdown is not None and recorder.fallen_steps * STEP_S > AFTER_FALL_S:
                 break
             step += 1
-        friction = world.friction
+        engine = world.read_back()
     settings = {
-        "mode": mode, "scene": scene.name, "reaim": reaim, "landing_reference": reference is not None,
-        "stand_s": stand_s, "step_s": STEP_S, "robot": robot.name, "robot_hash": robot.hash,
-        "friction_read_back": min(friction[name] for name in robot.foot.frames),
+        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(),
+        "perception": perceive.to_json(), "stand_s": stand_s, "step_s": STEP_S,
+        "robot": robot.name, "robot_hash": robot.hash,
+        "friction_read_back": min(engine["friction"]), "engine": engine,
         "perturbation": perturbation.to_json(),
         "disturbance": None if disturbance is None else asdict(disturbance),
     }  # fmt: skip
-    return recorder.result(pilot.solves, settings)
+    result = recorder.result(pilot.solves, settings)
+    return replace(result, honesty=honesty.check(result, real))

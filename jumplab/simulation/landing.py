@@ -9,7 +9,6 @@ feet flat and still, posture.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +17,7 @@ from proxsuite import proxqp
 from jumplab.robot import Robot
 from jumplab.simulation.actuation import Actuators
 from jumplab.simulation.body_terms import BodyTerms
+from jumplab.simulation.reference import Reference
 
 PERIOD_STEPS = 2  # our choice: 500 Hz
 WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
@@ -66,37 +66,6 @@ class LandingGains:
     uneven_weight: float = 0.02  # [1 / (100 N)^2] of the difference between both wrenches
     wrench_weight: float = 1e-3  # [1 / (100 N)^2]
     acceleration_weight: float = 1e-4
-
-
-class Reference(Protocol):
-    """A planned landing: anything that knows its CoM and momentum at a time, as :class:`LandingReference` does."""
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,) from the middle of the soles, its velocity (2,), and L about the pitch axis."""
-
-
-@dataclass(frozen=True)
-class LandingReference:
-    """A planned landing to follow: CoM from the middle between the soles.
-
-    Attributes
-    ----------
-    t : (N,) time since touchdown [s]; the last sample holds for ever.
-    com, com_velocity : (N, 2) x and z [m, m/s].
-    L : (N,) angular momentum about the pitch axis [kg m^2/s].
-    """
-
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    L: np.ndarray
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,), its velocity (2,) and momentum at ``time`` since touchdown."""
-        x, z, dx, dz, momentum = (
-            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
-        )
-        return np.array([x, z]), np.array([dx, dz]), float(momentum)
 
 
 class LandingController:
@@ -173,11 +142,13 @@ class LandingController:
         g, body = self.gains, self._terms
         rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
         goal, speed, momentum = foot_middle + np.array([0.0, 0.0, body.standing_height]), np.zeros(3), np.zeros(3)
+        push, twist = np.zeros(3), np.zeros(3)
         if self.reference is not None:
             com, com_rate, momentum[1] = self.reference.at(time)
             goal[[0, 2]], speed[[0, 2]] = foot_middle[[0, 2]] + com, com_rate
-        wish = rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
-        return wish, g.momentum_rate * (momentum - body.momentum)
+            push[[0, 2]], twist[1] = self.reference.feed_forward(time)
+        wish = push + rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
+        return wish, twist + g.momentum_rate * (momentum - body.momentum)
 
     def _trunk_wish(self, v):
         """Angular acceleration (3,) of the trunk in its own axes: upright in roll and pitch, yaw only damped."""

@@ -32,22 +32,27 @@ SLIGHT = Ranges(0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Standard deviations of white noise on what the landing controller is told; zero means exact.
+    """Standard deviations of what is wrong with the sensors; zero means exact.
 
-    Our choice for :meth:`typical`: 16-bit encoders, a mid-range inertial unit, leg odometry.
+    White noise is that of one sample at 1 kHz; biases and the error of the first attitude are drawn once per run.
     """
 
-    joint_rad: float = 0.0
-    joint_rate: float = 0.0  # [rad/s]
-    tilt_rad: float = 0.0
-    gyro: float = 0.0  # [rad/s]
-    velocity: float = 0.0  # [m/s], base
-    force: float = 0.0  # [N], each axis of a foot sensor
+    joint_rad: float = 0.0  # [rad] white
+    joint_rate: float = 0.0  # [rad/s] white
+    encoder_step_rad: float = 0.0  # [rad] quantisation of the joint angles
+    tilt_rad: float = 0.0  # [rad] roll and pitch as they are believed to be before the jump
+    gyro: float = 0.0  # [rad/s] white
+    gyro_bias: float = 0.0  # [rad/s]
+    accel: float = 0.0  # [m/s^2] white
+    accel_bias: float = 0.0  # [m/s^2]
+    force: float = 0.0  # [N] white, each foot
 
     @classmethod
     def typical(cls) -> SensorNoise:
-        """Encoders 0.5 mrad and 0.05 rad/s, tilt 5 mrad, gyro 0.02 rad/s, base velocity 0.02 m/s, force 3 N."""
-        return cls(5e-4, 0.05, 5e-3, 0.02, 0.02, 3.0)
+        """Our choice: 16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
+        return cls(
+            joint_rad=5e-4, joint_rate=0.05, encoder_step_rad=1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3,
+            accel=0.2, accel_bias=0.05, force=3.0)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ class Command:
     q: np.ndarray | None = None  # (nv - 6,) [rad]
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
+    share: float = 1.0  # of the torque limit, for the servo
 
 
 class Playback:
@@ -93,7 +94,7 @@ class Motors:
         """Give ``command`` to the engine at true joint rates ``rate``; returns the torque, None for a servo."""
         if command.tau is None:
             self._servo = True
-            limit = self.actuators.either_way(rate) * np.minimum(self._gain, 1.0)
+            limit = command.share * self.actuators.either_way(rate) * np.minimum(self._gain, 1.0)
             world.command_position(command.q, command.rate, limit, POSITION_GAIN, VELOCITY_GAIN)
             return None
         if self._servo:

@@ -8,18 +8,23 @@ import pinocchio as pin
 from jumplab.robot import Robot
 from jumplab.simulation.scene import Scene
 from jumplab.simulation.world import STEP_S
+from jumplab.task import GRAVITY
 from jumplab.trajectory import Tape
 
 START_HEIGHT_M = 0.30  # our choice: soles this far above the ground; earlier, the correction fights the swing itself
 RATE = 12.0  # [rad/s] our choice: 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
 LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
-CAPTURE_S = 0.13  # our choice: metres of foothold per m/s of forward speed, as in the plan's capture window
+FASTEST_FALL = 1.0  # [m/s] our choice: below it the foothold says little about the moment
 NEWTON_STEPS = 2  # two equations, nearly linear
 PROBE_RAD = 1e-4  # of the finite differences
 
 
 class Reaim:
-    """Turns hips and ankles so that the soles meet the ground flat, and as far ahead of the CoM as the speed asks for.
+    """Turns hips and ankles so that the soles meet the ground flat, and where they can catch the robot.
+
+    That is where the angular momentum about the soles' middle, L + m (z v_x + ahead v_z), is the planned one: an impact
+    under the soles does not change it, and what is left of it afterwards tips the robot over. A rule that knows the
+    forward speed alone puts the feet of a robot that is also pitched, low or turning too far ahead.
 
     The posture at touchdown is predicted as the tape's last one, with the trunk as far off its planned pitch as it is
     now. Without any error the correction is zero.
@@ -32,23 +37,28 @@ class Reaim:
         roles = ("hip_pitch", "ankle_pitch")
         self._rows = [[7 + robot.joint_names.index(name) for name in robot.joints[role]] for role in roles]
         self._end = tape.q[-1].copy()
-        self._ahead, self._tilt = self._aim(self._end)
-        self._speed = float(self._com_velocity(tape.q[-1], tape.v[-1])[0])
+        ahead, self._tilt, height = self._aim(self._end)
+        self._mass = robot.total_mass
+        speed, momentum = self._motion(tape.q[-1], tape.v[-1])
+        self._moment = momentum / self._mass + height * speed[0] + ahead * speed[2]
         self._now = np.zeros(len(robot.joint_names))
 
-    def _com_velocity(self, q, v) -> np.ndarray:
-        pin.centerOfMass(self._model, self._data, q, v)
-        return self._data.vcom[0]
+    def _motion(self, q, v) -> tuple[np.ndarray, float]:
+        """CoM velocity (3,), and angular momentum about the pitch axis."""
+        pin.ccrba(self._model, self._data, q, v)
+        return self._data.hg.linear / self._mass, float(self._data.hg.angular[1])
 
     def _sole_middle(self, q) -> np.ndarray:
         pin.framesForwardKinematics(self._model, self._data, q)
         return np.mean([self._data.oMf[frame].act(self._foot.center) for frame in self._frames], axis=0)
 
     def _aim(self, q) -> np.ndarray:
-        """Middle of the soles ahead of the CoM [m], and the soles' pitch [rad]."""
-        ahead = self._sole_middle(q)[0] - pin.centerOfMass(self._model, self._data, q, False)[0]
+        """Middle of the soles ahead of the CoM [m], the soles' pitch [rad], CoM above the soles [m]."""
+        com = pin.centerOfMass(self._model, self._data, q, False).copy()
+        middle = self._sole_middle(q)
         feet = [self._data.oMf[frame].rotation for frame in self._frames]
-        return np.array([ahead, np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])])
+        tilt = np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])
+        return np.array([middle[0] - com[0], tilt, com[2] - middle[2]])
 
     def correction(self, q: np.ndarray, v: np.ndarray, planned_pitch: float) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
@@ -60,26 +70,35 @@ class Reaim:
         """
         middle = self._sole_middle(q)
         if middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M:
-            x, y, z, w = q[3:7]
-            error = np.arctan2(2 * (w * y + x * z), 1 - 2 * (y * y + x * x)) - planned_pitch
+            error = pitch_of(q) - planned_pitch
             error = np.arctan2(np.sin(error), np.cos(error))
             most = RATE * STEP_S
-            self._now = self._now + np.clip(self._wish(q, v, error) - self._now, -most, most)
+            self._now = self._now + np.clip(self.wish(q, v, error) - self._now, -most, most)
         return self._now
 
-    def _wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
+    def wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
         """Correction (nv - 6,) with which the predicted touchdown has the soles flat and well placed."""
-        goal = np.array([self._ahead + CAPTURE_S * (self._com_velocity(q, v)[0] - self._speed), self._tilt])
+        speed, momentum = self._motion(q, v)
+        com = self._data.com[0].copy()
         guess = self._end.copy()
         turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch_error, 0.0))
         guess[3:7] = (turn * pin.Quaternion(guess[6], guess[3], guess[4], guess[5])).coeffs()
         for _ in range(NEWTON_STEPS):
             here = self._aim(guess)
+            drop = com[2] - here[2] - self._scene.top_at(self._sole_middle(q)[0])
+            fall = np.sqrt(max(speed[2] ** 2 + 2 * GRAVITY * drop, FASTEST_FALL**2))
+            goal = np.array([(momentum / self._mass + here[2] * speed[0] - self._moment) / fall, self._tilt])
             slope = np.empty((2, 2))
             for column, rows in enumerate(self._rows):
                 probe = guess.copy()
                 probe[rows] += PROBE_RAD
-                slope[:, column] = (self._aim(probe) - here) / PROBE_RAD
-            for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here), strict=True):
+                slope[:, column] = (self._aim(probe) - here)[:2] / PROBE_RAD
+            for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here[:2]), strict=True):
                 guess[rows] += angle
         return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles
+
+
+def pitch_of(q: np.ndarray) -> float:
+    """Pitch of the trunk in configuration ``q`` [rad]."""
+    x, y, z, w = q[3:7]
+    return float(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))

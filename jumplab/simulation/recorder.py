@@ -8,10 +8,10 @@ import pinocchio as pin
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
 from jumplab.simulation.actuation import Actuators
+from jumplab.simulation.honesty import STAND_S
 from jumplab.simulation.result import Metrics, SimulationResult
 from jumplab.simulation.world import STEP_S, Contacts
 
-STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
 CONTACT_FORCE_N = 5.0  # our choice: "a few newtons"; a height threshold would see the lift-off 20 ms late
 STILL_SPEED = 0.05  # [m/s] our choice: a CoM slower than this at the end stands
 LEVEL_TOLERANCE_M = 0.05  # our choice: soles this close to the planned height stand on the planned surface
@@ -52,6 +52,7 @@ class Recorder:
         contacts = [row[3] for row in self._rows]
         wrench = np.array([c.wrench for c in contacts])
         touching = np.array([[name in c.touching for name in self._links] for c in contacts])
+        colliding = np.array([bool(c.colliding) for c in contacts])
         com, com_velocity, momentum, inertia = _centroidal(self._robot, q, v)
         liftoff, touchdown = _events(wrench[:, :, 2].sum(axis=1))
         phase = np.full(len(q), "launch", dtype="<U7")
@@ -61,9 +62,8 @@ class Recorder:
             phase[touchdown:] = "landing"
         log = dict(
             t=np.arange(len(q)) * STEP_S, q=q, v=v, tau=tau, foot_wrench=wrench, com=com, com_velocity=com_velocity,
-            L=momentum, rho=inertia, phase=phase, touching=touching)  # fmt: skip
-        collisions = STEP_S * sum(bool(c.colliding) for c in contacts)
-        metrics = self._metrics(log, liftoff, touchdown, collisions, solves)
+            L=momentum, rho=inertia, phase=phase, touching=touching, colliding=colliding)  # fmt: skip
+        metrics = self._metrics(log, liftoff, touchdown, STEP_S * float(colliding.sum()), solves)
         for array in log.values():
             array.setflags(write=False)
         return SimulationResult(**log, link_names=self._links, joint_names=self._robot.joint_names, metrics=metrics,

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jumplab.errors import InputError
+from jumplab.simulation.honesty import Finding
 
 SCHEMA = "jumplab-simulation-1"
 
@@ -82,6 +83,8 @@ class SimulationResult:
     L : (N,) angular momentum about the pitch axis through the CoM;  rho : (N,) total pitch inertia about it.
     phase : (N,) "launch", "flight" or "landing", by the simulated contact forces.
     touching : (N, links) whether a link pressed on the ground;  link_names : (links,).
+    colliding : (N,) whether links of the robot pressed on each other.
+    honesty : what :func:`jumplab.simulation.honesty.check` found.
     """
 
     t: np.ndarray
@@ -95,10 +98,17 @@ class SimulationResult:
     rho: np.ndarray
     phase: np.ndarray
     touching: np.ndarray
+    colliding: np.ndarray
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     metrics: Metrics
     settings: dict
+    honesty: tuple[Finding, ...] = ()
+
+    @property
+    def honest(self) -> bool:
+        """True if every check of the run's honesty was made and passed."""
+        return bool(self.honesty) and all(finding.passed for finding in self.honesty)
 
     @property
     def landed(self) -> bool:
@@ -113,12 +123,13 @@ class SimulationResult:
     def arrays(self) -> dict[str, np.ndarray]:
         """All logs under the names of ``simulation.npz``."""
         names = ("t", "q", "v", "tau", "foot_wrench", "com", "com_velocity", "L", "rho", "phase", "touching",
-                 "link_names", "joint_names")  # fmt: skip
+                 "colliding", "link_names", "joint_names")  # fmt: skip
         return {"schema": np.array(SCHEMA), **{n: np.asarray(getattr(self, n)) for n in names}}
 
     def to_json(self) -> dict:
         """Metrics and settings as plain data, the content of ``simulation.json``."""
-        return {"schema": SCHEMA, **asdict(self.metrics), "settings": self.settings}
+        return {"schema": SCHEMA, **asdict(self.metrics), "settings": self.settings,
+                "honest": self.honest, "honesty": [finding.to_json() for finding in self.honesty]}  # fmt: skip
 
     def save(self, folder: str | Path, extra: dict | None = None) -> None:
         """Write ``simulation.npz``, then ``simulation.json`` (with ``extra`` entries), each whole or not at all.

@@ -6,8 +6,6 @@ The step is 1 ms, the paper's control cycle, without substeps. Everything outsid
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +13,17 @@ import pinocchio as pin
 
 from jumplab.errors import JumplabError, RobotError
 from jumplab.robot import Robot
-from jumplab.simulation.engine import bullet
+from jumplab.simulation.engine import bullet, load_urdf
 from jumplab.simulation.perturbation import FRICTION
 from jumplab.simulation.scene import REACH_M, Scene
 from jumplab.task import GRAVITY
 
 STEP_S = 0.001  # paper, Sec. VI-A: control cycle 1 ms
-SOLVER_ITERATIONS = 200  # our choice: 1000 land within 1 mm of it; 50, the default, 15 mm away in position mode
+SOLVER_ITERATIONS = 1000  # our choice: with 200, what is left unsolved tips the robot sideways by 2.5 mrad
 CONTACT_ERP = 0.1  # our choice: a deep penetration fades in 10 ms; the default 0.2 makes feet bounce off an impact
 CONTACT_SLOP_M = 1e-4  # our choice: boxes rest this deep; at zero, rounding would break the contact of a light toe
 GROUND_FRICTION = 1.0  # friction combines as a product, so the robot's own coefficient is the effective one
+TANGLES = 20  # our choice: postures tried until links are in each other; for a humanoid the first one does
 UNLIMITED_RATE = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -86,7 +85,7 @@ class World:
     """
 
     def __init__(self, robot: Robot, q: np.ndarray, v=None, *, scene: Scene | None = None, friction: float = FRICTION):
-        self.robot, self.scene = robot, scene or Scene.flat()
+        self.robot, self.scene, self._beyond_sole = robot, scene or Scene.flat(), 0.0
         self._client = bullet.connect(bullet.DIRECT)
         try:
             self._engine_settings()
@@ -95,6 +94,7 @@ class World:
             self._index_links()
             self._set_dynamics(friction)
             self._motors_off()
+            self._solid = self._feels_itself()
             self._place(np.asarray(q, float), np.zeros(robot.model.nv) if v is None else np.asarray(v, float))
         except BaseException:
             self.close()
@@ -130,16 +130,7 @@ class World:
         return body
 
     def _load(self, urdf: str) -> int:
-        handle, path = tempfile.mkstemp(suffix=".urdf")  # Bullet reads files only
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(urdf)
-            flags = bullet.URDF_USE_INERTIA_FROM_FILE | bullet.URDF_USE_SELF_COLLISION
-            return bullet.loadURDF(path, flags=flags, physicsClientId=self._client)
-        except bullet.error as e:
-            raise RobotError(f"robot {self.robot.name}: PyBullet cannot read the URDF: {e}") from e
-        finally:
-            os.remove(path)
+        return load_urdf(urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
 
     def _index_links(self) -> None:
         count = bullet.getNumJoints(self._body, physicsClientId=self._client)
@@ -185,6 +176,18 @@ class World:
         for joint, angle, speed in zip(self._joints, q[7:], v[6:], strict=True):
             bullet.resetJointState(self._body, joint, float(angle), float(speed), **client)
 
+    def _feels_itself(self) -> bool:
+        """Whether the engine notices links in each other: tangles the robot, before it is placed for the run."""
+        client, rng = {"physicsClientId": self._client}, np.random.default_rng(0)
+        bullet.resetBasePositionAndOrientation(self._body, [0.0, 0.0, REACH_M], [0.0, 0.0, 0.0, 1.0], **client)
+        for _ in range(TANGLES):
+            for joint, angle in zip(self._joints, rng.uniform(-np.pi, np.pi, len(self._joints)), strict=True):
+                bullet.resetJointState(self._body, joint, angle, **client)
+            bullet.performCollisionDetection(**client)
+            if bullet.getContactPoints(bodyA=self._body, bodyB=self._body, **client):
+                return True
+        return False
+
     # running ---------------------------------------------------------------------------------------------------
 
     @property
@@ -192,6 +195,17 @@ class World:
         """Friction coefficient of every link as the engine has it."""
         rows = (bullet.getDynamicsInfo(self._body, i - 1, physicsClientId=self._client) for i in range(len(self.links)))
         return {name: row[1] for name, row in zip(self.links, rows, strict=True)}
+
+    def read_back(self) -> dict:
+        """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg],
+        whether links collide with each other, and how far beyond the stated sole a foot ever touched [m]."""
+        client = {"physicsClientId": self._client}
+        ground = [bullet.getDynamicsInfo(block, -1, **client)[1] for block in self._ground]
+        feet = [bullet.getDynamicsInfo(self._body, link, **client)[1] for link in self._feet]
+        masses = (bullet.getDynamicsInfo(self._body, i - 1, **client)[0] for i in range(len(self.links)))
+        friction = sorted({foot * block for foot in feet for block in ground})
+        return {"friction": friction, "mass_kg": sum(masses), "self_collision": self._solid,
+                "beyond_sole_m": self._beyond_sole}  # fmt: skip
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
@@ -231,7 +245,7 @@ class World:
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
         client = {"physicsClientId": self._client}
-        wrench, touching, colliding = np.zeros((2, 6)), set(), set()
+        wrench, touching, colliding, points = np.zeros((2, 6)), set(), set(), ([], [])
         for row in bullet.getContactPoints(bodyA=self._body, **client):
             body_b, link_a, link_b, normal_force = row[2], row[3], row[4], row[9]
             if normal_force <= 0:
@@ -245,8 +259,19 @@ class World:
                 force = np.array((row[7], row[11], row[13])).T @ (normal_force, row[10], row[12])
                 wrench[side, :3] += force
                 wrench[side, 3:] += pin.skew(np.array(row[5])) @ force
+                points[side].append(row[5])
         for link, side in self._feet.items():
-            if wrench[side, :3].any():
-                origin = np.array(bullet.getLinkState(self._body, link, **client)[4])
+            if points[side]:
+                state = bullet.getLinkState(self._body, link, **client)
+                origin = np.array(state[4])
                 wrench[side, 3:] -= pin.skew(origin) @ wrench[side, :3]
+                self._note_sole(np.array(points[side]) - origin, state[5])
         return Contacts(wrench, frozenset(touching), frozenset(colliding))
+
+    def _note_sole(self, points: np.ndarray, quaternion) -> None:
+        """Remember how far contact points (k, 3), from the foot's origin in world axes, lay beyond the stated sole."""
+        x, y, z, w = quaternion
+        foot, local = self.robot.foot, points @ pin.Quaternion(w, x, y, z).toRotationMatrix()
+        side = np.abs(local[:, 1] - foot.center[1]) - foot.half_width
+        beyond = max((foot.heel - local[:, 0]).max(), (local[:, 0] - foot.toe).max(), side.max())
+        self._beyond_sole = max(self._beyond_sole, float(beyond))

@@ -1,0 +1,114 @@
+"""Who commands when: the tape until touchdown, a landing planned on the way down, the landing controller after it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jumplab.errors import InputError, JumplabError
+from jumplab.robot import Robot
+from jumplab.simulation.landing import PERIOD_STEPS, LandingController
+from jumplab.simulation.playback import Command, Playback
+from jumplab.simulation.reaim import Reaim, pitch_of
+from jumplab.simulation.reference import LEAD_S, Forecast, LandingAhead, LandingSource, landing_planner
+from jumplab.simulation.scene import Scene
+from jumplab.simulation.world import STEP_S
+from jumplab.trajectory import Tape
+
+LANDINGS = ("planned", "spring")
+WAIT_S = 0.5  # our choice: how long the robot may hang in the air after the tape's end before the run is given up
+TOUCHDOWN_FORCE_N = 30.0  # our choice: sum of both feet; 7 % of the weight, ten times the sensor noise
+EARLIEST_TOUCHDOWN = 0.5  # our choice: share of the planned flight before which a graze of the ground is no landing
+YIELD_S = 0.03  # our choice: before the ground is due, the position servos get less torque ...
+YIELD_SHARE = 0.2  # ... this share of the limit: enough for the last posture, too little to fight the impact
+
+
+class Pilot:
+    """Decides the command of each step: playback until touchdown, landing controller afterwards.
+
+    Parameters
+    ----------
+    tape, robot, scene : as planned.
+    mode : how the tape is played, see :class:`Playback`.
+    landing : "planned" or "spring", see :func:`jumplab.simulation.simulate_jump`.
+    reference : overrides ``landing`` if given.
+    reaim : correct the legs in the air.
+
+    Attributes
+    ----------
+    touchdown : step of the first contact after the flight, None until then.
+    ahead : what the landing controller follows, and why.
+    """
+
+    def __init__(self, tape: Tape, robot: Robot, mode: str, scene: Scene, landing: str,
+                 reference: LandingSource | None, reaim: bool):  # fmt: skip
+        if landing not in LANDINGS:
+            raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
+        self._robot, self._playback, self._forecast = robot, Playback(tape, robot, mode), Forecast(robot, tape, scene)
+        self._plan_landing = reference if callable(reference) else None
+        self._landing = LandingController(robot, reference=None if callable(reference) else reference)
+        self.ahead = LandingAhead(landing if reference is None else "given")
+        if self.ahead.source == "planned":
+            self._prepare()
+        self._reaim = Reaim(robot, tape, scene) if reaim else None
+        flight = tape.t[-1] - tape.takeoff_time
+        self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
+        self._none = np.zeros(len(robot.joint_names))
+        self._tau = self._none
+        self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
+        self.touchdown: int | None = None
+
+    def _prepare(self) -> None:
+        """Build the planner now, so that the solve in flight is all that is left to do."""
+        try:
+            landing_planner(self._robot)
+        except JumplabError as e:  # a robot for which stage 1 has no landing
+            self.ahead.followed, self.ahead.reason = "spring", str(e)
+
+    @property
+    def solves(self) -> tuple[int, int]:
+        """QPs posed by the landing controller, and how many of them failed."""
+        return self._landing.solves, self._landing.failures
+
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
+        """Command at ``step`` from measured state and vertical foot forces."""
+        if self.touchdown is None:
+            if step < self._earliest:
+                return self._playback.command(step, q, v, self._none)
+            if force.sum() <= TOUCHDOWN_FORCE_N:
+                return self._fly(step, q, v)
+            self._touch(step, q, v)
+        since = step - self.touchdown
+        if since % PERIOD_STEPS == 0:
+            self._tau = self._landing.torque(since * STEP_S, q, v, force)
+        return Command(tau=self._tau)
+
+    def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
+        left = self._forecast.time_left(q, v)
+        if left <= LEAD_S:
+            self._look_ahead(step, q, v, left)
+        aimed = self._none
+        if self._reaim is not None:
+            aimed = self._reaim.correction(q, v, self._playback.trunk_pitch(step))
+        command = self._playback.command(step, q, v, aimed)
+        return replace(command, share=YIELD_SHARE) if left <= YIELD_S else command
+
+    def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
+        """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
+        if self.ahead.source != "planned" or self.ahead.followed is not None:
+            return
+        there = q, v
+        if left > 0:
+            error = pitch_of(q) - self._playback.trunk_pitch(step)
+            error = float(np.arctan2(np.sin(error), np.cos(error)))
+            correction = None if self._reaim is None else self._reaim.wish(q, v, error)
+            there = self._forecast.state(q, v, error, correction)
+        self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
+
+    def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
+        self.touchdown = step
+        if self._plan_landing is not None:
+            self._landing.reference = self._plan_landing(q, v)
+            self.ahead.followed = "spring" if self._landing.reference is None else "given"
+        self._look_ahead(step, q, v, 0.0)  # the ground came early
