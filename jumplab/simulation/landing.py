@@ -36,6 +36,9 @@ MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] our choice: an impact mu
 UNBOUNDED = 1e20  # ProxQP's infinity
 TOLERANCE = 1e-6  # our choice: of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
 MAX_ITERATIONS = 300  # our choice: ten times what the hardest recorded QP took
+# our choice: 0.1 mN m, no motor resolves it. ProxQP's last digits depend on where its memory lies; without rounding the
+# same landing would differ from run to run
+TORQUE_DIGITS = 4
 FALLBACK_DAMPING = 3.0  # [N m s/rad] our choice: stable at 500 Hz on the lightest joint
 UNEVEN = np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(6))  # (12, 12), squared difference of the two wrenches
 
@@ -106,7 +109,7 @@ class LandingController:
         body.set_contact(contact)
         x = self._solve(*self._wishes(time, q, v, contact), v)
         tau = -FALLBACK_DAMPING * v[6:] + body.gravity_torque(contact) if x is None else body.torque(x)
-        return np.clip(tau, *self._actuators.range(v[6:]))
+        return np.clip(np.round(tau, TORQUE_DIGITS), *self._actuators.range(v[6:]))
 
     def _contact(self, time: float, foot_force: np.ndarray) -> np.ndarray:
         """Which feet (2,) may carry weight: those that did a moment ago, and any that hovers just beside one."""
