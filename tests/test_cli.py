@@ -20,8 +20,11 @@ from jumplab.errors import InfeasibleError, SolverError
 
 ROOT = Path(__file__).resolve().parent.parent
 STAGES = [{"stage": "SRMP launch", "iterations": 31, "build_s": 0.25, "solve_s": 0.125}]
-METRICS = {"foot_distance_m": 1.002, "com_rise_m": 0.497, "standing_s": 3.4, "landed": True, "reason": "stood"}
-FALL = {"foot_distance_m": None, "com_rise_m": None, "standing_s": 0.0, "landed": False, "reason": "fell"}
+FINDING = {"name": "mass", "value": 42.0, "limit": 42.5, "unit": "kg", "passed": True, "catches": "another robot"}
+METRICS = {"foot_distance_m": 1.002, "com_rise_m": 0.497, "standing_s": 3.4, "landed": True, "reason": "stood",
+           "honesty": [FINDING]}  # fmt: skip
+FALL = {"foot_distance_m": None, "com_rise_m": None, "standing_s": 0.0, "landed": False, "reason": "fell",
+        "honesty": [FINDING, FINDING | {"value": 43.0, "passed": False}]}  # fmt: skip
 HELP = "'jumplab --help' shows what is possible"
 HELP_PLAN = "'jumplab plan --help' shows what is possible"
 
@@ -232,11 +235,13 @@ def test_debug_shows_the_traceback(capsys, here, planner):
     [
         (
             METRICS,
-            "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n",
+            "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n"
+            "honesty: all 1 checks of the run passed\n",
         ),
         (
             FALL,
-            "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n",
+            "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n"
+            "NOT HONEST: mass 43 kg, at most 42.5: another robot\n",
         ),
     ],
 )
