@@ -147,8 +147,10 @@ TEXTS = [
      "link 'left_shank': mass = 0 kg, the body of joint 'left_knee' must weigh more than 0 kg"),
     ("no mass", without("<mass [^>]*>", SHANK),
      "link 'left_shank': <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"),
-    ("mass NaN", changed('value="3"', 'value="nan"', SHANK), "link 'left_shank': mass = 'nan' must be a finite number of kg"),
-    ("mass word", changed('value="3"', 'value="3 kg"', SHANK), "link 'left_shank': mass = '3 kg' must be a finite number of kg"),
+    ("mass NaN", changed('value="3"', 'value="nan"', SHANK),
+     "link 'left_shank': mass = 'nan' must be a finite number of kg"),
+    ("mass word", changed('value="3"', 'value="3 kg"', SHANK),
+     "link 'left_shank': mass = '3 kg' must be a finite number of kg"),
     ("mass negative", changed('value="3"', 'value="-3"', SHANK),
      "link 'left_shank': mass = -3 kg must not be negative; correct <mass>"),
     ("no inertia", without("<inertia [^>]*>", SHANK),
@@ -173,14 +175,15 @@ TEXTS = [
     ("grams", grams().replace('ixx="', 'ixx="1').replace('iyy="', 'iyy="1').replace('izz="', 'izz="1'),
      "weighs 42000 kg, a humanoid 0.5 to 400; are the masses in grams? divide by 1000"),
     ("millimetres", scaled(1000),
-     "the longest chain of joints measures 1141.47 m, a humanoid's 0.1 to 5; are the origins in millimetres? divide by 1000"),
+     "the longest chain of joints measures 1141.47 m, a humanoid's 0.1 to 5; are the origins in millimetres? divide by "
+     "1000"),
     ("no origins", scaled(0),
      "the longest chain of joints measures 0 m, a humanoid's 0.1 to 5; are the origins in kilometres, or are the "
      "origins missing?"),
 ]  # fmt: skip
 
 LIMITS = [
-    ("no limit", without("<limit [^>]*>", KNEE), "has no <limit>; add lower, upper, effort and velocity"),
+    ("no limit", without("<limit [^>]*>", KNEE), "has no <limit>; add lower, upper, effort, velocity"),
     ("no effort", limited(effort=None), "<limit> has no effort, which Pinocchio reads as 0; add it"),
     ("word", limited(upper="max"), "upper = 'max' must be a finite number"),
     ("infinite", limited(upper="inf"), "upper = 'inf' must be a finite number"),

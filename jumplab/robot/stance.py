@@ -64,10 +64,9 @@ def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarra
     base = np.asarray(toe) + toe_to_hip + _rotate(angles[3], model.base)
     q = pin.neutral(robot.model)
     q[:7] = [base[0], 0.0, base[1], 0.0, np.sin(angles[3] / 2), 0.0, np.cos(angles[3] / 2)]
-    joints = model.joint_angles(angles) * model.sign
-    for role, angle in zip(("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"), joints, strict=True):
-        for name in robot.joints[role]:
-            q[robot.model.idx_qs[robot.model.getJointId(name)]] = angle
+    joints = model.joint_angles(angles)
+    for name, row, sign in robot.role_signs():
+        q[robot.model.idx_qs[robot.model.getJointId(name)]] = sign * joints[row]
     return q
 
 

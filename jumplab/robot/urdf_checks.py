@@ -7,7 +7,8 @@ Every function yields sentences ``file: element: value, limit; what to do``, so 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from functools import partial
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -18,21 +19,26 @@ TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MASS_KG = (0.5, 400.0)  # our choice: from a hand-sized humanoid to twice the heaviest published one
 SIZE_M = (0.1, 5.0)  # our choice: largest distance between two joints in the neutral pose, likewise
 GYRATION_M = 1.0  # our choice: radius of gyration of one link; the longest published limb link has 0.2 m
+FRAME_KG = 5e-4  # our choice: links lighter than half a gram are frames, whose tensor nobody measured; it is ignored
 TRIANGLE_SLACK = 1e-3  # our choice: relative; rounding to four digits must not refuse a robot
 EFFORT_NM = 2000.0  # our choice: five times the strongest published electric humanoid joint
 SPEED_RAD_S = 60.0  # our choice: twice the fastest published humanoid joint; above it, deg/s or a placeholder
 ANGLE_RAD = 4 * np.pi  # our choice: beyond two turns, degrees or a placeholder
 
 
-def check(root: ET.Element, where: str) -> None:
-    """Raise :class:`RobotError` with the first fault of structure, inertials or size."""
-    for sentence in faults(root, where):
+def check(root: ET.Element, where: str, repair: Collection[str] = ()) -> None:
+    """Raise :class:`RobotError` with the first fault of structure, inertials or size that is not to be repaired."""
+    for sentence in faults(root, where, repair):
         raise RobotError(sentence)
 
 
-def faults(root: ET.Element, where: str) -> Iterator[str]:
-    """Faults of the whole file: of names and connections, else of inertials, else of units."""
-    for group in (structure_faults, inertial_faults, unit_faults):
+def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> Iterator[str]:
+    """Faults of the whole file: of names and connections, else of inertials, else of units.
+
+    ``repair`` may name "inertia" (tensors that no solid has) and "massless" (bodies without mass): these are no faults
+    then.
+    """
+    for group in (structure_faults, partial(inertial_faults, repair=repair), unit_faults):
         found = list(group(root, where))
         yield from found
         if found:  # the next group reads what this one refused
@@ -126,8 +132,8 @@ def _tree_faults(names: set, joints, where: str) -> Iterator[str]:
     if not roots:
         yield f"{where}: no link is the root: the joints form a cycle; each robot needs one link without a parent"
     elif len(roots) > 1:
-        yield (f"{where}: {len(roots)} links have no parent ({', '.join(map(repr, roots[:4]))}), Pinocchio keeps one tree "
-               f"and drops the rest; connect them")  # fmt: skip
+        yield (f"{where}: {len(roots)} links have no parent ({', '.join(map(repr, roots[:4]))}), Pinocchio keeps one "
+               f"tree and drops the rest; connect them")  # fmt: skip
     else:
         seen, todo = {roots[0]}, [roots[0]]
         below: dict[str, list[str]] = {}
@@ -152,28 +158,28 @@ def inertia_matrix(element: ET.Element) -> np.ndarray | None:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def inertial_faults(root: ET.Element, where: str) -> Iterator[str]:
+def inertial_faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> Iterator[str]:
     """Masses and inertias of every link, and bodies that weigh nothing."""
     bad = False
     for link in root.findall("link"):
         inertial = link.find("inertial")
         if inertial is not None:
-            for sentence in _inertial_faults(inertial, f"{where}: link {link.get('name')!r}"):
+            for sentence in _inertial_faults(inertial, f"{where}: link {link.get('name')!r}", "inertia" not in repair):
                 bad = True
                 yield sentence
-    if bad:
+    if bad or "massless" in repair:
         return
     for joint, links in moved_bodies(root).items():
         if sum(link_mass(link) for link in links) <= 0:
             name, child = joint.get("name"), links[0].get("name")
             if links[0].find("inertial") is None:
-                yield (f"{where}: link {child!r}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, "
-                       f"PyBullet 1 kg; joint {name!r} needs a body of more than 0 kg")  # fmt: skip
+                yield (f"{where}: link {child!r}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 "
+                       f"kg, PyBullet 1 kg; joint {name!r} needs a body of more than 0 kg")  # fmt: skip
             else:
                 yield f"{where}: link {child!r}: mass = 0 kg, the body of joint {name!r} must weigh more than 0 kg"
 
 
-def _inertial_faults(inertial: ET.Element, at: str) -> Iterator[str]:
+def _inertial_faults(inertial: ET.Element, at: str, strict: bool) -> Iterator[str]:
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     if mass is None:
         yield f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
@@ -198,7 +204,7 @@ def _inertial_faults(inertial: ET.Element, at: str) -> Iterator[str]:
         shown = {k: tensor.get(k) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
         key, text = next((k, v) for k, v in shown.items() if numbers(v, 1) is None)
         yield f"{at}: {key} = {text!r} must be a finite number of kg m^2"
-    elif value[0] > 0:
+    elif strict and value[0] >= FRAME_KG:
         yield from _tensor_faults(matrix, float(value[0]), at)
 
 
@@ -212,8 +218,10 @@ def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
                f"not exceed the sum of the others, no solid has this; correct <inertia>, or let it be repaired with "
                f"[source] repair = [\"inertia\"]")  # fmt: skip
     elif np.sqrt(moments[2] / mass) > GYRATION_M:
-        yield (f"{at}: moment of inertia {moments[2]:.3g} kg m^2 on {mass:g} kg is a radius of gyration of "
-               f"{np.sqrt(moments[2] / mass):.3g} m, at most {GYRATION_M:g} is likely; is it in g mm^2 or kg cm^2?")  # fmt: skip
+        yield (
+            f"{at}: moment of inertia {moments[2]:.3g} kg m^2 on {mass:g} kg is a radius of gyration of "
+            f"{np.sqrt(moments[2] / mass):.3g} m, at most {GYRATION_M:g} is likely; is it in g mm^2 or kg cm^2?"
+        )
 
 
 def link_mass(link: ET.Element) -> float:
@@ -281,15 +289,20 @@ def unit_faults(root: ET.Element, where: str) -> Iterator[str]:
                f"{SIZE_M[1]:g}; are the origins in {guess}")  # fmt: skip
 
 
+LIMITS = ("lower", "upper", "effort", "velocity")
+
+
 # limits ---------------------------------------------------------------------------------------------------------
-def limit_faults(joint: ET.Element, where: str) -> Iterator[str]:
-    """Faults of the limits of one joint that the jump uses."""
+def limit_faults(joint: ET.Element, where: str, told: dict[str, float] | None = None) -> Iterator[str]:
+    """Faults of the limits of one joint that the jump uses; ``told`` values go before those of the file."""
     at, limit = f"{where}: joint {joint.get('name')!r}", joint.find("limit")
-    if limit is None:
-        yield f"{at}: has no <limit>; add lower, upper, effort and velocity"
+    values = dict(told or {})
+    if limit is None and len(values) < len(LIMITS):
+        yield f"{at}: has no <limit>; add {', '.join(k for k in LIMITS if k not in values)}"
         return
-    values = {}
-    for key in ("lower", "upper", "effort", "velocity"):
+    for key in LIMITS:
+        if key in values:
+            continue
         text = limit.get(key)
         value = numbers(text, 1)
         if text is None:
@@ -306,8 +319,8 @@ def value_faults(v: dict[str, float], at: str) -> Iterator[str]:
     """Faults of lower, upper [rad], effort [N m] and velocity [rad/s]; ``at`` names file and joint."""
     low, high, effort, speed = v["lower"], v["upper"], v["effort"], v["velocity"]
     if max(abs(low), abs(high)) > ANGLE_RAD:
-        yield (f"{at}: range {low:g} ... {high:g} rad is beyond {ANGLE_RAD:.1f}: degrees or a placeholder; give the real "
-               f"range in rad")  # fmt: skip
+        yield (f"{at}: range {low:g} ... {high:g} rad is beyond {ANGLE_RAD:.1f}: degrees or a placeholder; give the "
+               f"real range in rad")  # fmt: skip
     elif low > high:
         yield f"{at}: lower = {low:g} rad is above upper = {high:g} rad; swap them"
     elif low == high:
@@ -319,5 +332,5 @@ def value_faults(v: dict[str, float], at: str) -> Iterator[str]:
     if speed <= 0:
         yield f"{at}: velocity = {speed:g} rad/s must be positive; give the speed limit"
     elif speed > SPEED_RAD_S:
-        yield (f"{at}: velocity = {speed:g} rad/s is above {SPEED_RAD_S:g}: deg/s or a placeholder; give the speed limit "
-               f"in rad/s")  # fmt: skip
+        yield (f"{at}: velocity = {speed:g} rad/s is above {SPEED_RAD_S:g}: deg/s or a placeholder; give the speed "
+               f"limit in rad/s")  # fmt: skip

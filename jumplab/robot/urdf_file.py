@@ -91,12 +91,18 @@ def parse(text: str, where: str) -> ET.Element:
         ends = text.rstrip().endswith("</robot>")
         kind = "is not well-formed XML" if ends else "ends before </robot>; it is cut short or is no URDF"
         raise RobotError(f"{where}: line {line}, column {column}: {kind} ({said})") from None
-    if any("xacro" in str(e.tag) for e in root.iter()) or "${" in text:
+    if any("xacro" in str(e.tag) for e in root.iter()) or _has_expressions(root):
         _refuse_xacro(where)
     tag = str(root.tag).rpartition("}")[2]
     if tag != "robot":
         raise RobotError(f"{where}: the root element is <{tag}>, {ROOTS.get(tag, 'a URDF begins with <robot>')}")
     return root
+
+
+def _has_expressions(root: ET.Element) -> bool:
+    """True if a number of a link or joint is still a ``${...}``; elsewhere (simulator plug-ins) they do no harm."""
+    parts = (e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter())
+    return any("${" in value for e in parts for value in e.attrib.values())
 
 
 def _refuse_xacro(where: str):

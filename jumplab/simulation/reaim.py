@@ -15,6 +15,7 @@ RATE = 12.0  # [rad/s] our choice: 0.8 rad within the last 0.2 m at 3 m/s, two t
 LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
 CAPTURE_S = 0.13  # our choice: metres of foothold per m/s of forward speed, as in the plan's capture window
 NEWTON_STEPS = 2  # two equations, nearly linear
+HIP_ANKLE = (0, 2)  # rows of jumplab.robot.SAGITTAL_JOINTS
 PROBE_RAD = 1e-4  # of the finite differences
 
 
@@ -29,8 +30,9 @@ class Reaim:
         self._model, self._data, self._foot = robot.model, robot.model.createData(), robot.foot
         self._scene = scene
         self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        roles = ("hip_pitch", "ankle_pitch")
-        self._rows = [[7 + robot.joint_names.index(name) for name in robot.joints[role]] for role in roles]
+        sides = [[(robot.joint_names.index(n), s) for n, row, s in robot.role_signs() if row == i] for i in HIP_ANKLE]
+        self._rows = [[7 + row for row, _ in side] for side in sides]
+        self._signs = [np.array([sign for _, sign in side]) for side in sides]  # left and right may turn opposite ways
         self._end = tape.q[-1].copy()
         self._ahead, self._tilt = self._aim(self._end)
         self._speed = float(self._com_velocity(tape.q[-1], tape.v[-1])[0])
@@ -76,10 +78,11 @@ class Reaim:
         for _ in range(NEWTON_STEPS):
             here = self._aim(guess)
             slope = np.empty((2, 2))
-            for column, rows in enumerate(self._rows):
+            for column, (rows, signs) in enumerate(zip(self._rows, self._signs, strict=True)):
                 probe = guess.copy()
-                probe[rows] += PROBE_RAD
+                probe[rows] += PROBE_RAD * signs
                 slope[:, column] = (self._aim(probe) - here) / PROBE_RAD
-            for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here), strict=True):
-                guess[rows] += angle
+            turns = np.linalg.solve(slope, goal - here)
+            for rows, signs, angle in zip(self._rows, self._signs, turns, strict=True):
+                guess[rows] += angle * signs
         return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles
