@@ -7,7 +7,7 @@ so is the configuration. Both results stand on their own, so a result folder can
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot import urdf_checks
+from jumplab.robot.clearance import free_range
 from jumplab.robot.config import entry, optional, roles_table, table
 from jumplab.robot.lumped import Body, Lumped, lump
 from jumplab.robot.tree import Tree
@@ -81,8 +82,26 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     feet = tuple(entry(config, "feet", "links", kind=str, count=2))
     lumped = lump(tree, config, roles, source, feet)
     sole = _sole(config, lumped, where)
+    lumped = _cut_hips(lumped, roles, _urdf(config, roles, lumped, sole))
     text = _urdf(config, roles, lumped, sole)
     return Jumper(text, _toml(config, roles, feet, sole, urdf, lumped), lumped, tree)
+
+
+def _cut_hips(lumped: Lumped, roles: dict, urdf: str) -> Lumped:
+    """Hip ranges cut to where the boxes of thigh and trunk meet."""
+    hips = roles["hip_pitch"]
+    free = free_range(urdf, hips)
+    if free is None:
+        return lumped
+    left, right = (lumped.body(name) for name in hips)
+    mirrored = free if left.axis @ right.axis > 0 else (-free[1], -free[0])
+    new = {}
+    for name, (low, high) in ((left.name, free), (right.name, mirrored)):
+        limits = next(b for b in lumped.bodies if b.name == name).limits
+        new[name] = limits | {"lower": max(limits["lower"], low), "upper": min(limits["upper"], high)}
+    bodies = tuple(replace(b, limits=new.get(b.name, b.limits)) for b in lumped.bodies)
+    cut = max(abs(free[0] - left.limits["lower"]), abs(free[1] - left.limits["upper"]))
+    return replace(lumped, bodies=bodies, changed=lumped.changed | {"hip range cut, thigh meets trunk": (cut, "rad")})
 
 
 def _sole(config: dict, lumped: Lumped, where: str) -> dict:

@@ -24,6 +24,7 @@ HEEL_UP_RAD = 0.5  # our choice: foot pitch considered as still pushing off
 TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; forward lean of a deep bow
 COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
 FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
+STANCE_SHARE = 0.08  # our choice: the stance lies at least this share of the inertia envelope's width inside it
 MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
 FLAT_COM_X_M = (-0.02, 0.13)  # our choice: where the CoM is while the feet are flat
 TOE_COM_X_M = (0.05, 0.25)  # our choice: where the CoM is while the heels are up
@@ -142,6 +143,21 @@ def _extension_speed(m, angles, com):
     return 1.0 / np.max(used, axis=0)
 
 
+def _around_stance(lower: np.ndarray, upper: np.ndarray, length: float, inertia: float):
+    """The two fits, shifted where needed so that the jump's first posture lies inside them.
+
+    Without arms that swing the envelope is narrow, and a stance that is a corner of it can be cut off.
+    """
+    low, high = np.polyval(lower, length), np.polyval(upper, length)
+    share = (inertia - low) / (high - low)
+    if share < STANCE_SHARE:
+        lower = lower - np.append(np.zeros(len(lower) - 1), (STANCE_SHARE - share) * (high - low) / (1 - STANCE_SHARE))
+    elif share > 1 - STANCE_SHARE:
+        excess = (share - 1 + STANCE_SHARE) * (high - low) / (1 - STANCE_SHARE)
+        upper = upper + np.append(np.zeros(len(upper) - 1), excess)
+    return lower, upper
+
+
 def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     """Sample the robot and fit its envelopes (Sec. III: "proper range respecting to the actual robot")."""
     m, p = robot.sagittal, postures(robot, count)
@@ -165,10 +181,11 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     half = -m.heel[0] / 2
     flat, toe = postures(robot, count, 0.0, FLAT_COM_X_M), postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M)
     capped = np.minimum(strongest, FORCE_CAP * strongest[0])
-    curves = ((lower, 2), (upper, 2), (capped, 3), (fastest, 3))
+    curves = ((capped, 3), (fastest, 3))
+    envelope = _around_stance(np.polyfit(grid, lower, 2), np.polyfit(grid, upper, 2), start[1], stance_rho)
     return Reach(
         (float(low), float(high)), grid, lower, upper, strongest, fastest,
-        *(np.polyfit(grid, values, degree) for values, degree in curves),
+        *envelope, *(np.polyfit(grid, values, degree) for values, degree in curves),
         _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat),
         (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
         float(mass.sum()),
