@@ -85,8 +85,28 @@ class Robot:
         file = locate(urdf, path.parent)
         if "source" not in config:
             return cls.from_text(read_urdf(file), text)
+        from jumplab.robot.accuracy import check_reduction  # builds on this class
+
         jumper = make_jumper(read_urdf(file), config, file.name, file)
-        return cls.from_text(jumper.urdf, jumper.config_text)
+        robot = cls.from_text(jumper.urdf, jumper.config_text)
+        check_reduction(robot)
+        return robot
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, *, repair: tuple[str, ...] = ()) -> Robot:
+        """A robot from nothing but its URDF: roles, soles and standing posture are found.
+
+        Parameters
+        ----------
+        path : the URDF file.
+        repair : what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that a solid can
+            have), "massless" (a gram for bodies without any).
+
+        Raises :class:`RobotError` where the file or the robot is not fit for jumping.
+        """
+        from jumplab.robot.checkup import check, draft  # they build on this class
+
+        return check(path, draft(path, repair).text).robot
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:

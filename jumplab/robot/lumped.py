@@ -14,7 +14,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot.config import table
 from jumplab.robot.roles import axis_of
-from jumplab.robot.tree import Joint, Tree
+from jumplab.robot.tree import Tree
 from jumplab.robot.urdf_checks import LIMITS, limit_faults
 
 ROUNDING_RAD = 1e-4  # our choice: URDFs print a right angle as 1.5708; axes this close to x, y or z are meant to be
@@ -344,7 +344,3 @@ def _pairs(tree: Tree, bodies: list[Body], roles: dict) -> list[tuple[str, str]]
         out += list(zip(*chains, strict=True))
     return out
 
-
-def joint_count(tree: Tree) -> int:
-    """Joints of the URDF that could move."""
-    return sum(isinstance(j, Joint) and j.kind in ("revolute", "continuous", "prismatic") for j in tree.joints.values())

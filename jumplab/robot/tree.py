@@ -214,3 +214,8 @@ def _joint(e: ET.Element) -> Joint:
         follows = mimic.get("joint"), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
     return Joint(e.get("name"), e.get("type"), e.find("parent").get("link"), e.find("child").get("link"),
                  _place(e), direction / max(np.linalg.norm(direction), 1e-12), limits, follows, e)  # fmt: skip
+
+
+def moving_count(tree: Tree) -> int:
+    """Joints of the URDF that could move."""
+    return sum(joint.kind in MOVING for joint in tree.joints.values())
