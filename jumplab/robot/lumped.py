@@ -284,7 +284,7 @@ def _mirrored(tree: Tree, bodies: list[Body], roles: dict, allowed: bool, change
                 gap = max(gap, float(np.abs(levers).max()))
             heavier = float(abs(own[3, 3] - other[3, 3]) / mean[3, 3])
             spread = float(np.abs(own - other)[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
-            worst["mass"] = max(worst["mass"], (max(heavier, spread if allowed else spread), "", left.name))
+            worst["mass"] = max(worst["mass"], (max(heavier, spread), "", left.name))
         worst["place"] = max(worst["place"], (gap, "m", left.name))
         place = (left.place + MIRROR @ right.place) / 2
         out[left.joint] = replace(left, place=place, inertia=_of_moments(mean) if mean[3, 3] > 0 else left.inertia)
@@ -304,7 +304,9 @@ def _same_axis(left: Body, right: Body) -> np.ndarray:
 def _judge(tree: Tree, before: list[Body], after: list[Body], worst: dict, allowed: bool, changed: dict) -> list[Body]:
     (gap, _, at), (share, _, heavy) = worst["place"], worst["mass"]
     if gap > MOST_UNLIKE_M or (share > MOST_UNLIKE):
-        what = f"{1e3 * gap:.1f} mm at {at!r}" if gap > MOST_UNLIKE_M else f"{100 * share:.1f} % in mass at {heavy!r}"
+        what = f"{1e3 * gap:.1f} mm at {at!r}"
+        if gap <= MOST_UNLIKE_M:
+            what = f"{100 * share:.1f} % in mass or inertia at {heavy!r}"
         raise RobotError(
             f"{tree.where}: left and right differ by {what}, at most {1e3 * MOST_UNLIKE_M:g} mm and {100 * MOST_UNLIKE:g} % can "
             f"be evened out; a symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from jumplab.robot.description import Robot
+from jumplab.robot.sagittal import SAGITTAL_JOINTS
 from jumplab.robot.stance import stance_angles
 
 SAMPLES = 2**16  # our choice: envelopes move by less than 1 % when doubled
@@ -53,6 +54,7 @@ class Reach:
     internal_inertia : constant part rho_I [kg m^2].
     cop : (heel, toe) from the middle of the sole [m].
     posture : (lower, upper) trunk pitch [rad].
+    weakest : "force" and "speed" -> the leg joint that saturates first where the leg extends best, with its limit.
     start : lean, length, turn, radius of the stance (theta_l, phi, theta_pl, varphi).
     mass : of the whole robot [kg].
     """
@@ -76,6 +78,7 @@ class Reach:
     posture: tuple[float, float]
     start: np.ndarray
     mass: float
+    weakest: dict
 
 
 def _turned(angle, vector):
@@ -102,9 +105,10 @@ def postures(robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RA
     from_sole = com - m.sole_center
     ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > com_x_m[0]) & (from_sole[:, 0] < com_x_m[1])
     ok &= from_sole[:, 1] > 0.15  # our choice: lower than this the robot sits
-    force = _static_force(m, angles, com)
-    speed = _extension_speed(m, angles, from_sole)
-    columns = {"angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force, "speed": speed}
+    force, strong = _static_force(m, angles, com)
+    speed, quick = _extension_speed(m, angles, from_sole)
+    columns = {"force_joint": strong, "speed_joint": quick,
+               "angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force, "speed": speed}  # fmt: skip
     return {name: x[ok] for name, x in columns.items()}
 
 
@@ -123,15 +127,16 @@ def _lowest_com(p: dict) -> np.ndarray:
 
 
 def _static_force(m, angles, com):
-    """Vertical force [N] at which the first leg joint saturates, CoP below the CoM but inside the sole."""
+    """Vertical force [N] at which the first leg joint saturates, CoP below the CoM but inside the sole; and which."""
     at = np.cumsum([_turned(angles[:, j], m.span[j]) for j in range(3)], axis=0)[..., 0]  # ankle, knee, hip x (3, n)
     cop = np.clip(com[:, 0], m.heel[0], 0.0)
     levers = np.maximum(np.abs(at - cop), MIN_FORCE_LEVER_M)
-    return FORCE_SHARE * np.min(m.effort[[2, 1, 0]][:, None] / levers, axis=0)
+    carried = m.effort[[2, 1, 0]][:, None] / levers
+    return FORCE_SHARE * np.min(carried, axis=0), 2 - np.argmin(carried, axis=0)
 
 
 def _extension_speed(m, angles, com):
-    """Rate of phi [m/s] at which ankle, knee or hip reaches its speed limit: foot and trunk still, CoM along phi."""
+    """Rate of phi [m/s] at which ankle, knee or hip reaches its speed limit, and which: foot and trunk still."""
     arms = np.einsum("i,ijk->jk", m.mass, m.com_arms()) / m.total_mass
     along = com / np.linalg.norm(com, axis=1, keepdims=True)
     turned = [_turned(angles[:, j], arms[j]) for j in (1, 2)]  # shank, thigh
@@ -140,7 +145,17 @@ def _extension_speed(m, angles, com):
     det = np.where(np.abs(det) < 1e-6, 1e-6, det)  # straight leg: no speed at all
     shank, thigh = (d * along[:, 0] - b * along[:, 1]) / det, (a * along[:, 1] - c * along[:, 0]) / det
     used = np.abs([shank / m.speed[2], (shank - thigh) / m.speed[1], thigh / m.speed[0]])
-    return 1.0 / np.max(used, axis=0)
+    return 1.0 / np.max(used, axis=0), 2 - np.argmax(used, axis=0)
+
+
+def _weakest(m, p: dict, phi: np.ndarray) -> dict:
+    """The joint that most often saturates in the best postures of the leg's stroke, for force and for speed."""
+    out, upper = {}, phi > np.median(phi)
+    for what, unit, limits in (("force", "N m", m.effort), ("speed", "rad/s", m.speed)):
+        best = p[what][upper] >= np.quantile(p[what][upper], 0.5)
+        joint = int(np.bincount(p[f"{what}_joint"][upper][best], minlength=3).argmax())
+        out[what] = f"{SAGITTAL_JOINTS[joint]} {limits[joint]:.3g} {unit}"
+    return out
 
 
 def _around_stance(lower: np.ndarray, upper: np.ndarray, length: float, inertia: float):
@@ -188,5 +203,5 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
         *envelope, *(np.polyfit(grid, values, degree) for values, degree in curves),
         _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat),
         (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
-        float(mass.sum()),
+        float(mass.sum()), _weakest(m, p, phi),
     )  # fmt: skip

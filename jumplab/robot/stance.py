@@ -25,11 +25,12 @@ def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
     return np.sum([_rotate(a, d) for a, d in zip(angles, arms, strict=True)], axis=0)
 
 
-def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
+def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits: bool = True) -> np.ndarray:
     """Absolute link angles (5,) of the standing posture, order foot, shank, thigh, trunk, arm [rad].
 
     Knee, trunk pitch and shoulder come from the robot's configuration (``knee_rad`` overrides the first); the shank's
-    lean follows from the CoM above the middle of the sole. Raises :class:`RobotError` if no lean does that.
+    lean follows from the CoM above the middle of the sole. Raises :class:`RobotError` if no lean does that, or, unless
+    ``within_limits`` is off, if a joint would leave its range.
     """
     knee = robot.stance["knee_rad"] if knee_rad is None else knee_rad
     pitch, shoulder = robot.stance["trunk_pitch_rad"], robot.stance["shoulder_rad"]
@@ -47,6 +48,8 @@ def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
             f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank "
             f"brings the CoM above the middle of the sole; change [stance] in its configuration"
         ) from None
+    if not within_limits:
+        return found
     joints = robot.sagittal.joint_angles(found)
     for name, angle, low, high in zip(SAGITTAL_JOINTS, joints, robot.sagittal.lower, robot.sagittal.upper, strict=True):
         if not low <= angle <= high:
