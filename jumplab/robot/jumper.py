@@ -194,7 +194,7 @@ def _boxes(config: dict, roles: dict, lumped: Lumped, sole: dict) -> dict[str, l
         knee, ankle = (lumped.body(roles[r][side]) for r in ("knee", "ankle_pitch"))
         foot = next(b for b in lumped.bodies if b.name == lumped_foot(lumped, ankle))
         _limb(out, knee.parent, lumped, places["hip_pitch"][side], knee.place, width["thigh"])
-        _limb(out, ankle.parent, lumped, knee.place, ankle.place, width["shank"])
+        _limb(out, knee.name, lumped, knee.place, ankle.place, width["shank"])
         size = [sole["toe"] - sole["heel"], 2 * sole["half"], width["foot"]]
         centre = [(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2]
         out[foot.name] = [(centre, size)]
