@@ -42,7 +42,9 @@ def _list(args: argparse.Namespace) -> None:
         try:
             robot = load_robot(name)
             arms = "swing" if robot.joints["shoulder_pitch"] else "held"
-            rows.append({"name": name, "kg": robot.total_mass, "joints": len(robot.joint_names), "arms": arms, "note": ""})
+            rows.append(
+                {"name": name, "kg": robot.total_mass, "joints": len(robot.joint_names), "arms": arms, "note": ""}
+            )
         except JumplabError as e:
             rows.append({"name": name, "kg": None, "joints": None, "arms": "", "note": str(e).rpartition(": ")[2]})
     print(table(rows, digits=3))

@@ -52,7 +52,9 @@ def _joints(ax: Axes, robot: Robot, front: Silhouette, q: np.ndarray, top: float
                 markeredgewidth=0.6, zorder=4 if name in roles else 5)  # fmt: skip
     for role, pair in robot.joints.items():
         if pair:
-            ax.text(0.20 * top, place[pair[0]][1], role.replace("_", " "), va="center", fontsize=7, color=ROLE_COLORS[role])
+            ax.text(
+                0.20 * top, place[pair[0]][1], role.replace("_", " "), va="center", fontsize=7, color=ROLE_COLORS[role]
+            )
         else:
             ax.text(0.0, 0.97 * top, "arms held", ha="center", va="center", fontsize=7, color=ROLE_COLORS[role])
 

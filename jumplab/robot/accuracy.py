@@ -97,7 +97,8 @@ def check_reduction(robot: Robot) -> ReductionError:
     if error.com_m > COM_LIMIT_M or worst > SHARE_LIMIT:
         raise RobotError(
             f"robot {robot.name}: its legs do not move in the sagittal plane: against the full robot the CoM is off by "
-            f"{1e3 * error.com_m:.2f} mm, inertia or momentum by {100 * worst:.2f} %, at most {1e3 * COM_LIMIT_M:g} mm and "
-            f"{100 * SHARE_LIMIT:g} % can be planned with; hold canted joints with [locked], or straighten their axes"
+            f"{1e3 * error.com_m:.2f} mm, inertia or momentum by {100 * worst:.2f} %, at most {1e3 * COM_LIMIT_M:g} mm "
+            f"and {100 * SHARE_LIMIT:g} % can be planned with; hold canted joints with [locked], or straighten "
+            f"their axes"
         )
     return error

@@ -20,7 +20,12 @@ from jumplab.robot.starter import safe_name, starter
 from jumplab.robot.tree import Tree, moving_count
 from jumplab.robot.urdf_file import parse, read_urdf
 
-ROLE_WORDS = {"hip_pitch": "hip pitch", "knee": "knee", "ankle_pitch": "ankle pitch", "shoulder_pitch": "shoulder pitch"}
+ROLE_WORDS = {
+    "hip_pitch": "hip pitch",
+    "knee": "knee",
+    "ankle_pitch": "ankle pitch",
+    "shoulder_pitch": "shoulder pitch",
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,9 @@ class Checkup:
         for i, (role, word) in enumerate(ROLE_WORDS.items()):
             pair = self.robot.joints[role]
             if not pair:
-                out.append({"role": word, "left": "held", "right": "held", "axes": "", "range": "", "N m": "", "rad/s": ""})
+                out.append(
+                    {"role": word, "left": "held", "right": "held", "axes": "", "range": "", "N m": "", "rad/s": ""}
+                )
                 continue
             axes = " ".join("+y" if x > 0 else "-y" for x in s.signs[i])
             out.append({"role": word, "left": pair[0], "right": pair[1], "axes": axes,
@@ -74,7 +81,8 @@ class Checkup:
             f"{moving_count(tree)} joints move, {len(self.jumper.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
-            f"standing: CoM {com[1]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, trunk {r.stance['trunk_pitch_rad']:.2f} rad",
+            f"standing: CoM {com[1]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
+            f"trunk {r.stance['trunk_pitch_rad']:.2f} rad",
             f"sagittal against full model: mass {e.mass_kg:.1e} kg, CoM {e.com_m:.1e} m, inertia {e.inertia_kgm2:.1e} "
             f"kg m^2, L {e.momentum_kgm2_s:.1e} kg m^2/s",
         ]

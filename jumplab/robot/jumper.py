@@ -169,8 +169,8 @@ def _trunk(robot: ET.Element, body: Body, boxes) -> None:
         even = 0.5 * min(low, low + middle - high) * np.eye(3)  # what is left is still a solid's
         if even[0, 0] <= 0:
             raise RobotError(
-                f"link {body.name!r} and what is fixed to it: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2 "
-                f"belong to no solid; correct <inertia>, or let it be repaired with [source] repair = [\"inertia\"]"
+                f"link {body.name!r} and what is fixed to it: principal moments {low:.3g}, {middle:.3g}, {high:.3g} "
+                f'kg m^2 belong to no solid; correct <inertia>, or let it be repaired with [source] repair = ["inertia"]'
             )
         rest = pin.Inertia(inertia.mass / 2, inertia.lever, matrix - even)
         inertia = pin.Inertia(inertia.mass / 2, inertia.lever, even)
@@ -205,13 +205,15 @@ def _boxes(config: dict, roles: dict, lumped: Lumped, sole: dict) -> dict[str, l
     trunk = lumped.bodies[0]
     default = [list(leg * np.array(TRUNK_BOX))]
     rows = table(config, "shapes").get("trunk_m", default)
-    good = isinstance(rows, list) and all(isinstance(r, list) and len(r) == 5 and r[0] < r[1] and r[3] < r[4] for r in rows)
+    good = isinstance(rows, list) and all(
+        isinstance(r, list) and len(r) == 5 and r[0] < r[1] and r[3] < r[4] for r in rows
+    )
     if not good:
         raise RobotError(
             f"robot configuration: 'shapes.trunk_m' = {rows!r} must be a list of [rear, front, half width, bottom, top]"
         )
     for rear, front, half, bottom, top in rows:
-        centre = hip + [(rear + front) / 2, 0.0, (bottom + top) / 2] - trunk.place
+        centre = hip + np.array([(rear + front) / 2, 0.0, (bottom + top) / 2]) - trunk.place
         centre[1] = 0.0
         out.setdefault(trunk.name, []).append((centre, [front - rear, 2 * half, top - bottom]))
     return out

@@ -108,7 +108,8 @@ def postures(robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RA
     force, strong = _static_force(m, angles, com)
     speed, quick = _extension_speed(m, angles, from_sole)
     columns = {"force_joint": strong, "speed_joint": quick,
-               "angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force, "speed": speed}  # fmt: skip
+               "angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force,
+               "speed": speed}  # fmt: skip
     return {name: x[ok] for name, x in columns.items()}
 
 

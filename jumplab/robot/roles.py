@@ -12,6 +12,7 @@ from jumplab.robot.tree import Joint, Tree
 
 PARALLEL = 0.999  # our choice: axes canted by less than 2.6 deg count as pitch
 SAME_M = 0.02  # our choice: how far from mirror images two limbs may stand
+BACKWARD_M = 0.01  # our choice: feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # our choice: cosine between the leg, hip to ankle, and the vertical
 ARM_SHARE = 0.5  # our choice: a joint that swings less than half of the arm's mass is no shoulder
 AXES = {"x": np.array([1.0, 0, 0]), "y": np.array([0, 1.0, 0]), "z": np.array([0, 0, 1.0])}
@@ -154,7 +155,7 @@ def find_roles(tree: Tree, angles: dict[str, float] | None = None) -> Roles:
     shoulder = _shoulders(finder, lateral, limb, order, notes)
     frame = finder.pose[limb.branch].rotation.T
     ahead = [_ahead(finder, f, legs["ankle_pitch"][k], forward) for k, f in enumerate(feet)]
-    if max(ahead) < -SAME_M:
+    if max(ahead) < -BACKWARD_M:
         notes.append(
             f"the feet point backwards ({max(ahead):.3f} m) for a robot whose knees bend backwards; check forward"
         )
@@ -213,8 +214,8 @@ def _explain(finder: _Finder) -> None:
                 if not finder.usable(joint):
                     kind = f"mimics {joint.mimic[0]!r}" if joint.mimic else f"is of type {joint.kind!r}"
                     raise RobotError(
-                        f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}, which must "
-                        f"be revolute with a range and a motor of its own"
+                        f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}, which "
+                        f"must be revolute with a range and a motor of its own"
                     )
     ends = [finder._moving(link, False) for link in tree.links if not tree.below[link]]
     legged = {c[-1].name: c for c in ends if c and finder.triple(c, AXES["y"])}

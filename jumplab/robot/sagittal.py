@@ -168,8 +168,8 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> 
     actuators : name -> dict(lower, upper, speed, effort, corner_speed) for every joint.
     urdf : the robot's XML, for its collision shapes.
 
-    Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or share no range. Left and right may turn
-    opposite ways.
+    Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or share no range. Left and right
+    may turn opposite ways.
     """
     data = model.createData()
     q = pin.neutral(model)

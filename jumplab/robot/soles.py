@@ -45,7 +45,9 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float, angles: dic
         low = points[points[:, 2] < points[:, 2].min() + SOLE_M]
         (x0, y0, z), (x1, y1, _) = low.min(axis=0), low.max(axis=0)
         if x1 - x0 > SMALLEST_M and y1 - y0 > SMALLEST_M:
-            return Sole((float(x0), float(x1)), (float(y0), float(y1)), float(z), f"from its {' and '.join(sorted(kinds))}")
+            return Sole(
+                (float(x0), float(x1)), (float(y0), float(y1)), float(z), f"from its {' and '.join(sorted(kinds))}"
+            )
     x, y = (tuple(float(leg_m * s) for s in GUESS[k]) for k in "xy")
     return Sole(x, y, float(leg_m * GUESS["z"]), "GUESSED from the leg's length: the foot has no shape that is at hand")
 
