@@ -147,7 +147,7 @@ def test_from_urdf_alone(tmp_path, bhr):
                          ids=["mirrored", "one-axis ankle", "held arms", "child"])  # fmt: skip
 def test_planned_clean_and_landed(tmp_path, variant, target):
     plan = plan_jump(JumpTask(*target), load(tmp_path, variant))
-    report = audit(plan.tape, plan.robot, plan.summary)
+    report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
     result = simulate_jump(plan.tape, plan.robot, scene=Scene.of_plan(plan.summary, plan.robot)).to_json()
     assert result["landed"], result["reason"]

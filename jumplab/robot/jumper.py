@@ -170,7 +170,8 @@ def _trunk(robot: ET.Element, body: Body, boxes) -> None:
         if even[0, 0] <= 0:
             raise RobotError(
                 f"link {body.name!r} and what is fixed to it: principal moments {low:.3g}, {middle:.3g}, {high:.3g} "
-                f'kg m^2 belong to no solid; correct <inertia>, or let it be repaired with [source] repair = ["inertia"]'
+                f"kg m^2 belong to no solid; correct <inertia>, or let it be repaired with [source] repair = "
+                f'["inertia"]'
             )
         rest = pin.Inertia(inertia.mass / 2, inertia.lever, matrix - even)
         inertia = pin.Inertia(inertia.mass / 2, inertia.lever, even)
