@@ -3,6 +3,6 @@
 A command imports the heavy libraries only once its input has been read, so that a mistake is told at once.
 """
 
-from jumplab.commands import audit, plan, robot, run, simulate
+from jumplab.commands import audit, envelope, plan, robot, run, simulate
 
-COMMANDS = (run, plan, simulate, audit, robot)  # in the order of ``jumplab --help``
+COMMANDS = (run, plan, simulate, audit, robot, envelope)  # in the order of ``jumplab --help``
