@@ -1,7 +1,5 @@
 """Published robots from the optional package example-robot-data: shipped configurations and true refusals."""
 
-from importlib import metadata
-
 import pytest
 
 from jumplab.errors import InfeasibleError, RobotError
@@ -11,28 +9,21 @@ from jumplab.robot import load_robot
 from jumplab.robot.accuracy import reduction_error
 from jumplab.robot.checkup import draft
 from jumplab.robot.description import SHIPPED
-from jumplab.robot.urdf_file import PACKAGE, locate
+from jumplab.robot.urdf_file import PACKAGE, have_published, locate
 from jumplab.simulation import Scene, simulate_jump
 from jumplab.task import JumpTask
 
 PUBLISHED = [name for name in SHIPPED if name != "bhr"]
 
 
-def installed() -> bool:
-    try:
-        return bool(metadata.version(PACKAGE))
-    except metadata.PackageNotFoundError:
-        return False
-
-
-here = pytest.mark.skipif(not installed(), reason=f"the optional package {PACKAGE} is not installed")
+here = pytest.mark.skipif(not have_published(), reason=f"the optional package {PACKAGE} is not installed")
 
 
 def urdf(name: str):
     return locate(f"{PACKAGE}:{name}", SHIPPED["bhr"].parent)
 
 
-@pytest.mark.skipif(installed(), reason="the published robots are there")
+@pytest.mark.skipif(have_published(), reason="the published robots are there")
 def test_without_the_package_the_way_to_it_is_told():
     with pytest.raises(RobotError, match=r"pip install 'jumplab\[robots\]'$"):
         load_robot("g1")

@@ -10,15 +10,15 @@ import numpy as np
 from jumplab.errors import RobotError
 from jumplab.robot import urdf_checks
 from jumplab.robot.accuracy import ReductionError, check_reduction
-from jumplab.robot.config import read_toml
-from jumplab.robot.description import Robot
+from jumplab.robot.config import entry, read_toml
+from jumplab.robot.description import SHIPPED, Robot
 from jumplab.robot.jumper import Jumper, make_jumper
 from jumplab.robot.roles import Roles
 from jumplab.robot.soles import Sole
 from jumplab.robot.stance import com_from_toe, stance_angles
 from jumplab.robot.starter import safe_name, starter
 from jumplab.robot.tree import Tree, moving_count
-from jumplab.robot.urdf_file import parse, read_urdf
+from jumplab.robot.urdf_file import locate, parse, read_urdf
 
 ROLE_WORDS = {
     "hip_pitch": "hip pitch",
@@ -113,3 +113,23 @@ def check(path: str | Path, config_text: str) -> Checkup:
     jumper = make_jumper(read_urdf(path), config, path.name, path)
     robot = Robot.from_text(jumper.urdf, jumper.config_text)
     return Checkup(robot, jumper, check_reduction(robot), stance_angles(robot))
+
+
+def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
+    """The checkup of a shipped robot, of a TOML file, or of a URDF whose roles are found; raises :class:`RobotError`.
+
+    Parameters
+    ----------
+    robot : name of a shipped robot, or path of a TOML or URDF file.
+    repair : what may be repaired where roles are found, see :meth:`jumplab.robot.Robot.from_urdf`.
+    """
+    path = SHIPPED.get(str(robot)) or Path(robot)
+    if path.suffix != ".toml":
+        return check(path, draft(path, repair).text)
+    try:
+        text = path.read_text()
+    except (OSError, ValueError) as e:
+        raise RobotError(f"{path}: cannot be read as text ({type(e).__name__})") from e
+    config = read_toml(text, str(path))
+    urdf = locate(entry(config, "urdf", kind=str), path.parent)
+    return check(urdf, text if "source" in config else draft(urdf, repair).text)

@@ -38,6 +38,14 @@ def locate(name: str, beside: Path) -> Path:
         ) from None
 
 
+def have_published() -> bool:
+    """True if the package with the published robots is installed."""
+    try:
+        return bool(metadata.version(PACKAGE))
+    except metadata.PackageNotFoundError:
+        return False
+
+
 def read_urdf(path: str | Path) -> str:
     """The text of a URDF file. Raises :class:`RobotError` if it cannot be one."""
     path = Path(path)
