@@ -11,6 +11,7 @@ from jumplab.envelope import BEYOND, OPEN, VERDICT, Envelope
 from jumplab.plotting.style import COLUMN_IN, new_figure, styled, tint
 
 REFUSED = {OPEN: "#9A9A9A", VERDICT: "#D5D5D5", BEYOND: "#F0F0F0"}
+MOST_TICKS = 14  # our choice: more would touch
 SHORT = {OPEN: "no plan found", VERDICT: "refused before solving", BEYOND: "not tried"}
 
 
@@ -34,6 +35,8 @@ def envelope_map(envelope: Envelope) -> Figure:
            ylim=(min(envelope.heights) - dy / 2, max(envelope.heights) + dy / 2),
            xlabel="distance [m]", ylabel="rise of the CoM [m]",
            title=f"{envelope.robot}: limit used most, in %")  # fmt: skip
+    if len(envelope.distances) <= MOST_TICKS >= len(envelope.heights):
+        ax.set(xticks=envelope.distances, yticks=envelope.heights)
     ax.grid(False)
     handles = [Patch(color=colors[n], label=n) for n in names]
     seen = {c.limiting for c in envelope.cells}

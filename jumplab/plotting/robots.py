@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -61,8 +62,6 @@ def _joints(ax: Axes, robot: Robot, front: Silhouette, q: np.ndarray, top: float
 
 def robot_height(robot: Robot, q: np.ndarray, joint: int) -> float:
     """Height of a joint's frame above the ground [m]; 1 is the trunk."""
-    import pinocchio as pin
-
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
     return float(data.oMi[joint].translation[2])
@@ -71,7 +70,8 @@ def robot_height(robot: Robot, q: np.ndarray, joint: int) -> float:
 def _reduction(ax: Axes, robot: Robot, top: float) -> None:
     m = robot.sagittal
     p = draw_five_link(ax, m, stance_angles(robot), -m.sole_center, BODY, linewidth=3.0)
-    middles = {"foot": p["toe"], "shank": (p["ankle"] + p["knee"]) / 2, "thigh": (p["knee"] + p["hip"]) / 2,
+    middles = {"foot": p["toe"] + [0.0, 0.03 * top], "shank": (p["ankle"] + p["knee"]) / 2,
+               "thigh": (p["knee"] + p["hip"]) / 2,
                "trunk": (p["hip"] + p["shoulder"]) / 2, "arm": p["hand"]}  # fmt: skip
     for (name, at), mass in zip(middles.items(), m.mass, strict=True):
         if mass > 0:

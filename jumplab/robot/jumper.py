@@ -123,7 +123,8 @@ def _numbers(*values: float) -> str:
     return " ".join(f"{0.0 + v:.12g}" for v in values)
 
 
-def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes=()) -> None:
+def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes=(), seen=()) -> None:
+    """A link with boxes that collide and are seen, and boxes that are only seen."""
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=_numbers(*inertia.lever), rpy="0 0 0")
@@ -131,8 +132,8 @@ def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes=()) -> None:
     m = inertia.inertia
     keys = {"ixx": m[0, 0], "ixy": m[0, 1], "ixz": m[0, 2], "iyy": m[1, 1], "iyz": m[1, 2], "izz": m[2, 2]}
     ET.SubElement(inertial, "inertia", {k: _numbers(0.0 if abs(v) < 1e-15 else v) for k, v in keys.items()})
-    for centre, size in boxes:
-        for kind in ("visual", "collision"):
+    for kind, shapes in (("visual", [*boxes, *seen]), ("collision", boxes)):
+        for centre, size in shapes:
             shape = ET.SubElement(link, kind)
             ET.SubElement(shape, "origin", xyz=_numbers(*centre), rpy="0 0 0")
             ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_numbers(*size))
@@ -155,12 +156,22 @@ def _urdf(config: dict, roles: dict, lumped: Lumped, sole: dict) -> str:
             _link(robot, body.name, body.inertia, boxes.get(body.name, ()))
             _joint(robot, body, by_name[body.parent])
         else:
-            _trunk(robot, body, boxes.get(body.name, ()))
+            hips = [lumped.body(name).place for name in roles["hip_pitch"]]
+            _trunk(robot, body, boxes.get(body.name, ()), np.mean(hips, axis=0) - body.place)
     ET.indent(robot)
     return f'<?xml version="1.0"?>\n{ET.tostring(robot, encoding="unicode")}\n'
 
 
-def _trunk(robot: ET.Element, body: Body, boxes) -> None:
+def _spine(boxes, hip: np.ndarray) -> list:
+    """A box from the hips to the lowest box of the trunk, for the eye: without it, trunks seem to float."""
+    centre, size = min(boxes, key=lambda b: b[0][2] - b[1][2] / 2)
+    bottom = centre[2] - size[2] / 2
+    if bottom <= hip[2]:
+        return []
+    return [(np.array([hip[0], 0.0, (bottom + hip[2]) / 2]), [0.5 * size[0], 0.5 * size[1], bottom - hip[2]])]
+
+
+def _trunk(robot: ET.Element, body: Body, boxes, hip: np.ndarray) -> None:
     """The trunk, as two links where its principal axes are tilted: PyBullet wants those of its base link upright."""
     inertia, rest = body.inertia, None
     matrix = inertia.inertia
@@ -175,7 +186,7 @@ def _trunk(robot: ET.Element, body: Body, boxes) -> None:
             )
         rest = pin.Inertia(inertia.mass / 2, inertia.lever, matrix - even)
         inertia = pin.Inertia(inertia.mass / 2, inertia.lever, even)
-    _link(robot, body.name, inertia, boxes)
+    _link(robot, body.name, inertia, boxes, _spine(boxes, hip))
     if rest is not None:
         name = f"{body.name}_rest"
         _link(robot, name, rest)
