@@ -7,7 +7,7 @@ from jumplab.passport.audit import audit
 from jumplab.pipeline import Planner
 from jumplab.robot import load_robot
 from jumplab.robot.accuracy import reduction_error
-from jumplab.robot.checkup import draft
+from jumplab.robot.checkup import check, draft
 from jumplab.robot.description import SHIPPED
 from jumplab.robot.urdf_file import PACKAGE, have_published, locate
 from jumplab.simulation import Scene, simulate_jump
@@ -94,3 +94,21 @@ REFUSED = [
 def test_no_jumper_and_why(name, repair, words):
     with pytest.raises(RobotError, match=words):
         draft(urdf(name), repair)
+
+
+ALLOWED = ("symmetry", "inertia", "massless")
+NO_ROBOT = [
+    ("icub_description/robots/icub.urdf",
+     r"joint 'l_hip_pitch': velocity = 100 rad/s is above 60: deg/s or a placeholder; .* \[limits\.hip_pitch\]"),
+    ("human_description/robots/human.urdf", r"left and right differ by 28\.0 mm at 'left_upperleg'"),
+    ("simple_humanoid_description/urdf/simple_humanoid.urdf",
+     r"needs ankle at -0\.\d+ rad, outside its range 0 \.\.\."),
+]  # fmt: skip
+
+
+@here
+@pytest.mark.parametrize(("name", "words"), NO_ROBOT, ids=[x[0].split("/")[-1] for x in NO_ROBOT])
+def test_faults_that_no_repair_covers(name, words):
+    path = urdf(name)
+    with pytest.raises(RobotError, match=words):
+        check(path, draft(path, ALLOWED).text)

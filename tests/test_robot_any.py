@@ -207,6 +207,15 @@ REFUSED = [
     (text(root()), config("x", toe=-0.05),
      "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
      "sides of it; correct [feet]"),
+    (text(root()), config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
+     "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
+     "links or their order left, right"),
+    (text(root()), config("x").replace('knee = ["left_knee"', 'knee = ["left_hip_yaw"'),
+     "my.urdf: between 'trunk' and 'left_foot' come left_hip_yaw, left_hip_pitch, left_ankle_pitch; hip, knee and "
+     "ankle must follow in this order; correct [joints]"),
+    (text(root()), config("x").replace('links = ["left_foot", "right_foot"]', 'links = ["left_foot", "left_foot"]'),
+     "my.urdf: the role joint 'right_hip_pitch' is not between 'trunk' and the foot 'left_foot'; correct [joints], "
+     "[feet] links or their order left, right"),
     (heavier_left(), config("x"),
      "my.urdf: left and right differ by 0 mm at 'trunk' and 0.333 % of mass or inertia at 'left_shank'; allow their "
      'mean with [source] repair = ["symmetry"]'),

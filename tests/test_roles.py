@@ -1,5 +1,6 @@
 """Roles found by motion, and legs that are no legs."""
 
+import random
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 
 from jumplab.errors import RobotError
+from jumplab.robot.checkup import check, draft
 from jumplab.robot.roles import find_roles
 from jumplab.robot.soles import find_sole
 from jumplab.robot.starter import starter
@@ -149,3 +151,27 @@ def test_repaired_inertia_is_that_of_a_solid():
         assert values[0] > 0 and values[2] <= values[0] + values[1]
     good = np.diag([1.0, 1.1, 1.2])
     np.testing.assert_allclose(repaired(good), good)
+
+
+def test_damaged_files_never_end_in_a_traceback(tmp_path):
+    """Random damage to a good URDF: a robot or a sentence, nothing else."""
+    rng, values = (
+        random.Random(8),
+        ("", "nan", "-1", "0", "1e9", "abc", "1 2 3", "0 0 0", "fixed", "continuous", "trunk"),
+    )
+    path, outcomes = tmp_path / "my.urdf", set()
+    for _ in range(60):
+        robot = root()
+        for _ in range(rng.choice((1, 1, 2))):
+            parent, child = rng.choice([(a, b) for a in robot.iter() for b in a])
+            if rng.random() < 0.3 or not child.attrib:
+                parent.remove(child)
+            else:
+                child.set(rng.choice(sorted(child.attrib)), rng.choice(values))
+        path.write_text(ET.tostring(robot, encoding="unicode"))
+        try:
+            outcomes.add(check(path, draft(path).text).robot.name)
+        except RobotError as e:
+            assert "\n" not in str(e) and len(str(e)) < 500
+            outcomes.add("refused")
+    assert "refused" in outcomes and len(outcomes) > 1

@@ -27,6 +27,13 @@ def changed(old: str, new: str, after: str = "") -> str:
     return GOOD[:start] + GOOD[start:].replace(old, new, 1)
 
 
+def collision(old: str, new: str) -> str:
+    """GOOD with a change in the left shank's collision shape."""
+    start = GOOD.index("<collision>", GOOD.index(SHANK))
+    assert old in GOOD[start:]
+    return GOOD[:start] + GOOD[start:].replace(old, new, 1)
+
+
 def without(pattern: str, after: str = "") -> str:
     """GOOD without the first match of a pattern behind the text ``after``."""
     start = GOOD.index(after)
@@ -171,6 +178,13 @@ TEXTS = [
                        'ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"'),
      "link 'left_hip_yaw_link': moment of inertia 1 kg m^2 on 0.001 kg is a radius of gyration of 31.6 m, at most 1 is "
      "likely; is it in g mm^2 or kg cm^2?"),
+    # shapes
+    ("box flat", collision('0.07 0.07 0.225', '0.07 0 0.225'),
+     "link 'left_shank': box size = '0.07 0 0.225' must be three positive numbers of m"),
+    ("box without size", collision('size="0.07 0.07 0.225"', ''),
+     "link 'left_shank': box size = None must be three positive numbers of m"),
+    ("shape lost", collision("0.03 0 -0.1975", "0.03 left -0.1975"),
+     "link 'left_shank': collision origin xyz = '0.03 left -0.1975' must be three finite numbers"),
     # units
     ("grams", grams().replace('ixx="', 'ixx="1').replace('iyy="', 'iyy="1').replace('izz="', 'izz="1'),
      "weighs 42000 kg, a humanoid 0.5 to 400; are the masses in grams? divide by 1000"),

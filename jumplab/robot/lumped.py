@@ -76,11 +76,26 @@ def moving_joints(tree: Tree, roles: dict, trunk: str, feet) -> list[str]:
             raise RobotError(
                 f"{tree.where}: joint {name!r} has a role, but is {kind}; it must be revolute with a motor of its own"
             )
-    for foot in feet:
+    for side, foot in enumerate(feet):
+        _check_order(tree, roles, trunk, foot, side)
         for joint in tree.path_between(trunk, foot):
             if joint.kind == "revolute" and not joint.mimic and joint.name not in moving:
                 moving.append(joint.name)
     return moving
+
+
+def _check_order(tree: Tree, roles: dict, trunk: str, foot: str, side: int) -> None:
+    """Hip, knee and ankle must follow each other between trunk and foot."""
+    path = [joint.name for joint in tree.path_between(trunk, foot)]
+    leg = [roles[role][side] for role in ("hip_pitch", "knee", "ankle_pitch")]
+    missing = [name for name in leg if name not in path]
+    if missing:
+        raise RobotError(f"{tree.where}: the role joint {missing[0]!r} is not between {trunk!r} and the foot {foot!r}; "
+                         f"correct [joints], [feet] links or their order left, right")  # fmt: skip
+    if not path.index(leg[0]) < path.index(leg[1]) < path.index(leg[2]):
+        found = ", ".join(sorted(leg, key=path.index))
+        raise RobotError(f"{tree.where}: between {trunk!r} and {foot!r} come {found}; hip, knee and ankle must "
+                         f"follow in this order; correct [joints]")  # fmt: skip
 
 
 def _groups(tree: Tree, moving: set[str]) -> dict[str, list[str]]:

@@ -9,7 +9,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot.urdf_checks import FRAME_KG, inertia_matrix, link_mass, numbers
+from jumplab.robot.urdf_checks import FRAME_KG, inertia_matrix, link_mass
+from jumplab.robot.urdf_numbers import numbers
 
 MOVING = ("revolute", "continuous", "prismatic")
 

@@ -14,6 +14,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jumplab.errors import RobotError
+from jumplab.robot.urdf_numbers import numbers
+from jumplab.robot.urdf_shapes import shape_faults
 
 TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MASS_KG = (0.5, 400.0)  # our choice: from a hand-sized humanoid to twice the heaviest published one
@@ -33,25 +35,16 @@ def check(root: ET.Element, where: str, repair: Collection[str] = ()) -> None:
 
 
 def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> Iterator[str]:
-    """Faults of the whole file: of names and connections, else of inertials, else of units.
+    """Faults of the whole file: of names and connections, else of inertials, else of units, else of shapes.
 
     ``repair`` may name "inertia" (tensors that no solid has) and "massless" (bodies without mass): these are no faults
     then.
     """
-    for group in (structure_faults, partial(inertial_faults, repair=repair), unit_faults):
+    for group in (structure_faults, partial(inertial_faults, repair=repair), unit_faults, shape_faults):
         found = list(group(root, where))
         yield from found
         if found:  # the next group reads what this one refused
             return
-
-
-def numbers(text: str | None, count: int) -> np.ndarray | None:
-    """``count`` finite numbers of an attribute, or None."""
-    try:
-        values = np.array([float(x) for x in (text or "").split()])
-    except ValueError:
-        return None
-    return values if len(values) == count and np.all(np.isfinite(values)) else None
 
 
 # structure ------------------------------------------------------------------------------------------------------
