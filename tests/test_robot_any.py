@@ -204,6 +204,10 @@ REFUSED = [
     (text(root()), config("x") + "[shapes]\ntrunk_m = [[1.0, 0.0, 0.1, 0.0, 1.0]]\n",
      "robot configuration: 'shapes.trunk_m' = [[1.0, 0.0, 0.1, 0.0, 1.0]] must be a list of [rear, front, half width, "
      "bottom, top]"),
+    (text(root()), config("x") + "[shapes]\ntrunk_m = []\n",
+     "robot configuration: 'shapes.trunk_m' = [] must be a list of [rear, front, half width, bottom, top]"),
+    (text(root()), config("x") + "[shapes]\nthigh_thickness_m = 0.0\n",
+     "robot configuration: 'shapes.thigh_thickness_m' = 0 must be positive"),
     (text(root()), config("x", toe=-0.05),
      "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
      "sides of it; correct [feet]"),

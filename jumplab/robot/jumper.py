@@ -202,6 +202,9 @@ def _boxes(config: dict, roles: dict, lumped: Lumped, sole: dict) -> dict[str, l
     leg = float(np.linalg.norm((places["hip_pitch"][0] - places["ankle_pitch"][0])[[0, 2]]))
     hip = np.mean(places["hip_pitch"], axis=0)
     width = {part: optional(config, share * leg, "shapes", f"{part}_thickness_m") for part, share in THICKNESS.items()}
+    for part, thickness in width.items():
+        if thickness <= 0:
+            raise RobotError(f"robot configuration: 'shapes.{part}_thickness_m' = {thickness:g} must be positive")
     for side in (0, 1):
         knee, ankle = (lumped.body(roles[r][side]) for r in ("knee", "ankle_pitch"))
         foot = next(b for b in lumped.bodies if b.name == lumped_foot(lumped, ankle))
@@ -215,12 +218,9 @@ def _boxes(config: dict, roles: dict, lumped: Lumped, sole: dict) -> dict[str, l
             lever = arm.inertia.lever
             out[arm.name] = [_stick(lever, 2 * lever, width["arm"], -lever * 0.7)]
     trunk = lumped.bodies[0]
-    default = [list(leg * np.array(TRUNK_BOX))]
+    default = [(leg * np.array(TRUNK_BOX)).tolist()]
     rows = table(config, "shapes").get("trunk_m", default)
-    good = isinstance(rows, list) and all(
-        isinstance(r, list) and len(r) == 5 and r[0] < r[1] and r[3] < r[4] for r in rows
-    )
-    if not good:
+    if not (isinstance(rows, list) and rows and all(map(_is_box, rows))):
         raise RobotError(
             f"robot configuration: 'shapes.trunk_m' = {rows!r} must be a list of [rear, front, half width, bottom, top]"
         )
@@ -229,6 +229,11 @@ def _boxes(config: dict, roles: dict, lumped: Lumped, sole: dict) -> dict[str, l
         centre[1] = 0.0
         out.setdefault(trunk.name, []).append((centre, [front - rear, 2 * half, top - bottom]))
     return out
+
+
+def _is_box(row) -> bool:
+    numbers = isinstance(row, list) and len(row) == 5 and all(type(x) in (int, float) for x in row)
+    return numbers and bool(np.all(np.isfinite(row))) and row[0] < row[1] and row[2] > 0 and row[3] < row[4]
 
 
 def lumped_foot(lumped: Lumped, ankle: Body) -> str:
