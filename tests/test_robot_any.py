@@ -126,6 +126,17 @@ def test_hips_bend_no_further_than_the_boxes_allow(tmp_path):
     assert robot.sagittal.lower[0] > load(tmp_path, plain).sagittal.lower[0]
 
 
+def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
+    (tmp_path / "s.urdf").write_text(text(root()))
+    (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
+    with pytest.raises(RobotError) as e:
+        load_robot(str(tmp_path / "s.toml"))
+    assert str(e.value) == (
+        "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
+        "start there: change [stance] in its configuration"
+    )
+
+
 def test_a_result_folder_reads_back_the_same_robot(tmp_path):
     robot = load(tmp_path, mirrored)
     assert Robot.from_text(robot.urdf, robot.config_text).hash == robot.hash

@@ -145,6 +145,20 @@ def test_starter_is_a_configuration():
     assert found["joints"]["knee"] == list(roles.joints["knee"]) and found["source"]["repair"] == ["symmetry"]
 
 
+def test_starter_stands_inside_the_ranges():
+    """Forearms that only bend forward, the other way round on the right side."""
+    import tomllib
+
+    robot = root()
+    for side, sign in (("left", 1), ("right", -1)):
+        j = joint(robot, f"{side}_shoulder_pitch")
+        j.find("axis").set("xyz", f"0 {sign} 0")
+        low, high = sorted((-2.3 * sign, 0.0 * sign))
+        j.find("limit").set("lower", str(low)), j.find("limit").set("upper", str(high))
+    stance = tomllib.loads(starter(tree(robot), "my.urdf", "my")[0])["stance"]
+    assert stance["shoulder_rad"] == pytest.approx(-0.15) and stance["knee_rad"] == pytest.approx(0.5)
+
+
 def test_repaired_inertia_is_that_of_a_solid():
     for moments in ([1.0, 1.0, 10.0], [0.0, 0.0, 0.0], [-1.0, 2.0, 2.0]):
         values = np.linalg.eigvalsh(repaired(np.diag(moments)))

@@ -15,7 +15,7 @@ from jumplab.robot.description import SHIPPED, Robot
 from jumplab.robot.jumper import Jumper, make_jumper
 from jumplab.robot.roles import Roles
 from jumplab.robot.soles import Sole
-from jumplab.robot.stance import com_from_toe, stance_angles
+from jumplab.robot.stance import check_stance, com_from_toe
 from jumplab.robot.starter import safe_name, starter
 from jumplab.robot.tree import Tree, moving_count
 from jumplab.robot.urdf_file import locate, parse, read_urdf
@@ -112,7 +112,7 @@ def check(path: str | Path, config_text: str) -> Checkup:
         raise RobotError("robot configuration: the table [source] is missing: it names trunk, forward, up and repair")
     jumper = make_jumper(read_urdf(path), config, path.name, path)
     robot = Robot.from_text(jumper.urdf, jumper.config_text)
-    return Checkup(robot, jumper, check_reduction(robot), stance_angles(robot))
+    return Checkup(robot, jumper, check_reduction(robot), check_stance(robot))
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:

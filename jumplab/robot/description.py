@@ -85,11 +85,13 @@ class Robot:
         file = locate(urdf, path.parent)
         if "source" not in config:
             return cls.from_text(read_urdf(file), text)
-        from jumplab.robot.accuracy import check_reduction  # builds on this class
+        from jumplab.robot.accuracy import check_reduction  # both build on this class
+        from jumplab.robot.stance import check_stance
 
         jumper = make_jumper(read_urdf(file), config, file.name, file)
         robot = cls.from_text(jumper.urdf, jumper.config_text)
         check_reduction(robot)
+        check_stance(robot)
         return robot
 
     @classmethod

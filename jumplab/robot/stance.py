@@ -10,6 +10,7 @@ from jumplab.errors import RobotError
 from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS
 
+STANCE_ROOM_RAD = 0.04  # our choice: plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # our choice: generous lean of the shank, both ways
 
 
@@ -58,6 +59,19 @@ def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits:
                 f"its range {low:g} ... {high:g}; change [stance] in its configuration"
             )
     return found
+
+
+def check_stance(robot: Robot) -> np.ndarray:
+    """The standing posture (5,), refused if a joint has less than :data:`STANCE_ROOM_RAD` left to its stops."""
+    angles, m = stance_angles(robot), robot.sagittal
+    for name, angle, low, high in zip(SAGITTAL_JOINTS, m.joint_angles(angles), m.lower, m.upper, strict=True):
+        if min(angle - low, high - angle) < STANCE_ROOM_RAD:
+            raise RobotError(
+                f"robot {robot.name}: standing, {name} is at {angle:.3f} rad, less than {STANCE_ROOM_RAD:g} from the "
+                f"end of its range {low:.3g} ... {high:.3g}; no plan can start there: change [stance] in its "
+                f"configuration"
+            )
+    return angles
 
 
 def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:

@@ -12,8 +12,9 @@ from jumplab.robot.roles import Roles, axis_of, find_roles
 from jumplab.robot.soles import Sole, find_sole
 from jumplab.robot.tree import Tree
 
-STANCE_KNEE_RAD = 0.5  # our choice: as the default robot stands; a third of the range if that is less
+STANCE_KNEE_RAD = 0.5  # our choice: as the default robot stands
 STANCE_TRUNK_RAD = 0.05
+STANCE_ROOM_RAD = 0.15  # our choice: from the joint stops
 
 
 def robot_turn(tree: Tree, roles: Roles) -> np.ndarray:
@@ -37,9 +38,21 @@ def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> t
     pose, turn = tree.poses(), robot_turn(tree, roles)
     at = {role: turn @ pose[tree.joints[roles.joints[role][0]].child].translation for role in ROLES[:3]}
     sole = find_sole(tree, roles.feet[0], turn, float(np.linalg.norm((at["hip_pitch"] - at["ankle_pitch"])[[0, 2]])))
-    limits = tree.joints[roles.joints["knee"][0]].limits
-    span = abs(limits.get("upper", 3.0) - limits.get("lower", 0.0))
-    return _text(roles, sole, urdf, name, repair, min(STANCE_KNEE_RAD, span / 3)), roles, sole
+    knee, shoulder = (_inside(tree, pose, turn, roles.joints[r], at_rest)
+                      for r, at_rest in (("knee", STANCE_KNEE_RAD), ("shoulder_pitch", 0.0)))  # fmt: skip
+    return _text(roles, sole, urdf, name, repair, knee, shoulder), roles, sole
+
+
+def _inside(tree: Tree, pose: dict, turn: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
+    """The angle about the robot's left that is nearest to ``wish`` and well inside the range of both joints [rad]."""
+    low, high = -np.inf, np.inf
+    for name in pair:
+        joint = tree.joints[name]
+        sign = float(np.sign((turn @ pose[joint.child].rotation @ joint.axis)[1]))
+        ends = sorted(sign * joint.limits.get(k, d) for k, d in (("lower", -np.pi), ("upper", np.pi)))
+        low, high = max(low, ends[0]), min(high, ends[1])
+    room = min(STANCE_ROOM_RAD, (high - low) / 3)
+    return float(np.clip(wish, low + room, high - room)) if low < high else wish
 
 
 def safe_name(text: str) -> str:
@@ -55,7 +68,7 @@ def _pair(values) -> str:
     return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
 
 
-def _text(roles: Roles, sole: Sole, urdf: str, name: str, repair, knee: float) -> str:
+def _text(roles: Roles, sole: Sole, urdf: str, name: str, repair, knee: float, shoulder: float) -> str:
     notes = "".join(f"# note: {note}\n" for note in roles.notes)
     joints = "\n".join(f"{role} = {_quoted(roles.joints[role])}" for role in ROLES)
     return f"""# Written by "jumplab robot check": correct what is wrong, then use it as --robot PATH.
@@ -82,7 +95,7 @@ sole_z_m = {sole.z:.4g}
 [stance]  # standing at rest; the rest follows from the CoM above the middle of the sole
 knee_rad = {knee:.3g}
 trunk_pitch_rad = {STANCE_TRUNK_RAD}
-shoulder_rad = 0.0
+shoulder_rad = {shoulder:.3g}
 
 [actuators]
 corner_speed_ratio = 0.5  # assumed: full torque up to this share of the speed limit
