@@ -25,13 +25,10 @@ def planar_quantities(robot: Robot, angles, rates, accels, toe_acceleration, gra
 
 
 def _joint_columns(robot: Robot):
-    model = robot.model
-    columns, rows = [], []
-    for i, role in enumerate(("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")):
-        for name in robot.joints[role]:
-            columns.append(model.idx_vs[model.getJointId(name)])
-            rows.append(i)
-    return np.array(columns), np.array(rows)
+    """Column in v, row of the role and sign of every joint with a role."""
+    model, rows = robot.model, robot.role_signs()
+    columns = [model.idx_vs[model.getJointId(name)] for name, _, _ in rows]
+    return np.array(columns), np.array([row for _, row, _ in rows]), np.array([sign for _, _, sign in rows])
 
 
 def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:
@@ -78,8 +75,7 @@ def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: d
     robot, whose base rows are left for the audit to judge.
     """
     model, n = robot.model, len(motion["t"])
-    columns, role = _joint_columns(robot)
-    signs = robot.sagittal.sign[role]
+    columns, role, signs = _joint_columns(robot)
     origin = -robot.sagittal.sole_center
     angles, rates, accels = motion["angles"], motion["rates"], motion["accels"]
     q = np.array([configuration(robot, x, p + origin) for x, p in zip(angles, motion["toe"], strict=True)])

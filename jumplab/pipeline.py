@@ -237,15 +237,16 @@ def guess_from_joints(
 def to_link_angles(robot: Robot, q, v, a) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Absolute link angles (n, 5) with rates and accelerations from full-robot q, v, a; the mean of left and right."""
     model, sagittal = robot.model, robot.sagittal
-    ids = [
-        [model.getJointId(n) for n in robot.joints[r]] for r in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
-    ]
-    iq = [[model.idx_qs[j] for j in pair] for pair in ids]
-    iv = [[model.idx_vs[j] for j in pair] for pair in ids]
+    parts = [[(model.getJointId(n), sign) for n, row, sign in robot.role_signs() if row == i] for i in range(4)]
+    iq = [[(model.idx_qs[j], sign) for j, sign in part] for part in parts]
+    iv = [[(model.idx_vs[j], sign) for j, sign in part] for part in parts]
     pitch = np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
     out = []
     for values, index, trunk in ((q, iq, pitch), (v, iv, v[:, 4]), (a, iv, a[:, 4])):
-        joints = np.stack([values[:, pair].mean(axis=1) for pair in index], -1) * sagittal.sign
+        joints = np.zeros((len(values), 4))  # arms that are held stay at zero
+        for i, pair in enumerate(index):
+            if pair:
+                joints[:, i] = np.mean([sign * values[:, column] for column, sign in pair], axis=0)
         out.append(sagittal.link_angles(joints, trunk))
     return tuple(out)
 

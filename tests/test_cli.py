@@ -17,6 +17,7 @@ import jumplab
 from jumplab import __main__ as cli
 from jumplab import store
 from jumplab.errors import InfeasibleError, SolverError
+from jumplab.robot.description import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
 STAGES = [{"stage": "SRMP launch", "iterations": 31, "build_s": 0.25, "solve_s": 0.125}]
@@ -50,7 +51,7 @@ def here(tmp_path, monkeypatch):
 
 
 REFUSALS = [
-    ("", "choose a command: run, plan, audit, simulate, trials, view or export; " + HELP),
+    ("", "choose a command: run, plan, audit, simulate, trials, view, export, robot or envelope; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
     ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
     ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),
@@ -77,7 +78,10 @@ REFUSALS = [
         "plan --out x --method magic",
         "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); " + HELP_PLAN,
     ),
-    ("plan --out x --robot asimo", "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+    (
+        "plan --out x --robot asimo",
+        f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
+    ),
     ("plan --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
     ("simulate", "the following arguments are required: DIR; 'jumplab simulate --help' shows what is possible"),
     ("simulate nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),

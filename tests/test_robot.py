@@ -20,7 +20,7 @@ from jumplab.models.full import FullBody
 from jumplab.models.planar import evaluator
 from jumplab.robot import SAGITTAL_LINKS, Robot, load_robot
 from jumplab.robot.bhr import table
-from jumplab.robot.description import GRAVITY
+from jumplab.robot.description import GRAVITY, SHIPPED
 from jumplab.robot.reach import postures, reach
 from jumplab.robot.stance import com_from_toe, configuration, stance_angles, stance_configuration
 from jumplab.task import GRAVITY as TASK_GRAVITY
@@ -398,10 +398,11 @@ def test_heavier_limbs_widen_the_envelope(bhr, envelope):
 def test_unknown_robot(tmp_path):
     with pytest.raises(RobotError) as e:
         load_robot("atlas")
-    assert str(e.value) == "robot 'atlas': neither a shipped robot (bhr) nor a readable TOML file"
+    known = ", ".join(SHIPPED)
+    assert str(e.value) == f"robot 'atlas': neither a shipped robot ({known}) nor a readable TOML file"
     assert e.value.exit_code == 2
     for name in (str(tmp_path), "", "a\0b", "x" * 5000):
-        with pytest.raises(RobotError, match=r"neither a shipped robot \(bhr\) nor a readable TOML file$"):
+        with pytest.raises(RobotError, match=r"neither a shipped robot \(bhr, .*\) nor a readable TOML file$"):
             load_robot(name)
 
 
@@ -449,7 +450,7 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
     config.write_text(bhr.config_text)
     with pytest.raises(RobotError) as e:
         load_robot(str(config))
-    assert str(e.value) == f"{config}: its URDF 'bhr.urdf' cannot be read as text (FileNotFoundError)"
+    assert str(e.value) == f"{tmp_path / 'bhr.urdf'}: there is no such file; give the path of a URDF"
     (tmp_path / "bhr.urdf").write_text("<robot")
     with pytest.raises(RobotError, match=r"^robot bhr: the URDF is no well-formed XML: "):
         load_robot(str(config))
@@ -504,16 +505,24 @@ def test_axes_may_point_the_other_way(bhr):
     np.testing.assert_allclose(*places, atol=1e-12)
 
 
-def test_mirrored_axes_are_refused_or_right(bhr):
-    """One knee turned round: either a sentence, or both knees still bend the same way."""
-    try:
-        other = flipped(bhr, "right_knee")
-        angles = stance_angles(other, 1.2)
-    except RobotError:
-        return
+def test_axes_may_be_mirrored(bhr):
+    """One knee turned round: both knees still bend the same way."""
+    other = flipped(bhr, "right_knee")
+    np.testing.assert_array_equal(other.sagittal.signs[1], [1, -1])
+    angles = stance_angles(other, 1.2)
     q = configuration(other, angles)
     left, right = (q[other.model.idx_qs[other.model.getJointId(n)]] for n in other.joints["knee"])
-    assert left == pytest.approx(-right)
+    assert left == pytest.approx(-right) and left == pytest.approx(1.2)
+
+
+def test_sides_that_share_no_angle_are_refused(bhr):
+    robot = Robot.from_text(flipped(bhr, "right_knee").urdf.replace('xyz="0 -1 0"', 'xyz="0 1 0"'), bhr.config_text)
+    with pytest.raises(RobotError) as e:
+        _ = robot.sagittal
+    assert str(e.value) == (
+        "'left_knee' and 'right_knee' have no angle in common: 0 ... 2.4 and -2.4 ... -0 rad about the same axis; "
+        "correct their limits"
+    )
 
 
 def test_limits_come_signed_and_doubled(bhr):

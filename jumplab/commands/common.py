@@ -21,7 +21,9 @@ def common_options() -> argparse.ArgumentParser:
 def robot_option() -> argparse.ArgumentParser:
     """``--robot``."""
     robot = argparse.ArgumentParser(add_help=False)
-    robot.add_argument("--robot", default="bhr", help="shipped robot (bhr) or path of a robot's TOML file")
+    robot.add_argument(
+        "--robot", default="bhr", help="shipped robot (see 'jumplab robot list') or path of a robot's TOML file"
+    )
     return robot
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jumplab.joint_map.options import Gain, Limits
 from jumplab.models.full import FullBody, FullTerms, skew
+from jumplab.robot import SAGITTAL_JOINTS
 
 OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # our choice: [N m], [rad/s] bounds of a row that is switched off, beyond all motion
 SIDES = ("left", "right")
@@ -162,8 +163,9 @@ class JointRows:
 def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
     """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
     robot, q = body.robot, q0.copy()
-    for name in robot.joints["shoulder_pitch"]:
-        q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * robot.sagittal.sign[3]
+    for name, row, sign in robot.role_signs():
+        if SAGITTAL_JOINTS[row] == "shoulder":
+            q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
     return q
 
 

@@ -187,7 +187,7 @@ class FullBody:
         """Pairs of joints, left and right, with the sign of a mirrored motion, and the pairs of each role."""
         model, data, roles = self.model, self.data, self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
-        shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]]
+        shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
         legs = [self._chain(j) for j in self.foot_joints]
         hip = self._chain(model.getJointId(roles["hip_pitch"][0]))
         pairs, groups = [], {"hip": [], "knee": [], "ankle": [], "shoulder": []}

@@ -124,6 +124,8 @@ def _nine_links(ax, body, q):
     style = dict(color="#5B6B7F", linewidth=3.0, solid_capstyle="round", zorder=2)
     hips, knees, ankles, shoulders = (np.array([p[n] for n in robot.joints[r]])
                                       for r in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"))  # fmt: skip
+    if not len(shoulders):  # arms that are held: shoulders are drawn above the hips
+        shoulders = hips + np.array([0.0, robot.sagittal.span[3, 1]])
     ax.plot(*shoulders.T, **style)
     ax.plot(*hips.T, **style)
     ax.plot(*np.array([shoulders.mean(axis=0), hips.mean(axis=0)]).T, **(style | {"linewidth": 7.0}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tomllib
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,38 +13,14 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError, said
+from jumplab.robot.config import ROLES, entry, read_toml, roles_table
+from jumplab.robot.jumper import make_jumper
 from jumplab.robot.sagittal import SagittalModel, reduce
+from jumplab.robot.urdf_file import locate, read_urdf
 
 GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
-SHIPPED = {"bhr": Path(__file__).parent / "bhr" / "bhr.toml"}
-ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
-
-
-def _toml(text: str, where: str) -> dict:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as e:
-        raise RobotError(f"{where}: not a TOML file: {e}") from e
-
-
-def _entry(config: dict, *path: str, kind: type = float, count: int | None = None):
-    """One checked entry of the configuration: a finite number or a text, or ``count`` of them."""
-    where, value = ".".join(path), config
-    for key in path:
-        if not isinstance(value, dict) or key not in value:
-            raise RobotError(f"robot configuration: the entry {where!r} is missing")
-        value = value[key]
-    items = value if count else [value]
-    numbers = kind is float
-    good = isinstance(items, list) and len(items) == (count or 1)
-    good = good and all(isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items)
-    if not good or (numbers and not np.all(np.isfinite(items))):
-        wanted = "a finite number" if numbers else "a text"
-        raise RobotError(
-            f"robot configuration: {where!r} = {value!r}, must be {f'{count} of ' if count else ''}{wanted}"
-        )
-    clean = [float(x) if numbers else x for x in items]
-    return clean if count else clean[0]
+HERE = Path(__file__).parent
+SHIPPED = {path.stem: path for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))}
 
 
 @dataclass(frozen=True)
@@ -78,7 +53,7 @@ class Robot:
     ----------
     name : short name, used in file names and messages.
     urdf : the XML text itself, so that a result folder can carry its robot.
-    joints : role -> (left, right) joint names.
+    joints : role -> (left, right) joint names; the shoulder's are () where the arms are held.
     foot : sole rectangle.
     stance : knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture.
     corner_speed_ratio : share of the speed limit up to which full torque is available.
@@ -107,20 +82,43 @@ class Robot:
             name = str(name_or_config)
             short = name if len(name) < 80 else name[:77] + "..."
             raise RobotError(f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file") from e
-        config = _toml(text, str(path))
+        config = read_toml(text, str(path))
         urdf = config.get("urdf")
         if not isinstance(urdf, str):
             raise RobotError(f"{path}: the entry 'urdf' must name the URDF file beside it, got {urdf!r}")
-        try:
-            return cls.from_text((path.parent / urdf).read_text(), text)
-        except (OSError, UnicodeDecodeError) as e:
-            raise RobotError(f"{path}: its URDF {urdf!r} cannot be read as text ({type(e).__name__})") from e
+        file = locate(urdf, path.parent)
+        if "source" not in config:
+            return cls.from_text(read_urdf(file), text)
+        from jumplab.robot.accuracy import check_reduction  # both build on this class
+        from jumplab.robot.stance import check_stance
+
+        jumper = make_jumper(read_urdf(file), config, file.name, file)
+        robot = cls.from_text(jumper.urdf, jumper.config_text)
+        check_reduction(robot)
+        check_stance(robot)
+        return robot
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, *, repair: tuple[str, ...] = ()) -> Robot:
+        """A robot from nothing but its URDF: roles, soles and standing posture are found.
+
+        Parameters
+        ----------
+        path : the URDF file.
+        repair : what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that a solid can
+            have), "massless" (a gram for bodies without any).
+
+        Raises :class:`RobotError` where the file or the robot is not fit for jumping.
+        """
+        from jumplab.robot.checkup import check, draft  # they build on this class
+
+        return check(path, draft(path, repair).text).robot
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:
         """Build a robot from the text of its URDF and of its TOML configuration; raises :class:`RobotError`."""
-        config = _toml(config_text, "robot configuration")
-        get = partial(_entry, config)
+        config = read_toml(config_text, "robot configuration")
+        get = partial(entry, config)
         x, y = get("feet", "sole_x_m", count=2), get("feet", "sole_y_m", count=2)
         links = get("feet", "links", kind=str, count=2)
         foot = Foot(tuple(links), x[0], x[1], (y[1] - y[0]) / 2, get("feet", "sole_z_m"))
@@ -128,7 +126,7 @@ class Robot:
             raise RobotError(
                 f"robot configuration: the sole {x} x {y} m has no area; give [heel, toe] and [right, left]"
             )
-        joints = {role: tuple(get("joints", role, kind=str, count=2)) for role in ROLES}
+        joints = roles_table(config)
         stance = {key: get("stance", key) for key in ("knee_rad", "trunk_pitch_rad", "shoulder_rad")}
         corner = get("actuators", "corner_speed_ratio")
         if not 0 < corner < 1:
@@ -223,6 +221,11 @@ class Robot:
     def sagittal(self) -> SagittalModel:
         """The symmetric five-link model of this robot."""
         return reduce(self.model, self.joints, self.foot, self.actuators, self.urdf)
+
+    def role_signs(self) -> list[tuple[str, int, float]]:
+        """(joint, row of its role, sign) for every joint with a role: joint angle = sign * sagittal angle."""
+        return [(name, row, float(sign)) for row, role in enumerate(ROLES)
+                for name, sign in zip(self.joints[role], self.sagittal.signs[row], strict=False)]  # fmt: skip
 
     @cached_property
     def total_mass(self) -> float:

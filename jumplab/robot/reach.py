@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from jumplab.robot.description import Robot
+from jumplab.robot.sagittal import SAGITTAL_JOINTS
 from jumplab.robot.stance import stance_angles
 
 SAMPLES = 2**16  # our choice: envelopes move by less than 1 % when doubled
@@ -24,6 +25,7 @@ HEEL_UP_RAD = 0.5  # our choice: foot pitch considered as still pushing off
 TRUNK_RAD = (-0.30, 1.30)  # our choice: backward lean that looks like falling; forward lean of a deep bow
 COM_X_M = (-0.10, 0.32)  # our choice: from behind the middle of the sole to the lean of a long jump at take-off
 FORCE_SHARE = 0.85  # our choice: share of the peak torques that stage 1 may count on
+STANCE_SHARE = 0.08  # our choice: the stance lies at least this share of the inertia envelope's width inside it
 MIN_FORCE_LEVER_M = 0.04  # our choice: a joint closer than this to the force line does not limit it
 FLAT_COM_X_M = (-0.02, 0.13)  # our choice: where the CoM is while the feet are flat
 TOE_COM_X_M = (0.05, 0.25)  # our choice: where the CoM is while the heels are up
@@ -52,6 +54,7 @@ class Reach:
     internal_inertia : constant part rho_I [kg m^2].
     cop : (heel, toe) from the middle of the sole [m].
     posture : (lower, upper) trunk pitch [rad].
+    weakest : "force" and "speed" -> the leg joint that saturates first where the leg extends best, with its limit.
     start : lean, length, turn, radius of the stance (theta_l, phi, theta_pl, varphi).
     mass : of the whole robot [kg].
     """
@@ -75,6 +78,7 @@ class Reach:
     posture: tuple[float, float]
     start: np.ndarray
     mass: float
+    weakest: dict
 
 
 def _turned(angle, vector):
@@ -101,9 +105,11 @@ def postures(robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RA
     from_sole = com - m.sole_center
     ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > com_x_m[0]) & (from_sole[:, 0] < com_x_m[1])
     ok &= from_sole[:, 1] > 0.15  # our choice: lower than this the robot sits
-    force = _static_force(m, angles, com)
-    speed = _extension_speed(m, angles, from_sole)
-    columns = {"angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force, "speed": speed}
+    force, strong = _static_force(m, angles, com)
+    speed, quick = _extension_speed(m, angles, from_sole)
+    columns = {"force_joint": strong, "speed_joint": quick,
+               "angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force,
+               "speed": speed}  # fmt: skip
     return {name: x[ok] for name, x in columns.items()}
 
 
@@ -122,15 +128,16 @@ def _lowest_com(p: dict) -> np.ndarray:
 
 
 def _static_force(m, angles, com):
-    """Vertical force [N] at which the first leg joint saturates, CoP below the CoM but inside the sole."""
+    """Vertical force [N] at which the first leg joint saturates, CoP below the CoM but inside the sole; and which."""
     at = np.cumsum([_turned(angles[:, j], m.span[j]) for j in range(3)], axis=0)[..., 0]  # ankle, knee, hip x (3, n)
     cop = np.clip(com[:, 0], m.heel[0], 0.0)
     levers = np.maximum(np.abs(at - cop), MIN_FORCE_LEVER_M)
-    return FORCE_SHARE * np.min(m.effort[[2, 1, 0]][:, None] / levers, axis=0)
+    carried = m.effort[[2, 1, 0]][:, None] / levers
+    return FORCE_SHARE * np.min(carried, axis=0), 2 - np.argmin(carried, axis=0)
 
 
 def _extension_speed(m, angles, com):
-    """Rate of phi [m/s] at which ankle, knee or hip reaches its speed limit: foot and trunk still, CoM along phi."""
+    """Rate of phi [m/s] at which ankle, knee or hip reaches its speed limit, and which: foot and trunk still."""
     arms = np.einsum("i,ijk->jk", m.mass, m.com_arms()) / m.total_mass
     along = com / np.linalg.norm(com, axis=1, keepdims=True)
     turned = [_turned(angles[:, j], arms[j]) for j in (1, 2)]  # shank, thigh
@@ -139,7 +146,32 @@ def _extension_speed(m, angles, com):
     det = np.where(np.abs(det) < 1e-6, 1e-6, det)  # straight leg: no speed at all
     shank, thigh = (d * along[:, 0] - b * along[:, 1]) / det, (a * along[:, 1] - c * along[:, 0]) / det
     used = np.abs([shank / m.speed[2], (shank - thigh) / m.speed[1], thigh / m.speed[0]])
-    return 1.0 / np.max(used, axis=0)
+    return 1.0 / np.max(used, axis=0), 2 - np.argmax(used, axis=0)
+
+
+def _weakest(m, p: dict, phi: np.ndarray) -> dict:
+    """The joint that most often saturates in the best postures of the leg's stroke, for force and for speed."""
+    out, upper = {}, phi > np.median(phi)
+    for what, unit, limits in (("force", "N m", m.effort), ("speed", "rad/s", m.speed)):
+        best = p[what][upper] >= np.quantile(p[what][upper], 0.5)
+        joint = int(np.bincount(p[f"{what}_joint"][upper][best], minlength=3).argmax())
+        out[what] = f"{SAGITTAL_JOINTS[joint]} {limits[joint]:.3g} {unit}"
+    return out
+
+
+def _around_stance(lower: np.ndarray, upper: np.ndarray, length: float, inertia: float):
+    """The two fits, shifted where needed so that the jump's first posture lies inside them.
+
+    Without arms that swing the envelope is narrow, and a stance that is a corner of it can be cut off.
+    """
+    low, high = np.polyval(lower, length), np.polyval(upper, length)
+    share = (inertia - low) / (high - low)
+    if share < STANCE_SHARE:
+        lower = lower - np.append(np.zeros(len(lower) - 1), (STANCE_SHARE - share) * (high - low) / (1 - STANCE_SHARE))
+    elif share > 1 - STANCE_SHARE:
+        excess = (share - 1 + STANCE_SHARE) * (high - low) / (1 - STANCE_SHARE)
+        upper = upper + np.append(np.zeros(len(upper) - 1), excess)
+    return lower, upper
 
 
 def reach(robot: Robot, count: int = SAMPLES) -> Reach:
@@ -165,11 +197,12 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     half = -m.heel[0] / 2
     flat, toe = postures(robot, count, 0.0, FLAT_COM_X_M), postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M)
     capped = np.minimum(strongest, FORCE_CAP * strongest[0])
-    curves = ((lower, 2), (upper, 2), (capped, 3), (fastest, 3))
+    curves = ((capped, 3), (fastest, 3))
+    envelope = _around_stance(np.polyfit(grid, lower, 2), np.polyfit(grid, upper, 2), start[1], stance_rho)
     return Reach(
         (float(low), float(high)), grid, lower, upper, strongest, fastest,
-        *(np.polyfit(grid, values, degree) for values, degree in curves),
+        *envelope, *(np.polyfit(grid, values, degree) for values, degree in curves),
         _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat),
         (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
-        float(mass.sum()),
+        float(mass.sum()), _weakest(m, p, phi),
     )  # fmt: skip

@@ -26,6 +26,10 @@ JOINT_OF_ANGLES = np.array(
     ]
 )
 
+LEG_ROLES = ("ankle_pitch", "knee", "hip_pitch")
+# limits of the massless arm of a robot whose arms are held; our choice: it hardly moves and never binds
+HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "effort": 10.0}
+
 
 @dataclass(frozen=True)
 class SagittalModel:
@@ -40,8 +44,9 @@ class SagittalModel:
     span : (5, 2) from that joint to the next: toe to ankle, to knee, to hip, to shoulder, to hand.
     heel, sole_center : (2,) from the toe.
     base : (2,) from the hip to the origin of the robot's base link, fixed in the trunk.
-    sign : (4,) +1 or -1, robot joint angle = sign * sagittal joint angle; order :data:`SAGITTAL_JOINTS`.
-    lower, upper, speed, effort, corner_speed : (4,) limits in sagittal signs; effort of both sides summed.
+    signs : (4, 2) +1 or -1 of the left and the right joint, robot joint angle = sign * sagittal joint angle; order
+        :data:`SAGITTAL_JOINTS`. Arms that are held have 1.
+    lower, upper, speed, effort, corner_speed : (4,) limits in sagittal signs, of the weaker side; effort of both sides.
     points : named points on the links for clearance, name -> (link index, (x, z) from the link's lower joint).
     """
 
@@ -52,13 +57,18 @@ class SagittalModel:
     heel: np.ndarray
     sole_center: np.ndarray
     base: np.ndarray
-    sign: np.ndarray
+    signs: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     speed: np.ndarray
     effort: np.ndarray
     corner_speed: np.ndarray
     points: dict
+
+    @property
+    def sign(self) -> np.ndarray:
+        """(4,) signs of the left joints."""
+        return self.signs[:, 0]
 
     @property
     def total_mass(self) -> float:
@@ -105,20 +115,31 @@ def _members(model: pin.Model, joints: dict) -> list[list[int]]:
     return [[j for j in part if part[j] == name] for name in SAGITTAL_LINKS]
 
 
-def _axis_sign(model: pin.Model, data: pin.Data, role: str, pair) -> float:
-    """+1 if the joints turn their limbs about +y in the neutral pose, -1 if about -y: found by motion, not by name."""
-    axes = []
+def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float]:
+    """+1 if a joint turns its limb about +y in the neutral pose, -1 if about -y: found by motion, not by name."""
+    signs = []
     for name in pair:
         joint = model.getJointId(name)
         jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)  # (6, nv)
         axis = jacobian[3:, model.idx_vs[joint]]
         if abs(axis[1]) < PITCH_AXIS:
             raise RobotError(f"role {role}: joint {name!r} turns about {np.round(axis, 3)}, not about the pitch axis y")
-        axes.append(float(np.sign(axis[1])))
-    if axes[0] != axes[1]:
-        raise RobotError(f"role {role}: {pair[0]!r} turns about {axes[0]:+.0f} y, {pair[1]!r} about {axes[1]:+.0f} y; "
-                         f"give both the same direction in the URDF")  # fmt: skip
-    return axes[0]
+        signs.append(float(np.sign(axis[1])))
+    return signs
+
+
+def _limits(actuators: dict, pair, signs) -> dict[str, float]:
+    """What both sides can do: the overlap of their ranges, the lower speed, twice the lower effort."""
+    both = [actuators[name] for name in pair]
+    ranges = [sorted((s * a["lower"], s * a["upper"])) for a, s in zip(both, signs, strict=True)]
+    out = {"lower": max(r[0] for r in ranges), "upper": min(r[1] for r in ranges)}
+    if not out["lower"] < out["upper"]:
+        raise RobotError(
+            f"{pair[0]!r} and {pair[1]!r} have no angle in common: {ranges[0][0]:g} ... {ranges[0][1]:g} and "
+            f"{ranges[1][0]:g} ... {ranges[1][1]:g} rad about the same axis; correct their limits"
+        )
+    out |= {key: min(a[key] for a in both) for key in ("speed", "corner_speed")}
+    return out | {"effort": 2 * min(a["effort"] for a in both)}
 
 
 def _limb_tip(model: pin.Model, data: pin.Data, urdf: str, members: list[int], root, com) -> np.ndarray:
@@ -142,12 +163,13 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> 
     Parameters
     ----------
     model : Pinocchio model with a free-flyer base.
-    joints : role -> (left, right) joint names for hip_pitch, knee, ankle_pitch, shoulder_pitch.
+    joints : role -> (left, right) joint names for hip_pitch, knee, ankle_pitch, shoulder_pitch; () for held arms.
     foot : object with ``frames`` (left, right), ``heel``, ``toe``, ``sole_z`` in the foot frame [m].
     actuators : name -> dict(lower, upper, speed, effort, corner_speed) for every joint.
     urdf : the robot's XML, for its collision shapes.
 
-    Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or turn opposite ways.
+    Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or share no range. Left and right
+    may turn opposite ways.
     """
     data = model.createData()
     q = pin.neutral(model)
@@ -159,6 +181,8 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> 
         total = pin.Inertia.Zero()
         for j in members:
             total += data.oMi[j].act(model.inertias[j])
+        if not members:  # arms that are held
+            continue
         mass[i], com[i] = total.mass, total.lever[[0, 2]]
         # products along y drop out of the pitch axis, so the two sides may simply be added
         inertia[i] = sum(
@@ -169,27 +193,25 @@ def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> 
     def place(role):
         return np.mean([data.oMi[model.getJointId(n)].translation[[0, 2]] for n in joints[role]], axis=0)
 
-    ankle, knee, hip, shoulder = (place(r) for r in ("ankle_pitch", "knee", "hip_pitch", "shoulder_pitch"))
+    ankle, knee, hip = (place(r) for r in LEG_ROLES)
+    held = not joints["shoulder_pitch"]
+    shoulder = hip + 2 * (com[3] - hip) if held else place("shoulder_pitch")  # held arms: a point to draw the trunk to
     frame = data.oMf[model.getFrameId(foot.frames[0])]
     toe = frame.act(np.array([foot.toe, 0.0, foot.sole_z]))[[0, 2]]
     heel = frame.act(np.array([foot.heel, 0.0, foot.sole_z]))[[0, 2]]
-    hand = _limb_tip(model, data, urdf, parts[4], shoulder, com[4])
+    hand = np.zeros(2) if held else _limb_tip(model, data, urdf, parts[4], shoulder, com[4])
+    if held:
+        com[4] = shoulder
     lower_joint = np.array([toe, ankle, knee, hip, shoulder])
     span = np.array([ankle - toe, knee - ankle, hip - knee, shoulder - hip, hand])
-    sign, limits = [], {key: [] for key in ("lower", "upper", "speed", "effort", "corner_speed")}
+    signs, rows = [], []
     for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
-        s = _axis_sign(model, data, role, joints[role])
-        sign.append(s)
-        left = actuators[joints[role][0]]
-        both = sorted((s * left["lower"], s * left["upper"]))
-        limits["lower"].append(both[0])
-        limits["upper"].append(both[1])
-        limits["speed"].append(left["speed"])
-        limits["corner_speed"].append(left["corner_speed"])
-        limits["effort"].append(sum(actuators[n]["effort"] for n in joints[role]))
+        signs.append(_axis_signs(model, data, role, joints[role]) or [1.0, 1.0])
+        rows.append(_limits(actuators, joints[role], signs[-1]) if joints[role] else HELD_ARM)
+    limits = {key: [row[key] for row in rows] for key in HELD_ARM}
     base = data.oMi[1].translation[[0, 2]] - hip
     points = {"toe": (0, np.zeros(2)), "heel": (0, heel - toe), "knee": (2, np.zeros(2)), "hip": (3, np.zeros(2)),
               "shoulder": (4, np.zeros(2)), "hand": (4, hand), "mid-arm": (4, hand / 2)}  # fmt: skip
     return SagittalModel(
-        mass, inertia, com - lower_joint, span, heel - toe, (heel - toe) / 2, base, np.array(sign),
+        mass, inertia, com - lower_joint, span, heel - toe, (heel - toe) / 2, base, np.array(signs),
         **{k: np.array(x) for k, x in limits.items()}, points=points)  # fmt: skip

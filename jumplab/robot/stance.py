@@ -10,6 +10,7 @@ from jumplab.errors import RobotError
 from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS
 
+STANCE_ROOM_RAD = 0.04  # our choice: plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # our choice: generous lean of the shank, both ways
 
 
@@ -25,11 +26,12 @@ def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
     return np.sum([_rotate(a, d) for a, d in zip(angles, arms, strict=True)], axis=0)
 
 
-def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
+def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits: bool = True) -> np.ndarray:
     """Absolute link angles (5,) of the standing posture, order foot, shank, thigh, trunk, arm [rad].
 
     Knee, trunk pitch and shoulder come from the robot's configuration (``knee_rad`` overrides the first); the shank's
-    lean follows from the CoM above the middle of the sole. Raises :class:`RobotError` if no lean does that.
+    lean follows from the CoM above the middle of the sole. Raises :class:`RobotError` if no lean does that, or, unless
+    ``within_limits`` is off, if a joint would leave its range.
     """
     knee = robot.stance["knee_rad"] if knee_rad is None else knee_rad
     pitch, shoulder = robot.stance["trunk_pitch_rad"], robot.stance["shoulder_rad"]
@@ -47,6 +49,8 @@ def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
             f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank "
             f"brings the CoM above the middle of the sole; change [stance] in its configuration"
         ) from None
+    if not within_limits:
+        return found
     joints = robot.sagittal.joint_angles(found)
     for name, angle, low, high in zip(SAGITTAL_JOINTS, joints, robot.sagittal.lower, robot.sagittal.upper, strict=True):
         if not low <= angle <= high:
@@ -57,6 +61,19 @@ def stance_angles(robot: Robot, knee_rad: float | None = None) -> np.ndarray:
     return found
 
 
+def check_stance(robot: Robot) -> np.ndarray:
+    """The standing posture (5,), refused if a joint has less than :data:`STANCE_ROOM_RAD` left to its stops."""
+    angles, m = stance_angles(robot), robot.sagittal
+    for name, angle, low, high in zip(SAGITTAL_JOINTS, m.joint_angles(angles), m.lower, m.upper, strict=True):
+        if min(angle - low, high - angle) < STANCE_ROOM_RAD:
+            raise RobotError(
+                f"robot {robot.name}: standing, {name} is at {angle:.3f} rad, less than {STANCE_ROOM_RAD:g} from the "
+                f"end of its range {low:.3g} ... {high:.3g}; no plan can start there: change [stance] in its "
+                f"configuration"
+            )
+    return angles
+
+
 def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:
     """Pinocchio configuration (nq,) of the full robot for absolute link angles (5,) and the toe's (x, z) [m]."""
     model = robot.sagittal
@@ -64,10 +81,9 @@ def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarra
     base = np.asarray(toe) + toe_to_hip + _rotate(angles[3], model.base)
     q = pin.neutral(robot.model)
     q[:7] = [base[0], 0.0, base[1], 0.0, np.sin(angles[3] / 2), 0.0, np.cos(angles[3] / 2)]
-    joints = model.joint_angles(angles) * model.sign
-    for role, angle in zip(("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"), joints, strict=True):
-        for name in robot.joints[role]:
-            q[robot.model.idx_qs[robot.model.getJointId(name)]] = angle
+    joints = model.joint_angles(angles)
+    for name, row, sign in robot.role_signs():
+        q[robot.model.idx_qs[robot.model.getJointId(name)]] = sign * joints[row]
     return q
 
 

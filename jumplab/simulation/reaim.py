@@ -16,6 +16,7 @@ RATE = 12.0  # [rad/s] our choice: 0.8 rad within the last 0.2 m at 3 m/s, two t
 LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] our choice: below it the foothold says little about the moment
 NEWTON_STEPS = 2  # two equations, nearly linear
+HIP_ANKLE = (0, 2)  # rows of jumplab.robot.SAGITTAL_JOINTS
 PROBE_RAD = 1e-4  # of the finite differences
 
 
@@ -34,8 +35,9 @@ class Reaim:
         self._model, self._data, self._foot = robot.model, robot.model.createData(), robot.foot
         self._scene = scene
         self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        roles = ("hip_pitch", "ankle_pitch")
-        self._rows = [[7 + robot.joint_names.index(name) for name in robot.joints[role]] for role in roles]
+        sides = [[(robot.joint_names.index(n), s) for n, row, s in robot.role_signs() if row == i] for i in HIP_ANKLE]
+        self._rows = [[7 + row for row, _ in side] for side in sides]
+        self._signs = [np.array([sign for _, sign in side]) for side in sides]  # left and right may turn opposite ways
         self._end = tape.q[-1].copy()
         ahead, self._tilt, height = self._aim(self._end)
         self._mass = robot.total_mass
@@ -89,12 +91,13 @@ class Reaim:
             fall = np.sqrt(max(speed[2] ** 2 + 2 * GRAVITY * drop, FASTEST_FALL**2))
             goal = np.array([(momentum / self._mass + here[2] * speed[0] - self._moment) / fall, self._tilt])
             slope = np.empty((2, 2))
-            for column, rows in enumerate(self._rows):
+            for column, (rows, signs) in enumerate(zip(self._rows, self._signs, strict=True)):
                 probe = guess.copy()
-                probe[rows] += PROBE_RAD
+                probe[rows] += PROBE_RAD * signs
                 slope[:, column] = (self._aim(probe) - here)[:2] / PROBE_RAD
-            for rows, angle in zip(self._rows, np.linalg.solve(slope, goal - here[:2]), strict=True):
-                guess[rows] += angle
+            turns = np.linalg.solve(slope, goal - here[:2])
+            for rows, signs, angle in zip(self._rows, self._signs, turns, strict=True):
+                guess[rows] += angle * signs
         return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles
 
 

@@ -187,16 +187,26 @@ def check_reachable(task: JumpTask, envelope: Reach, robot: Robot, settings: Srm
 def _check_height(task: JumpTask, can: Capability, name: str) -> None:
     limit = highest(can)
     if limit < CHECK_STEP_M:
+        why = f"its legs give {can.mean_force:.0f} N on average for a weight of {can.mass * can.gravity:.0f} N"
+        if can.mean_force > can.mass * can.gravity:
+            why += f" and reach {can.speed:.2f} m/s"
         raise InfeasibleError(
-            f"height = {task.height_m:g} m: {name} cannot leave the ground, its legs give {can.mean_force:.0f} N on "
-            f"average for a weight of {can.mass * can.gravity:.0f} N; give it stronger joints or less gravity"
+            f"height = {task.height_m:g} m: {name} cannot leave the ground, {why} ({_limiting(can)}); give it stronger "
+            f"joints or less gravity"
         )
     if task.height_m > limit:
         raise InfeasibleError(
             f"height = {task.height_m:g} m: take-off at {task.takeoff_speed:.2f} m/s, on average "
             f"{needed_force(can, task.height_m):.0f} N over {can.stroke:.2f} m of leg stroke; the legs of {name} reach "
-            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N; ask for {_below(limit)} m or less"
+            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); ask for {_below(limit)} m or less"
         )
+
+
+def _limiting(can: Capability) -> str:
+    """The joint that limits the rise, as a person would name it."""
+    by_force = can.stroke * (can.mean_force / (can.mass * can.gravity) - 1)
+    what = "force" if by_force < can.speed**2 / (2 * can.gravity) else "speed"
+    return f"limited by the {what} of {can.envelope.weakest[what]}"
 
 
 def _check_platform(task: JumpTask, can: Capability, name: str) -> None:

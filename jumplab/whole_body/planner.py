@@ -164,7 +164,7 @@ class WholeBodyPlanner:
     def _posture(self, name: str) -> np.ndarray:
         """Absolute link angles (5,) of a named posture of :data:`POSTURES`, CoM roughly above the sole."""
         knee, trunk, heel, arm = POSTURES[name]
-        angles = stance_angles(self.robot, knee) if knee < 1.8 else self.stance.copy()
+        angles = stance_angles(self.robot, knee, within_limits=False) if knee < 1.8 else self.stance.copy()
         return angles + np.array([heel, heel * 0.5, 0.0, trunk - angles[3], trunk + arm - angles[4]])
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:

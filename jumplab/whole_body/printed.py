@@ -19,7 +19,7 @@ from jumplab.errors import SolverError
 from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.models.planar import PlanarState, evaluator, symbols
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
-from jumplab.robot.description import ROLES
+from jumplab.robot.config import ROLES
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.stance import stance_angles
 from jumplab.solver import Nlp, PhaseGuess, Solution
@@ -251,14 +251,16 @@ class PrintedWholeBody:
 
     def _guess(self, joints: JointPlan, phase: str) -> dict[str, PhaseGuess]:
         """Stage 2's base link is the paper's base; its left side speaks for both."""
-        rows, model, sign = joints.rows(phase), self.robot.model, self.robot.sagittal.sign
+        rows, model = joints.rows(phase), self.robot.model
         t, q, v = joints.t[rows], joints.q[rows], joints.v[rows]
-        ids = [model.getJointId(self.robot.joints[role][0]) for role in ROLES]
+        left = {row: (model.getJointId(name), sign) for name, row, sign in reversed(self.robot.role_signs())}
+        still = np.zeros(len(t))  # arms that are held
         pitch = np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
         c, s = np.cos(pitch), np.sin(pitch)
-        theta = [q[:, 0], q[:, 2], pitch, *(q[:, [model.idx_qs[i] for i in ids]] * sign).T]
-        rate = [c * v[:, 0] + s * v[:, 2], c * v[:, 2] - s * v[:, 0], v[:, 4],
-                *(v[:, [model.idx_vs[i] for i in ids]] * sign).T]  # fmt: skip
+        angles, speeds = ([x[:, index[left[i][0]]] * left[i][1] if i in left else still for i in range(len(ROLES))]
+                          for x, index in ((q, model.idx_qs), (v, model.idx_vs)))  # fmt: skip
+        theta = [q[:, 0], q[:, 2], pitch, *angles]
+        rate = [c * v[:, 0] + s * v[:, 2], c * v[:, 2] - s * v[:, 0], v[:, 4], *speeds]
         theta, rate = (self._at_nodes(t, np.stack(x, -1)) for x in (theta, rate))
         force = self._at_nodes(t, joints.f[rows].sum(axis=1)[:, [0, 2]]) if phase == "launch" else None
         return {phase: PhaseGuess(float(t[-1] - t[0]), theta, rate, None, force)}

@@ -1,0 +1,69 @@
+"""Reading the entries of a robot's TOML file, each checked, each refused in one sentence."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+
+from jumplab.errors import RobotError
+
+ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+MAY_BE_HELD = ("shoulder_pitch",)  # an empty list: the arms are held, and belong to the trunk
+
+
+def read_toml(text: str, where: str) -> dict:
+    """The file as nested tables."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
+        raise RobotError(f"{where}: not a TOML file: {e}") from e
+
+
+def entry(config: dict, *path: str, kind: type = float, count: int | None = None):
+    """One checked entry of the configuration: a finite number or a text, or ``count`` of them."""
+    where, value = ".".join(path), config
+    for key in path:
+        if not isinstance(value, dict) or key not in value:
+            raise RobotError(f"robot configuration: the entry {where!r} is missing")
+        value = value[key]
+    items = value if count else [value]
+    numbers = kind is float
+    good = isinstance(items, list) and len(items) == (count or 1)
+    good = good and all(isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items)
+    if not good or (numbers and not np.all(np.isfinite(items))):
+        wanted = "a finite number" if numbers else "a text"
+        raise RobotError(
+            f"robot configuration: {where!r} = {value!r}, must be {f'{count} of ' if count else ''}{wanted}"
+        )
+    clean = [float(x) if numbers else x for x in items]
+    return clean if count else clean[0]
+
+
+def optional(config: dict, default, *path: str, kind: type = float, count: int | None = None):
+    """As :func:`entry`, or ``default`` where the entry is missing."""
+    value = config
+    for key in path:
+        if not isinstance(value, dict) or key not in value:
+            return default
+        value = value[key]
+    return entry(config, *path, kind=kind, count=count)
+
+
+def table(config: dict, name: str) -> dict:
+    """A table of the configuration, empty where it is missing."""
+    value = config.get(name, {})
+    if not isinstance(value, dict):
+        raise RobotError(f"robot configuration: {name!r} = {value!r} must be a table [{name}]")
+    return value
+
+
+def roles_table(config: dict) -> dict[str, tuple[str, ...]]:
+    """role -> (left, right) joint names; () for arms that are held."""
+    joints = {}
+    for role in ROLES:
+        if role in MAY_BE_HELD and table(config, "joints").get(role) == []:
+            joints[role] = ()
+        else:
+            joints[role] = tuple(entry(config, "joints", role, kind=str, count=2))
+    return joints

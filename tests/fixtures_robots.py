@@ -1,0 +1,201 @@
+"""Robots made from the default one by hand: other proportions, axes, ankles, arms and base links."""
+
+from xml.etree import ElementTree as ET
+
+from jumplab.robot.bhr import table
+
+GOOD = table.URDF_PATH.read_text()
+CONFIG = """
+name = "{name}"
+urdf = "{name}.urdf"
+[source]
+trunk = "{trunk}"
+forward = "{forward}"
+up = "{up}"
+repair = []
+[joints]
+hip_pitch = ["left_hip_pitch", "right_hip_pitch"]
+knee = ["left_knee", "right_knee"]
+ankle_pitch = ["left_ankle_pitch", "right_ankle_pitch"]
+shoulder_pitch = {shoulders}
+[feet]
+links = ["left_foot", "right_foot"]
+sole_x_m = [{heel}, {toe}]
+sole_y_m = [-{half}, {half}]
+sole_z_m = {z}
+[stance]
+knee_rad = 0.5
+trunk_pitch_rad = 0.05
+shoulder_rad = 0.0
+[actuators]
+corner_speed_ratio = 0.5
+"""
+SWINGING = '["left_shoulder_pitch", "right_shoulder_pitch"]'
+
+
+def config(name: str, size: float = 1.0, **values) -> str:
+    told = {"trunk": "trunk", "forward": "+x", "up": "+z", "shoulders": SWINGING, "heel": -0.1 * size,
+            "toe": 0.14 * size, "half": 0.05 * size, "z": -0.075 * size}  # fmt: skip
+    return CONFIG.format(name=name, **(told | values))
+
+
+def root() -> ET.Element:
+    return ET.fromstring(GOOD)
+
+
+def text(robot: ET.Element) -> str:
+    return ET.tostring(robot, encoding="unicode")
+
+
+def joint(robot: ET.Element, name: str) -> ET.Element:
+    return next(j for j in robot.findall("joint") if j.get("name") == name)
+
+
+def link(robot: ET.Element, name: str) -> ET.Element:
+    return next(x for x in robot.findall("link") if x.get("name") == name)
+
+
+def _scale(element: ET.Element, key: str, factor: float) -> None:
+    element.set(key, " ".join(f"{factor * float(x):.12g}" for x in element.get(key).split()))
+
+
+def plain() -> tuple[str, str]:
+    """The default robot through the whole of what is done to a stranger's robot."""
+    return GOOD, config("plain")
+
+
+def mirrored() -> tuple[str, str]:
+    """Every pitch joint of the right side turns the other way."""
+    robot = root()
+    for name in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
+        j = joint(robot, f"right_{name}")
+        j.find("axis").set("xyz", "0 -1 0")
+        limit = j.find("limit")
+        low, high = limit.get("lower"), limit.get("upper")
+        limit.set("lower", f"{-float(high)}")
+        limit.set("upper", f"{-float(low)}")
+    return text(robot), config("mirrored")
+
+
+def child(size: float = 0.6) -> tuple[str, str]:
+    """All lengths times ``size``; masses, torques and speeds as a body of the same material has them."""
+    robot = root()
+    for origin in robot.iter("origin"):
+        _scale(origin, "xyz", size)
+    for box in robot.iter("box"):
+        _scale(box, "size", size)
+    for mass in robot.iter("mass"):
+        _scale(mass, "value", size**3)
+    for inertia in robot.iter("inertia"):
+        for key in ("ixx", "iyy", "izz"):
+            _scale(inertia, key, size**5)
+    for limit in robot.iter("limit"):
+        _scale(limit, "effort", size**4)
+    return text(robot), config("child", size)
+
+
+def one_axis_ankle() -> tuple[str, str]:
+    """No ankle roll."""
+    robot = root()
+    for side in ("left", "right"):
+        joint(robot, f"{side}_ankle_roll").set("type", "fixed")
+    return text(robot), config("one_axis_ankle")
+
+
+def roll_first() -> tuple[str, str]:
+    """Ankle roll above ankle pitch."""
+    robot = root()
+    for side in ("left", "right"):
+        pitch, roll = joint(robot, f"{side}_ankle_pitch"), joint(robot, f"{side}_ankle_roll")
+        for tag in ("axis", "limit"):
+            a, b = pitch.find(tag), roll.find(tag)
+            pitch.remove(a), roll.remove(b)
+            pitch.append(b), roll.append(a)
+        pitch.set("name", f"{side}_ankle_roll"), roll.set("name", f"{side}_ankle_pitch")
+    return text(robot), config("roll_first")
+
+
+def heavy_arms(mass_kg: float = 5.0) -> tuple[str, str]:
+    """Arms of 5 kg instead of 2."""
+    robot = root()
+    for side in ("left", "right"):
+        inertial = link(robot, f"{side}_arm").find("inertial")
+        share = mass_kg / float(inertial.find("mass").get("value"))
+        _scale(inertial.find("mass"), "value", share)
+        for key in ("ixx", "iyy", "izz"):
+            _scale(inertial.find("inertia"), key, share)
+        _scale(joint(robot, f"{side}_shoulder_pitch").find("limit"), "effort", share)
+    return text(robot), config("heavy_arms")
+
+
+def held_arms() -> tuple[str, str]:
+    """No usable shoulder."""
+    return GOOD, config("held_arms", shoulders="[]")
+
+
+def arm_base() -> tuple[str, str]:
+    """The root is the left arm: the shoulder is met from its far end."""
+    robot = root()
+    shoulder = joint(robot, "left_shoulder_pitch")
+    place = shoulder.find("origin").get("xyz")
+    ET.SubElement(robot, "link", name="socket")
+    shoulder.find("parent").set("link", "left_arm")
+    shoulder.find("child").set("link", "socket")
+    shoulder.find("origin").set("xyz", "0 0 0")
+    shoulder.find("axis").set("xyz", "0 -1 0")
+    j = ET.SubElement(robot, "joint", name="socket_fixed", type="fixed")
+    ET.SubElement(j, "parent", link="socket")
+    ET.SubElement(j, "child", link="trunk")
+    ET.SubElement(j, "origin", xyz=" ".join(f"{-float(x)}" for x in place.split()))
+    return text(robot), config("arm_base")
+
+
+def waist() -> tuple[str, str]:
+    """The root is a chest above a waist joint; the legs hang on a pelvis below it."""
+    robot = root()
+    chest = ET.SubElement(robot, "link", name="chest")
+    inertial = ET.SubElement(chest, "inertial")
+    ET.SubElement(inertial, "origin", xyz="0.02 0 0.1")
+    ET.SubElement(inertial, "mass", value="2")
+    ET.SubElement(inertial, "inertia", ixx="0.01", ixy="0", ixz="0.002", iyy="0.012", iyz="0", izz="0.008")
+    j = ET.SubElement(robot, "joint", name="waist", type="revolute")
+    ET.SubElement(j, "parent", link="chest")
+    ET.SubElement(j, "child", link="trunk")
+    ET.SubElement(j, "origin", xyz="0 0 0")
+    ET.SubElement(j, "axis", xyz="0 1 0")
+    ET.SubElement(j, "limit", lower="-0.5", upper="0.5", effort="100", velocity="5")
+    return text(robot), config("waist") + "[locked]\nwaist = -0.1\n"
+
+
+def sideways() -> tuple[str, str]:
+    """The whole robot hangs on a root that is turned by 90 degrees: its trunk looks along +y of the root."""
+    robot = root()
+    ET.SubElement(robot, "link", name="turned")
+    j = ET.SubElement(robot, "joint", name="turn", type="fixed")
+    ET.SubElement(j, "parent", link="turned")
+    ET.SubElement(j, "child", link="trunk")
+    ET.SubElement(j, "origin", xyz="0.3 0.2 0.1", rpy="0 0 1.5707963267948966")
+    return text(robot), config("sideways", trunk="turned", forward="+y")
+
+
+def canted(angle_rad: float) -> tuple[str, str]:
+    """Both hips canted, as mirror images."""
+    import math
+
+    robot = root()
+    for side, sign in (("left", 1), ("right", -1)):
+        axis = f"0 {math.cos(angle_rad):.12f} {sign * math.sin(angle_rad):.12f}"
+        joint(robot, f"{side}_hip_pitch").find("axis").set("xyz", axis)
+    return text(robot), config("canted")
+
+
+VARIANTS = (plain, mirrored, child, one_axis_ankle, roll_first, heavy_arms, held_arms, arm_base, waist, sideways)
+
+
+def write(folder, variant, *args) -> str:
+    """Write a variant's two files into a folder; path of its TOML."""
+    urdf, toml = variant(*args)
+    path = folder / f"{variant.__name__}.toml"
+    path.write_text(toml)
+    (folder / f"{variant.__name__}.urdf").write_text(urdf)
+    return str(path)

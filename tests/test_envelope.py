@@ -1,0 +1,105 @@
+"""The map of jumps: cells agree with the planner, resume, and say what limits them."""
+
+import json
+import math
+
+import pytest
+from fixtures_robots import child, write
+
+from jumplab import envelope
+from jumplab.__main__ import main
+from jumplab.envelope import BEYOND, OPEN, VERDICT, Cell, Envelope, measure, usage
+from jumplab.errors import InputError
+from jumplab.plotting.envelope import envelope_map
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+from jumplab.whole_body import WholeBodyPlanner
+from jumplab.whole_body.settings import Limits
+
+
+def test_cells_are_plans_within_the_limits(bhr, tmp_path):
+    told = []
+    found = measure(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
+    near, far, *refused = found.cells
+    assert near.solved and far.solved and all(0.3 < c.share < 1.05 for c in (near, far))
+    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "ask for" in refused[0].reason
+    assert far.iterations <= near.iterations  # warm
+    assert (found.highest, found.farthest) == (far, far)
+    assert told[0] == "height 0.30 m: 2 of 2 cells, up to 0.60 m"
+
+
+def test_usage_is_that_of_the_plan(bhr):
+    plan = WholeBodyPlanner(bhr, tracking=False).plan(JumpTask(0.5, 0.3))
+    shares = usage(plan, bhr)
+    assert set(shares) == {
+        f"{j} {what}" for j in ("hip", "knee", "ankle", "shoulder") for what in ("torque", "speed")
+    } | {"friction"}
+    assert max(shares.values()) < 1.05
+    assert Limits().torque_share * shares["ankle torque"] > 0.2
+
+
+def test_an_interrupted_map_goes_on(bhr, tmp_path, monkeypatch):
+    first = measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+
+    def never(*_, **__):
+        raise AssertionError("a finished cell is not solved again")
+
+    monkeypatch.setattr(WholeBodyPlanner, "plan", never)
+    again = measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+    assert again == first
+    (file,) = (tmp_path / "cells").iterdir()
+    data = json.loads(file.read_text())
+    file.write_text(json.dumps(data | {"robot": "somebody"}))
+    with pytest.raises(InputError, match="belongs to another robot"):
+        measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+    file.write_text(file.read_text()[:20])  # cut short: no cell
+    with pytest.raises(AssertionError):
+        measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+
+
+def test_far_cells_are_not_tried_for_ever(bhr, monkeypatch):
+    def hopeless(self, task, guess, *, cold):
+        return Cell(task.distance_m, task.height_m, False, OPEN, math.nan), None
+
+    monkeypatch.setattr(envelope._Row, "_cell", hopeless)
+    monkeypatch.setattr(envelope, "_ROWS", {})
+    cells = measure(bhr, (0.1, 0.2, 0.3, 0.4), (0.3,)).cells
+    assert [c.limiting for c in cells] == [OPEN, OPEN, BEYOND, BEYOND]
+
+
+def test_grids_that_cannot_be_meant(bhr):
+    with pytest.raises(InputError, match=r"the map has 0 x 1 cells"):
+        measure(bhr, (), (0.3,))
+    with pytest.raises(InputError, match=r"height = "):
+        measure(bhr, (0.3,), (-1.0,))
+
+
+@pytest.mark.parametrize("argv, sentence", [
+    (["--distances-m", "0:1"], "jumplab: --distances-m must be A:B:STEP with A <= B and a positive STEP, got '0:1'"),
+    (["--heights-m", "1:0:0.1"],
+     "jumplab: --heights-m must be A:B:STEP with A <= B and a positive STEP, got '1:0:0.1'"),
+    (["--workers", "0"], "jumplab: --workers must be a whole number from 1 to 256, got '0'"),
+])  # fmt: skip
+def test_bad_input_in_one_sentence(capsys, tmp_path, argv, sentence):
+    assert main(["envelope", "--out", str(tmp_path / "x"), *argv]) == 2
+    assert capsys.readouterr().err.strip() == sentence
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.slow
+def test_the_command_draws_and_names_the_largest_jump(capsys, tmp_path):
+    robot = write(tmp_path, child)
+    argv = ["--distances-m", "0.2:0.4:0.2", "--heights-m", "0.2:0.2:0.1", "--workers", "1", "--robot", robot]
+    assert main(["envelope", "--out", str(tmp_path / "map"), *argv]) == 0
+    assert "limited by" in capsys.readouterr().out
+    assert (tmp_path / "map" / "envelope.png").stat().st_size > 5000
+    assert len(json.loads((tmp_path / "map" / "envelope.json").read_text())["cells"]) == 2
+    assert load_robot(robot).name == "child"
+
+
+def test_the_picture_has_every_reason():
+    cells = (Cell(0.0, 0.1, True, "friction", 0.9), Cell(0.1, 0.1, False, OPEN, math.nan),
+             Cell(0.0, 0.2, False, VERDICT, math.nan), Cell(0.1, 0.2, False, BEYOND, math.nan))  # fmt: skip
+    fig = envelope_map(Envelope("x", (0.0, 0.1), (0.1, 0.2), cells))
+    labels = [t.get_text() for t in fig.axes[0].get_legend().get_texts()]
+    assert labels == ["friction", "no plan found", "refused before solving", "not tried"]

@@ -1,0 +1,114 @@
+"""Published robots from the optional package example-robot-data: shipped configurations and true refusals."""
+
+import pytest
+
+from jumplab.errors import InfeasibleError, RobotError
+from jumplab.passport.audit import audit
+from jumplab.pipeline import Planner
+from jumplab.robot import load_robot
+from jumplab.robot.accuracy import reduction_error
+from jumplab.robot.checkup import check, draft
+from jumplab.robot.description import SHIPPED
+from jumplab.robot.urdf_file import PACKAGE, have_published, locate
+from jumplab.simulation import Scene, simulate_jump
+from jumplab.task import JumpTask
+
+PUBLISHED = [name for name in SHIPPED if name != "bhr"]
+
+
+here = pytest.mark.skipif(not have_published(), reason=f"the optional package {PACKAGE} is not installed")
+
+
+def urdf(name: str):
+    return locate(f"{PACKAGE}:{name}", SHIPPED["bhr"].parent)
+
+
+@pytest.mark.skipif(have_published(), reason="the published robots are there")
+def test_without_the_package_the_way_to_it_is_told():
+    with pytest.raises(RobotError, match=r"pip install 'jumplab\[robots\]'$"):
+        load_robot("g1")
+
+
+@here
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_sagittal_model_is_the_full_robot(name):
+    e = reduction_error(load_robot(name))
+    assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
+
+
+@here
+@pytest.mark.parametrize("name, kg", [("g1", 33.341), ("talos", 93.336), ("romeo", 40.529), ("alexander", 49.081)])
+def test_nothing_of_the_mass_is_lost(name, kg):
+    assert load_robot(name).total_mass == pytest.approx(kg, abs=1e-3)
+
+
+@here
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_what_is_found_is_what_the_configuration_says(name):
+    robot = load_robot(name)
+    from jumplab.robot.config import read_toml
+
+    config = read_toml(SHIPPED[name].read_text(), name)
+    found = draft(locate(config["urdf"], SHIPPED[name].parent), ("inertia",)).roles
+    assert found.joints == robot.joints
+    assert (found.trunk, found.forward, found.up) == tuple(config["source"][k] for k in ("trunk", "forward", "up"))
+
+
+@here
+@pytest.mark.slow
+@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05)), ("alexander", (0.2, 0.05))])
+def test_planned_clean_and_landed(name, target):
+    robot = load_robot(name)
+    plan = Planner(robot).plan(JumpTask(*target))
+    report = audit(plan.tape, plan.robot, plan.task)
+    assert [c.name for c in report.checks if not c.passed] == []
+    result = simulate_jump(plan.tape, plan.robot, scene=Scene.of_plan(plan.summary, plan.robot)).to_json()
+    assert result["landed"], result["reason"]
+    assert result["foot_distance_m"] == pytest.approx(target[0], abs=0.01)
+    assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
+
+
+@here
+@pytest.mark.parametrize("name, words", [
+    ("romeo", r"romeo cannot leave the ground, .* \(limited by the speed of hip 2\.09 rad/s\)"),
+    ("talos", r"\(limited by the speed of knee 7 rad/s\); ask for 0\.\d\d m or less"),
+    ("g1", r"ask for 0\.\d\d m or less"),
+])  # fmt: skip
+def test_too_much_is_refused_with_the_joint_and_the_largest_jump(name, words):
+    with pytest.raises(InfeasibleError, match=words):
+        Planner(load_robot(name)).plan(JumpTask(0.3, 1.2))
+
+
+REFUSED = [
+    ("bolt_description/robots/bolt.urdf", (), r"no pair of mirrored legs with three revolute pitch joints"),
+    ("alex_description/urdf/alex_nub_hands.urdf", (), r"no pair of mirrored legs"),
+    ("talos_data/robots/talos_full_v2.urdf", (), r"'rgbd_optical_frame': principal moment of inertia 0 kg m\^2"),
+    ("human_description/robots/human.urdf", (), r"link 'left_upperleg_virtual': has no <inertial>"),
+    ("cassie_description/robots/cassie.sdf", (), r"the root element is <sdf>, an SDF file, not a URDF$"),
+    ("panda_description/urdf/panda.urdf", (), r"no pair of mirrored legs"),
+]
+
+
+@here
+@pytest.mark.parametrize(("name", "repair", "words"), REFUSED, ids=[x[0].split("/")[-1] for x in REFUSED])
+def test_no_jumper_and_why(name, repair, words):
+    with pytest.raises(RobotError, match=words):
+        draft(urdf(name), repair)
+
+
+ALLOWED = ("symmetry", "inertia", "massless")
+NO_ROBOT = [
+    ("icub_description/robots/icub.urdf",
+     r"joint 'l_hip_pitch': velocity = 100 rad/s is above 60: deg/s or a placeholder; .* \[limits\.hip_pitch\]"),
+    ("human_description/robots/human.urdf", r"left and right differ by 28\.0 mm at 'left_upperleg'"),
+    ("simple_humanoid_description/urdf/simple_humanoid.urdf",
+     r"needs ankle at -0\.\d+ rad, outside its range 0 \.\.\."),
+]  # fmt: skip
+
+
+@here
+@pytest.mark.parametrize(("name", "words"), NO_ROBOT, ids=[x[0].split("/")[-1] for x in NO_ROBOT])
+def test_faults_that_no_repair_covers(name, words):
+    path = urdf(name)
+    with pytest.raises(RobotError, match=words):
+        check(path, draft(path, ALLOWED).text)

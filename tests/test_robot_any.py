@@ -1,0 +1,257 @@
+"""Robots that nobody described beforehand: lumped, reduced, planned, in three engines."""
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_robots import (
+    VARIANTS,
+    arm_base,
+    canted,
+    child,
+    config,
+    held_arms,
+    joint,
+    link,
+    mirrored,
+    one_axis_ankle,
+    plain,
+    root,
+    text,
+    waist,
+    write,
+)
+
+from jumplab.errors import RobotError
+from jumplab.passport.audit import audit
+from jumplab.pipeline import plan_jump
+from jumplab.robot import Robot, load_robot
+from jumplab.robot.accuracy import reduction_error
+from jumplab.robot.config import read_toml
+from jumplab.robot.description import Robot as Described
+from jumplab.robot.jumper import make_jumper
+from jumplab.robot.stance import stance_angles
+from jumplab.simulation import Scene, World, simulate_jump
+from jumplab.task import JumpTask
+
+FREE = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="{0}"/></joint>'
+
+
+def load(folder, variant, *args) -> Robot:
+    return load_robot(write(folder, variant, *args))
+
+
+def broken(urdf: str, toml: str) -> str:
+    """The sentence that refuses a robot."""
+    with pytest.raises(RobotError) as e:
+        jumper = make_jumper(urdf, read_toml(toml, "config"), "my.urdf")
+        _ = Described.from_text(jumper.urdf, jumper.config_text).sagittal
+    return str(e.value)
+
+
+# the models -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.__name__)
+def test_sagittal_model_is_the_full_robot(tmp_path, variant):
+    robot = load(tmp_path, variant)
+    e = reduction_error(robot)
+    assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
+
+
+def test_error_of_canted_axes_is_seen(tmp_path):
+    small, large = (reduction_error(load(tmp_path, canted, a)) for a in (0.01, 0.04))
+    assert 1e-6 < small.com_m < 1e-4 < large.com_m < 1e-3
+    assert large.com_m == pytest.approx(16 * small.com_m, rel=0.1)  # second order in the angle
+
+
+def test_badly_canted_axes_are_refused(tmp_path):
+    with pytest.raises(
+        RobotError, match=r"^role hip_pitch: joint 'left_hip_pitch' turns about \[.*\], not about the pitch"
+    ):
+        load(tmp_path, canted, 0.1)
+
+
+@pytest.mark.parametrize("variant", [mirrored, arm_base], ids=lambda v: v.__name__)
+def test_other_ways_to_write_the_same_robot(tmp_path, bhr, variant):
+    robot = load(tmp_path, variant)
+    for name in ("mass", "inertia", "com", "upper", "effort", "speed"):
+        np.testing.assert_allclose(getattr(robot.sagittal, name), getattr(bhr.sagittal, name), atol=1e-12)
+    np.testing.assert_allclose(robot.sagittal.lower[1:], bhr.sagittal.lower[1:], atol=1e-12)
+    assert robot.sagittal.lower[0] == pytest.approx(bhr.sagittal.lower[0], abs=0.03)  # cut to the boxes
+    np.testing.assert_allclose(stance_angles(robot), stance_angles(bhr), atol=1e-12)
+
+
+def test_held_joints_move_their_links(tmp_path):
+    """A waist held at -0.1 rad: the chest's CoM is where Pinocchio puts it in the URDF as it was."""
+    urdf, _ = waist()
+    robot, model = load(tmp_path, waist), pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+    q = pin.neutral(model)
+    q[model.idx_qs[model.getJointId("waist")]] = -0.1
+    data = model.createData()
+    pin.centerOfMass(model, data, q)
+    trunk = data.oMi[model.getJointId("waist")]
+    ours = robot.model.createData()
+    np.testing.assert_allclose(
+        pin.centerOfMass(robot.model, ours, pin.neutral(robot.model)), trunk.actInv(data.com[0]), atol=1e-12
+    )
+    assert "waist" not in robot.joint_names
+
+
+@pytest.mark.parametrize("variant", [plain, waist, one_axis_ankle, held_arms], ids=lambda v: v.__name__)
+def test_engines_agree_on_the_lumped_robot(tmp_path, variant):
+    robot = load(tmp_path, variant)
+    with World(robot, pin.neutral(robot.model)) as world:  # raises unless PyBullet's mass is Pinocchio's
+        q, v = world.state()
+    np.testing.assert_allclose(q, pin.neutral(robot.model), atol=1e-12)
+    assert np.abs(v).max() == 0
+    base = robot.model.frames[2].name if robot.model.frames[1].name == "root_joint" else "trunk"
+    urdf = robot.urdf.replace(f'<link name="{base}">', FREE.format(base) + f'<link name="{base}">', 1)
+    there = mujoco.MjModel.from_xml_string(urdf)
+    assert sum(there.body_mass) == pytest.approx(robot.total_mass, abs=1e-9)
+    ours = robot.model.createData()
+    M = pin.crba(robot.model, ours, pin.neutral(robot.model))
+    data = mujoco.MjData(there)
+    mujoco.mj_forward(there, data)
+    full = np.zeros((there.nv, there.nv))
+    mujoco.mj_fullM(there, data, full)
+    columns = [there.jnt_dofadr[there.joint(n).id] for n in robot.joint_names]
+    np.testing.assert_allclose(np.diag(full)[columns], np.diag(M)[6:], atol=1e-9)
+
+
+def test_hips_bend_no_further_than_the_boxes_allow(tmp_path):
+    fat = config("fat") + "[shapes]\ntrunk_m = [[-0.15, 0.2, 0.14, 0.05, 0.75]]\n"
+    (tmp_path / "fat.toml").write_text(fat)
+    (tmp_path / "fat.urdf").write_text(text(root()))
+    robot = load_robot(str(tmp_path / "fat.toml"))
+    assert -1.6 < robot.sagittal.lower[0] < -0.3
+    assert robot.sagittal.lower[0] > load(tmp_path, plain).sagittal.lower[0]
+
+
+def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
+    (tmp_path / "s.urdf").write_text(text(root()))
+    (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
+    with pytest.raises(RobotError) as e:
+        load_robot(str(tmp_path / "s.toml"))
+    assert str(e.value) == (
+        "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
+        "start there: change [stance] in its configuration"
+    )
+
+
+def test_a_result_folder_reads_back_the_same_robot(tmp_path):
+    robot = load(tmp_path, mirrored)
+    assert Robot.from_text(robot.urdf, robot.config_text).hash == robot.hash
+    assert "[source]" not in robot.config_text
+
+
+def test_from_urdf_alone(tmp_path, bhr):
+    (tmp_path / "my.urdf").write_text(bhr.urdf)
+    robot = Robot.from_urdf(tmp_path / "my.urdf")
+    assert robot.joints == bhr.joints and robot.name == "bhr"
+    np.testing.assert_allclose(robot.sagittal.mass, bhr.sagittal.mass, atol=1e-12)
+    assert (robot.foot.heel, robot.foot.toe, robot.foot.sole_z) == pytest.approx((-0.1, 0.14, -0.075))
+
+
+# the chain ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
+@pytest.mark.parametrize("variant, target", [(mirrored, (0.6, 0.3)), (one_axis_ankle, (0.6, 0.3)),
+                                             (held_arms, (0.6, 0.3)), (child, (0.3, 0.2))],
+                         ids=["mirrored", "one-axis ankle", "held arms", "child"])  # fmt: skip
+def test_planned_clean_and_landed(tmp_path, variant, target):
+    plan = plan_jump(JumpTask(*target), load(tmp_path, variant))
+    report = audit(plan.tape, plan.robot, plan.task)
+    assert [c.name for c in report.checks if not c.passed] == []
+    result = simulate_jump(plan.tape, plan.robot, scene=Scene.of_plan(plan.summary, plan.robot)).to_json()
+    assert result["landed"], result["reason"]
+    assert result["foot_distance_m"] == pytest.approx(target[0], abs=0.01)
+
+
+@pytest.mark.slow
+def test_mirrored_axes_give_the_same_plan(tmp_path):
+    a, b = (plan_jump(JumpTask(0.5, 0.3), load(tmp_path, v), method="direct") for v in (plain, mirrored))
+    assert a.statistics[0].iterations == b.statistics[0].iterations
+    np.testing.assert_allclose(a.tape.extra["planar_angles"], b.tape.extra["planar_angles"], atol=1e-9)
+    knee = list(a.tape.joint_names).index("right_knee")
+    np.testing.assert_allclose(a.tape.q[:, 7 + knee], -b.tape.q[:, 7 + knee], atol=1e-9)
+
+
+# configurations that cannot be meant ----------------------------------------------------------------------------
+def heavier_left() -> str:
+    robot = root()
+    link(robot, "left_shank").find("inertial/mass").set("value", "3.01")
+    return text(robot)
+
+
+def wider_left() -> str:
+    robot = root()
+    joint(robot, "left_hip_yaw").find("origin").set("xyz", "0.05 0.1 -0.43")
+    return text(robot)
+
+
+def prismatic() -> str:
+    robot = root()
+    joint(robot, "left_knee").set("type", "prismatic")
+    return text(robot)
+
+
+REFUSED = [
+    (text(root()), config("x", trunk="pelvis"),
+     "my.urdf: the configuration names the link 'pelvis', which the URDF lacks"),
+    (text(root()), config("x", forward="ahead"),
+     "robot configuration: 'source.forward' = 'ahead' must be one of +x -x +y -y +z -z"),
+    (text(root()), config("x", forward="+z"), "robot configuration: forward +z and up +z must be different axes"),
+    (text(root()), config("x").replace("repair = []", 'repair = ["all"]'),
+     "robot configuration: 'source.repair' knows inertia, massless, symmetry, got 'all'"),
+    (text(root()), config("x") + "[locked]\nneck = 0.1\n",
+     "my.urdf: [locked] names the joint 'neck', which the URDF lacks"),
+    (text(root()), config("x") + '[locked]\nleft_knee = "bent"\n',
+     "robot configuration: 'locked.left_knee' = 'bent', must be a finite number"),
+    (text(root()), config("x") + "[limits.neck]\neffort = 1.0\n",
+     "my.urdf: [limits.neck] names neither a joint of the URDF nor a role"),
+    (text(root()), config("x") + "[limits.knee]\ntorque = 1.0\n",
+     "robot configuration: 'limits.knee' may hold lower, upper, effort, velocity, got {'torque': 1.0}"),
+    (text(root()), config("x") + "[limits.knee]\neffort = -1.0\n",
+     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell it in "
+     "[limits.knee] of the configuration"),
+    (text(root()), config("x") + "[shapes]\ntrunk_m = [[1.0, 0.0, 0.1, 0.0, 1.0]]\n",
+     "robot configuration: 'shapes.trunk_m' = [[1.0, 0.0, 0.1, 0.0, 1.0]] must be a list of [rear, front, half width, "
+     "bottom, top]"),
+    (text(root()), config("x") + "[shapes]\ntrunk_m = []\n",
+     "robot configuration: 'shapes.trunk_m' = [] must be a list of [rear, front, half width, bottom, top]"),
+    (text(root()), config("x") + "[shapes]\nthigh_thickness_m = 0.0\n",
+     "robot configuration: 'shapes.thigh_thickness_m' = 0 must be positive"),
+    (text(root()), config("x", toe=-0.05),
+     "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
+     "sides of it; correct [feet]"),
+    (text(root()), config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
+     "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
+     "links or their order left, right"),
+    (text(root()), config("x").replace('knee = ["left_knee"', 'knee = ["left_hip_yaw"'),
+     "my.urdf: between 'trunk' and 'left_foot' come left_hip_yaw, left_hip_pitch, left_ankle_pitch; hip, knee and "
+     "ankle must follow in this order; correct [joints]"),
+    (text(root()), config("x").replace('links = ["left_foot", "right_foot"]', 'links = ["left_foot", "left_foot"]'),
+     "my.urdf: the role joint 'right_hip_pitch' is not between 'trunk' and the foot 'left_foot'; correct [joints], "
+     "[feet] links or their order left, right"),
+    (heavier_left(), config("x"),
+     "my.urdf: left and right differ by 0 mm at 'trunk' and 0.333 % of mass or inertia at 'left_shank'; allow their "
+     'mean with [source] repair = ["symmetry"]'),
+    (wider_left(), config("x"),
+     "my.urdf: left and right differ by 50.0 mm at 'left_hip_yaw_link', at most 15 mm and 10 % can be evened out; a "
+     "symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"),
+    (prismatic(), config("x"),
+     "my.urdf: joint 'left_knee' has a role, but is prismatic; it must be revolute with a motor of its own"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("urdf", "toml", "sentence"), REFUSED, ids=range(len(REFUSED)))
+def test_what_cannot_be_meant_is_refused(urdf, toml, sentence):
+    assert broken(urdf, toml) == sentence
+
+
+def test_symmetry_is_restored_on_request():
+    toml = read_toml(config("x").replace("repair = []", 'repair = ["symmetry"]'), "config")
+    jumper = make_jumper(heavier_left(), toml, "my.urdf")
+    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]
+    assert masses == pytest.approx([3.005, 3.005], abs=1e-12)
+    assert robot.total_mass == pytest.approx(42.01, abs=1e-9)
+    assert jumper.lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)

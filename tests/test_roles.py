@@ -1,0 +1,191 @@
+"""Roles found by motion, and legs that are no legs."""
+
+import random
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
+
+from jumplab.errors import RobotError
+from jumplab.robot.checkup import check, draft
+from jumplab.robot.roles import find_roles
+from jumplab.robot.soles import find_sole
+from jumplab.robot.starter import starter
+from jumplab.robot.tree import Tree, repaired
+
+LEGS = {
+    "hip_pitch": ("left_hip_pitch", "right_hip_pitch"),
+    "knee": ("left_knee", "right_knee"),
+    "ankle_pitch": ("left_ankle_pitch", "right_ankle_pitch"),
+}
+
+
+def tree(robot: ET.Element) -> Tree:
+    return Tree(robot, "my.urdf")
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.__name__)
+def test_roles_of_every_variant(variant):
+    roles = find_roles(tree(ET.fromstring(variant()[0])))
+    assert {k: v for k, v in roles.joints.items() if k != "shoulder_pitch"} == LEGS
+    last = "ankle_link" if variant is one_axis_ankle else "foot"  # the foot is then fixed to it
+    assert roles.feet == (f"left_{last}", f"right_{last}") and roles.trunk == "trunk"
+    assert (roles.forward, roles.up) == ("+x", "+z")
+
+
+def test_names_do_not_matter():
+    robot = root()
+    for i, element in enumerate(robot.findall("joint")):
+        element.set("name", f"j{i}")
+    roles = find_roles(tree(robot))
+    assert roles.joints["knee"] == tuple(
+        j.get("name") for j in robot.findall("joint") if j.find("child").get("link") in ("left_shank", "right_shank")
+    )
+
+
+def test_a_robot_that_looks_the_other_way():
+    """Knees that bend about -y make -x the front, and the right side the left."""
+    robot = root()
+    for side in ("left", "right"):
+        for name in ("hip_pitch", "knee", "ankle_pitch"):
+            j = joint(robot, f"{side}_{name}")
+            j.find("axis").set("xyz", "0 -1 0")
+    roles = find_roles(tree(robot))
+    assert roles.forward == "-x" and roles.joints["knee"] == ("right_knee", "left_knee")
+    assert any("backwards" in note for note in roles.notes)  # the toes still point along +x
+
+
+def test_canted_shoulders_are_held_and_said():
+    robot = root()
+    for side, sign in (("left", 1), ("right", -1)):
+        joint(robot, f"{side}_shoulder_pitch").find("axis").set("xyz", f"0 0.9613 {sign * 0.2756}")
+    roles = find_roles(tree(robot))
+    assert roles.joints["shoulder_pitch"] == ()
+    assert roles.notes[0].startswith("the arms are held: the first joint, 'right_shoulder_pitch', turns 16.0 deg off")
+
+
+def with_knee(kind: str) -> ET.Element:
+    robot = root()
+    for side in ("left", "right"):
+        joint(robot, f"{side}_knee").set("type", kind)
+    return robot
+
+
+def with_mimic() -> ET.Element:
+    robot = root()
+    for side in ("left", "right"):
+        ET.SubElement(joint(robot, f"{side}_knee"), "mimic", joint=f"{side}_hip_pitch")
+    return robot
+
+
+def one_leg() -> ET.Element:
+    robot, drop = root(), ["right_hip_yaw"]
+    for name in drop:
+        j = joint(robot, name)
+        child = j.find("child").get("link")
+        robot.remove(j), robot.remove(link(robot, child))
+        drop += [x.get("name") for x in robot.findall("joint") if x.find("parent").get("link") == child]
+    return robot
+
+
+def no_knees() -> ET.Element:
+    robot = with_knee("fixed")
+    for side in ("left", "right"):
+        j = joint(robot, f"{side}_knee")
+        j.remove(j.find("axis"))
+    return robot
+
+
+PLACE = "but has the place of a knee, which must be revolute with a range and a motor of its own"
+SENTENCES = [
+    (with_knee("fixed"), f"my.urdf: joint 'right_knee' is of type 'fixed', {PLACE}"),
+    (with_knee("continuous"), f"my.urdf: joint 'right_knee' is of type 'continuous', {PLACE}"),
+    (with_knee("prismatic"), f"my.urdf: joint 'right_knee' is of type 'prismatic', {PLACE}"),
+    (with_mimic(), f"my.urdf: joint 'right_knee' mimics 'right_hip_pitch', {PLACE}"),
+    (one_leg(), "my.urdf: one leg only: the chain that ends with joint 'left_ankle_roll' has no mirror image among 9 "
+                "links; a jumper needs two legs"),
+    (no_knees(), "my.urdf: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was found; the "
+                 "most on one chain about +-y are 2 ('left_hip_pitch', 'left_ankle_pitch')"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("robot", "sentence"), SENTENCES, ids=["fixed", "continuous", "prismatic", "mimic", "one", "none"]
+)
+def test_legs_that_are_no_legs(robot, sentence):
+    with pytest.raises(RobotError) as e:
+        find_roles(tree(robot))
+    assert str(e.value) == sentence
+
+
+def test_sole_from_boxes_spheres_or_nothing():
+    robot = root()
+    box = find_sole(tree(robot), "left_foot", np.eye(3), 0.7)
+    assert (*box.x, *box.y, box.z) == pytest.approx((-0.1, 0.14, -0.05, 0.05, -0.075)) and box.source == "from its box"
+    foot = link(robot, "left_foot")
+    for shape in foot.findall("collision"):
+        foot.remove(shape)
+    guess = find_sole(tree(robot), "left_foot", np.eye(3), 0.7)
+    assert guess.source.startswith("GUESSED") and guess.z == pytest.approx(-0.075, abs=1e-3)
+    for x in (-0.05, 0.12):
+        for y in (-0.03, 0.03):
+            shape = ET.SubElement(foot, "collision")
+            ET.SubElement(shape, "origin", xyz=f"{x} {y} -0.06")
+            ET.SubElement(ET.SubElement(shape, "geometry"), "sphere", radius="0.005")
+    ball = find_sole(tree(robot), "left_foot", np.eye(3), 0.7)
+    assert (*ball.x, *ball.y, ball.z) == pytest.approx((-0.055, 0.125, -0.035, 0.035, -0.065))
+
+
+def test_starter_is_a_configuration():
+    text_, roles, _ = starter(tree(root()), "C:\\robots\\my.urdf", "my", ("symmetry",))
+    import tomllib
+
+    found = tomllib.loads(text_)
+    assert found["joints"]["knee"] == list(roles.joints["knee"]) and found["source"]["repair"] == ["symmetry"]
+
+
+def test_starter_stands_inside_the_ranges():
+    """Forearms that only bend forward, the other way round on the right side."""
+    import tomllib
+
+    robot = root()
+    for side, sign in (("left", 1), ("right", -1)):
+        j = joint(robot, f"{side}_shoulder_pitch")
+        j.find("axis").set("xyz", f"0 {sign} 0")
+        low, high = sorted((-2.3 * sign, 0.0 * sign))
+        j.find("limit").set("lower", str(low)), j.find("limit").set("upper", str(high))
+    stance = tomllib.loads(starter(tree(robot), "my.urdf", "my")[0])["stance"]
+    assert stance["shoulder_rad"] == pytest.approx(-0.15) and stance["knee_rad"] == pytest.approx(0.5)
+
+
+def test_repaired_inertia_is_that_of_a_solid():
+    for moments in ([1.0, 1.0, 10.0], [0.0, 0.0, 0.0], [-1.0, 2.0, 2.0]):
+        values = np.linalg.eigvalsh(repaired(np.diag(moments)))
+        assert values[0] > 0 and values[2] <= values[0] + values[1]
+    good = np.diag([1.0, 1.1, 1.2])
+    np.testing.assert_allclose(repaired(good), good)
+
+
+def test_damaged_files_never_end_in_a_traceback(tmp_path):
+    """Random damage to a good URDF: a robot or a sentence, nothing else."""
+    rng, values = (
+        random.Random(8),
+        ("", "nan", "-1", "0", "1e9", "abc", "1 2 3", "0 0 0", "fixed", "continuous", "trunk"),
+    )
+    path, outcomes = tmp_path / "my.urdf", set()
+    for _ in range(60):
+        robot = root()
+        for _ in range(rng.choice((1, 1, 2))):
+            parent, child = rng.choice([(a, b) for a in robot.iter() for b in a])
+            if rng.random() < 0.3 or not child.attrib:
+                parent.remove(child)
+            else:
+                child.set(rng.choice(sorted(child.attrib)), rng.choice(values))
+        path.write_text(ET.tostring(robot, encoding="unicode"))
+        try:
+            outcomes.add(check(path, draft(path).text).robot.name)
+        except RobotError as e:
+            assert "\n" not in str(e) and len(str(e)) < 500
+            outcomes.add("refused")
+    assert "refused" in outcomes and len(outcomes) > 1
