@@ -119,7 +119,7 @@ def test_commit_that_was_killed_is_completed_by_the_next_reader(bhr, tmp_path, m
 
     store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary())
     store.write_simulation(tmp_path, Result(), store.read_plan(tmp_path)[2])
-    monkeypatch.setattr(store.os, "replace", dying)
+    monkeypatch.setattr(os, "replace", dying)
     with pytest.raises(Killed):
         store.write_plan(tmp_path, make_tape(bhr, 1.0), bhr, make_summary(1.0), passport)
     monkeypatch.undo()
