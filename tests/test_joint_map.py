@@ -135,7 +135,8 @@ def test_launch_matrices_are_the_written_problem(steps):
         wrench = x.A_f @ F - B_f
         cost = w.com * cp.sum_squares(x.A_c @ acc + x.B_c - target.com_acceleration)
         cost += w.force * cp.sum_squares(wrench[:3]) + w.moment * cp.sum_squares(wrench[3:])
-        cost += w.inertia * cp.square(x.J_rho @ acc + x.drift_rho - target.inertia_accel)
+        follow = w.inertia_toe if target.on_toes else w.inertia
+        cost += follow * cp.square(x.J_rho @ acc + x.drift_rho - target.inertia_accel)
         cost += w.posture * cp.sum_squares(acc[6:] - target.joints) + w.trunk * cp.sum_squares(acc[3:6] - target.trunk)
         cost += w.wrench * cp.sum_squares(F) + w.acceleration * cp.sum_squares(acc)
         rows = [x.M[:6] @ acc + x.H[:6] == x.J[:, :6].T @ F, qp.S @ acc == target.symmetry]
