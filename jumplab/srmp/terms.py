@@ -12,7 +12,7 @@ from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
 from jumplab.transcription import chain
 
-CROUCH_SMOOTHING_M = 0.01  # our choice: the positive part of a depth, rounded over this much
+CROUCH_SMOOTHING_M = 0.02  # our choice: the positive part of a depth, rounded over this much
 QUARTERS = (0.25, 0.5, 0.75)
 GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
 
