@@ -146,6 +146,8 @@ def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> 
 def _limits(table: np.ndarray) -> dict[str, float]:
     """Limits of an axis: from zero, or around values that hardly differ."""
     values = table[np.isfinite(table)]
+    if len(values) and not values.any():
+        return {"bottom": 0.0, "top": 1.0}
     if len(values) and values.min() > ALIKE * values.max():
         return {"bottom": ALIKE * values.min(), "top": (2 - ALIKE) * values.max()}
     return {"bottom": 0.0}
