@@ -92,7 +92,7 @@ def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> li
 
     rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
     if not heel_up:
-        rows.append(Term("CoM easily low", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch))
+        rows.append(Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch))
         for name, at, room in (("CoM not too low", "node", height), ("CoM not too low (between)", "interval", between)):
             rows.append(Term(name, "ours: flat feet", "m", at, room, lower=0.0, upper=np.inf, scale=0.1))
     return rows
