@@ -133,7 +133,7 @@ def test_hermite_reproduces_quintics_and_cubics():
 
 def test_track_from_state_begins_there_and_joins():
     t = np.linspace(0, 0.6, 61)
-    track = Track.of(t, np.sin(t), np.cos(t)).from_state(t, 0.2, 0.5)
+    track = Track.of(t, np.sin(t), np.cos(t)).from_state(t, 0.2, 0.5, 0.15)
     assert track.value[0] == pytest.approx(0.2) and track.rate[0] == pytest.approx(0.5)
     np.testing.assert_allclose(track.value[20:], np.sin(t[20:]), atol=1e-12)
     np.testing.assert_allclose(np.cumsum(track.feed) * t[1] + 0.5, track.rate[1:], atol=1e-12)

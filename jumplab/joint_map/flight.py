@@ -8,7 +8,7 @@ import numpy as np
 
 from jumplab.joint_map.options import Options
 from jumplab.joint_map.problem import SIDES, JointRows, Layout, State, StepQp, accelerations
-from jumplab.joint_map.reference import FlightReference, Track
+from jumplab.joint_map.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.models.full import FullBody, FullTerms, skew
 
 
@@ -59,12 +59,12 @@ class FlightQp:
         pairs = ("hip",) if form.pairs == "hips" else ("hip", "knee", "ankle", "shoulder")
         self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
         self.com0, self.momentum0 = start.com, start.momentum
-        self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate)
+        self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
         wide = np.zeros((2, 3))
         wide[:, 1] = start.foot_com[:, 1]  # the feet keep their distance
         both = Track(reference.foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (reference.foot.rate,
                      reference.foot.feed)))  # (n + 1, 2, 3)  # fmt: skip
-        self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate)
+        self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
         self.layout = self._layout(pairs)
         self._fixed = self._fixed_rows()
 

@@ -168,7 +168,7 @@ class LaunchQp:
         b[3:9] = (
             half * self._roots * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
         )
-        root = np.sqrt(w.inertia)
+        root = np.sqrt(w.inertia_toe if target.on_toes else w.inertia)
         A[9, WRENCH:] = root * terms.J_rho
         b[9] = root * (target.inertia_accel - terms.drift_rho)
         b[lay.at("joints")] = np.sqrt(w.posture) * target.joints

@@ -42,7 +42,8 @@ class LaunchWeights:
     com: float = 3.0  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
     force: float = 3e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
     moment: float = 1.0  # [cost] / [N m]^2, angular rows of A_f F - B_f
-    inertia: float = 1e-4  # [cost] / [kg m^2/s^2]^2; not printed: without it take-off inertia is left to chance
+    inertia: float = 3e-3  # [cost] / [kg m^2/s^2]^2, feet flat; not printed: without it rho is left to chance
+    inertia_toe: float = 6e-5  # the same on the toes: more drives the ankle to its speed limit and costs take-off speed
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet

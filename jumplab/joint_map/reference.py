@@ -11,7 +11,8 @@ from jumplab.joint_map.options import Gain
 
 STEP_TOLERANCE = 1e-3  # our choice: relative unevenness above which the time axis counts as having a gap
 COP_AT_TOE_M = 0.015  # our choice: reference CoP this close to the toe edge counts as standing on the toes
-BLEND_S = 0.15  # our choice: a quarter of a flight; longer, and the rates of take-off carry the legs far off
+FOOT_BLEND_S = 0.15  # our choice: a quarter of a flight; longer, and the rates of take-off carry the legs far off
+INERTIA_BLEND_S = 0.08  # our choice: arms and trunk are quicker than legs; shorter, they are at their limits
 COM = {"com": 2, "com_velocity": 2, "com_acceleration": 2}
 INERTIA = {"rho": 1, "rho_rate": 1, "rho_accel": 1}
 NEEDED = {  # array -> columns
@@ -102,14 +103,14 @@ class Track:
         """Acceleration to ask for over step k, from value and rate at its start: feed-forward + PD."""
         return self.feed[k] + gain.damping * (self.rate[k] - rate) + gain.stiffness * (self.value[k] - value)
 
-    def from_state(self, t: np.ndarray, value, rate) -> Track:
-        """The same reference, but beginning at a given value and rate and joining it smoothly after :data:`BLEND_S`.
+    def from_state(self, t: np.ndarray, value, rate, blend_s: float) -> Track:
+        """The same reference, but beginning at a given value and rate and joining it smoothly after ``blend_s``.
 
         The quintic that carries the initial offset down to zero is added (our choice: SRMP's pivot stays on the ground
         while the robot's heel may be up at take-off, so the two can meet only in the air).
         """
         start = np.asarray(value) - self.value[0], np.asarray(rate) - self.rate[0]
-        zero, ends = np.zeros_like(start[0]), np.array([0.0, min(BLEND_S, t[-1])])
+        zero, ends = np.zeros_like(start[0]), np.array([0.0, min(blend_s, t[-1])])
         offset = [np.array([x, zero]) for x in (*start, zero)]
         fade = Track.of(t, *hermite(ends, *offset, np.minimum(t, ends[1])))
         return Track(*(getattr(self, f.name) + getattr(fade, f.name) for f in fields(self)))

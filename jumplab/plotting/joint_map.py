@@ -18,7 +18,6 @@ from jumplab.plotting.style import (
     LIMIT_STYLE,
     PAGE_IN,
     PHASE_COLORS,
-    PURPLE,
     REFERENCE_STYLE,
     bare,
     by_phase,
@@ -38,7 +37,7 @@ GAP_M = 0.12  # our choice: between launch and flight
 LEVEL_M = 1e-3  # a platform lower than this is none
 TEXT_M = 0.24  # room for the frames' times below the ground
 ALIKE = 0.9  # our choice: values closer than this ratio are drawn on an axis of their own instead of from zero
-START_COLORS = (LAUNCH, FLIGHT, PURPLE)
+START_COLORS = (LAUNCH, FLIGHT)  # in turn
 
 
 # Fig. 7 ---------------------------------------------------------------------------------------------------------
@@ -147,6 +146,8 @@ def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> 
 def _limits(table: np.ndarray) -> dict[str, float]:
     """Limits of an axis: from zero, or around values that hardly differ."""
     values = table[np.isfinite(table)]
+    if len(values) and not values.any():
+        return {"bottom": 0.0, "top": 1.0}
     if len(values) and values.min() > ALIKE * values.max():
         return {"bottom": ALIKE * values.min(), "top": (2 - ALIKE) * values.max()}
     return {"bottom": 0.0}
@@ -159,7 +160,7 @@ def _dots(ax: Axes, table: np.ndarray) -> None:
     for k, values in enumerate(table.T):
         color = START_COLORS[k % len(START_COLORS)]
         ax.plot(np.full(len(values), k), values, linestyle="none", marker="o", markersize=4, color=color,
-                markerfacecolor=tint(color, 0.5), zorder=2)  # fmt: skip
+                markerfacecolor=tint(color, 0.5), zorder=2, clip_on=False)  # fmt: skip
         if np.isfinite(values).any():
             middle = np.nanmedian(values)
             ax.plot([k - 0.25, k + 0.25], [middle, middle], color=INK, linewidth=2.0, zorder=3)

@@ -32,6 +32,7 @@ TOE_COM_X_M = (0.05, 0.25)  # our choice: where the CoM is while the heels are u
 TOE_HEEL_UP_RAD = 0.9  # our choice: as stage 3 allows
 EASY_ARM_RAD = 1.0  # our choice: arms that swing but do not reach
 LOW_COM_QUANTILE = 0.003  # our choice: not the deepest squat that exists
+EASY_COM_QUANTILE = 0.05  # our choice: below, hardly a posture keeps the hip off its stop
 FORCE_CAP = 1.5  # our choice: nearly straight legs carry any load; the fit shall not chase that
 SPEED_QUANTILE = 0.98  # our choice: as for the force; a good posture for extending the leg fast
 
@@ -49,7 +50,8 @@ class Reach:
     inertia_low_fit, inertia_high_fit, force_fit, speed_fit : polynomial coefficients over phi, highest power first.
     usual_flat_fit, usual_toe_fit : quadratic coefficients of the inertia that flat-footed and heel-up postures usually
         have at phi.
-    low_com_fit : (slope, offset) of the lowest easy CoM height over its x with flat feet [m].
+    low_com_fit, easy_com_fit : (slope, offset) of the lowest CoM height over its x with flat feet [m], and of the one
+        above which hip and ankle are away from their stops.
     inertia : overall (lower, upper) of the pitch inertia, in any reachable posture [kg m^2].
     internal_inertia : constant part rho_I [kg m^2].
     cop : (heel, toe) from the middle of the sole [m].
@@ -72,6 +74,7 @@ class Reach:
     usual_flat_fit: np.ndarray
     usual_toe_fit: np.ndarray
     low_com_fit: np.ndarray
+    easy_com_fit: np.ndarray
     inertia: tuple[float, float]
     internal_inertia: float
     cop: tuple[float, float]
@@ -119,11 +122,11 @@ def _usual_inertia(p: dict) -> np.ndarray:
     return np.polyfit(np.linalg.norm(p["com"][easy], axis=1), p["rho"][easy], 2)
 
 
-def _lowest_com(p: dict) -> np.ndarray:
-    """Straight line z = a x + b below which the CoM is hardly reachable with flat feet, highest power first."""
+def _lowest_com(p: dict, quantile: float) -> np.ndarray:
+    """Straight line z = a x + b below which only that share of flat-footed postures lies, highest power first."""
     x, z = p["com"].T
     edges = np.linspace(*FLAT_COM_X_M, 9)  # our choice: about 2 cm each
-    low = [np.quantile(z[(x >= a) & (x < b)], LOW_COM_QUANTILE) for a, b in pairwise(edges)]
+    low = [np.quantile(z[(x >= a) & (x < b)], quantile) for a, b in pairwise(edges)]
     return np.polyfit((edges[1:] + edges[:-1]) / 2, low, 1)
 
 
@@ -202,7 +205,8 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     return Reach(
         (float(low), float(high)), grid, lower, upper, strongest, fastest,
         *envelope, *(np.polyfit(grid, values, degree) for values, degree in curves),
-        _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat),
+        _usual_inertia(flat), _usual_inertia(toe), _lowest_com(flat, LOW_COM_QUANTILE),
+        _lowest_com(flat, EASY_COM_QUANTILE),
         (float(lower.min()), float(upper.max())), float(m.inertia.sum()), (-half, half), TRUNK_RAD, start,
         float(mass.sum()), _weakest(m, p, phi),
     )  # fmt: skip

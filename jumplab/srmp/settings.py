@@ -35,9 +35,10 @@ class SrmpSettings:
     w_velocity: float = 2.0  # SL-J2
     w_momentum_end: float = 0.01  # SL-J3
     w_momentum_rate: float = 2e-3  # SL-J3
-    w_usual_inertia: float = 20.0  # ours: inertia that postures of this leg length usually have
+    w_usual_inertia: float = 60.0  # ours: inertia that postures of this leg length usually have
+    w_deep_crouch: float = 3e4  # ours: depth below an easy crouch; deeper, the hip is at its stop and rho not free
     touchdown_inertia: tuple[float, float] = (-0.3, 0.5)  # around the usual inertia at the touchdown leg length
-    w_turn: float = 0.5  # SL-J4
+    w_turn: float = 5.0  # SL-J4
     w_time: float = 0.5  # SL-J5
     w_inertia_accel: float = 5e-4  # SF-J1; less leaves L undecided: 1e-4 lets it wander by 0.3 % with the mesh
     w_inertia_jerk: float = 1e-7  # SF-J1

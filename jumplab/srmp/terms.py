@@ -12,6 +12,7 @@ from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
 from jumplab.transcription import chain
 
+CROUCH_SMOOTHING_M = 0.02  # our choice: the positive part of a depth, rounded over this much
 QUARTERS = (0.25, 0.5, 0.75)
 GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
 
@@ -79,6 +80,11 @@ def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> li
         com = srmp_state(p, mass).com
         return com[1] - slope * com[0] - offset
 
+    def deep(p):
+        com = srmp_state(p, mass).com
+        below = ca.polyval(ca.DM(reach.easy_com_fit), com[0]) - com[1]
+        return (below + ca.sqrt(below**2 + CROUCH_SMOOTHING_M**2)) / 2
+
     def between(left, right, step):
         # the CoM only touches this limit, at the bottom of the crouch: with nodes alone it would pass between two
         inside = [chain(left.q, left.v, left.a, left.j, share * step)[0] for share in QUARTERS]
@@ -86,6 +92,7 @@ def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> li
 
     rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
     if not heel_up:
+        rows.append(Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch))
         for name, at, room in (("CoM not too low", "node", height), ("CoM not too low (between)", "interval", between)):
             rows.append(Term(name, "ours: flat feet", "m", at, room, lower=0.0, upper=np.inf, scale=0.1))
     return rows
