@@ -51,7 +51,7 @@ class Table:
 
 
 def table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | Mapping[str, str] | None = None, *,
-          digits: int = 4) -> Table:  # fmt: skip
+          digits: int = 4, decimals: int | None = None) -> Table:  # fmt: skip
     """Rows of named values as a :class:`Table`.
 
     Parameters
@@ -60,12 +60,14 @@ def table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | Mapping[st
     columns : which keys, in which order; a mapping also renames them ("key": "heading"); None takes those of the first
         row.
     digits : significant digits of numbers.
+    decimals : places after the point instead, the same for every number that is not whole by its type; for tables of
+        quantities of one size, where 1.000 beside 0.997 should not shrink to 1.
     """
     rows = [dict(r) for r in rows]
     if columns is None:
         columns = list(rows[0]) if rows else []
     names = dict(columns) if isinstance(columns, Mapping) else {c: c for c in columns}
-    cells = [tuple(_text(r.get(key), digits) for key in names) for r in rows]
+    cells = [tuple(_text(r.get(key), digits, decimals) for key in names) for r in rows]
     right = tuple(bool(rows) and all(_number(r.get(key)) or r.get(key) is None for r in rows) for key in names)
     return Table(tuple(names.values()), tuple(cells), right)
 
@@ -74,7 +76,7 @@ def _number(x: Any) -> bool:
     return isinstance(x, int | float | np.integer | np.floating) and not isinstance(x, bool)
 
 
-def _text(x: Any, digits: int) -> str:
+def _text(x: Any, digits: int, decimals: int | None) -> str:
     if x is None:
         return ""
     if isinstance(x, bool | np.bool_):
@@ -82,5 +84,6 @@ def _text(x: Any, digits: int) -> str:
     if isinstance(x, int | np.integer):
         return str(int(x))
     if _number(x):
-        return f"{float(x):.{digits}g}" if math.isfinite(x) else "—"
+        form = f".{digits}g" if decimals is None else f".{decimals}f"
+        return f"{float(x):{form}}" if math.isfinite(x) else "—"
     return str(x)
