@@ -35,7 +35,7 @@ HEADING = "## Differences from the paper"
 # ---------------------------------------------------------------------------------------------- verdicts
 
 
-def judge(claim: str, ok: bool | None, measured: str, where: str, *, changed: bool = False) -> dict[str, str]:
+def judge(claim: str, ok: bool | None, measured: str, where: str, change: str = "") -> dict[str, str]:
     """One line of the table of claims.
 
     Parameters
@@ -44,7 +44,7 @@ def judge(claim: str, ok: bool | None, measured: str, where: str, *, changed: bo
     ok : whether the measurement agrees; None if nothing here can tell.
     measured : the numbers, with units.
     where : notebook that shows it at length.
-    changed : agrees only after something was read or done differently.
+    change : what was read, done or found differently, where that is part of the verdict.
 
     Raises
     ------
@@ -55,9 +55,11 @@ def judge(claim: str, ok: bool | None, measured: str, where: str, *, changed: bo
         if not (isinstance(text, str) and text.strip()):
             raise InputError(f"{name} of a claim must be a text, got {said(text)}; say what was measured and where")
     if ok is not None and not isinstance(ok, bool | np.bool_):
-        raise InputError(f"verdict of a claim must be True, False or None, got {said(ok)}; compare the number with a limit")
-    verdict = OPEN if ok is None else FAILS if not ok else CHANGED if changed else HOLDS
-    return {"claim": claim, "verdict": verdict, "measured": measured, "where": where}
+        raise InputError(
+            f"verdict of a claim must be True, False or None, got {said(ok)}; compare the number with a limit"
+        )
+    verdict = OPEN if ok is None else FAILS if not ok else CHANGED if change else HOLDS
+    return {"claim": claim, "verdict": verdict, "measured": measured, "change": change, "where": where}
 
 
 # ---------------------------------------------------------------------------------------------- measurements
@@ -80,7 +82,7 @@ def standing_height_m(robot: Robot) -> float:
 
 
 def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[str, float]:
-    """Largest differences of the five-link from the nine-link model over random motions alike on both sides (Sec. II-C).
+    """Largest differences of the five-link from the nine-link model over random symmetric motions (Sec. II-C).
 
     Returns
     -------
@@ -151,9 +153,7 @@ def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
     return rows
 
 
-def _from_start(
-    name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner
-) -> Start:
+def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner) -> Start:
     began = time.process_time()
     guess = None  # the planner's own: four postures joined by straight lines
     if name == "stage 2":

@@ -14,18 +14,24 @@ from jumplab.task import JumpTask
 
 
 @pytest.mark.parametrize(
-    ("ok", "changed", "verdict"),
+    ("ok", "change", "verdict"),
     [
-        (True, False, "holds"),
-        (np.bool_(True), True, "holds with a change"),
-        (False, False, "does not hold"),
-        (False, True, "does not hold"),
-        (None, False, "cannot be checked here"),
+        (True, "", "holds"),
+        (np.bool_(True), "half of it", "holds with a change"),
+        (False, "", "does not hold"),
+        (False, "half of it", "does not hold"),
+        (None, "", "cannot be checked here"),
     ],
 )
-def test_verdict_follows_the_measurement(ok, changed, verdict):
-    row = judge("it jumps", ok, "1.0 m", "00_overview", changed=changed)
-    assert row == {"claim": "it jumps", "verdict": verdict, "measured": "1.0 m", "where": "00_overview"}
+def test_verdict_follows_the_measurement(ok, change, verdict):
+    row = judge("it jumps", ok, "1.0 m", "00_overview", change)
+    assert row == {
+        "claim": "it jumps",
+        "verdict": verdict,
+        "measured": "1.0 m",
+        "change": change,
+        "where": "00_overview",
+    }
 
 
 @pytest.mark.parametrize(
@@ -97,7 +103,9 @@ HEAD = "## Differences from the paper\n\n| the paper says | we do | because | ef
 
 
 def test_readings_are_gathered_in_order(tmp_path):
-    first = write(tmp_path / "00_a.ipynb", "# Title\n\n| a | b |\n|---|---|\n| 1 | 2 |", HEAD + "| x | y | z | |\n\n## Versions")
+    first = write(
+        tmp_path / "00_a.ipynb", "# Title\n\n| a | b |\n|---|---|\n| 1 | 2 |", HEAD + "| x | y | z | |\n\n## Versions"
+    )
     second = write(tmp_path / "01_b.ipynb", f"text\n\n{HEAD}| $\\|A\\|$ | b | c | d |\n| e | f | g | h |")
     none = write(tmp_path / "02_c.ipynb", "# nothing here")
     rows = readings([first, str(second), none])
@@ -115,7 +123,10 @@ def test_readings_are_gathered_in_order(tmp_path):
     ("source", "sentence"),
     [
         (HEAD + "| a | b | c |", "00_a.ipynb: the row '| a | b | c |' of its differences from the paper has 3 columns"),
-        (HEAD.replace("effect", "so"), "00_a.ipynb: its differences from the paper have the columns the paper says, we do, because, so;"),
+        (
+            HEAD.replace("effect", "so"),
+            "00_a.ipynb: its differences from the paper have the columns the paper says, we do, because, so;",
+        ),
     ],
 )
 def test_broken_tables_are_named(tmp_path, source, sentence):
