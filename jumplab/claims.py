@@ -236,7 +236,9 @@ def _lines(path: Path) -> list[str]:
 
 
 def readings_markdown(rows: Iterable[dict[str, str]]) -> str:
-    """The rows of :func:`readings` as one Markdown table."""
-    columns = ("notebook", *READINGS)
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    return "\n".join([*lines, *(f"| {' | '.join(r[c] for c in columns)} |" for r in rows)])
+    """The rows of :func:`readings` as one Markdown table, whose first column leads to the notebooks beside it."""
+    lines = [f"| {' | '.join(('notebook', *READINGS))} |", "|---" * (1 + len(READINGS)) + "|"]
+    for row in rows:
+        name = row["notebook"]
+        lines.append(f"| [{name}]({name}.ipynb) | {' | '.join(row[c] for c in READINGS)} |")
+    return "\n".join(lines)

@@ -116,7 +116,7 @@ def test_readings_are_gathered_in_order(tmp_path):
     ]
     lines = readings_markdown(rows).splitlines()
     assert lines[:2] == ["| notebook | the paper says | we do | because | effect |", "|---|---|---|---|---|"]
-    assert lines[3] == r"| 01_b | $\|A\|$ | b | c | d |"
+    assert lines[3] == r"| [01_b](01_b.ipynb) | $\|A\|$ | b | c | d |"
 
 
 @pytest.mark.parametrize(
