@@ -1,14 +1,20 @@
-"""Every public name has a docstring, and nothing has grown beyond what one reads in one go."""
+"""Every public name has a docstring, nothing is longer than what one reads in one go, the README leaves nothing out."""
 
 import ast
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from jumplab import __main__ as command_line
+from jumplab import notebooks
+from jumplab.commands import COMMANDS
+
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 FUNCTION_LINES, MODULE_LINES, CELL_LINES = 60, 350, 25
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -62,6 +68,31 @@ def test_code_cells_are_short(path):
     cells = ["".join(c["source"]) for c in json.loads(path.read_text())["cells"] if c["cell_type"] == "code"]
     lengths = [len(source.splitlines()) for source in cells]
     assert max(lengths) <= CELL_LINES, lengths
+
+
+def everything_said(parser):
+    """Help of a command and of those below it."""
+    below = [p for a in parser._actions if isinstance(a.choices, dict) for p in a.choices.values()]
+    return parser.format_help() + "".join(map(everything_said, below))
+
+
+def test_readme_knows_every_notebook_and_command():
+    """And nothing that is not there: files that it links or names in code, commands with options that exist."""
+    assert {p.stem for p in NOTEBOOKS} == set(re.findall(r"^\| `(\d\d_\w+)` \|", README, re.M))
+    lines = re.findall(r"^jumplab (\w+) +(.*?) *(?:#.*)?$", README, re.M)
+    assert {name for name, _ in lines} == {c.__name__.rpartition(".")[2] for c in COMMANDS}
+    commands = next(a for a in command_line._parser()._actions if a.dest == "command").choices
+    for name, options in lines:
+        for option in re.findall(r"--[\w-]+", options):
+            assert option in everything_said(commands[name]), (name, option)
+
+
+def test_readme_points_at_files_that_exist():
+    named = re.findall(r"\]\(([^):]+)\)", README) + re.findall(
+        r"`((?:jumplab|notebooks|tests|figures)/[\w./]*)`", README
+    )
+    named += ["CITATION.cff", "LICENSE", "CHANGELOG.md", ".pre-commit-config.yaml", ".ci/run"]
+    assert len(named) > 8 and all((ROOT / name).exists() for name in named), named
 
 
 def test_these_checks_can_fail():
