@@ -1,0 +1,1 @@
+"""A humanoid robot jumps: planned by three chained optimisations, audited, simulated, and drawn."""

@@ -113,7 +113,8 @@ def write_plan(
 class Simulation(Protocol):
     """What :func:`write_simulation` needs of a simulation's result."""
 
-    def save(self, folder: Path, extra: dict | None = None) -> None: ...
+    def save(self, folder: Path, extra: dict | None = None) -> None:
+        """Write both files, with further entries for the second one."""
 
 
 def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[str, Any]) -> None:

@@ -14,7 +14,8 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from jumplab.terms import Phase, Point, Problem, Term
+from jumplab.layout import PhaseLayout
+from jumplab.terms import Point, Problem, Term
 
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
 
@@ -22,50 +23,6 @@ END_OF_PHASE = 1e-9  # share of a phase, far below one interval
 def chain(q, v, a, j, h):
     """Exact triple-integrator step of length ``h`` under constant jerk: new (q, v, a)."""
     return q + h * v + h * h / 2 * a + h**3 / 6 * j, v + h * a + h * h / 2 * j, a + h * j
-
-
-@dataclass(frozen=True)
-class PhaseLayout:
-    """Where the variables of one phase stand in the decision vector."""
-
-    phase: Phase
-    first: int  # index of the duration
-
-    @property
-    def nq(self) -> int:
-        return len(self.phase.coordinates)
-
-    @property
-    def nz(self) -> int:
-        return len(self.phase.states)
-
-    @property
-    def n_const(self) -> int:
-        return 1 + len(self.phase.constants)
-
-    @property
-    def stride(self) -> int:
-        return 4 * self.nq + self.nz  # state, further states, jerk
-
-    @property
-    def size(self) -> int:
-        return self.n_const + self.phase.intervals * self.stride + 3 * self.nq + self.nz
-
-    def constants(self) -> np.ndarray:
-        return self.first + np.arange(self.n_const)
-
-    def node(self, k: int) -> np.ndarray:
-        return self.first + self.n_const + k * self.stride + np.arange(3 * self.nq + self.nz)
-
-    def jerk(self, k: int) -> np.ndarray:
-        return self.first + self.n_const + k * self.stride + 3 * self.nq + self.nz + np.arange(self.nq)
-
-    def node_scales(self) -> np.ndarray:
-        p = self.phase
-        return np.concatenate([p.scale(k, self.nq) for k in "qva"] + [p.scale("z", self.nz)])
-
-    def constant_scales(self) -> np.ndarray:
-        return np.array([1.0, *(c[2] for c in self.phase.constants.values())])
 
 
 @dataclass(frozen=True)

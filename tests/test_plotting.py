@@ -291,6 +291,8 @@ def test_table_as_text_and_html():
     html = shown._repr_html_()
     assert "&lt;a&gt;" in html and html.count("<tr>") == 3 and 'text-align:right">1.23<' in html
     assert str(plotting.table([])) == "\n"
+    places = plotting.table([{"x": 1.0, "n": 3}, {"x": -0.0004, "n": None}, {"x": float("inf")}], decimals=3)
+    assert [row[0] for row in places.rows] == ["1.000", "0.000", "—"] and places.rows[0][1] == "3"
     buffer = io.StringIO()
     print(plotting.table(iter(rows)), file=buffer)
     assert buffer.getvalue().startswith("name      x  n  ok")

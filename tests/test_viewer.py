@@ -76,7 +76,8 @@ def test_page_needs_nothing_outside_itself(page):
     parser.feed(page.html)
     assert parser.found == [] and not {"link", "iframe", "img", "base", "object", "embed"} & set(parser.tags)
     assert set(re.findall(r"https?://[^\s\"'`<>\\]+", page.html)) == {"http://www.w3.org/1999/xhtml"}  # a name space
-    assert "@import" not in page.html and "cdn" not in page.html.lower().replace("cdnumber", "")
+    text = re.sub(r"[A-Za-z0-9+/=]{200,}", "", page.html).lower()  # without encoded poses, where any word may appear
+    assert "@import" not in text and "cdn" not in text.replace("cdnumber", "")
     assert page.html.count("</script>") == 2 and len(page.html) < 3e6
 
 

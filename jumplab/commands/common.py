@@ -19,7 +19,7 @@ def common_options() -> argparse.ArgumentParser:
 
 
 def robot_option() -> argparse.ArgumentParser:
-    """``--robot``."""
+    """The option ``--robot``."""
     robot = argparse.ArgumentParser(add_help=False)
     robot.add_argument(
         "--robot", default="bhr", help="shipped robot (see 'jumplab robot list') or path of a robot's TOML file"

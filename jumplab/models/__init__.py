@@ -1,0 +1,1 @@
+"""The models of the three stages: reaction mass pendulum, five links in the plane, nine links in space."""

@@ -102,7 +102,7 @@ class Replay:
 
     @property
     def gravity(self) -> float:
-        """[m/s^2]."""
+        """Gravity of the replayed model, positive [m/s^2]."""
         return float(-self.model.gravity.linear[2])
 
     @cached_property

@@ -120,10 +120,18 @@ def contact_comparison(reactions: Mapping[str, Mapping[str, np.ndarray]], robot:
     heel = robot.sagittal.heel[0]
     last = max(float(r["t"][-1]) for r in reactions.values())
     bottom.fill_between([0, last], 100 * heel, 0.0, color=tint("#999999", 0.18), linewidth=0)
-    for bound, name, va in ((heel, "heel", "top"), (0.0, "toe", "bottom")):
+    for bound, name in ((heel, "heel"), (0.0, "toe")):
         bottom.axhline(100 * bound, **LIMIT_STYLE)
-        offset = (2, 2 if va == "bottom" else -2)
-        bottom.annotate(name, (0, 100 * bound), offset, textcoords="offset points", fontsize=7, color="#666666", va=va)
+        bottom.annotate(
+            name,
+            (1, 100 * bound),
+            (3, 0),
+            xycoords=bottom.get_yaxis_transform(),
+            fontsize=7,
+            textcoords="offset points",
+            color="#666666",
+            va="center",
+        )  # beside the axes: no curve there
     for k, (name, r) in enumerate(reactions.items(), start=1):
         color = LAUNCH if k == len(reactions) else VERMILION
         top.plot(r["t"], 100 * r["heel_z"], color=color, label=name)

@@ -84,6 +84,6 @@ def _text(x: Any, digits: int, decimals: int | None) -> str:
     if isinstance(x, int | np.integer):
         return str(int(x))
     if _number(x):
-        form = f".{digits}g" if decimals is None else f".{decimals}f"
+        form = f".{digits}g" if decimals is None else f"z.{decimals}f"  # z: no minus before a zero
         return f"{float(x):{form}}" if math.isfinite(x) else "—"
     return str(x)

@@ -99,7 +99,8 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
                     flight.constants["leg"])  # fmt: skip
 
 
-def launch_function(mass, gravity):
+def launch_function(mass: float, gravity: float) -> ca.Function:
+    """The pendulum's CoM, momentum, inertia (each with rates), ground force and pivot torque from (q, v, a), 4 each."""
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
     s = SrmpState(mass, q, v, a, gravity)
     return ca.Function("srmp", [q, v, a], [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum,

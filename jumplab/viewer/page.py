@@ -99,7 +99,6 @@ def page(
     marks = [toe, toe + task.distance_m] if task else [toe]
     span = min(start, *marks) - AHEAD_M, max(end, *marks) + AHEAD_M
     stage.lay_ground(vis, scene, span, marks)
-    top = max(float(m.q[:, 2].max()) for m in motions.values()) + ABOVE_M
     facts: dict[str, Any] = {  # what player.js reads
         "title": describe_task(task) if task else "A jump",
         "note": f"robot {robot.name}, {robot.total_mass:.0f} kg · {fps:g} frames per second",
@@ -108,7 +107,7 @@ def page(
         "ruler": _ruler(scene, span, toe),
         "view": {
             "x": span,
-            "z": [min(0.0, _floor(scene, span)) - stage.TRACK_DEPTH_M, top],
+            "z": _heights(scene, span, motions),
             "width": 2 * stage.TRACK_HALF_WIDTH_M,
         },
         "colors": {
@@ -146,8 +145,11 @@ def _ruler(scene: Scene, span: tuple[float, float], zero: float) -> list[dict[st
     return [{"at": [x, front, scene.top_at(x)], "text": text} for x, text in places]
 
 
-def _floor(scene: Scene, span: tuple[float, float]) -> float:
-    return min((b.top for b in scene.blocks if b.x_from < span[1] and b.x_to > span[0]), default=0.0)
+def _heights(scene: Scene, span: tuple[float, float], motions: Mapping[str, Motion]) -> list[float]:
+    """What the view must show: from below the lowest ground to above the highest base [m]."""
+    low = min((b.top for b in scene.blocks if b.x_from < span[1] and b.x_to > span[0]), default=0.0)
+    high = max(float(m.q[:, 2].max()) for m in motions.values())
+    return [min(0.0, low) - stage.TRACK_DEPTH_M, high + ABOVE_M]
 
 
 def _assemble(title: str, facts: Mapping[str, Any], commands: list[str]) -> str:

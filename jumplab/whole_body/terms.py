@@ -21,6 +21,7 @@ class WholeBodyTerms:
 
     # model on a point -------------------------------------------------------------------------------------------
     def state(self, p: Point) -> PlanarState:
+        """The five links at this point, rooted at the toe; made once per point."""
         if "state" not in p.memo:
             angles, rates, accels = p.q, p.v, p.a
             if p.q.numel() == 4:  # flat foot
@@ -29,28 +30,34 @@ class WholeBodyTerms:
         return p.memo["state"]
 
     def wrench(self, p: Point):
+        """The ground's wrench (3,): F_x, F_z [N], moment about the toe [N m]; made once per point."""
         if "wrench" not in p.memo:
             p.memo["wrench"] = self.state(p).ground_wrench()
         return p.memo["wrench"]
 
     def toe_acceleration(self, p: Point):
+        """Acceleration (x, z) of the toe in flight [m/s^2]: the CoM falls freely, the toe moves about it."""
         acc = self.state(p).com_acceleration
         return (-acc[0], -p.p.gravity - acc[1])
 
     def torques(self, p: Point, flying: bool):
+        """Joint torques (4,) of both sides together [N m]; made once per point."""
         if "torques" not in p.memo:
             toe = self.toe_acceleration(p) if flying else (0.0, 0.0)
             p.memo["torques"] = self.state(p).torques(toe)
         return p.memo["torques"]
 
     def ballistic_com(self, p: Point):
+        """Place of the CoM (2,) on its parabola [m]."""
         t = p.time
         return ca.vertcat(p.c.com_x + p.c.vel_x * t, p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2)
 
     def ballistic_velocity(self, p: Point):
+        """Velocity of the CoM (2,) on its parabola [m/s]."""
         return ca.vertcat(p.c.vel_x, p.c.vel_z - p.p.gravity * p.time)
 
     def toe(self, p: Point):
+        """Place of the toe (2,) in flight [m]: the parabola less the CoM from the toe."""
         return self.ballistic_com(p) - self.state(p).com
 
     def ground(self, p: Point, x):
@@ -59,6 +66,7 @@ class WholeBodyTerms:
 
     # terms ------------------------------------------------------------------------------------------------------
     def limits_of_joints(self, flying: bool) -> list[Term]:
+        """Range, speed, torque, and torque against speed of every joint; all ours."""
         m, lim = self.model, self.limits
         speed = lim.speed_share * m.speed
         slope = m.effort / (m.speed - m.corner_speed) * lim.torque_share
@@ -85,6 +93,7 @@ class WholeBodyTerms:
         return rows
 
     def smoothness(self, flying: bool) -> list[Term]:
+        """Costs on joint accelerations and jerk (WL-J2, WF-J2), and ours on torques."""
         w = self.weights
 
         def accelerations(p):
@@ -99,6 +108,7 @@ class WholeBodyTerms:
         ]
 
     def ground_contact(self) -> list[Term]:
+        """The ground only pushes, within the friction cone; the body stays clear of it. All ours."""
         mu, mg = self.limits.friction, self.mg
 
         def cone(p):
@@ -128,6 +138,7 @@ class WholeBodyTerms:
         return Term("body clearance", "ours", "m", "node", heights, lower=lim.hand_clearance_m, upper=np.inf, scale=0.1)
 
     def flat_rows(self) -> list[Term]:
+        """Foot flat: the CoP stays within the sole (SL-P2 for the whole body)."""
         heel, margin, mg = self.model.heel[0], self.limits.cop_margin_m, self.mg
 
         def cop(p):
@@ -143,6 +154,7 @@ class WholeBodyTerms:
         return rows
 
     def toe_rows(self) -> list[Term]:
+        """Heel up: the CoP is at the toe; at take-off no wrench is left, and the CoM has its vertical speed."""
         mg = self.mg
         return [
             Term("CoP at the toe", "ours: heel up", "N m", "node", lambda p: self.wrench(p)[2], scale=0.1 * mg,
@@ -176,6 +188,7 @@ class WholeBodyTerms:
         return rows
 
     def toe_tracking(self) -> list[Term]:
+        """Heel up: references as in :meth:`tracking`, a quiet heel (WL-J3), and stage 1's L at take-off (WL-D1)."""
         w, lim = self.weights, self.limits
 
         def momentum(p):
@@ -191,6 +204,7 @@ class WholeBodyTerms:
         ]  # fmt: skip
 
     def flight_rows(self) -> list[Term]:
+        """Flight: angular momentum stays (WF-D1), the sole clears the ground, the body too, and the touchdown."""
         lim, model = self.limits, self.model
 
         def l_rate(p):
@@ -212,6 +226,7 @@ class WholeBodyTerms:
         return [*rows, self.body_clearance(True), *self.touchdown_rows()]
 
     def touchdown_rows(self) -> list[Term]:
+        """Touchdown: place, posture and rates of the landing, and the window in which the robot can be caught."""
         lim, model = self.limits, self.model
         sole = model.point_arms(0, model.sole_center)
 

@@ -1,0 +1,103 @@
+"""Every public name has a docstring, nothing is longer than what one reads in one go, the README leaves nothing out."""
+
+import ast
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from jumplab import __main__ as command_line
+from jumplab import notebooks
+from jumplab.commands import COMMANDS
+
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+FUNCTION_LINES, MODULE_LINES, CELL_LINES = 60, 350, 25
+FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def short(path):
+    return str(path.relative_to(ROOT))
+
+
+def public(node, prefix=""):
+    """(name, node) of every public class, function and method; what a function defines inside is its own business."""
+    for child in node.body:
+        if isinstance(child, FUNCTIONS | ast.ClassDef) and not child.name.startswith("_"):
+            yield prefix + child.name, child
+            if isinstance(child, ast.ClassDef):
+                yield from public(child, f"{prefix}{child.name}.")
+
+
+def overrides(node):
+    """A setter, or an overload: it is documented where it is defined first."""
+    return any(getattr(d, "attr", getattr(d, "id", "")) in ("setter", "overload") for d in node.decorator_list)
+
+
+def undocumented(tree):
+    """Names without a docstring of at least two words; "" is the module itself."""
+    nodes = [("", tree), *((name, node) for name, node in public(tree) if not overrides(node))]
+    return [name for name, node in nodes if len((ast.get_docstring(node) or "").split()) < 2]
+
+
+def long_functions(tree):
+    """Functions, methods and those inside them that are too long: name -> lines."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTIONS)]
+    lines = {node.name: node.end_lineno - node.lineno + 1 for node in functions}
+    return {name: n for name, n in lines.items() if n > FUNCTION_LINES}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=short)
+def test_public_names_are_documented(path):
+    missing = undocumented(ast.parse(path.read_text()))
+    assert not missing, f"{short(path)}: {', '.join(n or 'the module' for n in missing)}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=short)
+def test_functions_and_modules_are_short(path):
+    text = path.read_text()
+    assert not long_functions(ast.parse(text)), short(path)
+    assert len(text.splitlines()) <= MODULE_LINES, short(path)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=short)
+def test_code_cells_are_short(path):
+    cells = ["".join(c["source"]) for c in json.loads(path.read_text())["cells"] if c["cell_type"] == "code"]
+    lengths = [len(source.splitlines()) for source in cells]
+    assert max(lengths) <= CELL_LINES, lengths
+
+
+def everything_said(parser):
+    """Help of a command and of those below it."""
+    below = [p for a in parser._actions if isinstance(a.choices, dict) for p in a.choices.values()]
+    return parser.format_help() + "".join(map(everything_said, below))
+
+
+def test_readme_knows_every_notebook_and_command():
+    """And nothing that is not there: files that it links or names in code, commands with options that exist."""
+    assert {p.stem for p in NOTEBOOKS} == set(re.findall(r"^\| `(\d\d_\w+)` \|", README, re.M))
+    lines = re.findall(r"^jumplab (\w+) +(.*?) *(?:#.*)?$", README, re.M)
+    assert {name for name, _ in lines} == {c.__name__.rpartition(".")[2] for c in COMMANDS}
+    commands = next(a for a in command_line._parser()._actions if a.dest == "command").choices
+    for name, options in lines:
+        for option in re.findall(r"--[\w-]+", options):
+            assert option in everything_said(commands[name]), (name, option)
+
+
+def test_readme_points_at_files_that_exist():
+    named = re.findall(r"\]\(([^):]+)\)", README) + re.findall(
+        r"`((?:jumplab|notebooks|tests|figures)/[\w./]*)`", README
+    )
+    named += ["CITATION.cff", "LICENSE", "CHANGELOG.md", ".pre-commit-config.yaml", ".ci/run"]
+    assert len(named) > 8 and all((ROOT / name).exists() for name in named), named
+
+
+def test_these_checks_can_fail():
+    bad = '"""A module\'s docstring."""\nclass A:\n    """What A is for."""\n    def f(self):\n        pass\n'
+    bad += "    def _private(self):\n        pass\ndef g():\n    '''Short'''\n" + "    x = 1\n" * FUNCTION_LINES
+    tree = ast.parse(bad)
+    assert undocumented(tree) == ["A.f", "g"] and list(long_functions(tree)) == ["g"]
+    assert undocumented(ast.parse("x = 1")) == [""]
