@@ -40,8 +40,8 @@ HASHED = (PLAN, URDF, CONFIG)
 # Statements about one plan, which a new plan makes untrue and therefore removes.
 OF_SIMULATION = ("jump.html", "simulated_joints.csv", "simulated_motion.npz", "simulated_motion_clip.npz",
                  "simulated_replay")  # what a new simulation makes untrue  # fmt: skip
-DERIVED = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "plan.html",
-           "joints.csv", "motion.npz", "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
+DERIVED = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json",
+           "plan.html", "joints.csv", "motion.npz", "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
 PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
 LOCK_WAIT_S = 20.0  # our choice: a write lasts well under a second, so a longer wait means that something hangs
 _STAGING, _COMMIT = ".staging", ".commit"
@@ -299,11 +299,11 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
         result.save(staging, extra=planned)
 
 
-def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
-    """Write ``trials.json`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
+def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any], name: str) -> None:
+    """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
     with transaction(folder) as staging:
         _same_plan(Path(folder), summary)
-        (staging / "trials.json").write_text(to_json(report), encoding="utf-8")
+        (staging / name).write_text(to_json(report), encoding="utf-8")
 
 
 def _same_plan(folder: Path, summary: Mapping[str, Any]) -> None:
