@@ -113,8 +113,9 @@ def landing_basin(
     scene, plan = Scene.of_plan(summary, robot), plan_hash(summary)
     code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
     work = {}
-    for index, state in enumerate(states[:count]):
-        key = TrialKey(0, index, _hash(["basin", code, asdict(state)]), plan)
+    for state in states[:count]:
+        name = _hash(["basin", code, asdict(state)])  # whatever the grid: equal states are equal trials
+        key = TrialKey(0, int(name[:8], 16), name, plan)
         work[key] = joblib.delayed(drop)(tape, robot, scene, settings, key, state)
     trials, resumed = run_series(folder, work, jobs, progress)
     report = BasinReport(trials, 0, settings, plan, dict(summary["target"]), resumed, grid)
