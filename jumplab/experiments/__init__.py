@@ -3,7 +3,7 @@
 from jumplab.experiments.basin import BasinGrid, BasinReport, BasinState, landing_basin
 from jumplab.experiments.goal_bias import BiasedJump, GoalBias, reach_goal
 from jumplab.experiments.measurement import Measurement, measure
-from jumplab.experiments.monte_carlo import TrialReport, run_trials, wilson
+from jumplab.experiments.monte_carlo import TrialReport, run_trials, simulate_many, wilson
 from jumplab.experiments.outcome import outcomes
 from jumplab.experiments.trial import Trial, TrialKey, TrialSettings
 
@@ -23,5 +23,6 @@ __all__ = [
     "outcomes",
     "reach_goal",
     "run_trials",
+    "simulate_many",
     "wilson",
 ]

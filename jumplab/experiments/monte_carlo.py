@@ -27,7 +27,7 @@ from jumplab import store
 from jumplab.errors import InputError
 from jumplab.experiments.log import open_log
 from jumplab.experiments.trial import SCHEMA, Trial, TrialKey, TrialSettings, plan_hash, run_trial
-from jumplab.simulation import Scene
+from jumplab.simulation import Scene, SimulationResult, simulate_jump
 
 CONFIDENCE = 0.95
 LOOK_S = 0.5  # our choice: how often a worker looks whether its parent still lives
@@ -175,10 +175,27 @@ def run_series(
     return tuple(done[key] for key in work), resumed
 
 
-def _in_parallel(work: Iterable[Task], jobs: int) -> Iterable[Trial]:
-    """Results as they come, in any order."""
+def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = None) -> dict[str, SimulationResult]:
+    """Several jumps at once, on several cores.
+
+    Parameters
+    ----------
+    jumps : by name, the arguments of :func:`jumplab.simulation.simulate_jump`, all named.
+    jobs : processes; one per core if None.
+
+    Returns
+    -------
+    Results by the same names, as that function gives them one by one.
+    """
+    work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
+    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
+    return dict(zip(jumps, _in_parallel(work, jobs, "list"), strict=True))
+
+
+def _in_parallel(work: Iterable[Task], jobs: int, order: str = "generator_unordered") -> Iterable[Any]:
+    """Results, as they come unless ``order`` says otherwise."""
     options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
-    return joblib.Parallel(jobs, return_as="generator_unordered", max_nbytes=None, **options)(work)
+    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
 
 
 def _serve(parent: int) -> None:
