@@ -135,11 +135,11 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
         result.save(staging, extra=planned)
 
 
-def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
-    """Write ``trials.json`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
+def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any], name: str) -> None:
+    """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
     with transaction(folder) as staging:
         _same_plan(Path(folder), summary)
-        (staging / "trials.json").write_text(to_json(report), encoding="utf-8")
+        (staging / name).write_text(to_json(report), encoding="utf-8")
 
 
 def _same_plan(folder: Path, summary: Mapping[str, Any]) -> None:

@@ -24,7 +24,8 @@ HASHED = (PLAN, URDF, CONFIG)
 # Statements about one plan, which a new plan makes untrue and therefore removes.
 OF_SIMULATION = ("jump.html", "simulated_joints.csv", "simulated_motion.npz", "simulated_motion_clip.npz",
                  "simulated_replay")  # what a new simulation makes untrue  # fmt: skip
-DERIVED = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "plan.html",
+DERIVED = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json",
+           "plan.html",
            "joints.csv", "motion.npz", "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
 LOCK_WAIT_S = 20.0  # our choice: a write lasts well under a second, so a longer wait means that something hangs
 _STAGING, _COMMIT = ".staging", ".commit"

@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import replace
 
+import fixtures_core
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -58,7 +59,6 @@ def test_torques_stay_within_the_motors(bhr, jump):
     assert m.max_speed_ratio_before_touchdown < 0.9
     assert set(m.max_torque_ratio_by_joint) == set(bhr.joint_names)
     assert max(m.max_speed_ratio_by_joint.values()) == m.max_speed_ratio
-    assert max(m.overspeed_s.values()) <= 0.01
 
 
 def test_measurements_agree_with_mechanics(jump):
@@ -192,6 +192,25 @@ def test_the_landing_is_planned_in_flight(bhr, tape):
 
     (torque, force), (spring_torque, spring_force) = loads(planned), loads(spring)
     assert torque < 0.95 * spring_torque and force < 0.8 * spring_force
+
+
+def test_late_commands_make_no_joint_swing(bhr, tape):
+    """In the air a light foot must not be driven faster than a delay of 4 ms allows."""
+    run = simulate(tape, bhr, mode="pd", perturbation=Perturbation(delay_s=0.004), stand_s=0.01)
+    air = (run.t > tape.takeoff_time + 0.1) & (run.t < run.metrics.touchdown_s - 0.03)
+    planned = np.stack([np.interp(run.t, tape.t, column) for column in tape.v[:, 6:].T], axis=1)
+    assert np.abs(run.v[:, 6:] - planned)[air].max() < 0.5  # [rad/s]; 45 with the gains of the launch
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["position", "pd"])
+def test_the_impact_turns_no_knee_faster_than_its_motor(bhr, mode):
+    """Straighter knees were; a light foot whose edge comes down first may still be, for a step or two."""
+    m = simulate(fixtures_core.jump(1.0, 0.5).tape, bhr, mode=mode, stand_s=SHORT_S).metrics
+    late = {name for name, time in m.overspeed_s.items() if time > 0}
+    assert late <= {"left_ankle_pitch", "right_ankle_pitch"} and max(m.overspeed_s.values()) <= 0.002
+    assert m.max_speed_ratio_before_touchdown <= 1 and m.max_torque_ratio <= 1
+    assert m.foot_distance_touchdown_m == pytest.approx(1.0, abs=0.02) and m.com_rise_m == pytest.approx(0.5, abs=0.01)
 
 
 def test_no_limit_is_exceeded(jump):

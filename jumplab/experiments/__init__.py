@@ -1,12 +1,16 @@
 """What one does with a simulation: correct the goal, let many robots try, read their sensors."""
 
+from jumplab.experiments.basin import BasinGrid, BasinReport, BasinState, landing_basin
 from jumplab.experiments.goal_bias import BiasedJump, GoalBias, reach_goal
 from jumplab.experiments.measurement import Measurement, measure
-from jumplab.experiments.monte_carlo import TrialReport, run_trials, wilson
+from jumplab.experiments.monte_carlo import TrialReport, run_trials, simulate_many, wilson
 from jumplab.experiments.outcome import outcomes
 from jumplab.experiments.trial import Trial, TrialKey, TrialSettings
 
 __all__ = [
+    "BasinGrid",
+    "BasinReport",
+    "BasinState",
     "BiasedJump",
     "GoalBias",
     "Measurement",
@@ -14,9 +18,11 @@ __all__ = [
     "TrialKey",
     "TrialReport",
     "TrialSettings",
+    "landing_basin",
     "measure",
     "outcomes",
     "reach_goal",
     "run_trials",
+    "simulate_many",
     "wilson",
 ]

@@ -1,4 +1,4 @@
-"""What a laboratory could know of a jump: computed from simulated, noisy sensors with the planned robot's model."""
+"""What a laboratory could know of a jump: estimated from simulated, noisy sensors with the planned robot's model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot import Robot
-from jumplab.simulation import SensorNoise, SimulationResult
+from jumplab.simulation import Estimator, SensorNoise, SimulationResult
+from jumplab.simulation.sensors import Sensors
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Measurement:
     ----------
     t : (N,) [s].
     phase : (N,) "launch" or "flight".
-    com : (N, 2) x and z [m], with the toes standing where they started; nan in flight, where no sensor tells it.
+    com : (N, 2) x and z [m], from where the robot was put; in flight the inertial unit alone tells it.
     L : (N,) angular momentum about the pitch axis [kg m^2/s].
     rho : (N,) pitch inertia about the CoM [kg m^2].
     """
@@ -32,10 +33,10 @@ class Measurement:
 
 
 def measure(result: SimulationResult, robot: Robot, noise: SensorNoise | None = None, seed: int = 0) -> Measurement:
-    """Read the sensors of a simulated jump: encoders, and the trunk's tilt and gyro, each with white noise.
+    """Read the sensors of a simulated jump, and estimate its state as the robot itself would.
 
-    Neither L nor rho needs to know where the robot is or how fast it travels. The CoM is found from the toes, which
-    stand still until take-off.
+    Encoders, inertial unit and foot forces go through :class:`jumplab.simulation.Estimator`; CoM, L and rho are those
+    of the planned robot in the estimated state.
 
     Parameters
     ----------
@@ -44,34 +45,13 @@ def measure(result: SimulationResult, robot: Robot, noise: SensorNoise | None = 
     noise : :meth:`SensorNoise.typical` if None.
     seed : of the noise.
     """
-    noise, rng = SensorNoise.typical() if noise is None else noise, np.random.default_rng(seed)
-    seen = result.phase != "landing"
+    sensors = Sensors(SensorNoise.typical() if noise is None else noise, seed)
+    estimator = Estimator(robot, sensors.initial(result.q[0]), result.v[0], sensors.noise)
+    felt = np.concatenate([result.foot_wrench[:1], result.foot_wrench[:-1]])  # row k of the log acts after t[k]
     model, data = robot.model, robot.model.createData()
-    toe = np.array([robot.foot.toe, 0.0, robot.foot.sole_z])
-    frames = [model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-    start, rows = None, []
-    for true_q, true_v in zip(result.q[seen], result.v[seen], strict=True):
-        q, v = _read(true_q, true_v, noise, rng)
-        pin.ccrba(model, data, q, v)
-        pin.updateFramePlacements(model, data)
-        toes = np.mean([data.oMf[frame].act(toe) for frame in frames], axis=0)
-        if start is None:  # where the robot was put is known
-            pin.framesForwardKinematics(model, data, true_q)
-            start = np.mean([data.oMf[frame].act(toe) for frame in frames], axis=0)
-        place = data.com[0] - toes + start
-        rows.append((place[0], place[2], data.hg.angular[1], data.Ig.inertia[1, 1]))
-    rows, phase = np.array(rows), result.phase[seen]
-    com = np.where((phase == "launch")[:, None], rows[:, :2], np.nan)
-    return Measurement(result.t[seen], phase, com, rows[:, 2], rows[:, 3])
-
-
-def _read(q: np.ndarray, v: np.ndarray, noise: SensorNoise, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Configuration and velocity as encoders, tilt and gyro tell them; place and speed of the base are nobody's."""
-    q, v, joints = q.copy(), v.copy(), len(q) - 7
-    turn = pin.Quaternion(pin.exp3(noise.tilt_rad * rng.standard_normal(3)))
-    q[3:7] = (pin.Quaternion(q[6], q[3], q[4], q[5]) * turn).coeffs()
-    q[7:] += noise.joint_rad * rng.standard_normal(joints)
-    q[:3] = v[:3] = 0.0
-    v[3:6] += noise.gyro * rng.standard_normal(3)
-    v[6:] += noise.joint_rate * rng.standard_normal(joints)
-    return q, v
+    seen, rows = result.phase != "landing", []
+    for q, v, wrench in zip(result.q[seen], result.v[seen], felt[seen], strict=True):
+        pin.ccrba(model, data, *estimator.update(sensors.read(q, v, wrench)))
+        rows.append((data.com[0][0], data.com[0][2], data.hg.angular[1], data.Ig.inertia[1, 1]))
+    rows = np.array(rows)
+    return Measurement(result.t[seen], result.phase[seen], rows[:, :2], rows[:, 2], rows[:, 3])

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,11 @@ from jumplab import store
 from jumplab.errors import InputError
 from jumplab.experiments.log import open_log
 from jumplab.experiments.trial import SCHEMA, Trial, TrialKey, TrialSettings, plan_hash, run_trial
-from jumplab.simulation import Scene
+from jumplab.simulation import Scene, SimulationResult, simulate_jump
 
 CONFIDENCE = 0.95
 LOOK_S = 0.5  # our choice: how often a worker looks whether its parent still lives
+Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
@@ -139,33 +140,62 @@ def run_trials(
     InputError
         If ``n`` or ``seed`` cannot be meant, or the folder holds no whole plan or cannot be written.
     """
-    _check(n, seed, jobs)
+    check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)
+    scene, plan, known = Scene.of_plan(summary, robot), plan_hash(summary), settings.hash
+    keys = [TrialKey(seed, index, known, plan) for index in range(n)]
+    work = {key: joblib.delayed(run_trial)(tape, robot, scene, settings, key) for key in keys}
+    trials, resumed = run_series(folder, work, jobs, progress)
+    report = TrialReport(trials, seed, settings, plan, dict(summary["target"]), resumed)
+    store.write_trials(folder, report.to_json(), summary, "trials.json")
+    return report
+
+
+def run_series(
+    folder: str | Path, work: Mapping[TrialKey, Task], jobs: int | None, progress: bool | None
+) -> tuple[tuple[Trial, ...], int]:
+    """Do the ``work`` that the folder's log does not have yet, and keep it there.
+
+    Returns
+    -------
+    All trials in the order of ``work``, and how many of them the log had.
+    """
     store.ensure_writable(folder)
-    scene, plan = Scene.of_plan(summary, robot), plan_hash(summary)
-    settings_hash = settings.hash
-    keys = [TrialKey(seed, index, settings_hash, plan) for index in range(n)]
     with open_log(folder) as log:
-        done = {key: log.trials[key] for key in keys if key in log.trials}
+        done = {key: log.trials[key] for key in work if key in log.trials}
         resumed = len(done)
-        missing = [key for key in keys if key not in done]
-        work = (joblib.delayed(run_trial)(tape, robot, scene, settings, key) for key in missing)
+        missing = [task for key, task in work.items() if key not in done]
         hide = not (sys.stderr.isatty() if progress is None else progress)
-        with tqdm(total=n, initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
-            for trial in _in_parallel(work, min(jobs or joblib.cpu_count(), max(len(missing), 1))):
+        with tqdm(total=len(work), initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
+            for trial in _in_parallel(missing, min(jobs or joblib.cpu_count(), max(len(missing), 1))):
                 log.add(trial)
                 done[trial.key] = trial
                 bar.set_postfix_str(f"{sum(t.landed for t in done.values())} of {len(done)} landed", refresh=False)
                 bar.update()
-    report = TrialReport(tuple(done[key] for key in keys), seed, settings, plan, dict(summary["target"]), resumed)
-    store.write_trials(folder, report.to_json(), summary)
-    return report
+    return tuple(done[key] for key in work), resumed
 
 
-def _in_parallel(work: Iterable[tuple[Callable, tuple, dict]], jobs: int) -> Iterable[Trial]:
-    """Results as they come, in any order."""
+def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = None) -> dict[str, SimulationResult]:
+    """Several jumps at once, on several cores.
+
+    Parameters
+    ----------
+    jumps : by name, the arguments of :func:`jumplab.simulation.simulate_jump`, all named.
+    jobs : processes; one per core if None.
+
+    Returns
+    -------
+    Results by the same names, as that function gives them one by one.
+    """
+    work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
+    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
+    return dict(zip(jumps, _in_parallel(work, jobs, "list"), strict=True))
+
+
+def _in_parallel(work: Iterable[Task], jobs: int, order: str = "generator_unordered") -> Iterable[Any]:
+    """Results, as they come unless ``order`` says otherwise."""
     options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
-    return joblib.Parallel(jobs, return_as="generator_unordered", max_nbytes=None, **options)(work)
+    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
 
 
 def _serve(parent: int) -> None:
@@ -180,7 +210,8 @@ def _leave_with(parent: int) -> None:
     os._exit(1)
 
 
-def _check(n: int, seed: int, jobs: int | None) -> None:
+def check_numbers(n: int, seed: int, jobs: int | None) -> None:
+    """Raise :class:`InputError` unless these numbers can be meant."""
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("jobs", 1 if jobs is None else jobs, 1)):
         if isinstance(value, bool) or not isinstance(value, int):
             raise InputError(f"{name} must be a whole number, got {value!r}")

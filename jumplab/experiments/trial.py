@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from jumplab import store
 from jumplab.errors import InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import Metrics, Perturbation, Ranges, Scene, SensorNoise, simulate_jump
+from jumplab.simulation import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
 from jumplab.simulation.playback import MODES
 from jumplab.trajectory import Tape
 
@@ -79,7 +79,7 @@ class Trial:
     key : what it was.
     perturbation : every drawn number, as :meth:`jumplab.simulation.Perturbation.to_json` gives them.
     features : the drawn robot in a few numbers, see :func:`features`.
-    landed, reason : the verdict, and why.
+    landed, reason : the verdict, and why; a run that fails a check of its honesty has not landed.
     metrics : all numbers of the jump; None if the engine lost the robot.
     """
 
@@ -115,15 +115,23 @@ def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, k
         If the tape is not this robot's.
     """
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    try:
-        metrics = simulate_jump(
-            tape, robot, mode=settings.mode, perturbation=drawn, scene=scene, reaim=settings.reaim
-        ).metrics
-        landed, reason = metrics.landed, metrics.reason
-    except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
-        metrics, landed, reason = None, False, str(e)
-    trial = Trial(key, drawn.to_json(), features(drawn, robot), landed, reason, metrics)
+    verdict = judged(lambda: simulate_jump(
+        tape, robot, mode=settings.mode, perturbation=drawn, scene=scene, reaim=settings.reaim))  # fmt: skip
+    trial = Trial(key, drawn.to_json(), features(drawn, robot), *verdict)
     return Trial.from_line(trial.line())  # the very thing that a resumed run reads
+
+
+def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None]:
+    """Whether a jump counts as landed, why (not), and its metrics: a run that fails a check of its honesty does not."""
+    try:
+        result = simulate()
+    except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
+        return False, str(e), None
+    doubts = [str(finding) for finding in result.honesty if not finding.passed]
+    if result.honest:
+        return result.landed, result.reason, result.metrics
+    doubts = "; ".join(doubts) or "nothing was checked"
+    return False, f"not honest: {doubts}; the run's own verdict: {result.reason}", result.metrics
 
 
 def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:

@@ -25,7 +25,9 @@ class Limits:
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
-    touchdown_knee: tuple[float, float] = (0.7, 1.4)  # [rad]: stroke left to absorb the fall
+    # [rad] stroke left to absorb the fall; the impact turns a straighter knee faster than its motor can (20 rad/s), at
+    # 0.7 rad by 7 %
+    touchdown_knee: tuple[float, float] = (0.95, 1.4)
     touchdown_trunk: tuple[float, float] = (0.0, 0.30)  # [rad]
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
     capture_slope_s: float = 0.13

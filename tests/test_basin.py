@@ -1,0 +1,83 @@
+"""The landing basin: all combinations of a grid, in an order that any first part samples fairly, resumable."""
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+
+from jumplab import store
+from jumplab.errors import InputError
+from jumplab.experiments import BasinGrid, Trial, TrialSettings, basin, landing_basin
+
+SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
+
+
+@pytest.fixture(scope="module")
+def plan(bhr):
+    return jump(0.6, 0.3, method="direct")
+
+
+@pytest.fixture
+def folder(plan, bhr, tmp_path):
+    store.write_plan(tmp_path / "plan", plan.tape, bhr, plan.summary)
+    return tmp_path / "plan"
+
+
+def fake(tape, robot, scene, settings, key, state):
+    """Stands in for a simulation: too much pitch falls."""
+    landed = abs(state.pitch_deg) < 7
+    return Trial(key, {}, vars(state), landed, "stood" if landed else "trunk touched the ground 0.5 s", None)
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    monkeypatch.setattr(basin, "drop", fake)
+    monkeypatch.setattr(basin.BasinReport, "values", lambda self, name: np.zeros(0))
+
+
+def test_the_grid_has_all_combinations_once():
+    states = BasinGrid().states
+    assert len(set(states)) == 225 == len(states) and states == BasinGrid().states
+    assert {(s.speed_factor, s.pitch_deg) for s in states[:100]} == {
+        (x, p) for x in (0.8, 0.9, 1.0, 1.1, 1.2) for p in (-10, -5, 0, 5, 10)
+    }  # any first part of it has something of everything
+
+
+def test_counts_and_resumes(folder, fakes):
+    first = landing_basin(folder, 50, jobs=1)
+    assert first.resumed == 0 and first.count == 50
+    whole = landing_basin(folder, jobs=1)
+    assert (whole.count, whole.landed, whole.resumed) == (225, 135, 50) and whole.trials[:50] == first.trials
+    said = store.read_json(folder / "basin.json")
+    assert said["counts"] == {"trials": 225, "landed": 135, "failed": 90} and said["states"] == 225
+    assert {abs(row["pitch_deg"]) for row in said["failed"]} == {10.0} and len(said["failed"]) == 90
+    assert said["reasons"] == {"trunk touched the ground ... s": 90}
+    assert landing_basin(folder, settings=TrialSettings(reaim=False), jobs=1).resumed == 0
+    assert landing_basin(folder, 5, grid=BasinGrid(speed_factor=(1.0,)), jobs=1).resumed > 0  # the same states
+
+
+@pytest.mark.parametrize(
+    ("n", "sentence"),
+    [(0, "n = 0 is too small; it must be at least 1"), (226, "n = 226 is too large; the basin has 225 states")],
+)
+def test_bad_numbers(folder, n, sentence):
+    with pytest.raises(InputError) as e:
+        landing_basin(folder, n)
+    assert str(e.value) == sentence and not (folder / "basin.json").exists()
+
+
+def test_a_state_is_simulated_as_it_says(folder):
+    """The planned apex lands, one that is turned by 30 degrees without re-aim falls; both are kept beside trials."""
+    report = landing_basin(folder, settings=TrialSettings(reaim=False), grid=SMALL, jobs=1)
+    landed = {t.features["pitch_deg"]: t.landed for t in report.trials}
+    assert landed == {0.0: True, 30.0: False}
+    for trial in report.trials:
+        assert trial.features["friction"] == 0.6 == trial.perturbation["friction"] and not trial.perturbation["mass"]
+        turn = trial.metrics.touchdown_trunk_pitch_rad
+        assert (abs(turn) > 0.4) == (trial.features["pitch_deg"] == 30)
+    assert landing_basin(folder, settings=TrialSettings(reaim=False), grid=SMALL, jobs=1).trials == report.trials
+
+
+def test_trials_and_basin_share_the_log(folder, fakes, bhr):
+    landing_basin(folder, 3, jobs=1)
+    store.write_plan(folder, jump(0.6, 0.3, method="direct").tape, bhr, store.read_plan(folder)[2])
+    assert not {"basin.json", "trials.jsonl"} & {f.name for f in folder.iterdir()}  # a new plan, a new basin
