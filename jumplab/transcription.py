@@ -57,6 +57,14 @@ class PhaseLayout:
     def node(self, k: int) -> np.ndarray:
         return self.first + self.n_const + k * self.stride + np.arange(3 * self.nq + self.nz)
 
+    def nodes(self) -> np.ndarray:
+        """(N + 1, nx) places of all nodes."""
+        return self.node(0) + self.stride * np.arange(self.phase.intervals + 1)[:, None]
+
+    def jerks(self) -> np.ndarray:
+        """(N, nq) places of all jerks."""
+        return self.jerk(0) + self.stride * np.arange(self.phase.intervals)[:, None]
+
     def jerk(self, k: int) -> np.ndarray:
         return self.first + self.n_const + k * self.stride + 3 * self.nq + self.nz + np.arange(self.nq)
 
@@ -84,7 +92,7 @@ class Element:
     def __init__(self, local, data, outputs, terms, index, data_columns, owner, nodes):
         self.local, self.data, self.index, self.data_columns = local, data, index, data_columns  # index (n, ny)
         self.owner, self.nodes = owner, nodes
-        self.costs = [(t, e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]
+        self.costs = [(t, *e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]  # term, share, column
         self.constraints = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
 
 
@@ -175,7 +183,8 @@ class ElementBuilder:
 
     @staticmethod
     def _weighted(term, expression, step):
-        return step * ca.sumsqr(expression) if term.is_cost else expression / term.scale
+        """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
+        return (step, expression) if term.is_cost else expression / term.scale
 
 
 def _trapezoid(s):
@@ -209,7 +218,7 @@ class Assembled:
         self.n_par = builder.parameter_vector.numel()
         self.cost_terms: list[tuple[str, Term]] = []
         for e in builder.elements:
-            for term, _ in e.costs:
+            for term, *_ in e.costs:
                 self.cost_terms.append((e.owner, term))
         self.n_weight = len(self.cost_terms)
         # p = [parameters; weights; per phase: references (rows) x nodes, column major, preceded by s]
@@ -301,7 +310,7 @@ class _Piece:
         self.weights = ca.repmat(weights, 1, self.n)
         self.arguments = [element.local, element.data, parameters]
         self.w = ca.SX.sym("w", len(element.costs))
-        self.cost_parts = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.costs))
+        self.cost_parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for _, share, y in element.costs))
         self.g = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.constraints))
         self.total = ca.dot(self.w, self.cost_parts) if element.costs else ca.SX(0)
 
@@ -338,7 +347,7 @@ class _Piece:
     def hessian(self, lam_f, lam_g):
         """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
         lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
-        h = ca.triu(ca.hessian(scale * self.total + ca.dot(lam, self.g), self.e.local)[0])
+        h = ca.triu(self._curvature(lam, scale))
         rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
         if not len(rows):
             return None
@@ -348,3 +357,23 @@ class _Piece:
                            [self.weights, spread, ca.repmat(lam_f, 1, self.n)])  # fmt: skip
         i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
         return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
+
+    def _curvature(self, lam, scale):
+        """Hessian of scale * cost + lam . g.
+
+        A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with the multiplier 2 w y:
+        so everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
+        """
+        x, ys, mus, extra = self.e.local, [], [], ca.SX(self.ny, self.ny)
+        for k, (_, share, y) in enumerate(self.e.costs):
+            weight = scale * self.w[k] * share
+            jacobian = ca.jacobian(y, x)
+            extra += 2 * weight * (jacobian.T @ jacobian)
+            mixed = ca.jacobian(share, x).T @ (2 * scale * self.w[k] * (y.T @ jacobian))
+            extra += mixed + mixed.T
+            ys, mus = [*ys, y], [*mus, 2 * weight * y]
+        y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
+        held = ca.SX.sym("mu", y.numel())
+        bent = ca.hessian(ca.dot(held, y) + ca.dot(lam, self.g), x)[0]
+        symbols = [x, self.e.data, self.arguments[2], lam, held]
+        return extra + ca.Function("bent", symbols, [bent])(*symbols[:-1], mu)

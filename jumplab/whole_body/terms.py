@@ -33,14 +33,9 @@ class WholeBodyTerms:
             p.memo["wrench"] = self.state(p).ground_wrench()
         return p.memo["wrench"]
 
-    def toe_acceleration(self, p: Point):
-        acc = self.state(p).com_acceleration
-        return (-acc[0], -p.p.gravity - acc[1])
-
     def torques(self, p: Point, flying: bool):
         if "torques" not in p.memo:
-            toe = self.toe_acceleration(p) if flying else (0.0, 0.0)
-            p.memo["torques"] = self.state(p).torques(toe)
+            p.memo["torques"] = self.state(p).torques(None if flying else (0.0, 0.0))
         return p.memo["torques"]
 
     def ballistic_com(self, p: Point):
