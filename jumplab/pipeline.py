@@ -21,6 +21,7 @@ from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
+GUESS_STEP_S = 0.02  # our choice: stage 2's step here, where it is only a start for stage 3; the longest that it takes
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
 
 
@@ -42,7 +43,7 @@ class JumpPlan:
     ----------
     task, robot, method : what was asked, of whom, and how it was planned.
     tape : the 1 kHz tape of the full robot.
-    srmp, joints : results of stages 1 and 2 (None for the direct planner).
+    srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner.
     statistics : one row per stage.
     """
@@ -146,10 +147,35 @@ class Planner:
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         first, last = self._stage("srmp"), self._stage("whole body")
         srmp = first.plan(task)
-        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
+        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), GUESS_STEP_S, method="direct")
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *_body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+
+    def replan(self, previous: JumpPlan, task: JumpTask) -> JumpPlan:
+        """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
+
+        Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
+        out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
+
+        Raises
+        ------
+        InputError, InfeasibleError, SolverError
+            As :meth:`plan`.
+        """
+        if previous.robot.hash != self.robot.hash:
+            raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
+        check_platform(task, self.robot)
+        if previous.method == "direct":
+            check_reachable(task, self._stage("reach"), self.robot)
+            body, srmp, rows = self._stage("direct").plan(task, near=previous.whole_body), None, ()
+        else:
+            srmp = self._stage("srmp").plan(task, near=previous.srmp)
+            body = self._stage("whole body").plan(task, srmp, near=previous.whole_body)
+            rows = (_row("1 SRMP", srmp.solution.statistics),)
+        rows = (*rows, *_body_rows("direct" if srmp is None else "3 whole body", body))
+        tape = make_tape(body, self.robot, srmp)
+        return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
 
 
 def _row(stage: str, s: Statistics) -> StageRow:

@@ -25,7 +25,7 @@ from jumplab.solution import Multipliers, PhaseGuess, PhaseSolution, Solution, S
 from jumplab.terms import Problem
 from jumplab.transcription import Assembled
 
-__all__ = ["GOOD_STATUSES", "IPOPT", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
+__all__ = ["GOOD_STATUSES", "IPOPT", "WARM", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
 
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # our choice: scaled row error above which a "solved" status is not believed
@@ -42,6 +42,12 @@ IPOPT = {
     "print_level": 0,
     "sb": "yes",
 }
+
+
+# our choice: begun from a solution close by with its multipliers, the start is not pushed away from its limits
+WARM = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_start_bound_frac": 1e-6,
+        "warm_start_slack_bound_push": 1e-6, "warm_start_slack_bound_frac": 1e-6,
+        "warm_start_mult_bound_push": 1e-6}  # fmt: skip
 
 
 class Nlp:

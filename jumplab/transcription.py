@@ -361,8 +361,8 @@ class _Piece:
     def _curvature(self, lam, scale):
         """Hessian of scale * cost + lam . g.
 
-        A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with the multiplier 2 w y:
-        so everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
+        A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
+        everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
         """
         x, ys, mus, extra = self.e.local, [], [], ca.SX(self.ny, self.ny)
         for k, (_, share, y) in enumerate(self.e.costs):

@@ -2,9 +2,9 @@
 
 Configuration: absolute angles of foot, shank, thigh, trunk and arm, positive about +y. Every position is a sum of one
 vector per angle, so the toe can be fixed (launch) or follow from the ballistic CoM (flight) without any contact
-equation. Moments, momentum and inertia sum m_i times products of two such vectors; the sum over the links is taken once,
-in numbers, and what is left are ten differences of angles. Derivatives of that form are cheap, the second ones above
-all. :func:`lagrangian` is an independent derivation that tests compare with.
+equation. Moments, momentum and inertia sum m_i times products of two such vectors; the sum over the links is taken
+once, in numbers, and what is left are ten differences of angles. Derivatives of that form are cheap, the second ones
+above all. :func:`lagrangian` is an independent derivation that tests compare with.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ class PlanarState:
         """CoM acceleration relative to the toe [m/s^2] (2,)."""
         return ca.vertcat(*self._com[2])
 
-    # With (x, z) as the number x + i z, link i's CoM is sum_j exp(-i a_j) D_ij. For two such sums with constants D and E
-    # and P_jk = sum_i m_i conj(D_ij) E_ik, the moments sum_i m_i (z x'' - x z'') are the sum over j and k of
+    # With (x, z) as the number x + i z, link i's CoM is sum_j exp(-i a_j) D_ij. For two such sums with constants D and
+    # E and P_jk = sum_i m_i conj(D_ij) E_ik, the moments sum_i m_i (z x'' - x z'') are the sum over j and k of
     # Re(P_jk) (c a_k'' + s a_k'^2) + Im(P_jk) (c a_k'^2 - s a_k''), c and s of a_j - a_k.
     @cached_property
     def _differences(self):
