@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
 from proxsuite import proxqp
 
@@ -45,6 +44,8 @@ def row_scale(qp: StepQp) -> dict[str, np.ndarray]:
 
 def conflicts(qp: StepQp) -> tuple[str, ...]:
     """Rows that must give way if the QP is infeasible: those with slack in the least total (scaled) relaxation."""
+    import cvxpy as cp  # half of what a new process spends on imports: only for those who use it
+
     x = cp.Variable(qp.A.shape[1])
     scale = row_scale(qp)
     give = {k: cp.Variable(len(scale[k]), nonneg=True) for k in "EGR" if len(scale[k])}
@@ -106,6 +107,8 @@ class CvxpySolver:
     name = "cvxpy"
 
     def __init__(self, example: StepQp):
+        import cvxpy as cp
+
         self.x = x = cp.Variable(example.A.shape[1])
         self.moving = ~example.layout.steady_rows()
         self.steady = example.A[~self.moving]
@@ -123,6 +126,8 @@ class CvxpySolver:
 
     def solve(self, qp: StepQp, phase: str, t: float) -> Answer:
         """Solve one step; raises :class:`SolverError` if there is no trustworthy answer."""
+        import cvxpy as cp
+
         for k, value in self._values(qp).items():
             self.parameters[k].value = value
         status, iterations = "solver error", 0
