@@ -17,7 +17,7 @@ from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
-from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body import Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
@@ -106,30 +106,34 @@ def _peaks(names, values) -> dict[str, float]:
 
 
 class Planner:
-    """All stages for one robot, built on first use and kept for further targets."""
+    """All stages for one robot, built on first use and kept for further targets; ``mesh`` is that of stage 3."""
 
-    def __init__(self, robot: Robot):
-        self.robot = robot
+    def __init__(self, robot: Robot, mesh: Mesh = Mesh()):
+        self.robot, self.mesh = robot, mesh
         self._stages: dict = {}
 
-    def _stage(self, name: str):
+    def stage(self, name: str):
+        """A stage's planner: "reach", "srmp", "whole body" or "direct"."""
         if name not in self._stages:
             build = {
                 "reach": lambda: reach(self.robot),
                 "srmp": lambda: SrmpPlanner(self.robot),
-                "whole body": lambda: WholeBodyPlanner(self.robot),
-                "direct": lambda: WholeBodyPlanner(self.robot, tracking=False),
+                "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh),
+                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
 
-    def plan(self, task: JumpTask, method: str = "three-step") -> JumpPlan:
+    def plan(
+        self, task: JumpTask, method: str = "three-step", *, weights: Mapping[str, float] | None = None
+    ) -> JumpPlan:
         """Plan one jump.
 
         Parameters
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
+        weights : of stage 3's cost terms, instead of their own; name -> weight.
 
         Raises
         ------
@@ -140,16 +144,16 @@ class Planner:
             raise InputError(f"method {method!r}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
         if method == "direct":
-            check_reachable(task, self._stage("reach"), self.robot)
-            planner = self._stage("direct")
-            body = planner.plan(task)
-            rows = _body_rows("direct", body)
+            check_reachable(task, self.stage("reach"), self.robot)
+            planner = self.stage("direct")
+            body = planner.plan(task, weights=weights)
+            rows = body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
-        first, last = self._stage("srmp"), self._stage("whole body")
+        first, last = self.stage("srmp"), self.stage("whole body")
         srmp = first.plan(task)
         joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), GUESS_STEP_S, method="direct")
-        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
-        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *_body_rows("3 whole body", body))
+        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights)
+        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
 
     def replan(self, previous: JumpPlan, task: JumpTask) -> JumpPlan:
@@ -167,13 +171,13 @@ class Planner:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         check_platform(task, self.robot)
         if previous.method == "direct":
-            check_reachable(task, self._stage("reach"), self.robot)
-            body, srmp, rows = self._stage("direct").plan(task, near=previous.whole_body), None, ()
+            check_reachable(task, self.stage("reach"), self.robot)
+            body, srmp, rows = self.stage("direct").plan(task, near=previous.whole_body), None, ()
         else:
-            srmp = self._stage("srmp").plan(task, near=previous.srmp)
-            body = self._stage("whole body").plan(task, srmp, near=previous.whole_body)
+            srmp = self.stage("srmp").plan(task, near=previous.srmp)
+            body = self.stage("whole body").plan(task, srmp, near=previous.whole_body)
             rows = (_row("1 SRMP", srmp.solution.statistics),)
-        rows = (*rows, *_body_rows("direct" if srmp is None else "3 whole body", body))
+        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
         tape = make_tape(body, self.robot, srmp)
         return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
 
@@ -182,7 +186,8 @@ def _row(stage: str, s: Statistics) -> StageRow:
     return StageRow(stage, s.iterations, s.build_s, s.solve_s)
 
 
-def _body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+    """What stage 3 or the direct planner cost: the coarse mesh, if there was one, and the fine one."""
     fine = _row(stage, body.solution.statistics)
     return (fine,) if body.coarse is None else (_row(f"{stage}, coarse", body.coarse), fine)
 

@@ -89,7 +89,7 @@ class Multipliers:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a solve cost."""
+    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the solver's own."""
 
     iterations: int
     status: str
@@ -99,6 +99,7 @@ class Statistics:
     rows: int
     objective: float
     residual: float
+    functions_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -172,8 +172,9 @@ class Nlp:
         status = stats["return_status"]
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
             self._fail(status, stats["iter_count"], x0, p, (low, high), (row_low, row_high) if explain else None)
+        functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
         statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
-                                float(answer["f"]), residual)  # fmt: skip
+                                float(answer["f"]), residual, functions_s)  # fmt: skip
         lam_x, lam_g = (answer[k].full().ravel() for k in ("lam_x", "lam_g"))
         return Solution(self.problem, unpack(a, x), statistics, self._cost_shares(x, p),
                         self._constraint_report(g, row_low, row_high),

@@ -146,7 +146,7 @@ def test_a_failed_stage_feeds_nothing(monkeypatch):
 def test_a_failed_map_feeds_nothing(monkeypatch):
     failure, reached = SolverError("stage 2: no", stage="stage 2"), AssertionError("stage 3 ran")
     one = Planner(load_robot())
-    one._stages = {"srmp": planner()._stage("srmp"), "whole body": Broken(reached)}
+    one._stages = {"srmp": planner().stage("srmp"), "whole body": Broken(reached)}
 
     def fail(*arguments, **options):
         raise failure
@@ -163,7 +163,7 @@ def test_plan_jump_is_a_planner_for_one(monkeypatch):
 
 
 def test_guess_is_stage_twos_motion(plan):
-    body = planner()._stage("whole body")
+    body = planner().stage("whole body")
     guess = guess_from_joints(plan.joints, body, plan.task, plan.srmp.toe_s)
     assert {k: len(g.q) - 1 for k, g in guess.items()} == {"flat": body.mesh.flat, "toe": body.mesh.toe,
                                                            "flight": body.mesh.flight}  # fmt: skip

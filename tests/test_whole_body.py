@@ -240,13 +240,13 @@ def test_names_are_unique_within_a_phase(bhr):
 
 def test_unknown_names_are_refused():
     with pytest.raises(InputError) as e:
-        planner()._stage("direct").plan(JumpTask(0.5, 0.3), off=("gravity",))
+        planner().stage("direct").plan(JumpTask(0.5, 0.3), off=("gravity",))
     assert str(e.value).startswith("weight or switch 'gravity': the problem 'direct' has no such term; it has ")
 
 
 def test_a_switched_off_limit_is_gone():
     """Without the knee's window at touchdown the cost can only fall; with it, the window holds."""
-    body = planner()._stage("direct")
+    body = planner().stage("direct")
     usual = jump(1.0, 0.5, 0.0, "direct").whole_body
     free = body.plan(JumpTask(1.0, 0.5), guess=usual.solution.guess(), off=("knee at touchdown",))
     assert free.solution.statistics.objective <= usual.solution.statistics.objective * (1 + 1e-5)
@@ -259,7 +259,7 @@ def test_edge_of_the_platform(bhr):
 
 
 def test_references_are_stage_ones(bhr):
-    srmp, body = pendulum(1.0, 0.5), planner()._stage("whole body")
+    srmp, body = pendulum(1.0, 0.5), planner().stage("whole body")
     refs = body.references(srmp, body.mesh)
     for name, size in (("flat", body.mesh.flat), ("toe", body.mesh.toe), ("flight", body.mesh.flight)):
         assert refs[name]["rho"].shape == (1, size + 1)
@@ -273,7 +273,7 @@ def test_references_are_stage_ones(bhr):
 
 
 def test_naive_guess_keeps_its_place(bhr):
-    guess = planner()._stage("direct").naive_guess(JumpTask(1.0, 0.5))
+    guess = planner().stage("direct").naive_guess(JumpTask(1.0, 0.5))
     assert all(np.all(np.isfinite(g.q)) for g in guess.values())
     np.testing.assert_allclose(guess["flat"].q[-1], guess["toe"].q[0, 1:])
     np.testing.assert_allclose(guess["toe"].q[-1], guess["flight"].q[0])

@@ -3,6 +3,6 @@
 A command imports the heavy libraries only once its input has been read, so that a mistake is told at once.
 """
 
-from jumplab.commands import audit, export, plan, run, simulate, view
+from jumplab.commands import audit, bench, export, plan, run, simulate, sweep, view
 
-COMMANDS = (run, plan, simulate, audit, view, export)  # in the order of ``jumplab --help``
+COMMANDS = (run, plan, simulate, audit, view, export, sweep, bench)  # in the order of ``jumplab --help``
