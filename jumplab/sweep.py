@@ -1,7 +1,7 @@
 """Many plans: a grid of targets, robots and weights, over processes or a cluster, resumed where it stopped, one table.
 
-Every finished case is one line of ``cases.jsonl``, written whole or not at all; a sweep that was killed goes on with the
-cases that have no line yet. When all have one, ``table.csv`` holds them in order.
+Every finished case is one line of ``cases.jsonl``, written whole or not at all; a sweep that was killed goes on with
+the cases that have no line yet. When all have one, ``table.csv`` holds them in order.
 """
 
 from __future__ import annotations
