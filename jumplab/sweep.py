@@ -10,6 +10,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,7 @@ from jumplab.pipeline import METHODS, Planner
 from jumplab.robot import load_robot
 from jumplab.store import ensure_writable, locked, write_file
 from jumplab.task import JumpTask
+from jumplab.whole_body import build_problem
 from jumplab.whole_body.planner import platform_edge_m
 
 CASES, TABLE = "cases.jsonl", "table.csv"
@@ -128,8 +130,10 @@ def run(cases: list[Case], out: str | Path, *, jobs: int = -1, cluster: str | No
     InputError
         If a robot cannot be read, the folder holds another sweep, or there is no such cluster.
     """
+    _check_weights(cases)
     hashes = {name: load_robot(name).hash for name in sorted({case.robot for case in cases})}
     folder = ensure_writable(out)
+    folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         done = _resume(folder / CASES, cases, hashes)
         left = [case for case in cases if case.key() not in done]
@@ -148,6 +152,20 @@ def run(cases: list[Case], out: str | Path, *, jobs: int = -1, cluster: str | No
         rows = [done[case.key()] for case in cases]
         write_file(folder / TABLE, _csv(rows).encode())
     return rows
+
+
+def _check_weights(cases: list[Case]) -> None:
+    """Refuse weights of terms that stage 3 does not have, or that are no number, before anything is planned."""
+    for case in cases:
+        if case.weights:
+            problem = build_problem(load_robot(case.robot), tracking=case.method == "three-step")
+            known = {t.name for _, t in problem.terms() if t.is_cost}
+            for name, value in case.weights.items():
+                if name not in known:
+                    listed = ", ".join(sorted(known))
+                    raise InputError(f"weight {name!r}: stage 3 has no such cost; it has {listed}")
+                if not 0 <= value < math.inf:
+                    raise InputError(f"weight {name!r} = {value:g}: it must be a number of 0 or more")
 
 
 def _keyed(case: Case) -> tuple[str, dict]:

@@ -24,7 +24,7 @@ def plan():
 def test_three_steps_and_one(plan):
     direct = jump(1.0, 0.5, 0.0, "direct")
     assert (plan.method, direct.method) == METHODS
-    assert [row.stage for row in plan.statistics] == ["1 SRMP", "2 joint map", "3 whole body"]
+    assert [row.stage for row in plan.statistics] == ["1 SRMP", "2 joint map", "3 whole body, coarse", "3 whole body"]
     assert [row.stage for row in direct.statistics] == ["direct"]
     assert plan.srmp is not None and plan.joints is not None
     assert direct.srmp is None and direct.joints is None
@@ -174,9 +174,11 @@ def test_guess_is_stage_twos_motion(plan):
     robot = plan.robot
     last = plan.joints.q[-1]
     joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.sign
-    for angle, role in zip(joints, LIMBS, strict=True):
+    for angle, role in zip(joints[:3], LIMBS[:3], strict=True):
         own = np.mean([last[robot.model.idx_qs[robot.model.getJointId(n)]] for n in robot.joints[role]])
         assert angle == pytest.approx(own, abs=1e-9)
+    arm = pipeline.to_link_angles(robot, plan.joints.q, plan.joints.v, plan.joints.a)[0][-1, 4]
+    assert guess["flight"].q[-1, 4] == pytest.approx(pipeline.GUESS_ARM_SHARE * arm, abs=1e-9)
     velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
     rows = plan.joints.rows("flight")
     np.testing.assert_allclose(velocity, plan.joints.actual["com_velocity"][rows][0][[0, 2]], atol=0.15)
