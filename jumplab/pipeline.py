@@ -106,10 +106,13 @@ def _peaks(names, values) -> dict[str, float]:
 
 
 class Planner:
-    """All stages for one robot, built on first use and kept for further targets; ``mesh`` is that of stage 3."""
+    """All stages for one robot, built on first use and kept for further targets; ``mesh`` is that of stage 3.
 
-    def __init__(self, robot: Robot, mesh: Mesh = Mesh()):
-        self.robot, self.mesh = robot, mesh
+    ``keep`` keeps the built problems for later processes, see :mod:`jumplab.kept`.
+    """
+
+    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), *, keep: bool = False):
+        self.robot, self.mesh, self.keep = robot, mesh, keep
         self._stages: dict = {}
 
     def stage(self, name: str):
@@ -117,9 +120,9 @@ class Planner:
         if name not in self._stages:
             build = {
                 "reach": lambda: reach(self.robot),
-                "srmp": lambda: SrmpPlanner(self.robot),
-                "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh),
-                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False),
+                "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
+                "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
+                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
@@ -199,7 +202,7 @@ def _joint_row(joints: JointPlan) -> StageRow:
 
 def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> JumpPlan:
     """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
-    return Planner(robot).plan(task, method)
+    return Planner(robot, keep=True).plan(task, method)
 
 
 def guess_from_joints(

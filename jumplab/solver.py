@@ -11,6 +11,7 @@ import numpy as np
 
 from jumplab.elastic import least_violation
 from jumplab.errors import InputError, SolverError
+from jumplab.kept import assembled
 from jumplab.packing import (
     group_rows,
     is_off,
@@ -23,7 +24,6 @@ from jumplab.packing import (
 )
 from jumplab.solution import Multipliers, PhaseGuess, PhaseSolution, Solution, Statistics
 from jumplab.terms import Problem
-from jumplab.transcription import Assembled
 
 __all__ = ["GOOD_STATUSES", "IPOPT", "WARM", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
 
@@ -54,12 +54,13 @@ WARM = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_sta
 class Nlp:
     """A problem ready to be solved for any target.
 
-    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches.
+    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches. With a ``key``
+    its functions are kept for later processes, see :mod:`jumplab.kept`.
     """
 
-    def __init__(self, problem: Problem, options: Mapping | None = None):
+    def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None):
         began = time.perf_counter()
-        self.problem, self.assembled = problem, Assembled(problem)
+        self.problem, self.assembled = problem, assembled(problem, key)
         self.groups = group_rows(self.assembled)
         self._solver = self._new_solver(options)
         self.build_s = time.perf_counter() - began

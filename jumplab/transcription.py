@@ -207,19 +207,22 @@ def _defect(layout, left, right, step):
 class Assembled:
     """The NLP's sparse functions of (x, p), gathered from the elements."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, known: dict | None = None):
+        """``known`` are the functions of this very problem, its rows and cost terms, from an earlier process."""
         self.problem = problem
         self.layouts, at = {}, 0
         for phase in problem.phases:
             self.layouts[phase.name] = PhaseLayout(phase, at)
             at += self.layouts[phase.name].size
         self.size = at
-        builder = ElementBuilder(problem, self.layouts)
-        self.n_par = builder.parameter_vector.numel()
+        self.n_par = sum(problem.parameters.values())
+        builder = ElementBuilder(problem, self.layouts) if known is None else None
         self.cost_terms: list[tuple[str, Term]] = []
-        for e in builder.elements:
-            for term, *_ in e.costs:
-                self.cost_terms.append((e.owner, term))
+        if known is None:
+            self.cost_terms = [(e.owner, term) for e in builder.elements for term, *_ in e.costs]
+        else:
+            terms = {(owner, term.name): term for owner, term in problem.terms()}
+            self.cost_terms = [(owner, terms[owner, name]) for owner, name in known["costs"]]
         self.n_weight = len(self.cost_terms)
         # p = [parameters; weights; per phase: references (rows) x nodes, column major, preceded by s]
         self.data_first, at = {}, self.n_par + self.n_weight
@@ -229,7 +232,19 @@ class Assembled:
             at += rows * (layout.phase.intervals + 1)
         self.p_size = at
         self.rows: list[Row] = []
-        self._assemble(builder)
+        if known is None:
+            self._assemble(builder)
+        else:
+            self._take(known, terms)
+
+    def _take(self, known: dict, terms: dict) -> None:
+        terms = terms | {(name, _defect_term().name): _defect_term() for name in self.layouts}
+        self.rows = [Row(owner, terms[owner, name], node, i) for owner, name, node, i in known["rows"]]
+        self.n_rows = len(self.rows)
+        self.nlp, self.grad_f, self.jac_g = known["nlp"], known["grad_f"], known["jac_g"]
+        self.hess_lag, self.cost_parts = known["hess_lag"], known["cost_parts"]
+        if self.nlp.size1_in(0) != self.size or self.nlp.size1_out(1) != self.n_rows:
+            raise ValueError(f"{self.problem.name}: functions of another problem")
 
     def _assemble(self, builder):
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", self.p_size)

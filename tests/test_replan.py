@@ -79,7 +79,7 @@ def test_multipliers_of_two_meshes_say_the_same():
     coarse = pack_multipliers(found[60][1].assembled, found[60][1].groups, found[30][0].multipliers)[1]
     group = next(g for g in found[60][1].groups if g.term.name == "wall")
     total = {n: f[0].multipliers.rows["go", "wall"][1].sum() / n for n, f in found.items()}
-    assert total[30] == pytest.approx(total[60], rel=0.02) and total[60] > 1.0
+    assert total[30] == pytest.approx(total[60], rel=0.05) and total[60] > 1.0
     assert coarse[group.index].sum() == pytest.approx(total[60], rel=0.1)
     assert share[np.argmax(values[:, 0])] == pytest.approx(0.5, abs=0.1)
 

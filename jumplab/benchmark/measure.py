@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -42,7 +43,7 @@ from jumplab.robot import load_robot
 from jumplab.task import JumpTask
 robot, task = load_robot(sys.argv[1]), JumpTask(float(sys.argv[2]), float(sys.argv[3]))
 imports_s = time.process_time()
-plan = Planner(robot).plan(task)
+plan = Planner(robot, keep=sys.argv[4] == "keep").plan(task)
 cpu_s, wall_s = time.process_time(), time.perf_counter() - began
 peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 from jumplab.passport.audit import audit
@@ -99,13 +100,16 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
     near = planner.plan(replace(task, distance_m=task.distance_m - NEIGHBOUR_M))
     planner.plan(near.task, "direct")  # the first call of anything is not timed
     peaks: list[float] = []
-    for k in range(repeats):
-        say(f"repeat {k + 1} of {repeats}")
-        plans = _once(watch, planner, refined, near, task)
-        for name, plan in plans.items():
-            audits.setdefault(name, []).append(audit(plan.tape, robot, task).passed)
+    with TemporaryDirectory() as kept:
         if cold:
-            peaks.append(_cold(watch, robot_name, task, audits))
+            _cold(Stopwatch(), robot_name, task, {}, kept)  # fills the folder
+        for k in range(repeats):
+            say(f"repeat {k + 1} of {repeats}")
+            plans = _once(watch, planner, refined, near, task)
+            for name, plan in plans.items():
+                audits.setdefault(name, []).append(audit(plan.tape, robot, task).passed)
+            if cold:
+                peaks.append(_cold(watch, robot_name, task, audits, kept))
     say("growth with nodes and targets")
     growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
@@ -138,20 +142,24 @@ def _stages(watch: Stopwatch, planner: Planner, task: JumpTask) -> None:
     watch("plan: tape", make_tape, body, robot, srmp)
 
 
-def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict) -> float:
-    """One plan in a new process, times as the process itself counts them; returns its peak memory [GiB]."""
-    command = [sys.executable, "-c", COLD, robot_name, repr(task.distance_m), repr(task.height_m)]
-    began = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **ONE_THREAD})
-    if done.returncode:
-        raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
-    said = json.loads(done.stdout)
-    for name in ("cold", "cold: imports and robot"):
-        watch.cpu.setdefault(name, []).append(said["imports_s" if "imports" in name else "cpu_s"])
-    watch.wall.setdefault("cold", []).append(said["wall_s"])
-    watch.wall.setdefault("cold, with the audit and the end of the process", []).append(time.perf_counter() - began)
-    audits.setdefault("cold", []).append(said["clean"])
-    return said["peak_kib"] / 2**20
+def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict, kept: str) -> float:
+    """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
+    in the folder ``kept``; returns the peak memory of the first [GiB]."""
+    peak = 0.0
+    for name, how in (("cold", "fresh"), ("cold, functions kept", "keep")):
+        command = [sys.executable, "-c", COLD, robot_name, repr(task.distance_m), repr(task.height_m), how]
+        done = subprocess.run(
+            command, capture_output=True, text=True, env={**os.environ, **ONE_THREAD, "JUMPLAB_CACHE": kept}
+        )
+        if done.returncode:
+            raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
+        said = json.loads(done.stdout)
+        for key, number in ((name, "cpu_s"), (f"{name}: imports and robot", "imports_s")):
+            watch.cpu.setdefault(key, []).append(said[number])
+        watch.wall.setdefault(name, []).append(said["wall_s"])
+        audits.setdefault(name, []).append(said["clean"])
+        peak = max(peak, said["peak_kib"] / 2**20)
+    return peak
 
 
 def _nodes(planner: Planner, task: JumpTask, nodes) -> list[dict]:
@@ -160,7 +168,8 @@ def _nodes(planner: Planner, task: JumpTask, nodes) -> list[dict]:
     joints = map_to_joints(srmp, planner.robot, GUESS_STEP_S, method="direct")
     rows = []
     for n in nodes:
-        mesh = Mesh(*(max(round(share * n), 2) for share in (1 / 3, 4 / 15, 2 / 5)))
+        flat, toe = max(round(n / 3), 2), max(round(4 * n / 15), 2)
+        mesh = Mesh(flat, toe, max(n - flat - toe, 2))
         watch = Stopwatch()
         body = watch("build", WholeBodyPlanner, planner.robot, mesh, refine=False)
         guess = guess_from_joints(joints, body, task, srmp.toe_s)

@@ -33,7 +33,8 @@ def report(head: dict, cpu: dict, wall: dict, audits: dict, iterations: dict, fu
 
     Returns
     -------
-    dict of plain types: the numbers of :data:`GOALS` (None if not measured), ``goals`` (name -> value, limit, aim,
+    dict of plain types: the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
+    ``cold_over_direct``, but the new process found its functions on file), ``goals`` (name -> value, limit, aim,
     reached), ``peer`` (which way the direct NLP was solved faster), ``audits`` (name -> clean, of), ``median_s`` and
     ``raw_s`` (name -> CPU and wall times), ``iterations``, ``functions_s`` (CPU time of function evaluations in the
     solve on the fine mesh), ``where`` (stage -> share of the three steps' time), ``growth``, ``machine``.
@@ -46,8 +47,9 @@ def report(head: dict, cpu: dict, wall: dict, audits: dict, iterations: dict, fu
         "peak_memory_gib": max(peaks) if peaks else None,
         "node_growth_error": line_error(growth["nodes"]),
     }
+    whole = np.add(cpu["direct, build"], cpu[peer])
     if "cold" in cpu:
-        numbers["cold_over_direct"] = _ratio(cpu["cold"], np.add(cpu["direct, build"], cpu[peer]))
+        numbers["cold_over_direct"] = _ratio(cpu["cold"], whole)
     goals = {}
     for name, (limit, aim) in GOALS.items():
         value = numbers[name]
@@ -57,6 +59,7 @@ def report(head: dict, cpu: dict, wall: dict, audits: dict, iterations: dict, fu
         **numbers,
         "goals": goals,
         "peer": peer,
+        "cold_kept_over_direct": _ratio(cpu["cold, functions kept"], whole) if "cold" in cpu else None,
         "audits": {name: {"clean": sum(found), "of": len(found)} for name, found in audits.items()},
         **head,
         "median_s": {k: {n: float(np.median(x)) for n, x in v.items()} for k, v in (("cpu", cpu), ("wall", wall))},
@@ -102,6 +105,9 @@ def text(found: dict) -> str:
     lines = [f"direct NLP, the peer: {found['peer']} (the faster of two ways)", "", "ratios and limits"]
     for name, goal in found["goals"].items():
         lines.append(f"  {WORDS[name]:<76} {_goal(goal)}")
+    kept = found["cold_kept_over_direct"]
+    if kept is not None:
+        lines.append(f"  {'the same with functions kept from an earlier process':<76} {kept:.3f}")
     lines += ["", f"medians of {found['repeats']} repeats [s]" + " " * 24 + "CPU      wall"]
     cpu, wall = found["median_s"]["cpu"], found["median_s"]["wall"]
     for name in cpu:

@@ -51,11 +51,13 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
 
 
 class SrmpPlanner:
-    """Stage 1 for one robot: built once, solved for any target."""
+    """Stage 1 for one robot: built once, solved for any target; ``keep`` keeps what was built for later processes."""
 
-    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None):
+    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None, *,
+                 keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
-        self.nlp = Nlp(build_problem(robot, settings, self.reach), options)
+        key = f"{robot.hash} {settings}" if keep else None
+        self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **(options or {})})
 
     def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF,

@@ -83,16 +83,19 @@ class WholeBodyPlanner:
 
     With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once. By
     default whatever is faster, as measured: refining from the good guess that tracking has, at once from the naive one.
+    ``keep`` keeps what was built for later processes.
     """
 
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None, refine: bool | None = None):  # fmt: skip
+                 tracking: bool = True, options: Mapping | None = None, refine: bool | None = None,
+                 keep: bool = False):  # fmt: skip
         self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
         self.stance = stance_angles(robot)
         options = dict(options or {})
 
         def build(mesh: Mesh, extra: Mapping) -> Nlp:
-            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options})
+            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options},
+                       f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None)  # fmt: skip
 
         self.nlp = build(mesh, FINE)
         self._coarse = build(mesh.coarse(), COARSE) if (tracking if refine is None else refine) else None
