@@ -49,7 +49,7 @@ def here(tmp_path, monkeypatch):
 
 
 REFUSALS = [
-    ("", "choose a command: run, plan, simulate, audit, view or export; " + HELP),
+    ("", "choose a command: run, plan, simulate, audit, view, export, sweep or bench; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
     ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
     ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),
