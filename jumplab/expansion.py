@@ -41,8 +41,7 @@ def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot
     launch_s = flat.duration + toe.duration
     steps = int(np.ceil(launch_s * RATE_HZ - 1e-9))
     t_launch = launch_s - np.arange(steps, -1, -1) / RATE_HZ
-    parts = [_launch_sample(flat, toe, max(t, 0.0)) for t in t_launch]
-    q, v, a = (np.array([p[i] for p in parts]) for i in range(3))
+    q, v, a = _launch_samples(flat, toe, np.maximum(t_launch, 0.0))
     t_flight = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
     qf, vf, af = flight.sample(t_flight)
     c = flight.constants
@@ -62,10 +61,12 @@ def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot
         toe_phase_start=np.array(flat.duration - start))  # fmt: skip
 
 
-def _launch_sample(flat, toe, t):
-    if t < flat.duration:
-        return [np.concatenate([[0.0], x[0]]) for x in flat.sample(t)]
-    return [x[0] for x in toe.sample(min(t - flat.duration, toe.duration))]
+def _launch_samples(flat, toe, t):
+    """Angles, rates and accelerations (n, 5) at times of the launch; the flat foot does not turn."""
+    first = t < flat.duration
+    still = np.zeros((int(first.sum()), 1))
+    later = toe.sample(np.minimum(t[~first] - flat.duration, toe.duration))
+    return [np.concatenate([np.hstack([still, x]), y]) for x, y in zip(flat.sample(t[first]), later, strict=True)]
 
 
 def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: dict | None = None) -> Tape:
@@ -78,7 +79,7 @@ def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: d
     columns, role, signs = _joint_columns(robot)
     origin = -robot.sagittal.sole_center
     angles, rates, accels = motion["angles"], motion["rates"], motion["accels"]
-    q = np.array([configuration(robot, x, p + origin) for x, p in zip(angles, motion["toe"], strict=True)])
+    q = configuration(robot, angles, motion["toe"] + origin)
     v, a = np.zeros((n, model.nv)), np.zeros((n, model.nv))
     v[:, columns] = robot.sagittal.joint_angles(rates)[:, role] * signs
     a[:, columns] = robot.sagittal.joint_angles(accels)[:, role] * signs
@@ -118,22 +119,29 @@ def _base_motion(robot, motion):
 
 
 def _forces(robot, q, v, a, wrench, toe):
+    """Wrenches on the feet (n, K, 6), half of the planar one (n, 3) each, and the joint torques that go with them."""
     model = robot.model
     data = model.createData()
-    frames = [model.getFrameId(name) for name in robot.foot.frames]
-    joints = [model.frames[i].parentJoint for i in frames]
-    f, tau = np.zeros((len(q), len(frames), 6)), np.zeros((len(q), model.nv - 6))
+    frames = [model.frames[model.getFrameId(name)] for name in robot.foot.frames]
+    joints = [frame.parentJoint for frame in frames]
+    turn, place = np.empty((len(q), len(frames), 3, 3)), np.empty((len(q), len(frames), 3))  # of the feet's joints
+    for k, x in enumerate(q):
+        pin.forwardKinematics(model, data, x)
+        for i, joint in enumerate(joints):
+            turn[k, i], place[k, i] = data.oMi[joint].rotation, data.oMi[joint].translation
+    offset = np.einsum("kiab,ib->kia", turn, np.array([frame.placement.translation for frame in frames]))
+    lever = np.zeros_like(place)  # frame to toe
+    lever[..., [0, 2]] = toe[:, None] - (place + offset)[..., [0, 2]]
+    force, moment = np.zeros_like(place), np.zeros_like(place)
+    force[..., [0, 2]] = wrench[:, None, :2] / 2
+    moment[..., 1] = wrench[:, None, 2] / 2 + lever[..., 2] * force[..., 0] - lever[..., 0] * force[..., 2]
+    at_joint = np.concatenate([force, moment + np.cross(offset, force)], -1)
+    local = np.einsum("kiba,kicb->kica", turn, at_joint.reshape(*place.shape[:2], 2, 3)).reshape(*place.shape[:2], 6)
     external = pin.StdVec_Force()
     external.extend([pin.Force.Zero() for _ in range(model.njoints)])
+    tau = np.empty((len(q), model.nv - 6))
     for k in range(len(q)):
-        pin.forwardKinematics(model, data, q[k])
-        for i, (frame, joint) in enumerate(zip(frames, joints, strict=True)):
-            place = pin.updateFramePlacement(model, data, frame)
-            force = np.array([wrench[k, 0], 0.0, wrench[k, 1]]) / 2
-            lever = np.array([toe[k, 0] - place.translation[0], 0.0, toe[k, 1] - place.translation[2]])
-            moment = np.array([0.0, wrench[k, 2] / 2, 0.0]) + np.cross(lever, force)
-            f[k, i] = np.concatenate([force, moment])
-            world = pin.SE3(np.eye(3), place.translation)
-            external[joint] = data.oMi[joint].actInv(world.act(pin.Force(force, moment)))
+        for i, joint in enumerate(joints):
+            external[joint] = pin.Force(local[k, i])
         tau[k] = pin.rnea(model, data, q[k], v[k], a[k], external)[6:]
-    return f, tau
+    return np.concatenate([force, moment], -1), tau

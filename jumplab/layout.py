@@ -58,6 +58,14 @@ class PhaseLayout:
         """Indices of the states at node k (3 nq + nz,)."""
         return self.first + self.n_const + k * self.stride + np.arange(3 * self.nq + self.nz)
 
+    def nodes(self) -> np.ndarray:
+        """(N + 1, nx) places of all nodes."""
+        return self.node(0) + self.stride * np.arange(self.phase.intervals + 1)[:, None]
+
+    def jerks(self) -> np.ndarray:
+        """(N, nq) places of all jerks."""
+        return self.jerk(0) + self.stride * np.arange(self.phase.intervals)[:, None]
+
     def jerk(self, k: int) -> np.ndarray:
         """Indices of the jerk between nodes k and k + 1 (nq,)."""
         return self.first + self.n_const + k * self.stride + 3 * self.nq + self.nz + np.arange(self.nq)

@@ -17,7 +17,7 @@ from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
-from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body import Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
@@ -45,7 +45,7 @@ class JumpPlan:
     ----------
     task, robot, method : what was asked, of whom, and how it was planned.
     tape : the 1 kHz tape of the full robot.
-    srmp, joints : results of stages 1 and 2 (None for the direct planner).
+    srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner.
     statistics : one row per stage.
     """
@@ -124,31 +124,38 @@ def _peaks(names, values) -> dict[str, float]:
 
 
 class Planner:
-    """All stages for one robot, built on first use and kept for further targets."""
+    """All stages for one robot, built on first use and kept for further targets; ``mesh`` is that of stage 3.
 
-    def __init__(self, robot: Robot):
+    ``keep`` keeps the built problems for later processes, see :mod:`jumplab.kept`.
+    """
+
+    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), *, keep: bool = False):
         needs(robot, Robot, "the robot to plan for")
-        self.robot = robot
+        self.robot, self.mesh, self.keep = robot, mesh, keep
         self._stages: dict = {}
 
-    def _stage(self, name: str):
+    def stage(self, name: str):
+        """A stage's planner: "reach", "srmp", "whole body" or "direct"."""
         if name not in self._stages:
             build = {
                 "reach": lambda: reach(self.robot),
-                "srmp": lambda: SrmpPlanner(self.robot),
-                "whole body": lambda: WholeBodyPlanner(self.robot),
-                "direct": lambda: WholeBodyPlanner(self.robot, tracking=False),
+                "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
+                "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
+                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
 
-    def plan(self, task: JumpTask, method: str = "three-step") -> JumpPlan:
+    def plan(
+        self, task: JumpTask, method: str = "three-step", *, weights: Mapping[str, float] | None = None
+    ) -> JumpPlan:
         """Plan one jump.
 
         Parameters
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
+        weights : of stage 3's cost terms, instead of their own; name -> weight.
 
         Raises
         ------
@@ -160,15 +167,15 @@ class Planner:
             raise InputError(f"method {said(method)}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
         if method == "direct":
-            check_reachable(task, self._stage("reach"), self.robot)
-            planner = self._stage("direct")
-            body = planner.plan(task)
-            rows = _body_rows("direct", body)
+            check_reachable(task, self.stage("reach"), self.robot)
+            planner = self.stage("direct")
+            body = planner.plan(task, weights=weights)
+            rows = body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         srmp, joints = self._first_two(task)
-        last = self._stage("whole body")
-        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
-        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *_body_rows("3 whole body", body))
+        last = self.stage("whole body")
+        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights)
+        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
 
     def _first_two(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
@@ -182,7 +189,7 @@ class Planner:
             raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
 
     def _pass(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
-        srmp = self._stage("srmp").plan(task)
+        srmp = self.stage("srmp").plan(task)
         return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
 
     def _nearest(self, task: JumpTask) -> str:
@@ -200,12 +207,38 @@ class Planner:
                 return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
         return ""
 
+    def replan(self, previous: JumpPlan, task: JumpTask) -> JumpPlan:
+        """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
+
+        Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
+        out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
+
+        Raises
+        ------
+        InputError, InfeasibleError, SolverError
+            As :meth:`plan`.
+        """
+        if previous.robot.hash != self.robot.hash:
+            raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
+        check_platform(task, self.robot)
+        if previous.method == "direct":
+            check_reachable(task, self.stage("reach"), self.robot)
+            body, srmp, rows = self.stage("direct").plan(task, near=previous.whole_body), None, ()
+        else:
+            srmp = self.stage("srmp").plan(task, near=previous.srmp)
+            body = self.stage("whole body").plan(task, srmp, near=previous.whole_body)
+            rows = (_row("1 SRMP", srmp.solution.statistics),)
+        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
+        tape = make_tape(body, self.robot, srmp)
+        return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
+
 
 def _row(stage: str, s: Statistics) -> StageRow:
     return StageRow(stage, s.iterations, s.build_s, s.solve_s)
 
 
-def _body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+    """What stage 3 or the direct planner cost: the coarse mesh, if there was one, and the fine one."""
     fine = _row(stage, body.solution.statistics)
     return (fine,) if body.coarse is None else (_row(f"{stage}, coarse", body.coarse), fine)
 
@@ -217,7 +250,7 @@ def _joint_row(joints: JointPlan) -> StageRow:
 
 def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> JumpPlan:
     """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
-    return Planner(robot).plan(task, method)
+    return Planner(robot, keep=True).plan(task, method)
 
 
 def guess_from_joints(

@@ -72,8 +72,24 @@ class PhaseSolution:
 
 
 @dataclass(frozen=True)
+class Multipliers:
+    """Lagrange multipliers of a solution, free of its mesh: what each limit is worth.
+
+    Attributes
+    ----------
+    rows : (owner, term name) -> shares of the phase (K,), values (K, C); of limits along a phase per unit of share.
+    nodes : phase -> (N + 1, nx) of the bounds on node variables, per unit of share.
+    constants : phase -> of the bounds on duration and constants.
+    """
+
+    rows: dict
+    nodes: dict
+    constants: dict
+
+
+@dataclass(frozen=True)
 class Statistics:
-    """What a solve cost."""
+    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the solver's own."""
 
     iterations: int
     status: str
@@ -83,6 +99,7 @@ class Statistics:
     rows: int
     objective: float
     residual: float
+    functions_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -94,6 +111,7 @@ class Solution:
     statistics: Statistics
     cost_shares: tuple[dict, ...]
     constraint_report: tuple[dict, ...]
+    multipliers: Multipliers | None = None
 
     def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
         """All phases as a warm start, on another mesh if asked."""

@@ -11,9 +11,21 @@ import numpy as np
 
 from jumplab.elastic import least_violation
 from jumplab.errors import InputError, SolverError
-from jumplab.solution import PhaseGuess, PhaseSolution, Solution, Statistics
-from jumplab.terms import Bound, Problem
-from jumplab.transcription import Assembled, PhaseLayout
+from jumplab.kept import assembled
+from jumplab.packing import (
+    group_rows,
+    is_off,
+    pack,
+    pack_multipliers,
+    row_bounds,
+    unpack,
+    unpack_multipliers,
+    variable_bounds,
+)
+from jumplab.solution import Multipliers, PhaseGuess, PhaseSolution, Solution, Statistics
+from jumplab.terms import Problem
+
+__all__ = ["GOOD_STATUSES", "IPOPT", "WARM", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
 
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # our choice: scaled row error above which a "solved" status is not believed
@@ -26,26 +38,30 @@ IPOPT = {
     "max_iter": 300,
     "max_wall_time": 60.0,  # [s]; a solve that needs longer is lost, not slow
     "mu_strategy": "adaptive",
+    "mumps_pivot_order": 0,  # AMD; beyond 10 000 rows MUMPS would choose METIS, and an iteration costs twice as much
     "nlp_scaling_method": "none",  # the terms carry their scales
     "print_level": 0,
     "sb": "yes",
 }
 
 
-def _resolve(value, parameters, size):
-    value = value(parameters) if callable(value) else value
-    return np.broadcast_to(np.asarray(value, float).ravel(), (size,))
+# our choice: begun from a solution close by with its multipliers, the start is not pushed away from its limits
+WARM = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_start_bound_frac": 1e-6,
+        "warm_start_slack_bound_push": 1e-6, "warm_start_slack_bound_frac": 1e-6,
+        "warm_start_mult_bound_push": 1e-6}  # fmt: skip
 
 
 class Nlp:
     """A problem ready to be solved for any target.
 
-    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches.
+    Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches. With a ``key``
+    its functions are kept for later processes, see :mod:`jumplab.kept`.
     """
 
-    def __init__(self, problem: Problem, options: Mapping | None = None):
+    def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None):
         began = time.perf_counter()
-        self.problem, self.assembled = problem, Assembled(problem)
+        self.problem, self.assembled = problem, assembled(problem, key)
+        self.groups = group_rows(self.assembled)
         self._solver = self._new_solver(options)
         self.build_s = time.perf_counter() - began
 
@@ -72,9 +88,6 @@ class Nlp:
                 )
 
     # building blocks of one solve -------------------------------------------------------------------------------
-    def _is_off(self, owner, name, off):
-        return name in off or f"{owner}/{name}" in off
-
     def _parameter_vector(self, parameters, references, weights, off):
         a, problem = self.assembled, self.problem
         unknown = set(parameters) ^ set(problem.parameters)
@@ -86,7 +99,7 @@ class Nlp:
         weight = []
         for owner, term in a.cost_terms:
             w = weights.get(f"{owner}/{term.name}", weights.get(term.name, term.weight))
-            weight.append(0.0 if self._is_off(owner, term.name, off) else w)
+            weight.append(0.0 if is_off(owner, term.name, off) else w)
         columns = self._reference_columns(references)
         vector = np.concatenate([np.concatenate([*values, [0.0]])[:-1], weight, *columns])
         if not np.all(np.isfinite(vector)):
@@ -119,107 +132,10 @@ class Nlp:
             columns.append(np.concatenate(rows).ravel(order="F"))
         return columns
 
-    def _variable_bounds(self, parameters, off):
-        a = self.assembled
-        low, high = np.full(a.size, -np.inf), np.full(a.size, np.inf)
-        for layout in a.layouts.values():
-            phase = layout.phase
-            ends = [phase.duration, *(c[:2] for c in phase.constants.values())]
-            for i, (lo, hi), s in zip(layout.constants(), ends, layout.constant_scales(), strict=True):
-                low[i], high[i] = _resolve(lo, parameters, 1)[0] / s, _resolve(hi, parameters, 1)[0] / s
-            for bound in phase.bounds:
-                if not self._is_off(phase.name, bound.name, off):
-                    self._apply(layout, bound, parameters, low, high)
-        return low, high
-
-    @staticmethod
-    def _apply(layout: PhaseLayout, bound: Bound, parameters, low, high):
-        n, nq = layout.phase.intervals, layout.nq
-        first = {"q": 0, "v": nq, "a": 2 * nq, "z": 3 * nq, "j": 0}[bound.on]
-        size = layout.nz if bound.on == "z" else nq
-        nodes = {"all": range(n + 1), "start": (0,), "end": (n,), "inner": range(1, n + 1)}[bound.where]
-        lo = _resolve(bound.lower, parameters, size) / layout.phase.scale(bound.on, size)
-        hi = _resolve(bound.upper, parameters, size) / layout.phase.scale(bound.on, size)
-        for k in nodes:
-            if bound.on == "j" and k == n:
-                continue
-            i = layout.jerk(k) if bound.on == "j" else layout.node(k)[first : first + size]
-            low[i], high[i] = np.maximum(low[i], lo), np.minimum(high[i], hi)
-            worst = int(np.argmax(low[i] - high[i]))
-            if low[i][worst] > high[i][worst]:
-                which = f"bound {bound.name!r} of phase {layout.phase.name!r} and another on {bound.on!r}"
-                gap = f"at node {k}, component {worst}: {low[i][worst]:.4g} > {high[i][worst]:.4g} (scaled)"
-                raise InputError(f"{which} exclude each other {gap}; look at those that depend on the target")
-
-    def _row_bounds(self, parameters, off):
-        rows, cache, sizes = self.assembled.rows, {}, {}
-        low, high = np.empty(len(rows)), np.empty(len(rows))
-        for row in rows:
-            key = (row.owner, row.term.name)
-            sizes[key] = max(sizes.get(key, 0), row.component + 1)
-        for i, row in enumerate(rows):
-            key = (row.owner, row.term.name)
-            if key not in cache:
-                count = sizes[key]
-                lo = _resolve(row.term.lower, parameters, count) / row.term.scale
-                hi = _resolve(row.term.upper, parameters, count) / row.term.scale
-                switched = self._is_off(row.owner, row.term.name, off)
-                cache[key] = (np.full(count, -np.inf), np.full(count, np.inf)) if switched else (lo, hi)
-            low[i], high[i] = cache[key][0][row.component], cache[key][1][row.component]
-        return low, high
-
-    def _checked_guess(self, guess, layout) -> PhaseGuess:
-        name, n = layout.phase.name, layout.phase.intervals
-        if name not in guess:
-            raise InputError(f"{self.problem.name}: the guess has no phase {name!r}")
-        g = guess[name]
-        for key, size in (("q", layout.nq), ("v", layout.nq), ("a", layout.nq), ("z", layout.nz)):
-            x = getattr(g, key)
-            what = f"{self.problem.name}: guess {key!r} of phase {name!r}"
-            if x is not None and np.shape(x) != (n + 1, size):
-                raise InputError(f"{what} has shape {np.shape(x)}, must be {(n + 1, size)}")
-            if x is not None and not np.all(np.isfinite(x)):
-                raise InputError(f"{what} is not finite")
-        if not (np.isfinite(g.duration) and g.duration > 0):
-            raise InputError(f"{self.problem.name}: guess of phase {name!r} has the duration {g.duration} s")
-        return g
-
-    def _pack(self, guess: Mapping[str, PhaseGuess]):
-        x = np.zeros(self.assembled.size)
-        for layout in self.assembled.layouts.values():
-            phase, n = layout.phase, layout.phase.intervals
-            g = self._checked_guess(guess, layout)
-            t = np.linspace(0, g.duration, n + 1)
-            v = np.gradient(g.q, t, axis=0) if g.v is None else g.v
-            a = np.gradient(v, t, axis=0) if g.a is None else g.a
-            z = np.zeros((n + 1, layout.nz)) if g.z is None else g.z
-            j = np.diff(a, axis=0) / (g.duration / n) / phase.scale("j", layout.nq)
-            nodes = np.concatenate([g.q, v, a, z], axis=1) / layout.node_scales()
-            constants = [g.duration, *(g.constants.get(c, 0.0) for c in phase.constants)]
-            x[layout.constants()] = np.array(constants) / layout.constant_scales()
-            for k in range(n + 1):
-                x[layout.node(k)] = nodes[k]
-            for k in range(n):
-                x[layout.jerk(k)] = j[k]
-        return x
-
-    def _unpack(self, x) -> dict[str, PhaseSolution]:
-        out = {}
-        for name, layout in self.assembled.layouts.items():
-            n, nq, phase = layout.phase.intervals, layout.nq, layout.phase
-            nodes = np.array([x[layout.node(k)] for k in range(n + 1)]) * layout.node_scales()
-            jerk = np.array([x[layout.jerk(k)] for k in range(n)]) * phase.scale("j", nq)
-            constants = x[layout.constants()] * layout.constant_scales()
-            q, v, a, z = np.split(nodes, [nq, 2 * nq, 3 * nq], axis=1)
-            duration = float(constants[0])
-            named = {c: float(value) for c, value in zip(phase.constants, constants[1:], strict=True)}
-            out[name] = PhaseSolution(np.linspace(0, duration, n + 1), q, v, a, jerk, z, duration, named)
-        return out
-
     # solving ----------------------------------------------------------------------------------------------------
     def solve(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], *, references: Mapping | None = None,
               weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
-              explain: bool = True) -> Solution:  # fmt: skip
+              multipliers: Multipliers | None = None, explain: bool = True) -> Solution:  # fmt: skip
         """Solve for one target.
 
         Parameters
@@ -229,6 +145,7 @@ class Nlp:
         references : phase name -> reference name -> (size, N + 1).
         weights : term name (or "phase/name") -> weight, instead of the term's own.
         off : names of terms and bounds to leave out.
+        multipliers : of a solution close by, on any mesh; used if ipopt's option ``warm_start_init_point`` is "yes".
         explain : look for the terms in conflict if there is no solution; it costs about as much as the solve.
 
         Raises
@@ -241,11 +158,15 @@ class Nlp:
         self.problem.check_names([*weights, *off], "weight or switch")
         self._check_weights(weights)
         p = self._parameter_vector(parameters, references, weights, off)
-        low, high = self._variable_bounds(parameters, off)
-        row_low, row_high = self._row_bounds(parameters, off)
-        x0 = np.clip(self._pack(guess), low, high)
+        a = self.assembled
+        low, high = variable_bounds(a, parameters, off)
+        row_low, row_high = row_bounds(self.groups, a.n_rows, parameters, off)
+        x0 = np.clip(pack(a, guess), low, high)
+        start = {}
+        if multipliers is not None:
+            start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, self.groups, multipliers), strict=True))
         began = time.perf_counter()
-        answer = self._solver(x0=x0, p=p, lbx=low, ubx=high, lbg=row_low, ubg=row_high)
+        answer = self._solver(x0=x0, p=p, lbx=low, ubx=high, lbg=row_low, ubg=row_high, **start)
         solve_s = time.perf_counter() - began
         stats = self._solver.stats()
         x, g = answer["x"].full().ravel(), answer["g"].full().ravel()
@@ -258,10 +179,13 @@ class Nlp:
             if not explain:
                 raise SolverError(said, stage=self.problem.name, status=status)
             self._fail(said, status, x0, p, (low, high), (row_low, row_high))
+        functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
         statistics = Statistics(int(stats["iter_count"]), status, self.build_s, solve_s, len(x), len(g),
-                                float(answer["f"]), residual)  # fmt: skip
-        return Solution(self.problem, self._unpack(x), statistics, self._cost_shares(x, p),
-                        self._constraint_report(g, row_low, row_high))  # fmt: skip
+                                float(answer["f"]), residual, functions_s)  # fmt: skip
+        lam_x, lam_g = (answer[k].full().ravel() for k in ("lam_x", "lam_g"))
+        return Solution(self.problem, unpack(a, x), statistics, self._cost_shares(x, p),
+                        self._constraint_report(g, row_low, row_high),
+                        unpack_multipliers(a, self.groups, lam_x, lam_g))  # fmt: skip
 
     def _cost_shares(self, x, p):
         a = self.assembled
@@ -274,17 +198,18 @@ class Nlp:
         )
 
     def _constraint_report(self, g, low, high):
-        best: dict[tuple, dict] = {}
-        for row, value, lo, hi in zip(self.assembled.rows, g, low, high, strict=True):
-            if row.term.name == "jerk chain" or not (np.isfinite(lo) or np.isfinite(hi)):
+        out = []
+        for group in self.groups:
+            term, i = group.term, group.index
+            slack = np.minimum(g[i] - low[i], high[i] - g[i])
+            if term.name == "jerk chain" or not np.any(np.isfinite(slack)):
                 continue
-            slack, scale = min(value - lo, hi - value), row.term.scale
-            key = (row.owner, row.term.name)
-            if key not in best or slack * scale < best[key]["slack"]:
-                best[key] = dict(phase=row.owner, name=row.term.name, equation=row.term.equation, unit=row.term.unit,
-                                 kind="equality" if lo == hi else "inequality", node=row.node,
-                                 value=float(value * scale), slack=float(slack * scale))  # fmt: skip
-        return tuple(best.values())
+            k, c = np.unravel_index(np.argmin(slack), slack.shape)
+            row = i[k, c]
+            out.append(dict(phase=group.owner, name=term.name, equation=term.equation, unit=term.unit,
+                            kind="equality" if low[row] == high[row] else "inequality", node=int(group.nodes[k]),
+                            value=float(g[row] * term.scale), slack=float(slack[k, c] * term.scale)))  # fmt: skip
+        return tuple(out)
 
     def _refuse_no_numbers(self, points, p, said, status):
         """Name the terms that are no number, or have no slope, at one of the points; ipopt says only that some are."""
@@ -298,7 +223,7 @@ class Nlp:
 
     def _without_number(self, x, p) -> list[str]:
         """Terms with a value or slope at ``x`` that is not finite: "phase/term at node k, t = ... s of the phase"."""
-        a, phases, named = self.assembled, self._unpack(x), {}
+        a, phases, named = self.assembled, unpack(self.assembled, x), {}
         slope = a.jac_g(x, p)[1]
         bad = ~np.isfinite(a.nlp(x, p)[1].full().ravel())
         bad[np.array(slope.sparsity().row(), int)[~np.isfinite(np.array(slope.nonzeros()))]] = True
@@ -318,7 +243,7 @@ class Nlp:
         """Re-solve with every row softened, and say which terms cannot be met together, where and by how much."""
         x, beyond = least_violation(self.assembled, x0, p, box, rows)
         worst: dict[tuple, tuple] = {}
-        phases = self._unpack(x)
+        phases = unpack(self.assembled, x)
         for row, amount in zip(self.assembled.rows, beyond, strict=True):
             key = (row.owner, row.term.name)
             if amount > CONFLICT_LIMIT and amount > worst.get(key, (0,))[0]:

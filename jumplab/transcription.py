@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from jumplab.layout import PhaseLayout
+from jumplab.pieces import Piece, gather, scatter
 from jumplab.terms import Point, Problem, Term
 
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
@@ -41,7 +42,7 @@ class Element:
     def __init__(self, local, data, outputs, terms, index, data_columns, owner, nodes):
         self.local, self.data, self.index, self.data_columns = local, data, index, data_columns  # index (n, ny)
         self.owner, self.nodes = owner, nodes
-        self.costs = [(t, e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]
+        self.costs = [(t, *e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]  # term, share, column
         self.constraints = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
 
 
@@ -132,7 +133,8 @@ class ElementBuilder:
 
     @staticmethod
     def _weighted(term, expression, step):
-        return step * ca.sumsqr(expression) if term.is_cost else expression / term.scale
+        """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
+        return (step, expression) if term.is_cost else expression / term.scale
 
 
 def _trapezoid(s):
@@ -155,19 +157,22 @@ def _defect(layout, left, right, step):
 class Assembled:
     """The NLP's sparse functions of (x, p), gathered from the elements."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, known: dict | None = None):
+        """``known`` are the functions of this very problem, its rows and cost terms, from an earlier process."""
         self.problem = problem
         self.layouts, at = {}, 0
         for phase in problem.phases:
             self.layouts[phase.name] = PhaseLayout(phase, at)
             at += self.layouts[phase.name].size
         self.size = at
-        builder = ElementBuilder(problem, self.layouts)
-        self.n_par = builder.parameter_vector.numel()
+        self.n_par = sum(problem.parameters.values())
+        builder = ElementBuilder(problem, self.layouts) if known is None else None
         self.cost_terms: list[tuple[str, Term]] = []
-        for e in builder.elements:
-            for term, _ in e.costs:
-                self.cost_terms.append((e.owner, term))
+        if known is None:
+            self.cost_terms = [(e.owner, term) for e in builder.elements for term, *_ in e.costs]
+        else:
+            terms = {(owner, term.name): term for owner, term in problem.terms()}
+            self.cost_terms = [(owner, terms[owner, name]) for owner, name in known["costs"]]
         self.n_weight = len(self.cost_terms)
         # p = [parameters; weights; per phase: references (rows) x nodes, column major, preceded by s]
         self.data_first, at = {}, self.n_par + self.n_weight
@@ -177,7 +182,19 @@ class Assembled:
             at += rows * (layout.phase.intervals + 1)
         self.p_size = at
         self.rows: list[Row] = []
-        self._assemble(builder)
+        if known is None:
+            self._assemble(builder)
+        else:
+            self._take(known, terms)
+
+    def _take(self, known: dict, terms: dict) -> None:
+        terms = terms | {(name, _defect_term().name): _defect_term() for name in self.layouts}
+        self.rows = [Row(owner, terms[owner, name], node, i) for owner, name, node, i in known["rows"]]
+        self.n_rows = len(self.rows)
+        self.nlp, self.grad_f, self.jac_g = known["nlp"], known["grad_f"], known["jac_g"]
+        self.hess_lag, self.cost_parts = known["hess_lag"], known["cost_parts"]
+        if self.nlp.size1_in(0) != self.size or self.nlp.size1_out(1) != self.n_rows:
+            raise ValueError(f"{self.problem.name}: functions of another problem")
 
     def _assemble(self, builder):
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", self.p_size)
@@ -191,16 +208,16 @@ class Assembled:
                 self._data(p, e),
                 p[: self.n_par],
             ]
-            pieces.append(_Piece(e, builder.parameter_vector, inputs, weights, keep, rows))
+            pieces.append(Piece(e, builder.parameter_vector, inputs, weights, keep, rows))
             rows, weight_at = rows + len(keep), weight_at + len(e.costs)
         self.n_rows = rows
         lam_g = ca.MX.sym("lam_g", rows)
         costs = [c for c in (piece.costs() for piece in pieces) if c is not None]
         f, parts = sum(c[0] for c in costs), ca.vertcat(*(c[1] for c in costs))
-        grad = sum(_scatter(piece.e.index.ravel(), self.size) @ piece.gradient() for piece in pieces if piece.e.costs)
+        grad = sum(scatter(piece.e.index.ravel(), self.size) @ piece.gradient() for piece in pieces if piece.e.costs)
         g = ca.vertcat(*(piece.rows() for piece in pieces if piece.e.constraints))
-        jac = _gather([piece.jacobian() for piece in pieces if piece.e.constraints], (rows, self.size))
-        hess = _gather([h for h in (piece.hessian(lam_f, lam_g) for piece in pieces) if h], (self.size, self.size))
+        jac = gather([piece.jacobian() for piece in pieces if piece.e.constraints], (rows, self.size))
+        hess = gather([h for h in (piece.hessian(lam_f, lam_g) for piece in pieces) if h], (self.size, self.size))
         self.nlp = ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"])
         self.grad_f = ca.Function("nlp_grad_f", [x, p], [f, grad], ["x", "p"], ["f", "grad_f_x"])
         self.jac_g = ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"])
@@ -228,80 +245,3 @@ class Assembled:
         first, rows = self.data_first[e.owner]
         index = np.concatenate([first + k * rows + np.arange(rows) for k in e.data_columns])
         return ca.reshape(p[index.tolist()], rows, len(e.data_columns))
-
-
-def _scatter(index, size) -> ca.DM:
-    """0/1 matrix that adds entry i of a vector to position index[i]."""
-    index = np.asarray(index, int)
-    return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
-
-
-def _gather(pieces, shape):
-    """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
-    values = ca.vertcat(*(piece[0] for piece in pieces))
-    rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
-    key = cols.astype(np.int64) * shape[0] + rows
-    unique, inverse = np.unique(key, return_inverse=True)
-    pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
-    if len(unique) == len(key):
-        return ca.MX(pattern, values[np.argsort(key).tolist()])
-    return ca.MX(pattern, _scatter(inverse, len(unique)) @ values)
-
-
-class _Piece:
-    """What one element contributes to the NLP: its small functions, differentiated once, called for all repetitions."""
-
-    def __init__(self, element: Element, parameters, inputs, weights, keep, first_row):
-        self.e, self.keep, self.first_row = element, keep, first_row
-        self.n, self.ny = element.index.shape
-        self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
-        self.weights = ca.repmat(weights, 1, self.n)
-        self.arguments = [element.local, element.data, parameters]
-        self.w = ca.SX.sym("w", len(element.costs))
-        self.cost_parts = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.costs))
-        self.g = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.constraints))
-        self.total = ca.dot(self.w, self.cost_parts) if element.costs else ca.SX(0)
-
-    def _map(self, name, extra_symbols, output, extra_values):
-        function = ca.Function(name, [*self.arguments, *extra_symbols], [output], {"cse": True})
-        return function.map(self.n)(*self.inputs, *extra_values)
-
-    def costs(self):
-        """(weighted sum, unweighted parts) or None."""
-        if not self.e.costs:
-            return None
-        parts = ca.sum2(self._map("costs", [], self.cost_parts, []))
-        return ca.dot(self.weights[:, 0], parts), parts
-
-    def gradient(self):
-        """Local gradients, one under the other."""
-        return ca.vec(self._map("gradient", [self.w], ca.gradient(self.total, self.e.local), [self.weights]))
-
-    def rows(self):
-        """Kept constraint rows."""
-        return ca.vec(self._map("rows", [], self.g, []))[self.keep.tolist()]
-
-    def jacobian(self):
-        """(values, rows, columns) of the kept rows' Jacobian."""
-        j = ca.jacobian(self.g, self.e.local)
-        rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
-        row_of = np.full(self.g.numel() * self.n, -1)
-        row_of[self.keep] = self.first_row + np.arange(len(self.keep))
-        i = row_of[(np.arange(self.n)[:, None] * self.g.numel() + rows[None]).ravel()]
-        used = i >= 0
-        values = ca.vec(self._map("jacobian", [], ca.vertcat(*j.nonzeros()), []))[np.flatnonzero(used).tolist()]
-        return values, i[used], self.e.index[:, cols].ravel()[used]
-
-    def hessian(self, lam_f, lam_g):
-        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
-        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
-        h = ca.triu(ca.hessian(scale * self.total + ca.dot(lam, self.g), self.e.local)[0])
-        rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
-        if not len(rows):
-            return None
-        mine = lam_g[self.first_row : self.first_row + len(self.keep)]
-        spread = ca.reshape(_scatter(self.keep, self.g.numel() * self.n) @ mine, self.g.numel(), self.n)
-        values = self._map("hessian", [self.w, lam, scale], ca.vertcat(*h.nonzeros()),
-                           [self.weights, spread, ca.repmat(lam_f, 1, self.n)])  # fmt: skip
-        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
-        return ca.vec(values), np.minimum(i, j), np.maximum(i, j)

@@ -4,6 +4,7 @@ import os
 
 os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["JUMPLAB_CACHE"] = ""  # nothing that an earlier version built
 
 import pytest
 

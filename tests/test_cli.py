@@ -50,8 +50,9 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+NAMES = "run, plan, audit, simulate, trials, view, export, robot, envelope, sweep or bench"
 REFUSALS = [
-    ("", "choose a command: run, plan, audit, simulate, trials, view, export, robot or envelope; " + HELP),
+    ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
     ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
     ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),

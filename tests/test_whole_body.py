@@ -40,13 +40,18 @@ def sagittal_columns(run, values):
 @pytest.mark.slow
 def test_it_solves(run):
     s = run.plan.whole_body.solution.statistics
-    assert s.status in GOOD_STATUSES and s.residual < 1e-4 and s.iterations <= 40
+    most = 80 if run.plan.method == "direct" else 40  # from a naive guess, and from a coarse solution
+    assert s.status in GOOD_STATUSES and s.residual < 1e-4 and s.iterations <= most
 
 
 def test_the_mesh_is_refined(run):
-    """Half the mesh first; the fine one, begun from its solution, needs fewer iterations."""
+    """A third of the mesh first; the fine one, begun from its solution, needs fewer iterations. The direct planner is
+    faster without."""
     body = run.plan.whole_body
-    assert body.coarse.variables < 0.6 * body.solution.statistics.variables
+    if run.plan.method == "direct":
+        assert body.coarse is None
+        return
+    assert body.coarse.variables < 0.4 * body.solution.statistics.variables
     assert body.solution.statistics.iterations < max(body.coarse.iterations, 25)
 
 
@@ -240,13 +245,13 @@ def test_names_are_unique_within_a_phase(bhr):
 
 def test_unknown_names_are_refused():
     with pytest.raises(InputError) as e:
-        planner()._stage("direct").plan(JumpTask(0.5, 0.3), off=("gravity",))
+        planner().stage("direct").plan(JumpTask(0.5, 0.3), off=("gravity",))
     assert str(e.value).startswith("weight or switch 'gravity': the problem 'direct' has no such term; it has ")
 
 
 def test_a_switched_off_limit_is_gone():
     """Without the knee's window at touchdown the cost can only fall; with it, the window holds."""
-    body = planner()._stage("direct")
+    body = planner().stage("direct")
     usual = jump(1.0, 0.5, 0.0, "direct").whole_body
     free = body.plan(JumpTask(1.0, 0.5), guess=usual.solution.guess(), off=("knee at touchdown",))
     assert free.solution.statistics.objective <= usual.solution.statistics.objective * (1 + 1e-5)
@@ -259,7 +264,7 @@ def test_edge_of_the_platform(bhr):
 
 
 def test_references_are_stage_ones(bhr):
-    srmp, body = pendulum(1.0, 0.5), planner()._stage("whole body")
+    srmp, body = pendulum(1.0, 0.5), planner().stage("whole body")
     refs = body.references(srmp, body.mesh)
     for name, size in (("flat", body.mesh.flat), ("toe", body.mesh.toe), ("flight", body.mesh.flight)):
         assert refs[name]["rho"].shape == (1, size + 1)
@@ -273,7 +278,7 @@ def test_references_are_stage_ones(bhr):
 
 
 def test_naive_guess_keeps_its_place(bhr):
-    guess = planner()._stage("direct").naive_guess(JumpTask(1.0, 0.5))
+    guess = planner().stage("direct").naive_guess(JumpTask(1.0, 0.5))
     assert all(np.all(np.isfinite(g.q)) for g in guess.values())
     np.testing.assert_allclose(guess["flat"].q[-1], guess["toe"].q[0, 1:])
     np.testing.assert_allclose(guess["toe"].q[-1], guess["flight"].q[0])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
 from proxsuite import proxqp
 from scipy.linalg import LinAlgError, lu_factor, lu_solve
@@ -76,6 +75,8 @@ class CvxpySolver:
     name = "cvxpy"
 
     def __init__(self, example: StepQp):
+        import cvxpy as cp
+
         self.x = x = cp.Variable(example.A.shape[1])
         self.moving = ~example.layout.steady_rows()
         self.steady = example.A[~self.moving]
@@ -93,6 +94,8 @@ class CvxpySolver:
 
     def solve(self, qp: StepQp, phase: str, t: float) -> Answer:
         """Solve one step; raises :class:`SolverError` if there is no trustworthy answer."""
+        import cvxpy as cp
+
         for k, value in self._values(qp).items():
             self.parameters[k].value = value
         status, iterations = "solver error", 0

@@ -1,9 +1,10 @@
 """Stage 3's model: five links in the sagittal plane, rooted at the toe (Sec. II-C of the paper).
 
 Configuration: absolute angles of foot, shank, thigh, trunk and arm, positive about +y. Every position is a sum of one
-vector per angle, so velocities and accelerations need one pass (Newton-Euler), and the toe can be fixed (launch) or
-follow from the ballistic CoM (flight) without any contact equation. :func:`lagrangian` is an independent derivation
-that tests compare with.
+vector per angle, so the toe can be fixed (launch) or follow from the ballistic CoM (flight) without any contact
+equation. Moments, momentum and inertia sum m_i times products of two such vectors; the sum over the links is taken
+once, in numbers, and what is left are ten differences of angles. Derivatives of that form are cheap, the second ones
+above all. :func:`lagrangian` is an independent derivation that tests compare with.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import numpy as np
 
 from jumplab.robot.sagittal import JOINT_OF_ANGLES, SagittalModel
 from jumplab.task import GRAVITY
+
+NEGLIGIBLE = 1e-14  # share of the largest of some coefficients: below it is rounding
 
 
 def _dot(vectors: np.ndarray, columns) -> list:
@@ -59,11 +62,6 @@ class PlanarState:
             acceleration.append(((p, q), (-q, p)))
         return place, velocity, acceleration
 
-    @cached_property
-    def _links(self):
-        arms = self.model.com_arms()
-        return [[_dot(arms[i], turn) for turn in self._turn] for i in range(5)]
-
     def point(self, name_or_arms, order: int = 0):
         """(x, z) of a named point or (5, 2) arms from the toe; ``order`` 1, 2 gives velocity, acceleration."""
         arms = name_or_arms
@@ -91,34 +89,87 @@ class PlanarState:
         """CoM acceleration relative to the toe [m/s^2] (2,)."""
         return ca.vertcat(*self._com[2])
 
-    def _relative(self, order):
-        return [[x - self._com[order][0], z - self._com[order][1]] for x, z in (link[order] for link in self._links)]
+    # With (x, z) as the number x + i z, link i's CoM is sum_j exp(-i a_j) D_ij. For two such sums with constants D and
+    # E and P_jk = sum_i m_i conj(D_ij) E_ik, the moments sum_i m_i (z x'' - x z'') are the sum over j and k of
+    # Re(P_jk) (c a_k'' + s a_k'^2) + Im(P_jk) (c a_k'^2 - s a_k''), c and s of a_j - a_k.
+    @cached_property
+    def _differences(self):
+        """(cos, sin) of a_j - a_k for every pair (j, k)."""
+        out = {(j, j): (1.0, 0.0) for j in range(5)}
+        for j in range(5):
+            for k in range(j + 1, 5):
+                difference = self.angles[j] - self.angles[k]
+                c, s = ca.cos(difference), ca.sin(difference)
+                out[j, k], out[k, j] = (c, s), (c, -s)
+        return out
+
+    @cached_property
+    def _waves(self):
+        """Per pair (j, k) the factors of Re(P_jk) and Im(P_jk) in a moment of inertial forces."""
+        out = {}
+        for (j, k), (c, s) in self._differences.items():
+            w2, a = self.rates[k] ** 2, self.accels[k]
+            out[j, k] = (a, w2) if j == k else (c * a + s * w2, c * w2 - s * a)
+        return out
+
+    def _sum(self, pairs: np.ndarray, factors) -> ca.SX:
+        """Sum of Re(P) and Im(P) times their factors, skipping zeros."""
+        total, size = 0, np.abs(pairs).max(initial=0.0)
+        for at, (real, imaginary) in factors.items():
+            for number, factor in ((pairs[at].real, real), (pairs[at].imag, imaginary)):
+                if abs(number) > NEGLIGIBLE * size:
+                    total = total + float(number) * factor
+        return total
+
+    def _arms(self) -> np.ndarray:
+        return self.model.com_arms() @ np.array([1.0, 1j])  # (link, angle)
+
+    def _com_arms(self) -> np.ndarray:
+        return self.model.mass @ self._arms() / self.model.total_mass  # (angle,)
+
+    def _moment(self, about: np.ndarray, links, ballistic: bool):
+        """Moment (about +y) that links need about a point with complex arms (5,): with the toe still, or in free fall.
+
+        Gravity is left out: in free fall it does nothing, and otherwise see :meth:`_weight`.
+        """
+        links, arms = list(links), self._arms()
+        mass, moving = self.model.mass[links], arms[links] - (self._com_arms() if ballistic else 0.0)
+        pairs = np.einsum("i,ij,ik->jk", mass, np.conj(arms[links] - about), moving)
+        return sum(float(self.model.inertia[i]) * self.accels[i] for i in links) + self._sum(pairs, self._waves)
+
+    def _weight(self, about: np.ndarray, links):
+        """(x, z) of the links' masses times their places from a point with complex arms (5,) [kg m]."""
+        links = list(links)
+        arms = self.model.mass[links] @ (self._arms()[links] - about)
+        return _dot(np.stack([arms.real, arms.imag], -1), self._turn[0])
+
+    def _central(self) -> np.ndarray:
+        """P of both sums taken from the CoM."""
+        arms = self._arms() - self._com_arms()
+        return np.einsum("i,ij,ik->jk", self.model.mass, np.conj(arms), arms)
 
     @cached_property
     def angular_momentum(self):
         """Centroidal angular momentum L about +y [kg m^2/s]."""
-        spin = ca.dot(ca.DM(self.model.inertia), self.rates)
-        pairs = zip(self.model.mass, self._relative(0), self._relative(1), strict=True)
-        return spin + sum(m * (r[1] * v[0] - r[0] * v[1]) for m, r, v in pairs)
+        factors = {(j, k): (c * self.rates[k], -s * self.rates[k]) for (j, k), (c, s) in self._differences.items()}
+        return ca.dot(ca.DM(self.model.inertia), self.rates) + self._sum(self._central(), factors)
 
     @cached_property
     def angular_momentum_rate(self):
         """dL/dt [N m]."""
-        spin = ca.dot(ca.DM(self.model.inertia), self.accels)
-        pairs = zip(self.model.mass, self._relative(0), self._relative(2), strict=True)
-        return spin + sum(m * (r[1] * a[0] - r[0] * a[1]) for m, r, a in pairs)
+        return self._moment(self._com_arms(), range(5), True)
 
     @cached_property
     def inertia(self):
         """Pitch inertia about the CoM, rho = rho_R + rho_I [kg m^2]; rho_I, the links' own, is constant."""
-        pairs = zip(self.model.mass, self._relative(0), strict=True)
-        return float(self.model.inertia.sum()) + sum(m * (r[0] ** 2 + r[1] ** 2) for m, r in pairs)
+        factors = {(j, k): (c, -s) for (j, k), (c, s) in self._differences.items()}
+        return float(self.model.inertia.sum()) + self._sum(self._central(), factors)
 
     @cached_property
     def inertia_rate(self):
         """d rho / dt [kg m^2/s]."""
-        pairs = zip(self.model.mass, self._relative(0), self._relative(1), strict=True)
-        return 2 * sum(m * (r[0] * v[0] + r[1] * v[1]) for m, r, v in pairs)
+        factors = {(j, k): (s * self.rates[k], c * self.rates[k]) for (j, k), (c, s) in self._differences.items()}
+        return 2 * self._sum(self._central(), factors)
 
     @cached_property
     def joints(self):
@@ -131,29 +182,28 @@ class PlanarState:
         return ca.DM(JOINT_OF_ANGLES) @ self.rates
 
     def torques(self, toe_acceleration=(0.0, 0.0)):
-        """Joint torques hip, knee, ankle, shoulder, both sides summed [N m] (4,); needs no ground wrench."""
-        ax, az = toe_acceleration[0], toe_acceleration[1] + self.gravity
-        model = self.model
+        """Joint torques hip, knee, ankle, shoulder, both sides summed [N m] (4,); needs no ground wrench.
 
-        def moment(joint_arms, links):
-            px, pz = _dot(joint_arms, self._turn[0])
-            total = 0
-            for i in links:
-                (x, z), _, (bx, bz) = self._links[i]
-                total += model.inertia[i] * self.accels[i]
-                total += model.mass[i] * ((z - pz) * (bx + ax) - (x - px) * (bz + az))
-            return total  # what the links need about that joint
+        ``toe_acceleration`` (x, z) [m/s^2]; None if the CoM falls freely.
+        """
 
-        arms = [model.point_arms(i, np.zeros(2)) for i in range(5)]  # lower joints: toe, ankle, knee, hip, shoulder
-        return ca.vertcat(-moment(arms[3], (3, 4)), -moment(arms[2], (2, 3, 4)), -moment(arms[1], (1, 2, 3, 4)),
-                          moment(arms[4], (4,)))  # fmt: skip
+        def moment(joint, links):
+            about = self.model.point_arms(joint, np.zeros(2)) @ np.array([1.0, 1j])
+            inertial = self._moment(about, links, toe_acceleration is None)
+            if toe_acceleration is None:
+                return inertial
+            (x, z), (ax, az) = self._weight(about, links), toe_acceleration
+            return inertial + z * ax - x * (az + self.gravity)
+
+        # lower joints of the links: toe, ankle, knee, hip, shoulder
+        return ca.vertcat(-moment(3, (3, 4)), -moment(2, (2, 3, 4)), -moment(1, (1, 2, 3, 4)), moment(4, (4,)))
 
     def ground_wrench(self):
         """(3,) F_x, F_z [N] and moment about the toe [N m] on the robot while the toe stands still."""
-        m = self.model.total_mass
-        (cx, cz), (ax, az) = self._com[0], self._com[2]
-        fx, fz = m * ax, m * (az + self.gravity)
-        return ca.vertcat(fx, fz, self.angular_momentum_rate + cz * fx - cx * fz)
+        m, toe = self.model.total_mass, np.zeros(5)
+        ax, az = self._com[2]
+        moment = self._moment(toe, range(5), False) - self._weight(toe, range(5))[0] * self.gravity
+        return ca.vertcat(m * ax, m * (az + self.gravity), moment)
 
 
 def symbols() -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -16,7 +16,7 @@ SHANK_LEAN_RAD = (-0.6, 1.4)  # our choice: generous lean of the shank, both way
 
 def _rotate(angle, vector):
     c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]])
+    return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
@@ -75,15 +75,20 @@ def check_stance(robot: Robot) -> np.ndarray:
 
 
 def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:
-    """Pinocchio configuration (nq,) of the full robot for absolute link angles (5,) and the toe's (x, z) [m]."""
-    model = robot.sagittal
-    toe_to_hip = np.sum([_rotate(angles[j], model.span[j]) for j in range(3)], axis=0)
-    base = np.asarray(toe) + toe_to_hip + _rotate(angles[3], model.base)
-    q = pin.neutral(robot.model)
-    q[:7] = [base[0], 0.0, base[1], 0.0, np.sin(angles[3] / 2), 0.0, np.cos(angles[3] / 2)]
+    """Pinocchio configuration of the full robot for absolute link angles and the toe's (x, z) [m].
+
+    One posture, (5,) and (2,) -> (nq,), or many, (n, 5) and (n, 2) -> (n, nq).
+    """
+    model, angles = robot.sagittal, np.asarray(angles)
+    base = np.asarray(toe) + sum(_rotate(angles[..., j], model.span[j]) for j in range(3))
+    base = base + _rotate(angles[..., 3], model.base)
+    q = np.broadcast_to(pin.neutral(robot.model), (*angles.shape[:-1], robot.model.nq)).copy()
+    q[..., 0], q[..., 2] = base[..., 0], base[..., 1]
+    q[..., 3:7] = 0.0
+    q[..., 4], q[..., 6] = np.sin(angles[..., 3] / 2), np.cos(angles[..., 3] / 2)
     joints = model.joint_angles(angles)
     for name, row, sign in robot.role_signs():
-        q[robot.model.idx_qs[robot.model.getJointId(name)]] = sign * joints[row]
+        q[..., robot.model.idx_qs[robot.model.getJointId(name)]] = sign * joints[..., row]
     return q
 
 

@@ -10,7 +10,7 @@ from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
-from jumplab.solver import Nlp, PhaseGuess, Solution
+from jumplab.solver import WARM, Nlp, PhaseGuess, Solution
 from jumplab.srmp.nearest import nearest
 from jumplab.srmp.plan import SrmpFlight, SrmpLaunch, SrmpPlan
 from jumplab.srmp.problem import SYMMETRY_OFF, build_problem
@@ -51,14 +51,18 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
 
 
 class SrmpPlanner:
-    """Stage 1 for one robot: built once, solved for any target."""
+    """Stage 1 for one robot: built once, solved for any target; ``keep`` keeps what was built for later processes."""
 
-    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None):
+    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None, *,
+                 keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
-        self.nlp = Nlp(build_problem(robot, settings, self.reach), options)
+        key = f"{robot.hash} {settings}" if keep else None
+        self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
+        self._warm = self.nlp.with_options({**WARM, **(options or {})})
 
-    def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF) -> SrmpPlan:
-        """Solve for a target.
+    def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF,
+             near: SrmpPlan | None = None) -> SrmpPlan:  # fmt: skip
+        """Solve for a target; ``near`` is a plan for one close by to begin with, if that works.
 
         Raises
         ------
@@ -68,14 +72,21 @@ class SrmpPlanner:
             If there is no solution; names the violated terms, and a target close by that has one.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
+        if near is not None:
+            try:
+                return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers)
+            except SolverError:
+                pass  # as if there had been none
         try:
             return self._solve(task, guess, weights, off)
         except SolverError as failure:
             raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
 
-    def _solve(self, task: JumpTask, guess, weights, off, explain=True) -> SrmpPlan:
+    def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
-        solution = self.nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off, explain=explain)
+        nlp = self.nlp if multipliers is None else self._warm
+        solution = nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off, explain=explain,
+                             multipliers=multipliers)  # fmt: skip
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
-from jumplab.solver import Nlp, PhaseGuess, Solution, Statistics
+from jumplab.solver import WARM, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
 from jumplab.whole_body.problem import build_problem
@@ -22,10 +22,10 @@ POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0)
             "touchdown": (0.9, 0.15, 0.0, 0.2)}  # fmt: skip
 
 
+# our choice: from here on the cost moves by less than one in a million, the rows are met to their own tolerance
+FINE = {"tol": 1e-4, "compl_inf_tol": 1e-5}
 # our choice: the coarse solution is only a start, digits beyond these would be lost on the finer mesh
 COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
-# our choice: close to a solution, so keep to it; of three barriers the one with the fewest iterations
-WARM = {"mu_strategy": "monotone", "mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6}
 
 
 @dataclass(frozen=True)
@@ -81,30 +81,37 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
 class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
 
-    A target is solved on a coarse mesh first and refined from there; ``refine=False`` solves on ``mesh`` at once.
+    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once. By
+    default whatever is faster, as measured: refining from the good guess that tracking has, at once from the naive one.
+    ``keep`` keeps what was built for later processes.
     """
 
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None, refine: bool = True):  # fmt: skip
+                 tracking: bool = True, options: Mapping | None = None, refine: bool | None = None,
+                 keep: bool = False):  # fmt: skip
         self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
         self.stance = stance_angles(robot)
         options = dict(options or {})
 
         def build(mesh: Mesh, extra: Mapping) -> Nlp:
-            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options})
+            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options},
+                       f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None)  # fmt: skip
 
-        self.nlp = build(mesh, {})
-        self._coarse = build(mesh.coarse(), COARSE) if refine else None
-        self._refined = self.nlp.with_options({**WARM, **options}) if refine else None
+        self.nlp = build(mesh, FINE)
+        self._coarse = build(mesh.coarse(), COARSE) if (tracking if refine is None else refine) else None
+        self._warm = self.nlp.with_options({**FINE, **WARM, **options})
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
-             weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
+             weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
+             near: WholeBodyPlan | None = None) -> WholeBodyPlan:  # fmt: skip
         """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
 
         Parameters
         ----------
         guess : start values on any mesh; those of :meth:`naive_guess` if None.
         weights, off : as in :meth:`jumplab.solver.Nlp.solve`.
+        near : this planner's plan for a target close by, to begin with instead of ``guess``; if that leads nowhere, the
+            target is solved from ``guess`` all the same.
 
         Raises
         ------
@@ -113,6 +120,11 @@ class WholeBodyPlanner:
         """
         how = {"weights": weights, "off": off}
         guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
+        if near is not None:
+            try:
+                return WholeBodyPlan(task, self._from(near.solution, srmp, parameters, how))
+            except SolverError:
+                pass  # as if there had been none
         if self._coarse is not None:
             try:
                 return self._refine(task, srmp, guess, parameters, how)
@@ -127,10 +139,12 @@ class WholeBodyPlanner:
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
         first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
-        start = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
-        references = self.references(srmp, self.mesh)
-        solution = self._refined.solve(parameters, start, references=references, explain=False, **how)
-        return WholeBodyPlan(task, solution, first.statistics)
+        return WholeBodyPlan(task, self._from(first, srmp, parameters, how), first.statistics)
+
+    def _from(self, known: Solution, srmp, parameters, how) -> Solution:
+        """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
+        return self._warm.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
+                                references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
         """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""

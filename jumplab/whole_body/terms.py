@@ -35,16 +35,10 @@ class WholeBodyTerms:
             p.memo["wrench"] = self.state(p).ground_wrench()
         return p.memo["wrench"]
 
-    def toe_acceleration(self, p: Point):
-        """Acceleration (x, z) of the toe in flight [m/s^2]: the CoM falls freely, the toe moves about it."""
-        acc = self.state(p).com_acceleration
-        return (-acc[0], -p.p.gravity - acc[1])
-
     def torques(self, p: Point, flying: bool):
         """Joint torques (4,) of both sides together [N m]; made once per point."""
         if "torques" not in p.memo:
-            toe = self.toe_acceleration(p) if flying else (0.0, 0.0)
-            p.memo["torques"] = self.state(p).torques(toe)
+            p.memo["torques"] = self.state(p).torques(None if flying else (0.0, 0.0))
         return p.memo["torques"]
 
     def ballistic_com(self, p: Point):

@@ -1,0 +1,190 @@
+"""How long a plan takes, against one direct NLP on the same machine in the same run.
+
+What is compared: ``plan`` is the whole of the three steps, from the target to the 1 kHz tape. ``direct`` is the solve
+of one NLP with the same model, limits, mesh, tolerances and derivatives, without stages 1 and 2, from a naive guess;
+of its two ways, at once or over a coarse mesh, the faster one counts. Times are medians; every plan that was timed is
+audited afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from jumplab.benchmark.report import report
+from jumplab.errors import InputError, SolverError
+from jumplab.joint_map import map_to_joints
+from jumplab.passport.audit import audit
+from jumplab.pipeline import JumpPlan, Planner, body_rows, guess_from_joints, make_tape
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+from jumplab.whole_body import Mesh, WholeBodyPlanner
+
+TASK, MESH = JumpTask(1.0, 0.5), Mesh()  # the paper's target, the usual mesh
+NEIGHBOUR_M = 0.05  # our choice: how much farther the re-planned target is
+NODES = (20, 40, 60, 80, 100, 120)  # intervals of the three phases together
+TARGETS = (1, 2, 4, 8)
+NODE_REPEATS = 3  # our choice: the growth is a fit over many meshes
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+COLD = """
+import time
+began = time.perf_counter()
+import json, resource, sys
+from jumplab.pipeline import Planner
+from jumplab.robot import load_robot
+from jumplab.task import JumpTask
+robot, task = load_robot(sys.argv[1]), JumpTask(float(sys.argv[2]), float(sys.argv[3]))
+imports_s = time.process_time()
+plan = Planner(robot, keep=sys.argv[4] == "keep").plan(task)
+cpu_s, wall_s = time.process_time(), time.perf_counter() - began
+peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+from jumplab.passport.audit import audit
+print(json.dumps(dict(cpu_s=cpu_s, wall_s=wall_s, imports_s=imports_s, peak_kib=peak_kib,
+                      clean=audit(plan.tape, robot, task).passed)))
+"""
+
+
+class Stopwatch:
+    """CPU and wall times [s] of named pieces of work, one number per repeat."""
+
+    def __init__(self):
+        self.cpu: dict[str, list[float]] = {}
+        self.wall: dict[str, list[float]] = {}
+
+    def __call__(self, name: str, work: Callable, *arguments, **options):
+        """Do the work, and keep what it took."""
+        cpu, wall = time.process_time(), time.perf_counter()
+        answer = work(*arguments, **options)
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+        self.cpu.setdefault(name, []).append(cpu)
+        self.wall.setdefault(name, []).append(wall)
+        return answer
+
+
+def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh: Mesh = MESH,
+          nodes: tuple[int, ...] = NODES, cold: bool = True, say: Callable[[str], None] = print) -> dict:  # fmt: skip
+    """Measure everything.
+
+    Parameters
+    ----------
+    robot_name : shipped robot, or path of a TOML file.  task : the target.
+    repeats : how often each thing is done; at least 1.
+    mesh : of stage 3 and of the direct NLP; ``cold`` processes know only the default.
+    nodes : numbers of intervals for the growth with nodes.
+    cold : also time new processes.  say : is told what goes on.
+
+    Returns
+    -------
+    dict of plain types, see :func:`jumplab.benchmark.report.report`.
+
+    Raises
+    ------
+    InputError
+        For fewer repeats than 1.
+    JumplabError
+        If the target has no plan.
+    """
+    if repeats < 1:
+        raise InputError(f"repeats = {repeats}: it takes 1 or more")
+    robot, watch = load_robot(robot_name), Stopwatch()
+    planner, refined = Planner(robot, mesh), WholeBodyPlanner(robot, mesh, tracking=False, refine=True)
+    audits: dict[str, list[bool]] = {}
+    near = planner.plan(replace(task, distance_m=task.distance_m - NEIGHBOUR_M))
+    planner.plan(near.task, "direct")  # the first call of anything is not timed
+    peaks: list[float] = []
+    with TemporaryDirectory() as kept:
+        if cold:
+            _cold(Stopwatch(), robot_name, task, {}, kept)  # fills the folder
+        for k in range(repeats):
+            say(f"repeat {k + 1} of {repeats}")
+            plans = _once(watch, planner, refined, near, task)
+            for name, plan in plans.items():
+                audits.setdefault(name, []).append(audit(plan.tape, robot, task).passed)
+            if cold:
+                peaks.append(_cold(watch, robot_name, task, audits, kept))
+    say("growth with nodes and targets")
+    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
+    head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
+    iterations = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
+    functions = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
+    return report(head, watch.cpu, watch.wall, audits, iterations, functions, growth, peaks)
+
+
+def _once(watch: Stopwatch, planner: Planner, refined: WholeBodyPlanner, near: JumpPlan, task: JumpTask) -> dict:
+    """Time everything once, in turn; returns the plans."""
+    robot, direct = planner.robot, planner.stage("direct")
+    plans = {"plan": watch("plan", planner.plan, task), "re-plan": watch("re-plan", planner.replan, near, task)}
+    at_once = watch("direct, at once", direct.plan, task)
+    refined_body = watch("direct, over a coarse mesh", refined.plan, task)
+    watch("direct, build", WholeBodyPlanner, robot, planner.mesh, tracking=False)
+    for body in (at_once, refined_body):
+        plan = JumpPlan(task, robot, "direct", make_tape(body, robot), None, None, body, body_rows("direct", body))
+        plans["direct, over a coarse mesh" if body.coarse else "direct, at once"] = plan
+    _stages(watch, planner, task)
+    return plans
+
+
+def _stages(watch: Stopwatch, planner: Planner, task: JumpTask) -> None:
+    """The three steps once more, each timed apart."""
+    robot, last = planner.robot, planner.stage("whole body")
+    srmp = watch("plan: 1 SRMP", planner.stage("srmp").plan, task)
+    joints = watch("plan: 2 joint map", map_to_joints, srmp, robot, method="direct")
+    guess = watch("plan: 2 to 3", guess_from_joints, joints, last, task, srmp.toe_s)
+    body = watch("plan: 3 whole body", last.plan, task, srmp, guess=guess)
+    watch("plan: tape", make_tape, body, robot, srmp)
+
+
+def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict, kept: str) -> float:
+    """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
+    in the folder ``kept``; returns the peak memory of the first [GiB]."""
+    peak = 0.0
+    for name, how in (("cold", "fresh"), ("cold, functions kept", "keep")):
+        command = [sys.executable, "-c", COLD, robot_name, repr(task.distance_m), repr(task.height_m), how]
+        done = subprocess.run(
+            command, capture_output=True, text=True, env={**os.environ, **ONE_THREAD, "JUMPLAB_CACHE": kept}
+        )
+        if done.returncode:
+            raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
+        said = json.loads(done.stdout)
+        for key, number in ((name, "cpu_s"), (f"{name}: imports and robot", "imports_s")):
+            watch.cpu.setdefault(key, []).append(said[number])
+        watch.wall.setdefault(name, []).append(said["wall_s"])
+        audits.setdefault(name, []).append(said["clean"])
+        peak = max(peak, said["peak_kib"] / 2**20)
+    return peak
+
+
+def _nodes(planner: Planner, task: JumpTask, nodes) -> list[dict]:
+    """Cost of one iteration of stage 3 on ever finer meshes, all solved at once from stage 2's guess."""
+    srmp = planner.stage("srmp").plan(task)
+    joints = map_to_joints(srmp, planner.robot, method="direct")
+    rows = []
+    for n in nodes:
+        flat, toe = max(round(n / 3), 2), max(round(4 * n / 15), 2)
+        mesh = Mesh(flat, toe, max(n - flat - toe, 2))
+        watch = Stopwatch()
+        body = watch("build", WholeBodyPlanner, planner.robot, mesh, refine=False)
+        guess = guess_from_joints(joints, body, task, srmp.toe_s)
+        for _ in range(NODE_REPEATS):
+            s = watch("solve", body.plan, task, srmp, guess=guess).solution.statistics
+        solve_s = float(np.median(watch.cpu["solve"]))
+        rows.append(dict(intervals=mesh.flat + mesh.toe + mesh.flight, variables=s.variables,
+                         iterations=s.iterations, build_s=watch.cpu["build"][0], solve_s=solve_s,
+                         iteration_s=solve_s / s.iterations))  # fmt: skip
+    return rows
+
+
+def _targets(planner: Planner, task: JumpTask) -> dict[str, float]:
+    """CPU time [s] of planning so many different targets with one planner."""
+    watch = Stopwatch()
+    for k in range(TARGETS[-1]):
+        watch("plan", planner.plan, replace(task, distance_m=task.distance_m - 0.02 * k))
+    return {str(n): sum(watch.cpu["plan"][:n]) for n in TARGETS}

@@ -1,0 +1,103 @@
+"""One repeated small function as a part of a sparse NLP: values and exact derivatives for all repetitions at a time."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+
+def scatter(index, size) -> ca.DM:
+    """0/1 matrix that adds entry i of a vector to position index[i]."""
+    index = np.asarray(index, int)
+    return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
+
+
+def gather(pieces, shape):
+    """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
+    values = ca.vertcat(*(piece[0] for piece in pieces))
+    rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
+    key = cols.astype(np.int64) * shape[0] + rows
+    unique, inverse = np.unique(key, return_inverse=True)
+    pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
+    if len(unique) == len(key):
+        return ca.MX(pattern, values[np.argsort(key).tolist()])
+    return ca.MX(pattern, scatter(inverse, len(unique)) @ values)
+
+
+class Piece:
+    """What one element contributes to the NLP: its small functions, differentiated once, called for all repetitions."""
+
+    def __init__(self, element, parameters, inputs, weights, keep, first_row):
+        self.e, self.keep, self.first_row = element, keep, first_row
+        self.n, self.ny = element.index.shape
+        self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
+        self.weights = ca.repmat(weights, 1, self.n)
+        self.arguments = [element.local, element.data, parameters]
+        self.w = ca.SX.sym("w", len(element.costs))
+        self.cost_parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for _, share, y in element.costs))
+        self.g = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.constraints))
+        self.total = ca.dot(self.w, self.cost_parts) if element.costs else ca.SX(0)
+
+    def _map(self, name, extra_symbols, output, extra_values):
+        function = ca.Function(name, [*self.arguments, *extra_symbols], [output], {"cse": True})
+        return function.map(self.n)(*self.inputs, *extra_values)
+
+    def costs(self):
+        """(weighted sum, unweighted parts) or None."""
+        if not self.e.costs:
+            return None
+        parts = ca.sum2(self._map("costs", [], self.cost_parts, []))
+        return ca.dot(self.weights[:, 0], parts), parts
+
+    def gradient(self):
+        """Local gradients, one under the other."""
+        return ca.vec(self._map("gradient", [self.w], ca.gradient(self.total, self.e.local), [self.weights]))
+
+    def rows(self):
+        """Kept constraint rows."""
+        return ca.vec(self._map("rows", [], self.g, []))[self.keep.tolist()]
+
+    def jacobian(self):
+        """(values, rows, columns) of the kept rows' Jacobian."""
+        j = ca.jacobian(self.g, self.e.local)
+        rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
+        row_of = np.full(self.g.numel() * self.n, -1)
+        row_of[self.keep] = self.first_row + np.arange(len(self.keep))
+        i = row_of[(np.arange(self.n)[:, None] * self.g.numel() + rows[None]).ravel()]
+        used = i >= 0
+        values = ca.vec(self._map("jacobian", [], ca.vertcat(*j.nonzeros()), []))[np.flatnonzero(used).tolist()]
+        return values, i[used], self.e.index[:, cols].ravel()[used]
+
+    def hessian(self, lam_f, lam_g):
+        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
+        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
+        h = ca.triu(self._curvature(lam, scale))
+        rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
+        if not len(rows):
+            return None
+        mine = lam_g[self.first_row : self.first_row + len(self.keep)]
+        spread = ca.reshape(scatter(self.keep, self.g.numel() * self.n) @ mine, self.g.numel(), self.n)
+        values = self._map("hessian", [self.w, lam, scale], ca.vertcat(*h.nonzeros()),
+                           [self.weights, spread, ca.repmat(lam_f, 1, self.n)])  # fmt: skip
+        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
+        return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
+
+    def _curvature(self, lam, scale):
+        """Hessian of scale * cost + lam . g.
+
+        A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
+        everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
+        """
+        x, ys, mus, extra = self.e.local, [], [], ca.SX(self.ny, self.ny)
+        for k, (_, share, y) in enumerate(self.e.costs):
+            weight = scale * self.w[k] * share
+            jacobian = ca.jacobian(y, x)
+            extra += 2 * weight * (jacobian.T @ jacobian)
+            mixed = ca.jacobian(share, x).T @ (2 * scale * self.w[k] * (y.T @ jacobian))
+            extra += mixed + mixed.T
+            ys, mus = [*ys, y], [*mus, 2 * weight * y]
+        y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
+        held = ca.SX.sym("mu", y.numel())
+        bent = ca.hessian(ca.dot(held, y) + ca.dot(lam, self.g), x)[0]
+        symbols = [x, self.e.data, self.arguments[2], lam, held]
+        return extra + ca.Function("bent", symbols, [bent])(*symbols[:-1], mu)

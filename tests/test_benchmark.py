@@ -1,0 +1,78 @@
+"""The benchmark's report, on a small mesh: complete, true to its own raw times, honest. Nothing is timed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jumplab import benchmark
+from jumplab.benchmark.report import line_error, report, text
+from jumplab.errors import InputError
+from jumplab.task import JumpTask
+from jumplab.whole_body import Mesh
+
+TIMES = {"plan": [0.5, 0.6], "re-plan": [0.2, 0.2], "direct, at once": [1.0, 1.0], "direct, build": [0.5, 0.5],
+         "direct, over a coarse mesh": [2.0, 0.9], "plan: 1 SRMP": [0.1, 0.1],
+         "plan: 3 whole body": [0.3, 0.5]}  # fmt: skip
+NODES = [dict(intervals=n, iteration_s=1e-3 + 2e-4 * n, iterations=20, solve_s=1.0) for n in (20, 40, 80)]
+
+
+def made(**other) -> dict:
+    """A report of made-up times."""
+    growth = {"nodes": NODES, "targets_cpu_s": {"1": 0.5}}
+    return report({"repeats": 2}, {**TIMES, **other}, TIMES, {"plan": [True, False]}, {"plan": {"1 SRMP": 9}},
+                  {"plan": 0.1}, growth, [0.4, 0.5] if "cold" in other else [])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found():
+    return benchmark.bench("bhr", JumpTask(0.4, 0.3), 1, Mesh(9, 6, 9), nodes=(20, 24, 28), cold=False,
+                           say=lambda word: None)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_report_is_plain_and_complete(found):
+    again = json.loads(json.dumps(found))
+    assert {"warm_over_direct", "replan_over_direct", "cold_over_direct", "raw_s", "median_s", "growth"} <= set(again)
+    cpu = again["raw_s"]["cpu"]
+    assert all(len(times) == 1 and times[0] > 0 for times in cpu.values())
+    assert again["warm_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
+    assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
+    assert again["cold_over_direct"] is None and again["goals"]["cold_over_direct"]["reached"] is None
+    assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
+    assert sum(again["where"].values()) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_every_timed_plan_was_audited(found):
+    assert {"plan", "re-plan", *benchmark.DIRECT} == set(found["audits"])
+    assert all(a["of"] == 1 for a in found["audits"].values())
+
+
+def test_the_faster_way_is_the_peer():
+    assert made()["peer"] == "direct, at once"  # medians 1.0 and 1.45
+    assert made(**{"direct, over a coarse mesh": [0.8, 0.9]})["peer"] == "direct, over a coarse mesh"
+
+
+def test_what_is_not_reached_is_said():
+    slow = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
+    said = text(slow)
+    assert slow["goals"]["cold_over_direct"] == dict(value=3.0, limit=1.5, aim=None, reached=False)
+    assert slow["cold_kept_over_direct"] == pytest.approx(2.0)
+    assert "3.000  (limit 1.5): not reached" in said and "0.550  (limit 0.6, aim 0.25): reached" in said
+    assert "where the time of the three steps goes" in said and "3 whole body" in said
+    assert "plans that were timed and are clean in the audit: plan 1 of 2" in said
+    assert "not measured" in text(made())
+
+
+def test_growth_is_the_distance_from_a_line():
+    assert line_error(NODES) == pytest.approx(0.0, abs=1e-12)
+    bent = [dict(row, iteration_s=row["intervals"] ** 2 * 1e-6) for row in NODES]
+    assert line_error(bent) > 0.2 and line_error(NODES[:2]) is None
+    assert np.isclose(made()["node_growth_error"], 0.0)
+
+
+def test_no_repeats():
+    with pytest.raises(InputError) as e:
+        benchmark.bench(repeats=0)
+    assert str(e.value) == "repeats = 0: it takes 1 or more"

@@ -1,0 +1,114 @@
+"""Beginning with a known solution: multipliers from mesh to mesh, a warm solve, and a neighbouring target."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fixtures_core import jump, planner
+from test_solver import flat_guess, move
+from test_transcription import toy
+
+from jumplab import pipeline
+from jumplab.errors import InputError
+from jumplab.packing import group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.passport.audit import audit
+from jumplab.solver import WARM, Nlp, PhaseGuess
+from jumplab.task import JumpTask
+from jumplab.terms import Term
+from jumplab.transcription import Assembled
+
+
+@pytest.fixture(scope="module")
+def assembled():
+    return Assembled(toy())
+
+
+def test_packing_and_unpacking_are_inverse(assembled):
+    x = np.random.default_rng(0).uniform(0.5, 1.5, assembled.size)
+    phases = unpack(assembled, x)
+    again = {n: PhaseGuess(p.duration, p.q, p.v, p.a, p.z, p.constants) for n, p in phases.items()}
+    packed = pack(assembled, again)
+    for layout in assembled.layouts.values():  # jerks follow from the accelerations, so they are another matter
+        for index in (layout.nodes(), layout.constants()):
+            np.testing.assert_allclose(packed[index], x[index], rtol=1e-14)
+        for k in range(layout.phase.intervals + 1):
+            np.testing.assert_array_equal(layout.nodes()[k], layout.node(k))
+        for k in range(layout.phase.intervals):
+            np.testing.assert_array_equal(layout.jerks()[k], layout.jerk(k))
+
+
+def test_every_row_is_in_one_group(assembled):
+    groups = group_rows(assembled)
+    found = np.concatenate([g.index.ravel() for g in groups])
+    np.testing.assert_array_equal(np.sort(found), np.arange(assembled.n_rows))
+    for g in groups:
+        for (k, c), i in np.ndenumerate(g.index):
+            row = assembled.rows[i]
+            assert (row.owner, row.term.name, row.node, row.component) == (g.owner, g.term.name, g.nodes[k], c)
+
+
+def test_rows_that_are_off_have_no_bounds(assembled):
+    groups = group_rows(assembled)
+    low, high = row_bounds(groups, assembled.n_rows, {}, ("one/mid row", "meet"))
+    for i, row in enumerate(assembled.rows):
+        expected = (-np.inf, np.inf) if row.term.name in ("mid row", "meet") else (0.0, 0.0)
+        assert (low[i], high[i]) == expected
+
+
+def test_multipliers_survive_on_their_own_mesh(assembled):
+    rng, groups = np.random.default_rng(1), group_rows(assembled)
+    lam_x, lam_g = rng.normal(size=assembled.size), rng.normal(size=assembled.n_rows)
+    x, g = pack_multipliers(assembled, groups, unpack_multipliers(assembled, groups, lam_x, lam_g))
+    np.testing.assert_allclose(g, lam_g, rtol=1e-14)
+    for layout in assembled.layouts.values():
+        np.testing.assert_allclose(x[layout.nodes()], lam_x[layout.nodes()], rtol=1e-14)
+        np.testing.assert_array_equal(x[layout.constants()], lam_x[layout.constants()])
+
+
+def test_multipliers_of_two_meshes_say_the_same():
+    """Least jerk below a speed limit: what the limit is worth does not depend on the mesh, up to its own error."""
+    found = {}
+    for n in (30, 60):
+        wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.7)
+        problem = move(wall)
+        nlp = Nlp(replace(problem, phases=(replace(problem.phases[0], intervals=n),)))
+        guess = {"go": flat_guess()["go"].resampled(n)}
+        found[n] = nlp.solve({"goal": 1.0}, guess), nlp
+    share, values = found[60][0].multipliers.rows["go", "wall"]
+    coarse = pack_multipliers(found[60][1].assembled, found[60][1].groups, found[30][0].multipliers)[1]
+    group = next(g for g in found[60][1].groups if g.term.name == "wall")
+    total = {n: f[0].multipliers.rows["go", "wall"][1].sum() / n for n, f in found.items()}
+    assert total[30] == pytest.approx(total[60], rel=0.05) and total[60] > 1.0
+    assert coarse[group.index].sum() == pytest.approx(total[60], rel=0.1)
+    assert share[np.argmax(values[:, 0])] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_warm_start_with_multipliers_is_short():
+    wall = Term("wall", "-", "m/s", "node", lambda p: p.v, lower=-np.inf, upper=1.7)
+    nlp = Nlp(move(wall))
+    first = nlp.solve({"goal": 1.0}, flat_guess())
+    again = nlp.with_options(WARM).solve({"goal": 1.0}, first.guess(), multipliers=first.multipliers)
+    assert again.statistics.iterations <= first.statistics.iterations / 2
+    assert again.statistics.objective == pytest.approx(first.statistics.objective, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", pipeline.METHODS)
+def test_a_neighbouring_target(bhr, method):
+    """From the plan for 0.95 m to 1.0 m: as good as from nothing, clean, and with far fewer iterations."""
+    fresh = jump(1.0, 0.5, 0.0, method)
+    again = planner().replan(jump(0.95, 0.5, 0.0, method), fresh.task)
+    assert (again.method, again.task, again.joints) == (method, fresh.task, None)
+    assert audit(again.tape, bhr, again.task).passed
+    cost = [p.whole_body.solution.statistics.objective for p in (again, fresh)]
+    assert cost[0] == pytest.approx(cost[1], rel=1e-3)
+    spent = [sum(r.iterations for r in p.statistics if "joint" not in r.stage) for p in (again, fresh)]
+    assert spent[0] < spent[1] / 2
+
+
+def test_of_another_robot():
+    other = SimpleNamespace(robot=SimpleNamespace(name="other", hash="another"))
+    with pytest.raises(InputError) as e:
+        planner().replan(other, JumpTask(0.9, 0.5))
+    assert str(e.value) == "the previous plan is for the robot other, not for bhr"

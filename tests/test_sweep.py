@@ -1,0 +1,162 @@
+"""Sweeps: the grid, the table, going on after a kill, a cluster, and every refusal."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_cli import one_sentence, run
+from test_store import names
+
+from jumplab import sweep
+from jumplab.commands.sweep import values_of, weights_of
+from jumplab.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def quick(case: sweep.Case) -> dict:
+    """In place of a plan."""
+    return dict.fromkeys(sweep.COLUMNS) | {"weights": case.weights, "distance_m": case.distance_m, "planned": True}
+
+
+def test_grid_runs_distances_fastest():
+    cases = sweep.grid([0.1, 0.2], [0.3, 0.4], robots=["bhr"], weights=[{}, {"torque": 2.0}])
+    assert len(cases) == 8 and len({c.key() for c in cases}) == 8
+    assert [(c.distance_m, c.height_m) for c in cases[:3]] == [(0.1, 0.3), (0.2, 0.3), (0.1, 0.4)]
+    assert cases[4].weights == {"torque": 2.0}
+
+
+def test_values_as_they_are_typed():
+    assert values_of("--x", "0:1.2:13") == [round(0.1 * k, 9) for k in range(13)]
+    assert values_of("--x", "0.5") == [0.5] and values_of("--x", "1,-2,3e-1") == [1.0, -2.0, 0.3]
+    assert values_of("--x", "2:3:1") == [2.0]
+    assert weights_of(["a=1,2", "b=3"]) == [{"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 3.0}]
+
+
+@pytest.mark.slow
+def test_a_small_sweep_is_one_table(tmp_path):
+    """Two targets that can be planned, one that cannot: three rows, true to their plans."""
+    cases = sweep.grid([0.3, 2.9], [0.3]) + sweep.grid([0.3], [0.3], weights=[{"torque": 3e-4}])
+    rows = sweep.run(cases, tmp_path, jobs=1, progress=False)
+    assert [row["planned"] for row in rows] == [True, False, True]
+    assert rows[0]["clean"] and rows[0]["planned_distance_m"] == pytest.approx(0.3, abs=1e-3)
+    assert rows[1]["reason"].startswith("distance = 2.9 m: ") and rows[1]["cost"] is None
+    assert rows[2]["cost"] > rows[0]["cost"]
+    with open(tmp_path / sweep.TABLE, newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["weights"] for row in table] == ["", "", "torque=0.0003"]
+    assert tuple(table[0]) == sweep.COLUMNS
+    assert sweep.run(cases, tmp_path, jobs=1, progress=False) == rows  # nothing is planned again
+
+
+def test_it_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    cases, planned = sweep.grid([0.1, 0.2, 0.3], [0.3]), []
+
+    def some(case):
+        if len(planned) == 2:
+            raise KeyboardInterrupt
+        planned.append(case.distance_m)
+        return quick(case)
+
+    monkeypatch.setattr(sweep, "run_case", some)
+    with pytest.raises(KeyboardInterrupt):
+        sweep.run(cases, tmp_path, jobs=1, progress=False)
+    assert sweep.TABLE not in names(tmp_path)
+    log = tmp_path / sweep.CASES
+    log.write_bytes(log.read_bytes()[:-7])  # as if the power had gone within the last line
+    planned.clear()
+    rows = sweep.run(cases, tmp_path, jobs=1, progress=False)
+    assert planned == [0.2, 0.3] and [row["distance_m"] for row in rows] == [0.1, 0.2, 0.3]
+    assert all(json.loads(line) for line in log.read_text().splitlines())
+
+
+@pytest.mark.slow
+def test_killed_for_good(tmp_path):
+    """SIGKILL while two processes plan; the rest follows, the finished lines stay as they were."""
+    out = tmp_path / "sweep"
+    command = [sys.executable, "-m", "jumplab", "sweep", "--distance-m", "0.2:0.6:5", "--height-m", "0.2", "--out",
+               str(out), "--jobs", "1"]  # fmt: skip
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    log = out / sweep.CASES
+    for _ in range(600):
+        if log.exists() and log.read_bytes().count(b"\n") >= 2:
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = log.read_bytes()
+    assert 2 <= before.count(b"\n") and not (out / sweep.TABLE).exists()
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "5 cases, 5 planned, 5 of them clean in the audit; table in " in done.stdout
+    assert log.read_bytes().startswith(before[: before.rindex(b"\n") + 1])
+    assert len((out / sweep.TABLE).read_text().splitlines()) == 6
+
+
+@pytest.mark.slow
+def test_the_same_on_a_cluster(tmp_path):
+    """A local Dask cluster gives the rows that this process gives."""
+    distributed = pytest.importorskip("distributed")
+    cases = sweep.grid([0.3, 0.5], [0.3])
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster:
+        far = sweep.run(cases, tmp_path / "far", cluster=cluster.scheduler_address, progress=False)
+    near = sweep.run(cases, tmp_path / "near", jobs=1, progress=False)
+    for a, b in zip(far, near, strict=True):
+        assert a["clean"] and b["clean"]
+        assert (a["distance_m"], a["iterations"]) == (b["distance_m"], b["iterations"])
+        assert a["cost"] == pytest.approx(b["cost"], rel=1e-9)
+
+
+def test_no_such_cluster(tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match=r"^no Dask scheduler answers at 'nowhere:1' "):
+        sweep.run(sweep.grid([0.3], [0.3]), tmp_path, cluster="tcp://nowhere:1".removeprefix("tcp://"), progress=False)
+
+
+def test_another_sweep_is_not_mixed_in(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep, "run_case", quick)
+    sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)
+    with pytest.raises(InputError) as e:
+        sweep.run(sweep.grid([0.2], [0.3]), tmp_path, jobs=1, progress=False)
+    assert str(e.value) == f"{str(tmp_path)!r} holds a sweep of other targets, robots or weights; choose another folder"
+    (tmp_path / sweep.CASES).write_text("good morning\n")
+    with pytest.raises(InputError, match=r"is no log of a sweep; choose another folder$"):
+        sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)
+
+
+REFUSALS = [
+    ("sweep", "the following arguments are required: --out; 'jumplab sweep --help' shows what is possible"),
+    ("sweep --out s --distance-m 0:1", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1'"),
+    ("sweep --out s --distance-m 0:1:x", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1:x'"),
+    ("sweep --out s --height-m low", "--height-m must be a number, got 'low'"),
+    ("sweep --out s --height-m 9", "height = 9 m is outside 0.02 ... 1.5 m"),
+    ("sweep --out s --weight torque", "--weight must be TERM=A,B,..., got 'torque'"),
+    ("sweep --out s --jobs many", "--jobs must be a number of processes, or -1 for all processors, got 'many'"),
+    ("sweep --out s --method magic", "method 'magic': choose one of three-step, direct"),
+    ("sweep --out s --distance-m 0.1,0.1", "the sweep has the same case twice; give every value once"),
+    ("sweep --out s --robot asimo", "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+    ("bench --repeats 0", "--repeats must be a number from 1 to 1000, got '0'"),
+    ("bench --repeats 1 --json no/such/file", "--json must name a file in a folder that exists, got 'no/such/file'"),
+    ("bench --distance-m far", "--distance-m must be a number, got 'far'"),
+]
+
+
+@pytest.mark.parametrize(("command", "sentence"), REFUSALS, ids=[c for c, _ in REFUSALS])
+def test_refusals(capsys, tmp_path, monkeypatch, command, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert one_sentence(*run(capsys, *command.split())) == sentence
+    assert names(tmp_path) == [] and os.listdir(tmp_path) == []
+
+
+def test_an_unknown_weight_is_refused_at_once(tmp_path):
+    """Not once per case, after the robot has been built."""
+    with pytest.raises(InputError) as e:
+        sweep.run(sweep.grid([0.3], [0.3], weights=[{"torqe": 1.0}]), tmp_path / "s", jobs=1, progress=False)
+    assert str(e.value).startswith("weight 'torqe': stage 3 has no such cost; it has ")
+    assert not (tmp_path / "s").exists()
