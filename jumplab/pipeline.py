@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, SolverError
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.robot import Robot
@@ -154,7 +154,7 @@ class Planner:
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         first, last = self.stage("srmp"), self.stage("whole body")
         srmp = first.plan(task)
-        joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), GUESS_STEP_S, method="direct")
+        joints = _mapped(srmp, self.robot.under_gravity(task.gravity))
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights)
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
@@ -183,6 +183,14 @@ class Planner:
         rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
         tape = make_tape(body, self.robot, srmp)
         return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
+
+
+def _mapped(srmp: SrmpPlan, robot: Robot) -> JointPlan:
+    """Stage 2 with long steps, and where a step has no solution, with steps half as long."""
+    try:
+        return map_to_joints(srmp, robot, GUESS_STEP_S, method="direct")
+    except SolverError:
+        return map_to_joints(srmp, robot, GUESS_STEP_S / 2, method="direct")
 
 
 def _row(stage: str, s: Statistics) -> StageRow:
