@@ -65,5 +65,5 @@ class Mesh:
         return {"flat": self.flat, "toe": self.toe, "flight": self.flight}
 
     def coarse(self) -> Mesh:
-        """A third of the intervals: where a solve begins before it is refined on this mesh."""
-        return Mesh(*(max(n // 3, 2) for n in (self.flat, self.toe, self.flight)))
+        """Half of the intervals: where a solve begins before it is refined on this mesh."""
+        return Mesh(*(max(n // 2, 2) for n in (self.flat, self.toe, self.flight)))
