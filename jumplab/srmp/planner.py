@@ -18,6 +18,10 @@ from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 
+# ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
+# iterations instead of 22 in the middle, and 40 instead of 43 at most
+CURVATURE = {"neg_curv_test_tol": 1e-12}
+
 
 def parameters(task: JumpTask, envelope: Reach) -> dict:
     """Parameter values of the stage-1 problem for a target."""
@@ -57,8 +61,9 @@ class SrmpPlanner:
                  keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
+        options = {**CURVATURE, **(options or {})}
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
-        self._warm = self.nlp.with_options({**WARM, **(options or {})})
+        self._warm = self.nlp.with_options({**WARM, **options})
 
     def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF,
              near: SrmpPlan | None = None) -> SrmpPlan:  # fmt: skip
