@@ -178,7 +178,8 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | Non
         try:
             papermill.execute_notebook(
                 literal(notebook), literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
-                progress_bar={"desc": label} if label else False, kernel_manager_class=_kernel_manager(Path(scratch)),
+                progress_bar={"desc": label, "disable": None} if label else False,  # None: only on a terminal
+                kernel_manager_class=_kernel_manager(Path(scratch)),
             )  # fmt: skip
         except PapermillExecutionError as e:
             keep_failed.mkdir(exist_ok=True)
