@@ -17,7 +17,7 @@ from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
-from jumplab.whole_body import WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body import FlipPlanner, WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
@@ -138,6 +138,8 @@ class Planner:
                 "srmp": lambda: SrmpPlanner(self.robot),
                 "whole body": lambda: WholeBodyPlanner(self.robot),
                 "direct": lambda: WholeBodyPlanner(self.robot, tracking=False),
+                "whole body flip": lambda: FlipPlanner(self.robot),
+                "direct flip": lambda: FlipPlanner(self.robot, tracking=False),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
@@ -161,7 +163,7 @@ class Planner:
         check_platform(task, self.robot)
         if method == "direct":
             check_reachable(task, self._stage("reach"), self.robot)
-            planner = self._stage("direct")
+            planner = self._stage("direct flip" if task.rotation_rad else "direct")
             body = planner.plan(task)
             rows = _body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
