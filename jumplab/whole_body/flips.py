@@ -16,8 +16,8 @@ from jumplab.task import JumpTask
 from jumplab.whole_body.planner import COARSE, WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 
-# our choice: a solve that needs more is lost; solutions took 46 to 87 iterations on the coarse mesh
-EFFORT = {"max_iter": 160, "max_wall_time": 30.0}
+# our choice: a solve that needs more is lost; solutions took 46 to 109 iterations on the coarse mesh
+EFFORT = {"max_iter": 130, "max_wall_time": 30.0}
 # our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
 # Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
@@ -44,21 +44,42 @@ class FlipPlanner(WholeBodyPlanner):
                  tracking: bool = True, options: Mapping | None = None):  # fmt: skip
         options = {**EFFORT, **(options or {})}
         super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights.of_flip(), tracking=tracking, options=options)
-        self._searches = (self._coarse, self._coarse.with_options({**COARSE, **MONOTONE, **options}))
+        monotone = self._coarse.with_options({**COARSE, **MONOTONE, **options})
+        self._easy = {"weights": {"jerk": weights.jerk}, "off": ("jerk box",)}  # a first idea of the motion may be rough
+        self._searches = ((self._coarse, self._easy), (monotone, self._easy), (self._coarse, {}))
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
-        """Solve for a target; as in the base class, but the coarse mesh has the last word: it is searched twice."""
+        """Solve for a target; as in the base class, but with three searches on the coarse mesh, and no cold fine one.
+
+        Raises
+        ------
+        SolverError
+            After some seconds, if every search ends without a plan.
+        """
         guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
-        how = {"weights": weights, "off": off}
-        for last, search in ((False, self._searches[0]), (True, self._searches[1])):
-            self._coarse = search
+        mesh, weights, failure = self.mesh.coarse(), dict(weights or {}), None
+        start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
+        references = self.references(srmp, mesh)
+        for coarse, ease in self._searches:
+            how = {"weights": {**ease.get("weights", {}), **weights}, "off": (*ease.get("off", ()), *off)}
             try:
-                return self._refine(task, srmp, guess, parameters, how)
-            except SolverError:
-                if last:
-                    raise
-        raise AssertionError("unreachable")
+                first = coarse.solve(parameters, start, references=references, explain=False, **how)
+                return self._finish(task, srmp, first, parameters, weights=weights, off=off)
+            except SolverError as e:
+                failure = failure or e
+        raise SolverError(
+            f"{failure}; three searches from a flip's postures ended so: this robot may not do it within its limits, "
+            f"ask for another height or distance",
+            stage=failure.stage, status=failure.status,
+        )  # fmt: skip
+
+    def _finish(self, task, srmp, first, parameters, **how) -> WholeBodyPlan:
+        """The fine mesh, from a solution on the coarse one."""
+        start = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
+        references = self.references(srmp, self.mesh)
+        solution = self._refined.solve(parameters, start, references=references, explain=False, **how)
+        return WholeBodyPlan(task, solution, first.statistics)
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""
