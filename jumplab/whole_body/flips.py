@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -10,10 +11,11 @@ from scipy.interpolate import PchipInterpolator
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe
-from jumplab.solver import PhaseGuess
+from jumplab.solver import Nlp, PhaseGuess
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
-from jumplab.whole_body.planner import COARSE, WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body.planner import COARSE, WARM, WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body.problem import build_problem
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 
 # our choice: a solve that needs more is lost; solutions took 46 to 109 iterations on the coarse mesh
@@ -43,43 +45,48 @@ class FlipPlanner(WholeBodyPlanner):
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
                  tracking: bool = True, options: Mapping | None = None):  # fmt: skip
         options = {**EFFORT, **(options or {})}
-        super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights.of_flip(), tracking=tracking, options=options)
-        monotone = self._coarse.with_options({**COARSE, **MONOTONE, **options})
-        self._easy = {"weights": {"jerk": weights.jerk}, "off": ("jerk box",)}  # a first idea of the motion may be rough
-        self._searches = ((self._coarse, self._easy), (monotone, self._easy), (self._coarse, {}))
+        super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights.of_flip(), tracking=tracking,
+                         options=options, refine=False)  # fmt: skip
+        # the first idea of the motion may be rough: jerks as they like, and as few nodes as a jump's
+        self.rough, free = replace(mesh.coarse(), toe=mesh.toe), {"weights": {"jerk": weights.jerk}, "off": ("jerk box",)}
+        rough = build_problem(robot, self.rough, replace(self.limits, jerk=None), weights, tracking=tracking)
+        first = Nlp(rough, {**COARSE, **options})
+        self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
+        # the adaptive barrier keeps the box where it can be kept; else the plan is as smooth as its audit finds it
+        self._finishes = ((self.nlp, {}), (self.nlp.with_options({**WARM, **options}), free))
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
-        """Solve for a target; as in the base class, but with three searches on the coarse mesh, and no cold fine one.
+        """Solve for a target; as in the base class, but with two searches on the coarse mesh, and no cold fine one.
 
         Raises
         ------
         SolverError
             After some seconds, if every search ends without a plan.
         """
-        guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
-        mesh, weights, failure = self.mesh.coarse(), dict(weights or {}), None
-        start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
-        references = self.references(srmp, mesh)
-        for coarse, ease in self._searches:
-            how = {"weights": {**ease.get("weights", {}), **weights}, "off": (*ease.get("off", ()), *off)}
+        guess, parameters, failure = guess or self.naive_guess(task), self.parameters(task, srmp), None
+        start = {name: guess[name].resampled(n) for name, n in self.rough.intervals().items()}
+        references = self.references(srmp, self.rough), self.references(srmp, self.mesh)
+        for search in self._searches:
             try:
-                first = coarse.solve(parameters, start, references=references, explain=False, **how)
-                return self._finish(task, srmp, first, parameters, weights=weights, off=off)
+                first = search.solve(parameters, start, references=references[0], weights=weights, off=off,
+                                     explain=False)  # fmt: skip
             except SolverError as e:
                 failure = failure or e
+                continue
+            fine = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
+            for finish, free in self._finishes:
+                how = {"weights": {**free.get("weights", {}), **(weights or {})}, "off": (*free.get("off", ()), *off)}
+                try:
+                    solution = finish.solve(parameters, fine, references=references[1], explain=False, **how)
+                    return WholeBodyPlan(task, solution, first.statistics)
+                except SolverError as e:
+                    failure = failure or e
         raise SolverError(
-            f"{failure}; three searches from a flip's postures ended so: this robot may not do it within its limits, "
+            f"{failure}; two searches from a flip's postures ended so: this robot may not do it within its limits, "
             f"ask for another height or distance",
             stage=failure.stage, status=failure.status,
         )  # fmt: skip
-
-    def _finish(self, task, srmp, first, parameters, **how) -> WholeBodyPlan:
-        """The fine mesh, from a solution on the coarse one."""
-        start = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
-        references = self.references(srmp, self.mesh)
-        solution = self._refined.solve(parameters, start, references=references, explain=False, **how)
-        return WholeBodyPlan(task, solution, first.statistics)
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""

@@ -48,7 +48,7 @@ class Limits:
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
-                       jerk=12_000.0, momentum_share=0.15)  # fmt: skip
+                       jerk=25_000.0, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Mesh:
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over: the wrench changes faster while the heel is up, the tuck in flight."""
-        return replace(self, flat=3 * self.flat // 2, toe=2 * self.toe, flight=3 * self.flight // 2)
+        return replace(self, toe=3 * self.toe // 2, flight=3 * self.flight // 2)
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
