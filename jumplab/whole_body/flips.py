@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe
-from jumplab.solver import Nlp, PhaseGuess
+from jumplab.solver import Nlp, PhaseGuess, Solution
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
 from jumplab.whole_body.planner import COARSE, WARM, WholeBodyPlan, WholeBodyPlanner
@@ -48,12 +48,11 @@ class FlipPlanner(WholeBodyPlanner):
         super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights.of_flip(), tracking=tracking,
                          options=options, refine=False)  # fmt: skip
         # the first idea of the motion may be rough: jerks as they like, and as few nodes as a jump's
-        self.rough, free = replace(mesh.coarse(), toe=mesh.toe), {"weights": {"jerk": weights.jerk}, "off": ("jerk box",)}
+        self.rough, self._jerk = replace(mesh.coarse(), toe=mesh.toe), weights.jerk
         rough = build_problem(robot, self.rough, replace(self.limits, jerk=None), weights, tracking=tracking)
         first = Nlp(rough, {**COARSE, **options})
         self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
-        # the adaptive barrier keeps the box where it can be kept; else the plan is as smooth as its audit finds it
-        self._finishes = ((self.nlp, {}), (self.nlp.with_options({**WARM, **options}), free))
+        self._warm = self.nlp.with_options({**WARM, **options})
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> WholeBodyPlan:  # fmt: skip
@@ -74,19 +73,38 @@ class FlipPlanner(WholeBodyPlanner):
             except SolverError as e:
                 failure = failure or e
                 continue
-            fine = {name: first.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
-            for finish, free in self._finishes:
-                how = {"weights": {**free.get("weights", {}), **(weights or {})}, "off": (*free.get("off", ()), *off)}
-                try:
-                    solution = finish.solve(parameters, fine, references=references[1], explain=False, **how)
-                    return WholeBodyPlan(task, solution, first.statistics)
-                except SolverError as e:
-                    failure = failure or e
+            try:
+                return WholeBodyPlan(
+                    task, self._finish(parameters, first, references[1], weights, off), first.statistics
+                )
+            except SolverError as e:
+                failure = failure or e
         raise SolverError(
             f"{failure}; two searches from a flip's postures ended so: this robot may not do it within its limits, "
             f"ask for another height or distance",
             stage=failure.stage, status=failure.status,
         )  # fmt: skip
+
+    def _finish(self, parameters, first: Solution, references, weights, off) -> Solution:
+        """The fine mesh: within the box on jerks at once, or by way of a motion without it, or at last without it.
+
+        What is left of jumps then is for the audit to find.
+        """
+
+        def fine(solver: Nlp, start: Solution, free: bool) -> Solution:
+            guess = {name: start.phases[name].guess(n) for name, n in self.mesh.intervals().items()}
+            w, without = ({"jerk": self._jerk}, ("jerk box",)) if free else ({}, ())
+            return solver.solve(parameters, guess, references=references, weights={**w, **(weights or {})},
+                                off=(*without, *off), explain=False)  # fmt: skip
+
+        try:
+            return fine(self.nlp, first, False)
+        except SolverError:
+            loose = fine(self._warm, first, True)
+        try:
+            return fine(self.nlp, loose, False)
+        except SolverError:
+            return loose
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""

@@ -30,7 +30,7 @@ class Limits:
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
     capture_slope_s: float = 0.13
     capture_window_m: tuple[float, float] = (-0.02, 0.02)
-    capture_moment: float | None = None  # if set, [kg m^2/s] about the sole's middle at touchdown, instead of the window
+    capture_moment: float | None = None  # if set, [kg m^2/s] about the sole's middle at touchdown, not the window
     jerk: float | None = None  # if set, box on the links' jerk in toe phase and flight [rad/s^3]
     flight_clear: tuple[str, ...] = ("hand", "mid-arm", "knee")  # points that stay clear in flight ...
     flight_clearance_m: float = 0.05  # ... by this much
@@ -48,7 +48,7 @@ class Limits:
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
-                       jerk=25_000.0, momentum_share=0.15)  # fmt: skip
+                       jerk=13_500.0, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Mesh:
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over: the wrench changes faster while the heel is up, the tuck in flight."""
-        return replace(self, toe=3 * self.toe // 2, flight=3 * self.flight // 2)
+        return replace(self, flat=3 * self.flat // 2, toe=3 * self.toe // 2, flight=3 * self.flight // 2)
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
