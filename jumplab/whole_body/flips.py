@@ -86,9 +86,9 @@ class FlipPlanner(WholeBodyPlanner):
         )  # fmt: skip
 
     def _finish(self, parameters, first: Solution, references, weights, off) -> Solution:
-        """The fine mesh: within the box on jerks at once, or by way of a motion without it, or at last without it.
+        """The fine mesh: within the box on jerks or, where the search for that does not end, without it.
 
-        What is left of jumps then is for the audit to find.
+        What jumps of the torques that leaves is for the audit to find.
         """
 
         def fine(solver: Nlp, start: Solution, free: bool) -> Solution:
@@ -100,11 +100,7 @@ class FlipPlanner(WholeBodyPlanner):
         try:
             return fine(self.nlp, first, False)
         except SolverError:
-            loose = fine(self._warm, first, True)
-        try:
-            return fine(self.nlp, loose, False)
-        except SolverError:
-            return loose
+            return fine(self._warm, first, True)
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""
