@@ -17,7 +17,7 @@ from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
-from jumplab.whole_body import Mesh, WholeBodyPlan, WholeBodyPlanner
+from jumplab.whole_body import FlipPlanner, Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
@@ -48,6 +48,7 @@ class JumpPlan:
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner.
     statistics : one row per stage.
+    skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     """
 
     task: JumpTask
@@ -58,6 +59,7 @@ class JumpPlan:
     joints: JointPlan | None
     whole_body: WholeBodyPlan
     statistics: tuple[StageRow, ...]
+    skipped: str | None = None
 
     @property
     def planned_distance_m(self) -> float:
@@ -106,6 +108,7 @@ class JumpPlan:
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],
+            **({"skipped": self.skipped} if self.skipped else {}),
             "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
         }
 
@@ -142,6 +145,8 @@ class Planner:
                 "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
                 "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
                 "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
+                "whole body flip": lambda: FlipPlanner(self.robot),
+                "direct flip": lambda: FlipPlanner(self.robot, tracking=False),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
@@ -168,15 +173,35 @@ class Planner:
         check_platform(task, self.robot)
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
-            planner = self.stage("direct")
+            planner = self.stage("direct flip" if task.rotation_rad else "direct")
             body = planner.plan(task, weights=weights)
             rows = body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
+        if task.rotation_rad:
+            return self._flip(task)
         srmp, joints = self._first_two(task)
         last = self.stage("whole body")
         body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights)
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+
+    def _flip(self, task: JumpTask) -> JumpPlan:
+        """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
+        its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
+        """
+        srmp, joints, skipped = self.stage("srmp").plan(task), None, None
+        last = self.stage("whole body flip")
+        rows = [_row("1 SRMP", srmp.solution.statistics)]
+        try:
+            joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+            rows.append(_joint_row(joints))
+        except SolverError as e:
+            skipped = f"{e}; stage 3 began from postures of a flip instead"
+        guess = None if joints is None else guess_from_joints(joints, last, task, srmp.toe_s)
+        body = last.plan(task, srmp, guess=guess)
+        rows = (*rows, *body_rows("3 whole body", body))
+        return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
+                        skipped)  # fmt: skip
 
     def _first_two(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
         """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""

@@ -5,8 +5,9 @@ origin, so contact needs no equation; in flight the CoM is the parabola and the 
 remains. Term names carry the paper's equations; what the paper leaves out is marked "ours".
 """
 
+from jumplab.whole_body.flips import FlipPlanner
 from jumplab.whole_body.planner import WholeBodyPlan, WholeBodyPlanner
 from jumplab.whole_body.problem import build_problem
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 
-__all__ = ["Limits", "Mesh", "Weights", "WholeBodyPlan", "WholeBodyPlanner", "build_problem"]
+__all__ = ["FlipPlanner", "Limits", "Mesh", "Weights", "WholeBodyPlan", "WholeBodyPlanner", "build_problem"]

@@ -48,20 +48,28 @@ def _flat_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     return Phase("flat", LINKS[1:], mesh.flat, limits.flat_s, tuple(terms), start, scales=SCALES)
 
 
+def _jerk_box(limits: Limits) -> tuple[Bound, ...]:
+    """None for jumps that do not turn over."""
+    if limits.jerk is None:
+        return ()
+    return (Bound("jerk box", "ours: flips", "rad/s^3", "j", -limits.jerk, limits.jerk),)
+
+
 def _toe_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     # inner: at the first node the flat foot before it says so already, and a bound on top has multipliers without limit
     low, high = [0.0] + 4 * [-ANGLE_BOX_RAD], [limits.heel_up_rad] + 4 * [ANGLE_BOX_RAD]
     heel = Bound("heel not below ground", "WL-K2", "rad", "q", low, high, "inner")
     terms = b.smoothness(False) + b.limits_of_joints(False) + b.ground_contact() + b.toe_rows()
-    return Phase("toe", LINKS, mesh.toe, limits.toe_s, tuple(terms), (heel,), scales=SCALES)
+    return Phase("toe", LINKS, mesh.toe, limits.toe_s, tuple(terms), (heel, *_jerk_box(limits)), scales=SCALES)
 
 
-def _flight_phase(b: WholeBodyTerms, mesh: Mesh) -> Phase:
+def _flight_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     box = Bound("link angles", "ours: box", "rad", "q", -ANGLE_BOX_RAD, ANGLE_BOX_RAD)
     constants = {"com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0), "vel_x": (*SPEED_BOX_M_S, 1.0),
                  "vel_z": (*SPEED_BOX_M_S, 1.0)}  # fmt: skip
     terms = b.smoothness(True) + b.limits_of_joints(True) + b.flight_rows()
-    return Phase("flight", LINKS, mesh.flight, FLIGHT_S, tuple(terms), (box,), constants=constants, scales=SCALES)
+    bounds = (box, *_jerk_box(limits))
+    return Phase("flight", LINKS, mesh.flight, FLIGHT_S, tuple(terms), bounds, constants=constants, scales=SCALES)
 
 
 def _ballistic(b: WholeBodyTerms) -> Term:
@@ -85,7 +93,7 @@ def build_problem(robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), 
                   tracking: bool = True) -> Problem:  # fmt: skip
     """Flat foot, toe and flight in one problem: stage 3 with ``tracking``, the direct planner without."""
     b = WholeBodyTerms(robot, limits, weights)
-    flat, toe, flight = _flat_phase(b, mesh, limits), _toe_phase(b, mesh, limits), _flight_phase(b, mesh)
+    flat, toe, flight = _flat_phase(b, mesh, limits), _toe_phase(b, mesh, limits), _flight_phase(b, mesh, limits)
     joints = (_continuity("flat", "toe"), _continuity("toe", "flight"), _ballistic(b))
     parameters = dict(stance=5, distance=1, platform=1, edge=1, takeoff_speed=1, rotation=1, gravity=1)
     if not tracking:

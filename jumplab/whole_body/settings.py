@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,25 @@ class Limits:
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
     capture_slope_s: float = 0.13
     capture_window_m: tuple[float, float] = (-0.02, 0.02)
+    capture_moment: float | None = None  # if set, [kg m^2/s] about the sole's middle at touchdown, not the window
+    jerk: float | None = None  # if set, box on the links' jerk in toe phase and flight [rad/s^3]
+    flight_clear: tuple[str, ...] = ("hand", "mid-arm", "knee")  # points that stay clear in flight ...
+    flight_clearance_m: float = 0.05  # ... by this much
     momentum_share: float = 0.01  # L at take-off within this share of stage 1's
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
+
+    def of_flip(self) -> Limits:
+        """The same for a jump that turns over: it arrives turning, and any limb may pass close to the ground.
+
+        The trunk cannot stop before touchdown while L stays what the turn needed, so it may still turn (5 rad/s). Where
+        the soles belong then depends on that momentum as much as on v_x: what counts is the angular momentum about the
+        middle of the soles, which the impact does not change; 4 kg m^2/s tip the robot no farther than the window does.
+        Torques would jump from node to node (jerks of 60,000 rad/s^3) were these not kept in a box. Stage 1's rod turns
+        with other inertia than the body, so its L is followed to 15 %.
+        """
+        points = ("hand", "mid-arm", "knee", "hip", "shoulder")
+        return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
+                       jerk=13_500.0, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,6 +68,10 @@ class Weights:
     ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
     track_duration: float = 50.0  # [1] / [s]^2
 
+    def of_flip(self) -> Weights:
+        """The same for a jump that turns over: limbs in haste, whose jerk must not jump between nodes."""
+        return replace(self, jerk=5 * self.jerk)
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -59,6 +80,10 @@ class Mesh:
     flat: int = 25
     toe: int = 20
     flight: int = 30
+
+    def of_flip(self) -> Mesh:
+        """The same for a jump that turns over: the wrench changes faster while the heel is up, the tuck in flight."""
+        return replace(self, flat=3 * self.flat // 2, toe=3 * self.toe // 2, flight=3 * self.flight // 2)
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""

@@ -121,15 +121,17 @@ class WholeBodyTerms:
         return [*rows, self.body_clearance(False)]
 
     def body_clearance(self, flying: bool) -> Term:
-        """Hand, mid-arm and knee stay away from the ground and from the platform's edge."""
+        """Hand, mid-arm and knee (in a flip, hip and shoulder too) stay away from ground and platform's edge."""
         lim = self.limits
+        names = lim.flight_clear if flying else ("hand", "mid-arm", "knee")
+        least = lim.flight_clearance_m if flying else lim.hand_clearance_m
 
         def heights(p):
             toe = self.toe(p) if flying else ca.SX.zeros(2)
-            points = [toe + self.state(p).point(name) for name in ("hand", "mid-arm", "knee")]
+            points = [toe + self.state(p).point(name) for name in names]
             return ca.vertcat(*(x[1] - self.ground(p, x[0] + lim.edge_clearance_m) for x in points))
 
-        return Term("body clearance", "ours", "m", "node", heights, lower=lim.hand_clearance_m, upper=np.inf, scale=0.1)
+        return Term("body clearance", "ours", "m", "node", heights, lower=least, upper=np.inf, scale=0.1)
 
     def flat_rows(self) -> list[Term]:
         """Foot flat: the CoP stays within the sole (SL-P2 for the whole body)."""
@@ -228,6 +230,10 @@ class WholeBodyTerms:
             ahead = self.state(p).point(sole)[0] - self.state(p).com[0]
             return ahead - lim.capture_offset_m - lim.capture_slope_s * p.c.vel_x
 
+        def moment(p):
+            arm, speed = self.state(p).com - self.state(p).point(sole), self.ballistic_velocity(p)
+            return self.state(p).angular_momentum + model.total_mass * (arm[1] * speed[0] - arm[0] * speed[1])
+
         rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
         return [
             Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
@@ -242,5 +248,7 @@ class WholeBodyTerms:
             Term("trunk rate at touchdown", "ours", "rad/s", "end", lambda p: self.state(p).rates[3], lower=-trunk,
                  upper=trunk),
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
-                 upper=lim.capture_window_m[1], scale=0.1),
+                 upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
+            Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
+                 lower=-lim.capture_moment, upper=lim.capture_moment, scale=10.0),
         ]  # fmt: skip
