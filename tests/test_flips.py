@@ -30,7 +30,7 @@ def backflip():
 @pytest.mark.parametrize("turns", (-2, -1, 1, 2))
 def test_guess_turns_as_asked_and_goes_where_it_should(turns):
     """The foot of the guess ends flat after whole turns, and its toe ends near the target."""
-    flips = planner()._stage("direct flip")
+    flips = planner().stage("direct flip")
     task = JumpTask(0.2, 0.5, rotation_rad=turns * TURN)
     guess = flips.naive_guess(task)
     assert abs(guess["flight"].q[-1, 0] - turns * TURN) < 0.01
@@ -45,8 +45,8 @@ def test_a_jump_keeps_its_own_limits():
     assert Limits().touchdown_trunk_rate == 1.0 and Limits().of_flip().touchdown_trunk_rate == 5.0
     assert Limits().of_flip().torque_share == Limits().torque_share == 0.85  # the stated margin
     assert Mesh() == Mesh(25, 20, 30) and Weights().jerk < Weights().of_flip().jerk
-    assert isinstance(planner()._stage("direct flip"), FlipPlanner)
-    assert not isinstance(planner()._stage("direct"), FlipPlanner)
+    assert isinstance(planner().stage("direct flip"), FlipPlanner)
+    assert not isinstance(planner().stage("direct"), FlipPlanner)
 
 
 def test_rotation_is_whole_turns():
