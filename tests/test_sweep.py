@@ -16,6 +16,7 @@ from test_store import names
 from jumplab import sweep
 from jumplab.commands.sweep import values_of, weights_of
 from jumplab.errors import InputError
+from jumplab.robot.description import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -140,7 +141,10 @@ REFUSALS = [
     ("sweep --out s --jobs many", "--jobs must be a number of processes, or -1 for all processors, got 'many'"),
     ("sweep --out s --method magic", "method 'magic': choose one of three-step, direct"),
     ("sweep --out s --distance-m 0.1,0.1", "the sweep has the same case twice; give every value once"),
-    ("sweep --out s --robot asimo", "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+    (
+        "sweep --out s --robot asimo",
+        f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
+    ),
     ("bench --repeats 0", "--repeats must be a number from 1 to 1000, got '0'"),
     ("bench --repeats 1 --json no/such/file", "--json must name a file in a folder that exists, got 'no/such/file'"),
     ("bench --distance-m far", "--distance-m must be a number, got 'far'"),
