@@ -16,6 +16,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from jumplab import notebooks, store
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
+from jumplab.robot.description import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
@@ -122,7 +123,7 @@ def test_failing_notebook_stops_the_chain(tmp_path, cell, kind, sentence):
         ({"distance_m": float("nan")}, "parameter distance_m must be finite, got nan"),
         ({"distance_m": 50}, "distance = 50 m is outside -3 ... 3 m"),
         ({"robot": ""}, "parameter robot must be a name or a path, got ''"),
-        ({"robot": "asimo"}, "robot 'asimo': neither a shipped robot (bhr) nor a readable TOML file"),
+        ({"robot": "asimo"}, f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file"),
     ],
 )
 def test_bad_parameters_are_refused_before_anything_runs(tmp_path, parameters, sentence):
