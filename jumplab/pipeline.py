@@ -9,7 +9,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError, needs, said
 from jumplab.expansion import expand, planar_motion, planar_quantities
-from jumplab.joint_map import JointPlan, Options, map_to_joints
+from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
@@ -22,7 +22,6 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
-QP = Options()  # of stage 2, as every plan uses them
 SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
@@ -77,9 +76,12 @@ class JumpPlan:
     def weights(self) -> dict[str, dict[str, float]]:
         """Cost weights of the stages, as solved: stage -> "phase/term" -> weight."""
         found = {"whole body": _weights(self.whole_body.solution)}
+        if self.joints is not None:
+            o = self.joints.options
+            qps = {f"{phase}/{k}": w for phase in ("launch", "flight") for k, w in vars(getattr(o, phase)).items()}
+            found = {"joint map": qps, **found}
         if self.srmp is not None:
-            qps = {f"{phase}/{k}": w for phase in ("launch", "flight") for k, w in vars(getattr(QP, phase)).items()}
-            found = {"SRMP": _weights(self.srmp.solution), "joint map": qps, **found}
+            found = {"SRMP": _weights(self.srmp.solution), **found}
         return found
 
     @property
@@ -193,7 +195,7 @@ class Planner:
         last = self.stage("whole body flip")
         rows = [_row("1 SRMP", srmp.solution.statistics)]
         try:
-            joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+            joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
             rows.append(_joint_row(joints))
         except SolverError as e:
             skipped = f"{e}; stage 3 began from postures of a flip instead"
@@ -215,7 +217,7 @@ class Planner:
 
     def _pass(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
         srmp = self.stage("srmp").plan(task)
-        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
+        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
 
     def _nearest(self, task: JumpTask) -> str:
         """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""

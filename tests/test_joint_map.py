@@ -149,10 +149,12 @@ def test_launch_matrices_are_the_written_problem(steps):
         F, acc = cp.Variable(12), cp.Variable(20)
         B_f = force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
         wrench = x.A_f @ F - B_f
-        cost = w.com * cp.sum_squares(x.A_c @ acc + x.B_c - target.com_acceleration)
-        cost += w.force * cp.sum_squares(wrench[:3]) + w.moment * cp.sum_squares(wrench[3:])
-        follow = w.inertia_toe if target.on_toes else w.inertia
-        cost += follow * cp.square(x.J_rho @ acc + x.drift_rho - target.inertia_accel)
+        com, force = (w.com, w.force) if target.on_toes else (w.com_x, w.force_x)  # forwards
+        com_miss = x.A_c @ acc + x.B_c - target.com_acceleration
+        cost = com * cp.square(com_miss[0]) + w.com * cp.sum_squares(com_miss[1:])
+        cost += force * cp.square(wrench[0]) + w.force * cp.sum_squares(wrench[1:3])
+        cost += w.moment * cp.sum_squares(wrench[3:])
+        cost += target.inertia_weight * cp.square(x.J_rho @ acc + x.drift_rho - target.inertia_accel)
         cost += w.posture * cp.sum_squares(acc[6:] - target.joints) + w.trunk * cp.sum_squares(acc[3:6] - target.trunk)
         cost += w.wrench * cp.sum_squares(F) + w.acceleration * cp.sum_squares(acc)
         rows = [x.M[:6] @ acc + x.H[:6] == x.J[:, :6].T @ F, qp.S @ acc == target.symmetry]
@@ -203,9 +205,10 @@ def test_the_cvxpy_problem_is_dpp(steps):
 
 
 def test_missing_half_halves_the_targets():
-    """X^T W X + f X with f = -b^T A has its optimum at half of b."""
-    plan = mapped(half=False)
-    assert plan.tracking["takeoff_velocity"] > 0.05 and plan.tracking["launch_momentum"] > 0.2
+    """X^T W X + f X with f = -b^T A has its optimum at half of b; the feedback mends the velocity, not L or the place."""
+    printed, ours = mapped(half=False).tracking, mapped().tracking
+    assert printed["launch_momentum"] > 0.2 > 10 * ours["launch_momentum"]
+    assert printed["launch_com"] > 3 * ours["launch_com"]
 
 
 def test_three_base_rows_do_not_conserve_angular_momentum():

@@ -6,12 +6,13 @@ and matrices of any step.
 
 from jumplab.joint_map.flight import FlightQp, FlightTarget
 from jumplab.joint_map.launch import LaunchQp, LaunchTarget
-from jumplab.joint_map.options import PRINTED, FlightWeights, Form, Gain, Gains, LaunchWeights, Limits, Options
+from jumplab.joint_map.options import GENTLE, PRINTED, FlightWeights, Form, Gain, Gains, LaunchWeights, Limits, Options
 from jumplab.joint_map.problem import State, StepQp
 from jumplab.joint_map.rollout import JointMapper, JointPlan, Statistics, map_to_joints
 from jumplab.joint_map.solve import CvxpySolver, DirectSolver
 
 __all__ = [
+    "GENTLE",
     "PRINTED",
     "CvxpySolver",
     "DirectSolver",

@@ -30,6 +30,7 @@ class LaunchTarget:
     joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
     symmetry : right side of the symmetry rows, zero but for the drift control (k,).
     on_toes : heel up, CoP at the toe.
+    inertia_weight : of the inertia's term at this step, see :class:`~jumplab.joint_map.options.LaunchWeights`.
     """
 
     com_acceleration: np.ndarray
@@ -41,6 +42,7 @@ class LaunchTarget:
     trunk: np.ndarray
     symmetry: np.ndarray
     on_toes: bool
+    inertia_weight: float
 
 
 class LaunchQp:
@@ -51,6 +53,11 @@ class LaunchQp:
     body : nine-link quantities.  q0 : (nq,) configuration at the start, soles flat.
     reference : stage 1's launch.  options : gains, weights, limits, form.
     toe_s : length of the toe phase [s]; None starts it where the reference's CoP stays at the toe.
+
+    Attributes
+    ----------
+    roots : square roots of the weights of the CoM's rows (3,) and of the momentum's (6,), feet flat and on the toes.
+    inertia_weights : (n,) weight of the inertia's term by step.
     """
 
     name = "launch"
@@ -68,7 +75,11 @@ class LaunchQp:
         # on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
         pairs = ("hip",) if form.pairs == "hips" else ("hip", "shoulder")
         self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
-        self._roots = np.sqrt([options.launch.force] * 3 + [options.launch.moment] * 3)
+        w = options.launch
+        com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
+        force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
+        self.roots = tuple(zip(com, force, strict=True))
+        self.inertia_weights = self._inertia_weights()
         self.layout = self._layout(pairs)
         self._fixed = self._fixed_rows()
 
@@ -87,6 +98,13 @@ class LaunchQp:
         ground = [("ground", [f"{s} {r}" for s in SIDES for r in FOOT_ROWS]), ("heel", SIDES)]
         steady = ("joints", "trunk turn", "wrench", "acceleration")
         return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
+
+    def _inertia_weights(self) -> np.ndarray:
+        """(n,) by step: the flat feet's, fading geometrically to the toes' before the heel rises."""
+        w, start = self.options.launch, self.t[:-1]
+        heel_off = start[self.on_toes][0] if self.on_toes.any() else self.t[-1]
+        left = np.clip((heel_off - start) / w.inertia_fade_s, 0.0, 1.0)
+        return np.where(self.on_toes, w.inertia_toe, w.inertia_toe * (w.inertia / w.inertia_toe) ** left)
 
     def _fixed_rows(self):
         """Matrices with all rows that never change filled in, and the weights' roots."""
@@ -141,7 +159,8 @@ class LaunchQp:
             mirror = np.zeros(len(self.S))
         on_toes = bool(self.on_toes[k])
         floor = self._heel_floor(terms, on_toes)
-        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes)
+        weight = float(self.inertia_weights[k])
+        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight)
 
     def _heel_floor(self, terms: FullTerms, on_toes: bool) -> np.ndarray:
         gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
@@ -161,14 +180,12 @@ class LaunchQp:
         b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
         lower, upper = np.empty(len(R)), np.empty(len(R))
         half = 1.0 if form.half else 0.5  # without the 1/2 the optimum of X^T W X + f X is half of b
-        root = np.sqrt(w.com)
-        A[:3, WRENCH:] = root * terms.A_c
-        b[:3] = half * root * (target.com_acceleration - terms.B_c)  # com
-        A[3:9, :WRENCH] = self._roots[:, None] * terms.A_f
-        b[3:9] = (
-            half * self._roots * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
-        )
-        root = np.sqrt(w.inertia_toe if target.on_toes else w.inertia)
+        com, force = self.roots[target.on_toes]
+        A[:3, WRENCH:] = com[:, None] * terms.A_c
+        b[:3] = half * com * (target.com_acceleration - terms.B_c)
+        A[3:9, :WRENCH] = force[:, None] * terms.A_f
+        b[3:9] = half * force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
+        root = np.sqrt(target.inertia_weight)
         A[9, WRENCH:] = root * terms.J_rho
         b[9] = root * (target.inertia_accel - terms.drift_rho)
         b[lay.at("joints")] = np.sqrt(w.posture) * target.joints

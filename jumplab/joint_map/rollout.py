@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, SolverError
 from jumplab.joint_map.audit import audit, tracking
 from jumplab.joint_map.flight import FlightQp
 from jumplab.joint_map.launch import WRENCH, LaunchQp
-from jumplab.joint_map.options import Options
+from jumplab.joint_map.options import GENTLE, Options
 from jumplab.joint_map.problem import State
 from jumplab.joint_map.reference import FlightReference, LaunchReference
 from jumplab.joint_map.solve import solver_class
@@ -55,7 +55,7 @@ class JointPlan:
         [m] (mean of both soles relative to the CoM), of this motion and of stage 1; com relative to the pivot.
     tracking : summary of errors, see :func:`jumplab.joint_map.audit.tracking`.
     residuals : name -> largest violation, re-evaluated by Pinocchio, see :func:`jumplab.joint_map.audit.audit`.
-    statistics : what it cost.
+    statistics : what it cost.  options : gains, weights, limits and form of the QPs that made it.
     """
 
     t: np.ndarray
@@ -73,6 +73,7 @@ class JointPlan:
     tracking: dict
     residuals: dict
     statistics: Statistics
+    options: Options
 
     def rows(self, phase: str) -> slice:
         """Rows of one phase."""
@@ -203,7 +204,7 @@ class JointMapper:
             x.setflags(write=False)
         names = {"joint_names": self.robot.joint_names, "contact_frames": self.robot.foot.frames}
         seen = {"actual": actual, "reference": reference, "tracking": errors, "residuals": residuals}
-        return JointPlan(**data, **names, **seen, statistics=statistics)
+        return JointPlan(**data, **names, **seen, statistics=statistics, options=self.options)
 
     def _at_origins(self, terms, F) -> np.ndarray:
         """Wrenches moved from the tiptoes to the origins of the foot frames."""
@@ -243,11 +244,20 @@ def map_to_joints(srmp_plan, robot: Robot, step_s: float = 0.01, method: str = "
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
     robot : the robot.  step_s : step of the roll-out [s].
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
-    options : gains, weights, limits, form.  q0 : (nq,) start at rest; the robot's stance by default.
+    options : gains, weights, limits, form; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
+    q0 : (nq,) start at rest; the robot's stance by default.
 
     Raises
     ------
     InputError : the reference has gaps, NaN or wrong lengths, or an option is unknown.
     SolverError : a QP has no trustworthy answer; names phase, time and the rows that conflict.
     """
-    return JointMapper(srmp_plan, robot, step_s, options, q0).run(method)
+    if options is not None:
+        return JointMapper(srmp_plan, robot, step_s, options, q0).run(method)
+    try:
+        return JointMapper(srmp_plan, robot, step_s, Options(), q0).run(method)
+    except SolverError as firm:
+        try:
+            return JointMapper(srmp_plan, robot, step_s, GENTLE, q0).run(method)
+        except SolverError:
+            raise firm from None

@@ -21,6 +21,8 @@ from jumplab.task import JumpTask
 # ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
 # iterations instead of 22 in the middle, and 40 instead of 43 at most
 CURVATURE = {"neg_curv_test_tol": 1e-12}
+# our choice: the barrier stays above a tenth of the tolerance; below, iterations polish what nobody asked for
+BARRIER = {"mu_min": 1e-7}
 
 
 def parameters(task: JumpTask, envelope: Reach) -> dict:
@@ -61,7 +63,7 @@ class SrmpPlanner:
                  keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
-        options = {**CURVATURE, **(options or {})}
+        options = {**CURVATURE, **BARRIER, **(options or {})}
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **options})
 

@@ -25,6 +25,9 @@ class Limits:
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
+    # [rad/s] if set: a foot that still turns meets the ground with toe or heel first, and the impact spins it; at
+    # 2.4 rad/s the ankle passed its speed limit by 11 %
+    touchdown_foot_rate: float | None = 0.3
     # [rad] stroke left to absorb the fall; the impact turns a straighter knee faster than its motor can (20 rad/s), at
     # 0.7 rad by 7 %
     touchdown_knee: tuple[float, float] = (0.95, 1.4)
@@ -49,8 +52,8 @@ class Limits:
         with other inertia than the body, so its L is followed to 15 %.
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
-        return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
-                       jerk=13_500.0, momentum_share=0.15)  # fmt: skip
+        return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, capture_moment=4.0,
+                       flight_clear=points, flight_clearance_m=0.06, jerk=13_500.0, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -247,6 +247,9 @@ class WholeBodyTerms:
                  lower=-rate, upper=rate),
             Term("trunk rate at touchdown", "ours", "rad/s", "end", lambda p: self.state(p).rates[3], lower=-trunk,
                  upper=trunk),
+            *([] if lim.touchdown_foot_rate is None else [
+                Term("foot rate at touchdown", "ours: toe and heel meet the ground together", "rad/s", "end",
+                     lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
                  upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
             Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
