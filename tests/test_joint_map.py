@@ -205,7 +205,7 @@ def test_the_cvxpy_problem_is_dpp(steps):
 
 
 def test_missing_half_halves_the_targets():
-    """X^T W X + f X with f = -b^T A has its optimum at half of b; the feedback mends the velocity, not L or the place."""
+    """X^T W X + f X with f = -b^T A has its optimum at half of b; feedback mends the velocity, not L or the place."""
     printed, ours = mapped(half=False).tracking, mapped().tracking
     assert printed["launch_momentum"] > 0.2 > 10 * ours["launch_momentum"]
     assert printed["launch_com"] > 3 * ours["launch_com"]
