@@ -13,6 +13,7 @@ from jumplab.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
+TESTS = sorted((ROOT / "tests").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FUNCTION_LINES, MODULE_LINES, CELL_LINES = 60, 350, 25
@@ -56,7 +57,7 @@ def test_public_names_are_documented(path):
     assert not missing, f"{short(path)}: {', '.join(n or 'the module' for n in missing)}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=short)
+@pytest.mark.parametrize("path", [*MODULES, *TESTS], ids=short)
 def test_functions_and_modules_are_short(path):
     text = path.read_text()
     assert not long_functions(ast.parse(text)), short(path)

@@ -34,6 +34,7 @@ from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "jumplab" / "plotting").glob("*.py"))
+DATES = re.compile(rb"Matplotlib v|CreationDate|ModDate|Software|20[2-9][0-9]-[01][0-9]-")
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +193,21 @@ def test_saving_writes_three_files_without_dates(tmp_path, bhr):
     assert caption[3].startswith("Made with python 3.") and "casadi" in caption[3]
     for suffix in ("png", "pdf"):
         data = (folder / f"x.{suffix}").read_bytes()
-        assert not re.search(rb"Matplotlib v|CreationDate|Software|20[2-9][0-9]-[01][0-9]-", data)
+        assert not DATES.search(data)
     pixels = plt.imread(folder / "x.png").shape[1::-1]
     assert pixels == pytest.approx(style.DPI * fig.get_size_inches(), abs=1)
+
+
+@pytest.mark.slow
+def test_drawn_twice_means_the_same_bytes(figure, material, bhr, request, tmp_path):
+    """One copy has been looked at before, the other is fresh; saving again changes nothing either."""
+    again = FIGURES[request.node.callspec.params["figure"]](material, bhr)
+    for folder, fig in (("seen", figure), ("fresh", again), ("twice", again)):
+        plotting.save_figure(fig, "x", tmp_path / folder)
+    for kind in ("png", "pdf"):
+        seen, fresh, twice = ((tmp_path / f / f"x.{kind}").read_bytes() for f in ("seen", "fresh", "twice"))
+        assert seen == fresh == twice, kind
+        assert not DATES.search(fresh), kind
 
 
 def test_files_are_the_same_in_every_process(tmp_path):
@@ -212,6 +225,17 @@ def test_files_are_the_same_in_every_process(tmp_path):
         subprocess.run([sys.executable, "-c", code, str(folder), size], env=env, check=True)
         made.append({p.name: p.read_bytes() for p in folder.iterdir()})
     assert made[0] == made[1] and len(made[0]) == 6
+
+
+def test_captions_of_several_jumps_and_of_none():
+    tasks = [JumpTask(1.0, 0.5), JumpTask(0.7, 0.55, 0.5)]
+    said = style.caption_text("A and C.", tasks).splitlines()
+    assert said[:2] == [
+        "A and C.",
+        "Targets: 1.00 m forward, CoM rise 0.50 m; 0.70 m forward, CoM rise 0.55 m, landing 0.50 m higher.",
+    ]
+    assert style.caption_text("", tasks[:1]).startswith("No caption.\nTarget: 1.00 m forward, CoM rise 0.50 m.")
+    assert "Target" not in style.caption_text("A drawing.")
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../a", ".hidden"])
