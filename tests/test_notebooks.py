@@ -189,6 +189,23 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
         notebooks.find_notebooks()
 
 
+def test_some_notebooks_alone_leave_the_others_as_they_are(tmp_path, monkeypatch):
+    """By number or by name, in their order; only a notebook that is no more loses its executed copy."""
+    for k, stem in enumerate(("00_first", "01_second", "02_third")):
+        make_notebook(tmp_path, stem, RECORD % (k, k))
+    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
+    chosen = notebooks.find_notebooks(["02_third", "00"])
+    assert [p.stem for p in chosen] == ["00_first", "02_third"]
+    executed = tmp_path / "executed" / "notebooks"
+    executed.mkdir(parents=True)
+    for stem in ("01_second", "07_gone"):
+        (executed / f"{stem}.ipynb").write_text("old")
+    notebooks.run_notebooks(notebooks=chosen, progress=False)
+    assert names(executed) == ["00_first.ipynb", "01_second.ipynb", "02_third.ipynb"]
+    with pytest.raises(InputError, match=r"^no notebook '03'; there are 00_first, 01_second, 02_third$"):
+        notebooks.find_notebooks(["01", "03"])
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     """No half result, no kernel: the sleeping notebook's process is gone soon after."""
