@@ -44,6 +44,18 @@ def undocumented(tree):
     return [name for name, node in nodes if len((ast.get_docstring(node) or "").split()) < 2]
 
 
+def unhinted(tree):
+    """Public functions and methods with a parameter, or a result, of no stated type."""
+    missing = []
+    for name, node in public(tree):
+        if isinstance(node, FUNCTIONS):
+            a = node.args
+            given = [x for x in (*a.posonlyargs, *a.args, *a.kwonlyargs) if x.arg not in ("self", "cls")]
+            if node.returns is None or any(x.annotation is None for x in given):
+                missing.append(name)
+    return missing
+
+
 def long_functions(tree):
     """Functions, methods and those inside them that are too long: name -> lines."""
     functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTIONS)]
@@ -55,6 +67,12 @@ def long_functions(tree):
 def test_public_names_are_documented(path):
     missing = undocumented(ast.parse(path.read_text()))
     assert not missing, f"{short(path)}: {', '.join(n or 'the module' for n in missing)}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=short)
+def test_public_functions_state_their_types(path):
+    missing = unhinted(ast.parse(path.read_text()))
+    assert not missing, f"{short(path)}: {', '.join(missing)}"
 
 
 @pytest.mark.parametrize("path", [*MODULES, *TESTS], ids=short)
@@ -102,3 +120,4 @@ def test_these_checks_can_fail():
     tree = ast.parse(bad)
     assert undocumented(tree) == ["A.f", "g"] and list(long_functions(tree)) == ["g"]
     assert undocumented(ast.parse("x = 1")) == [""]
+    assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))
