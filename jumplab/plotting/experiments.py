@@ -51,6 +51,7 @@ LABEL_ROOM_M = 0.14  # our choice: for a frame's time above a head
 LABEL_SIDES = {"launch": "right", "flight": "center", "landing": "left"}  # away from the neighbour's head
 LEGEND_IN, TALLEST_IN = 0.3, 3.2
 WIDE_FRAME_M = 1.5  # our choice: wide enough for a ditch of 0.8 m and its edges
+WIDE_PIXELS_PER_M = 180  # our choice: 235 pixels per inch of a page-wide line, where a PNG has 200
 FRAMES = (0, 1, 3, 5, 8, 11)  # of the twelve of frame_rows: start, crouch, lift-off, flight, touchdown, end
 ROW_LABEL_IN = 0.25
 BASIN_SINGLE_IN, BASIN_ROW_IN = 2.4, 1.55  # our choice: height of a single map, of each of several rows
@@ -162,7 +163,8 @@ def _camera(result: SimulationResult, scene: Scene) -> Camera:
     rows = frame_rows(result)[list(FRAMES)]
     floor = 0.0 if result.landed else min(0.0, scene.top_at(float(result.com[-1, 0])))
     below = DITCH_SHOWN_M if floor == 0 and any(b.top < 0 for b in scene.blocks) else BELOW_M
-    return Camera(width=WIDE_FRAME_M, bottom=floor - below, top=float(result.q[rows, 2].max()) + ABOVE_M)
+    top = float(result.q[rows, 2].max()) + ABOVE_M
+    return Camera(width=WIDE_FRAME_M, bottom=floor - below, top=top, pixels_per_m=WIDE_PIXELS_PER_M)
 
 
 # Fig. 14 ---------------------------------------------------------------------------------------------------------
