@@ -12,7 +12,9 @@ ELASTIC = {"tol": 1e-4, "acceptable_tol": 1e-3, "max_iter": 200, "max_wall_time"
            "mu_strategy": "adaptive", "nlp_scaling_method": "none"}  # fmt: skip
 
 
-def least_violation(a: Assembled, x0, p, box, rows) -> tuple[np.ndarray, np.ndarray]:
+def least_violation(
+    a: Assembled, x0: np.ndarray, p: np.ndarray, box: tuple[np.ndarray, np.ndarray], rows: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Minimise the sum of row violations (L1) plus a trace of the cost, from ``x0``.
 
     Parameters

@@ -15,7 +15,14 @@ SHORTEST_STEP = 0.05  # our choice: share of a sample; a shorter last step is jo
 _EVALUATORS: dict = {}
 
 
-def planar_quantities(robot: Robot, angles, rates, accels, toe_acceleration, gravity: float) -> dict[str, np.ndarray]:
+def planar_quantities(
+    robot: Robot,
+    angles: np.ndarray,
+    rates: np.ndarray,
+    accels: np.ndarray,
+    toe_acceleration: np.ndarray,
+    gravity: float,
+) -> dict[str, np.ndarray]:
     """Every planar quantity at n instants: name -> (n, size) or (n,); inputs are (n, 5), (n, 5), (n, 5), (n, 2)."""
     key = (robot.hash, gravity)
     if key not in _EVALUATORS:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,22 +53,33 @@ class RunReport:
 # ---------------------------------------------------------------------------------------------- finding them
 
 
-def find_notebooks() -> list[Path]:
+def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
     """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
+
+    Parameters
+    ----------
+    names : which ones, by number or whole name ("02", "02_srmp"); all if empty.
 
     Raises
     ------
     InputError
-        If there are none; an installed package carries no notebooks.
+        If there are none, since an installed package carries no notebooks; or none of a name.
     """
     places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
     for place in places:
         found = sorted(place.glob(PATTERN))
         if found:
-            return found
+            return _named(found, names)
     raise InputError(
         f"no notebooks in {' nor in '.join(repr(str(p)) for p in places)}; run this in a clone of the repository"
     )
+
+
+def _named(found: list[Path], names: Sequence[str]) -> list[Path]:
+    for name in names:
+        if not any(name in (p.stem, p.stem[:2]) for p in found):
+            raise InputError(f"no notebook {name!r}; there are {', '.join(p.stem for p in found)}")
+    return [p for p in found if not names or {p.stem, p.stem[:2]} & set(names)]
 
 
 # ---------------------------------------------------------------------------------------------- running them
@@ -118,7 +129,7 @@ def run_notebooks(
             given = {k: v for k, v in values.items() if k in declared[notebook]}
             label = f"{i}/{len(notebooks)} {notebook.stem}" if progress else None
             _execute(notebook, given, work, label, keep_failed=out / "failed")
-        _publish(work, out, figures)
+        _publish(work, out, figures, sources=notebooks[0].parent)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
 
 
@@ -243,13 +254,13 @@ def _kernel_manager(scratch: Path) -> type:
 # ---------------------------------------------------------------------------------------------- publishing
 
 
-def _publish(work: Path, out: Path, figures: Path) -> None:
+def _publish(work: Path, out: Path, figures: Path, sources: Path) -> None:
     with store.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():
                 os.replace(p, staging / p.name)
     for old in (out / "notebooks").glob(PATTERN):
-        if not (work / "notebooks" / old.name).exists():
+        if not (sources / old.name).exists():  # executed once, since removed or renamed
             old.unlink()
     _place(work / "notebooks", out / "notebooks")
     _place(work / "figures", figures)

@@ -3,8 +3,9 @@ time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +15,13 @@ from jumplab.terms import Bound, Problem, Term
 from jumplab.transcription import Assembled, PhaseLayout
 
 
-def resolve(value, parameters, size) -> np.ndarray:
+def resolve(value: Any, parameters: Any, size: int) -> np.ndarray:
     """A bound as numbers (size,): itself, or what it says of the parameters."""
     value = value(parameters) if callable(value) else value
     return np.broadcast_to(np.asarray(value, float).ravel(), (size,))
 
 
-def is_off(owner: str, name: str, off) -> bool:
+def is_off(owner: str, name: str, off: Container[str]) -> bool:
     """Whether a term or bound is left out."""
     return name in off or f"{owner}/{name}" in off
 
@@ -53,7 +54,9 @@ def group_rows(a: Assembled) -> tuple[RowGroup, ...]:
     return tuple(out)
 
 
-def row_bounds(groups, n_rows: int, parameters, off) -> tuple[np.ndarray, np.ndarray]:
+def row_bounds(
+    groups: Sequence[RowGroup], n_rows: int, parameters: Any, off: Container[str]
+) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of all rows (n_rows,), scaled."""
     low, high = np.full(n_rows, -np.inf), np.full(n_rows, np.inf)
     for g in groups:
@@ -64,7 +67,7 @@ def row_bounds(groups, n_rows: int, parameters, off) -> tuple[np.ndarray, np.nda
     return low, high
 
 
-def variable_bounds(a: Assembled, parameters, off) -> tuple[np.ndarray, np.ndarray]:
+def variable_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of all variables (size,), scaled; refuses bounds that exclude each other."""
     low, high = np.full(a.size, -np.inf), np.full(a.size, np.inf)
     for layout in a.layouts.values():
@@ -149,14 +152,14 @@ def unpack(a: Assembled, x: np.ndarray) -> dict[str, PhaseSolution]:
 
 
 # multipliers ----------------------------------------------------------------------------------------------------
-def unpack_multipliers(a: Assembled, groups, lam_x: np.ndarray, lam_g: np.ndarray) -> Multipliers:
+def unpack_multipliers(a: Assembled, groups: Sequence[RowGroup], lam_x: np.ndarray, lam_g: np.ndarray) -> Multipliers:
     """Multipliers of rows and bounds by name and share of the phase, so that another mesh can begin with them."""
     rows = {(g.owner, g.term.name): (g.share, lam_g[g.index] * _density(g)) for g in groups}
     nodes = {n: lam_x[x.nodes()] * x.phase.intervals for n, x in a.layouts.items()}
     return Multipliers(rows, nodes, {n: lam_x[x.constants()] for n, x in a.layouts.items()})
 
 
-def pack_multipliers(a: Assembled, groups, given: Multipliers) -> tuple[np.ndarray, np.ndarray]:
+def pack_multipliers(a: Assembled, groups: Sequence[RowGroup], given: Multipliers) -> tuple[np.ndarray, np.ndarray]:
     """(lam_x, lam_g) for this mesh from multipliers of the same problem on any mesh."""
     lam_x, lam_g = np.zeros(a.size), np.zeros(a.n_rows)
     for g in groups:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
 
-def scatter(index, size) -> ca.DM:
+def scatter(index: np.ndarray, size: int) -> ca.DM:
     """0/1 matrix that adds entry i of a vector to position index[i]."""
     index = np.asarray(index, int)
     return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
 
 
-def gather(pieces, shape):
+def gather(pieces: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
     values = ca.vertcat(*(piece[0] for piece in pieces))
     rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
@@ -42,22 +44,22 @@ class Piece:
         function = ca.Function(name, [*self.arguments, *extra_symbols], [output], {"cse": True})
         return function.map(self.n)(*self.inputs, *extra_values)
 
-    def costs(self):
+    def costs(self) -> tuple[ca.MX, ca.MX] | None:
         """(weighted sum, unweighted parts) or None."""
         if not self.e.costs:
             return None
         parts = ca.sum2(self._map("costs", [], self.cost_parts, []))
         return ca.dot(self.weights[:, 0], parts), parts
 
-    def gradient(self):
+    def gradient(self) -> ca.MX:
         """Local gradients, one under the other."""
         return ca.vec(self._map("gradient", [self.w], ca.gradient(self.total, self.e.local), [self.weights]))
 
-    def rows(self):
+    def rows(self) -> ca.MX:
         """Kept constraint rows."""
         return ca.vec(self._map("rows", [], self.g, []))[self.keep.tolist()]
 
-    def jacobian(self):
+    def jacobian(self) -> tuple:
         """(values, rows, columns) of the kept rows' Jacobian."""
         j = ca.jacobian(self.g, self.e.local)
         rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
@@ -68,7 +70,7 @@ class Piece:
         values = ca.vec(self._map("jacobian", [], ca.vertcat(*j.nonzeros()), []))[np.flatnonzero(used).tolist()]
         return values, i[used], self.e.index[:, cols].ravel()[used]
 
-    def hessian(self, lam_f, lam_g):
+    def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple | None:
         """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
         lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
         h = ca.triu(self._curvature(lam, scale))

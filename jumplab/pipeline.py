@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -139,7 +140,7 @@ class Planner:
         self.robot, self.mesh, self.keep = robot, mesh, keep
         self._stages: dict = {}
 
-    def stage(self, name: str):
+    def stage(self, name: str) -> Any:
         """A stage's planner: "reach", "srmp", "whole body" or "direct"."""
         if name not in self._stages:
             build = {
@@ -294,7 +295,9 @@ def guess_from_joints(
                                      rel["com"][takeoff], rel["com_velocity"][takeoff])  # fmt: skip
 
 
-def to_link_angles(robot: Robot, q, v, a) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def to_link_angles(
+    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Absolute link angles (n, 5) with rates and accelerations from full-robot q, v, a; the mean of left and right."""
     model, sagittal = robot.model, robot.sagittal
     parts = [[(model.getJointId(n), sign) for n, row, sign in robot.role_signs() if row == i] for i in range(4)]

@@ -55,7 +55,7 @@ class PhaseSolution:
     duration: float
     constants: dict
 
-    def sample(self, t) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
         t = np.atleast_1d(np.asarray(t, float))
         n = len(self.j)

@@ -13,7 +13,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -56,7 +56,12 @@ class Case:
 
 
 def grid(
-    distances, heights, platforms=(0.0,), robots=("bhr",), weights=({},), method: str = "three-step"
+    distances: Sequence[float],
+    heights: Sequence[float],
+    platforms: Sequence[float] = (0.0,),
+    robots: Sequence[str] = ("bhr",),
+    weights: Sequence[Mapping[str, float]] = ({},),
+    method: str = "three-step",
 ) -> list[Case]:
     """All combinations, distances running fastest; refuses none, too many, and impossible targets or methods."""
     if method not in METHODS:

@@ -7,7 +7,7 @@ exactly. Costs and constraints are :class:`Term` objects that a notebook can lis
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
@@ -46,7 +46,7 @@ class Point:
     memo: dict = field(default_factory=dict)
 
     @property
-    def time(self):
+    def time(self) -> ca.SX:
         """Time since the phase began [s]."""
         return self.s * self.duration
 
@@ -169,7 +169,7 @@ class Problem:
         pairs += [(p.name, b.name) for p in self.phases for b in p.bounds]
         return {name for _, name in pairs} | {f"{owner}/{name}" for owner, name in pairs}
 
-    def check_names(self, names, what: str) -> None:
+    def check_names(self, names: Iterable[str], what: str) -> None:
         """Raise :class:`InputError` if a name is not a term or bound of this problem."""
         known = self.term_names()
         for name in names:

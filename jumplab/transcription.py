@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,7 +22,7 @@ from jumplab.terms import Point, Problem, Term
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
 
 
-def chain(q, v, a, j, h):
+def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
     """Exact triple-integrator step of length ``h`` under constant jerk: new (q, v, a)."""
     return q + h * v + h * h / 2 * a + h**3 / 6 * j, v + h * a + h * h / 2 * j, a + h * j
 

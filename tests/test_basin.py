@@ -6,7 +6,7 @@ from fixtures_core import jump
 
 from jumplab import store
 from jumplab.errors import InputError
-from jumplab.experiments import BasinGrid, Trial, TrialSettings, basin, landing_basin
+from jumplab.experiments import BasinGrid, Trial, TrialSettings, basin, landing_basin, states_kept
 
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
 
@@ -44,7 +44,8 @@ def test_the_grid_has_all_combinations_once():
 
 def test_counts_and_resumes(folder, fakes):
     first = landing_basin(folder, 50, jobs=1)
-    assert first.resumed == 0 and first.count == 50
+    assert first.resumed == 0 and first.count == 50 == states_kept(folder)
+    assert states_kept(folder, TrialSettings(reaim=False)) == 0 < states_kept(folder, grid=BasinGrid(pitch_deg=(5.0,)))
     whole = landing_basin(folder, jobs=1)
     assert (whole.count, whole.landed, whole.resumed) == (225, 135, 50) and whole.trials[:50] == first.trials
     said = store.read_json(folder / "basin.json")

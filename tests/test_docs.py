@@ -13,6 +13,7 @@ from jumplab.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
+TESTS = sorted((ROOT / "tests").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FUNCTION_LINES, MODULE_LINES, CELL_LINES = 60, 350, 25
@@ -43,6 +44,18 @@ def undocumented(tree):
     return [name for name, node in nodes if len((ast.get_docstring(node) or "").split()) < 2]
 
 
+def unhinted(tree):
+    """Public functions and methods with a parameter, or a result, of no stated type."""
+    missing = []
+    for name, node in public(tree):
+        if isinstance(node, FUNCTIONS):
+            a = node.args
+            given = [x for x in (*a.posonlyargs, *a.args, *a.kwonlyargs) if x.arg not in ("self", "cls")]
+            if node.returns is None or any(x.annotation is None for x in given):
+                missing.append(name)
+    return missing
+
+
 def long_functions(tree):
     """Functions, methods and those inside them that are too long: name -> lines."""
     functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTIONS)]
@@ -57,6 +70,12 @@ def test_public_names_are_documented(path):
 
 
 @pytest.mark.parametrize("path", MODULES, ids=short)
+def test_public_functions_state_their_types(path):
+    missing = unhinted(ast.parse(path.read_text()))
+    assert not missing, f"{short(path)}: {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("path", [*MODULES, *TESTS], ids=short)
 def test_functions_and_modules_are_short(path):
     text = path.read_text()
     assert not long_functions(ast.parse(text)), short(path)
@@ -101,3 +120,4 @@ def test_these_checks_can_fail():
     tree = ast.parse(bad)
     assert undocumented(tree) == ["A.f", "g"] and list(long_functions(tree)) == ["g"]
     assert undocumented(ast.parse("x = 1")) == [""]
+    assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))

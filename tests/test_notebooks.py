@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -188,6 +189,23 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
         notebooks.find_notebooks()
 
 
+def test_some_notebooks_alone_leave_the_others_as_they_are(tmp_path, monkeypatch):
+    """By number or by name, in their order; only a notebook that is no more loses its executed copy."""
+    for k, stem in enumerate(("00_first", "01_second", "02_third")):
+        make_notebook(tmp_path, stem, RECORD % (k, k))
+    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
+    chosen = notebooks.find_notebooks(["02_third", "00"])
+    assert [p.stem for p in chosen] == ["00_first", "02_third"]
+    executed = tmp_path / "executed" / "notebooks"
+    executed.mkdir(parents=True)
+    for stem in ("01_second", "07_gone"):
+        (executed / f"{stem}.ipynb").write_text("old")
+    notebooks.run_notebooks(notebooks=chosen, progress=False)
+    assert names(executed) == ["00_first.ipynb", "01_second.ipynb", "02_third.ipynb"]
+    with pytest.raises(InputError, match=r"^no notebook '03'; there are 00_first, 01_second, 02_third$"):
+        notebooks.find_notebooks(["01", "03"])
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     """No half result, no kernel: the sleeping notebook's process is gone soon after."""
@@ -224,33 +242,6 @@ def wait_for(condition, seconds=60.0):
 
 
 # ------------------------------------------------------------------------------------------ inside a notebook
-
-
-@pytest.mark.parametrize(
-    ("injected", "sentence"),
-    [
-        ("distnace_m = 2.0", "unknown notebook parameter 'distnace_m'; this notebook knows distance_m"),
-        ("distance_m = 'far'", "parameter distance_m must be of type float, got 'far'"),
-        ("distance_m = float('inf')", "parameter distance_m must be finite, got inf"),
-        ("height_m = -1", "height = -1 m is outside 0.02 ... 1.5 m"),
-        ("n = 1.5", "parameter n must be of type int, got 1.5"),
-        ("n = True", "parameter n must be of type int, got True"),
-        ("out = ''", "parameter out must be a name or a path, got ''"),
-        ("robot = None", "parameter robot must be of type str, got None"),
-    ],
-)
-def test_check_parameters_refuses(injected, sentence):
-    cell = f"# Parameters\n{injected}\n"
-    namespace = {"In": ["", "distance_m = 1.0\nn = 1", cell], "distance_m": 1.0, "n": 1}
-    exec(cell, namespace)
-    with pytest.raises(InputError) as e:
-        notebooks.check_parameters(namespace, n=int)
-    assert str(e.value).startswith(sentence)
-
-
-def test_check_parameters_accepts_what_is_meant():
-    notebooks.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
-    notebooks.check_parameters({"fast": True, "In": ["# Parameters\nfast = True"]}, fast=bool)
 
 
 def test_what_a_notebook_asks_is_known_before_it_runs(tmp_path):
@@ -313,6 +304,23 @@ def test_chain_runs_and_publishes(chain):
     assert {p.suffix for p in figures} >= {".png", ".pdf"}
     least = {".png": 500, ".pdf": 500, ".txt": 40}  # bytes: a caption is a sentence
     assert all(p.stat().st_size > least[p.suffix] for p in figures)
+    assert {f"f{k:02}" for k in range(1, 15)} <= {p.name[:3] for p in figures}  # every figure of the paper
+
+
+def test_figures_say_what_they_show_and_not_when(chain):
+    """Captions with target, robot and versions, but for drawings of no jump; no dates in pictures."""
+    drawings = {"f02_framework", "f04_pendulum"}
+    robot_alone = {"f03_link_models", "f03b_simulation_model", "your_robot", "your_robot_envelope"}
+    for path in chain.figures.rglob("*.txt"):
+        said = path.read_text(encoding="utf-8")
+        assert "Made with python 3." in said and "casadi" in said, path.name
+        assert ("Robot: " in said) == (path.stem not in drawings), path.name
+        assert ("Target" in said) == (path.stem not in drawings | robot_alone), path.name
+        for kind in (".png", ".pdf"):
+            data = path.with_suffix(kind).read_bytes()
+            assert not re.search(rb"Matplotlib v|CreationDate|ModDate|Software|20[2-9][0-9]-[01][0-9]-", data), (
+                path.name
+            )
 
 
 def test_chain_lands_where_it_should(chain):

@@ -34,6 +34,7 @@ from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "jumplab" / "plotting").glob("*.py"))
+DATES = re.compile(rb"Matplotlib v|CreationDate|ModDate|Software|20[2-9][0-9]-[01][0-9]-")
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +193,28 @@ def test_saving_writes_three_files_without_dates(tmp_path, bhr):
     assert caption[3].startswith("Made with python 3.") and "casadi" in caption[3]
     for suffix in ("png", "pdf"):
         data = (folder / f"x.{suffix}").read_bytes()
-        assert not re.search(rb"Matplotlib v|CreationDate|Software|20[2-9][0-9]-[01][0-9]-", data)
+        assert not DATES.search(data)
     pixels = plt.imread(folder / "x.png").shape[1::-1]
     assert pixels == pytest.approx(style.DPI * fig.get_size_inches(), abs=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
+def test_drawn_twice_means_the_same_bytes(name, material, bhr, tmp_path):
+    made = []
+    for folder in (tmp_path / "one", tmp_path / "other"):
+        plotting.save_figure(FIGURES[name](material, bhr), "x", folder)
+        made.append([(folder / f"x.{kind}").read_bytes() for kind in ("png", "pdf")])
+    assert made[0] == made[1] and not any(DATES.search(data) for data in made[0])
+
+
+def test_saved_twice_means_the_same_bytes(tmp_path):
+    """The layout is that of the first time."""
+    fig = plotting.pendulum_diagram()
+    for name in "ab":
+        plotting.save_figure(fig, name, tmp_path)
+    for kind in ("png", "pdf"):
+        assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes(), kind
 
 
 def test_files_are_the_same_in_every_process(tmp_path):
@@ -212,6 +232,17 @@ def test_files_are_the_same_in_every_process(tmp_path):
         subprocess.run([sys.executable, "-c", code, str(folder), size], env=env, check=True)
         made.append({p.name: p.read_bytes() for p in folder.iterdir()})
     assert made[0] == made[1] and len(made[0]) == 6
+
+
+def test_captions_of_several_jumps_and_of_none():
+    tasks = [JumpTask(1.0, 0.5), JumpTask(0.7, 0.55, 0.5)]
+    said = style.caption_text("A and C.", tasks).splitlines()
+    assert said[:2] == [
+        "A and C.",
+        "Targets: 1.00 m forward, CoM rise 0.50 m; 0.70 m forward, CoM rise 0.55 m, landing 0.50 m higher.",
+    ]
+    assert style.caption_text("", tasks[:1]).startswith("No caption.\nTarget: 1.00 m forward, CoM rise 0.50 m.")
+    assert "Target" not in style.caption_text("A drawing.")
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../a", ".hidden"])

@@ -1,6 +1,6 @@
-"""Pictures of the experiments: what lies where in a scene, what sensors say, and what the map of trials counts."""
+"""Pictures of the experiments: what lies where in a scene, what sensors say, and what the maps count."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
-from jumplab.experiments import Trial, TrialKey, measure, wilson
+from jumplab.experiments import BasinGrid, BasinReport, Trial, TrialKey, TrialSettings, measure, wilson
 from jumplab.plotting import experiments as pictures
 from jumplab.plotting import render
 from jumplab.plotting.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
@@ -144,3 +144,42 @@ def test_map_shows_what_decides():
 
 def test_map_of_nothing():
     assert len(pictures.trial_map([]).axes) == 6
+
+
+# ------------------------------------------------------------------------------------------ wrong states
+
+
+def basin_of(grid):
+    """A basin in which states fall that are turned forward on a slippery floor."""
+    fate = [(s, s.pitch_deg <= 0 or s.friction > 0.6) for s in grid.states]
+    trials = [Trial(TrialKey(0, k, "", ""), {}, asdict(s), ok, "", None) for k, (s, ok) in enumerate(fate)]
+    return BasinReport(tuple(trials), 0, TrialSettings(), "", {}, 0, grid)
+
+
+@pytest.mark.parametrize(
+    ("grid", "panels"),
+    [(BasinGrid(), 9), (BasinGrid((0.8, 1.0), (-20.0, 0.0, 20.0), (0.0,), (0.5,)), 1)],
+    ids=["whole", "one height and floor"],
+)
+def test_basin_shows_every_state_in_its_place(grid, panels):
+    basin = basin_of(grid)
+    fig = pictures.basin_map(basin)
+    assert len(fig.axes) == panels and smallest_font(fig) >= MIN_FONT_PT
+    drawn = {LANDING: set(), VERMILION: set()}
+    for ax in fig.axes:
+        for line in ax.lines:
+            if line.get_color() in drawn:
+                drawn[line.get_color()] |= {
+                    (ax.get_title("left"), *map(round, map(float, p))) for p in line.get_xydata()
+                }
+    assert [len(places) for places in drawn.values()] == [basin.landed, basin.count - basin.landed]
+    assert all("friction 0.5:" in title and pitch > 0 for title, _, pitch in drawn[VERMILION])
+    titles = [ax.get_title("left") for ax in fig.axes]
+    assert titles[0] == ("0.1 m lower, friction 0.5: 15/25" if panels == 9 else "planned height, friction 0.5: 4/6")
+
+
+def test_titles_of_a_whole_basin_keep_apart():
+    fig = pictures.basin_map(basin_of(BasinGrid()))
+    fig.draw_without_rendering()
+    boxes = [ax._left_title.get_window_extent() for ax in fig.axes[3:6]]
+    assert boxes[0].x1 < boxes[1].x0 and boxes[1].x1 < boxes[2].x0 and boxes[2].x1 <= fig.bbox.x1

@@ -1,4 +1,4 @@
-"""``jumplab run``: all notebooks, in order."""
+"""``jumplab run``: all notebooks, or some, in order."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from jumplab.errors import InputError
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Declare ``jumplab run``."""
-    run = commands.add_parser("run", help="execute all notebooks: plan, audit, simulation, figures",
+    run = commands.add_parser("run", help="execute the notebooks: plan, audit, simulation, figures",
                               parents=[common_options(), target_options(), robot_option()])  # fmt: skip
+    run.add_argument("notebook", nargs="*", metavar="NOTEBOOK", help="which ones, as 00 or 02_srmp (default: all)")
     run.add_argument("--out", metavar="DIR", help="results and executed notebooks (default: executed/ in the checkout)")
     run.add_argument(
         "--figures", metavar="DIR", help="figures (default: DIR/figures with --out, else figures/ in the checkout)"
@@ -48,9 +49,13 @@ def _run(args: argparse.Namespace) -> None:
 
     from jumplab import notebooks, store
 
-    report = notebooks.run_notebooks(values, out=out, figures=figures)
-    print_summary(store.read_plan(report.out)[2])
-    print_simulation(store.read_json(report.out / "simulation.json"))
+    report = notebooks.run_notebooks(
+        values, out=out, figures=figures, notebooks=notebooks.find_notebooks(args.notebook)
+    )
+    if (report.out / "plan.npz").is_file():
+        print_summary(store.read_plan(report.out)[2])
+    if (report.out / "simulation.json").is_file():
+        print_simulation(store.read_json(report.out / "simulation.json"))
     print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
     if (report.out / "jump.html").is_file():
         print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")

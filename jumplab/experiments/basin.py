@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 
 from jumplab import store
 from jumplab.errors import InputError
+from jumplab.experiments.log import open_log
 from jumplab.experiments.monte_carlo import TrialReport, check_numbers, run_series
 from jumplab.experiments.trial import HASH_DIGITS, Trial, TrialKey, TrialSettings, judged, plan_hash
 from jumplab.robot import Robot
@@ -111,16 +113,32 @@ def landing_basin(
         raise InputError(f"n = {count} is too large; the basin has {len(states)} states")
     tape, robot, summary = store.read_plan(folder)
     scene, plan = Scene.of_plan(summary, robot), plan_hash(summary)
-    code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
-    work = {}
-    for state in states[:count]:
-        name = _hash(["basin", code, asdict(state)])  # whatever the grid: equal states are equal trials
-        key = TrialKey(0, int(name[:8], 16), name, plan)
-        work[key] = joblib.delayed(drop)(tape, robot, scene, settings, key, state)
+    keys = _keys(states[:count], settings, plan)
+    work = {key: joblib.delayed(drop)(tape, robot, scene, settings, key, state) for key, state in keys.items()}
     trials, resumed = run_series(folder, work, jobs, progress)
     report = BasinReport(trials, 0, settings, plan, dict(summary["target"]), resumed, grid)
     store.write_trials(folder, report.to_json(), summary, "basin.json")
     return report
+
+
+def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), grid: BasinGrid = BasinGrid()) -> int:
+    """How many states of ``grid`` the plan in ``folder`` has been dropped from; :func:`landing_basin` runs the others.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no whole plan, or its log cannot be read.
+    """
+    plan = plan_hash(store.read_plan(folder)[2])
+    with open_log(folder) as log:
+        return sum(key in log.trials for key in _keys(grid.states, settings, plan))
+
+
+def _keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
+    """Each state's name in the log; whatever the grid, equal states are equal trials."""
+    code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
+    names = [_hash(["basin", code, asdict(state)]) for state in states]
+    return {TrialKey(0, int(n[:8], 16), n, plan): state for n, state in zip(names, states, strict=True)}
 
 
 def drop(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: TrialKey, state: BasinState) -> Trial:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 
@@ -38,7 +40,7 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
     }
 
 
-def audit(mapper, data: dict, held: np.ndarray, nodes: list, steps: list) -> dict[str, float]:
+def audit(mapper: Any, data: dict, held: np.ndarray, nodes: list, steps: list) -> dict[str, float]:
     """Largest violations, from Pinocchio's inverse dynamics and the robot's own limits, not from the QPs' matrices.
 
     Keys: ``base_force`` (base rows of the inverse dynamics less the wrenches [N, N m]; in flight it shows the drift

@@ -72,7 +72,7 @@ class StepQp:
     upper: np.ndarray
     layout: Layout = field(repr=False)
 
-    def block(self, name: str):
+    def block(self, name: str) -> tuple[np.ndarray, ...]:
         """Matrix and right side (or lower and upper side) of the rows of one named block."""
         matrix, rows = self.layout.blocks[name]
         sides = {"A": ("A", "b"), "E": ("E", "e"), "G": ("G", "h"), "R": ("R", "lower", "upper")}
@@ -143,7 +143,16 @@ class JointRows:
         left = np.maximum(left, 0.0)
         return np.minimum(self.limits.stop_rate * left, np.sqrt(2 * self.brake * left))
 
-    def fill(self, R, lower, upper, terms: FullTerms, start: State, step: float, first: int):
+    def fill(
+        self,
+        R: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        terms: FullTerms,
+        start: State,
+        step: float,
+        first: int,
+    ) -> None:
         """Write 2 n rows: torque M theta'' + H - J^T F, then acceleration; theta'' begins at column ``first`` of x."""
         n = len(self.speed)
         R[:n, first:] = terms.M[6:]
@@ -154,7 +163,7 @@ class JointRows:
         lower[n:], upper[n:] = self.acceleration(start.q[7:], start.v[6:], step)
 
     @staticmethod
-    def labels(body: FullBody):
+    def labels(body: FullBody) -> list[tuple[str, list[str]]]:
         """Blocks of the rows that :meth:`fill` writes."""
         names = list(body.robot.joint_names)
         return [("torque", names), ("speed and range", names)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ NEEDED = {  # array -> columns
 }
 
 
-def checked(srmp, phase: str) -> dict[str, np.ndarray]:
+def checked(srmp: Any, phase: str) -> dict[str, np.ndarray]:
     """Arrays of one phase of stage 1's result; raises :class:`InputError` naming array and time if one is unusable."""
     source = getattr(srmp, phase, None)
     if source is None or not hasattr(source, "t"):
@@ -52,7 +53,9 @@ def checked(srmp, phase: str) -> dict[str, np.ndarray]:
     return out
 
 
-def hermite(grid: np.ndarray, value, rate, accel, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def hermite(
+    grid: np.ndarray, value: np.ndarray, rate: np.ndarray, accel: np.ndarray | None, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Value and rate at times ``t`` of the quintic pieces through value, rate and acceleration on an even ``grid``.
 
     Without ``accel`` the pieces are cubic.
@@ -95,15 +98,15 @@ class Track:
         return cls(value, rate, np.diff(rate, axis=0) / step)
 
     @classmethod
-    def sample(cls, grid, value, rate, accel, t) -> Track:
+    def sample(cls, grid: np.ndarray, value: np.ndarray, rate: np.ndarray, accel: np.ndarray, t: np.ndarray) -> Track:
         """Through the samples of stage 1."""
         return cls.of(t, *hermite(grid, value, rate, accel, t))
 
-    def command(self, k: int, value, rate, gain: Gain):
+    def command(self, k: int, value: np.ndarray, rate: np.ndarray, gain: Gain) -> np.ndarray:
         """Acceleration to ask for over step k, from value and rate at its start: feed-forward + PD."""
         return self.feed[k] + gain.damping * (self.rate[k] - rate) + gain.stiffness * (self.value[k] - value)
 
-    def from_state(self, t: np.ndarray, value, rate, blend_s: float) -> Track:
+    def from_state(self, t: np.ndarray, value: np.ndarray, rate: np.ndarray, blend_s: float) -> Track:
         """The same reference, but beginning at a given value and rate and joining it smoothly after ``blend_s``.
 
         The quintic that carries the initial offset down to zero is added (our choice: SRMP's pivot stays on the ground
@@ -137,7 +140,7 @@ class LaunchReference:
     cop_x: np.ndarray
 
     @classmethod
-    def sample(cls, srmp, step_s: float) -> LaunchReference:
+    def sample(cls, srmp: Any, step_s: float) -> LaunchReference:
         """From stage 1's launch."""
         r = checked(srmp, "launch")
         t, grid = nodes(r["t"][-1], step_s), r["t"]
@@ -172,7 +175,7 @@ class FlightReference:
     turn: np.ndarray
 
     @classmethod
-    def sample(cls, srmp, step_s: float) -> FlightReference:
+    def sample(cls, srmp: Any, step_s: float) -> FlightReference:
         """From stage 1's flight."""
         r = checked(srmp, "flight")
         t, grid = nodes(r["t"][-1], step_s), r["t"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +14,7 @@ from jumplab.joint_map.audit import audit, tracking
 from jumplab.joint_map.flight import FlightQp
 from jumplab.joint_map.launch import WRENCH, LaunchQp
 from jumplab.joint_map.options import GENTLE, Options
-from jumplab.joint_map.problem import State
+from jumplab.joint_map.problem import State, StepQp
 from jumplab.joint_map.reference import FlightReference, LaunchReference
 from jumplab.joint_map.solve import solver_class
 from jumplab.models.full import FullBody, FullTerms
@@ -123,7 +124,7 @@ class JointMapper:
         q = pin.integrate(self.body.model, start.q, start.v * (h / 2) + guess * (h * h / 8))
         return self.body.terms(q, start.v + guess * (h / 2))
 
-    def problem(self, qp, k: int, start: State):
+    def problem(self, qp: LaunchQp | FlightQp, k: int, start: State) -> tuple[FullTerms, Any, StepQp]:
         """Quantities in the middle of step ``k`` of a phase, target, and the matrices of its QP, to look at.
 
         ``qp`` is :attr:`launch` or one from :meth:`flight_from`; ``start.a`` guesses the step's accelerations. With
@@ -133,7 +134,7 @@ class JointMapper:
         terms = self.middle(start, start.a, qp.step)
         return terms, target, qp.matrices(terms, target, start)
 
-    def roll(self, qp, solver_type, state: State) -> dict:
+    def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> dict:
         """Solve and integrate all steps of one phase; lists by name, and where the time went."""
         h, first, clock = qp.step, WRENCH if qp is self.launch else 0, time.perf_counter
         out = {"states": [state], "nodes": [], "steps": [], "F": [], "answers": []}
@@ -235,8 +236,14 @@ class JointMapper:
         return actual, reference
 
 
-def map_to_joints(srmp_plan, robot: Robot, step_s: float = 0.01, method: str = "cvxpy", options: Options | None = None,
-                  q0=None) -> JointPlan:  # fmt: skip
+def map_to_joints(
+    srmp_plan: Any,
+    robot: Robot,
+    step_s: float = 0.01,
+    method: str = "cvxpy",
+    options: Options | None = None,
+    q0: np.ndarray | None = None,
+) -> JointPlan:
     """Map stage 1's momentum and inertia trajectories to the joints of the full robot (Sec. IV).
 
     Parameters

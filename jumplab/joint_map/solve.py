@@ -39,7 +39,9 @@ class Answer:
     residual: float
 
 
-def checked_answer(qp: StepQp, x, iterations: int, status: str, good: bool, phase: str, t: float) -> Answer:
+def checked_answer(
+    qp: StepQp, x: np.ndarray | None, iterations: int, status: str, good: bool, phase: str, t: float
+) -> Answer:
     """The answer, or :class:`SolverError` naming phase, time, status and the rows that conflict."""
     residual, worst = np.inf, ""
     if x is not None and np.all(np.isfinite(x)):
@@ -111,7 +113,17 @@ class CvxpySolver:
         return checked_answer(qp, self.x.value, iterations, status, status in GOOD_CVXPY, phase, t)
 
 
-def polished(hessian, linear, equal, right, rows, low, high, x, multipliers) -> np.ndarray:
+def polished(
+    hessian: np.ndarray,
+    linear: np.ndarray,
+    equal: np.ndarray,
+    right: np.ndarray,
+    rows: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    x: np.ndarray,
+    multipliers: np.ndarray,
+) -> np.ndarray:
     """The optimum (n,) from the rows that bind at ``x``: minimise 1/2 x' H x + g' x with those rows as equalities.
 
     ProxQP's vectorised builds sum in an order that depends on where memory happens to lie, so the last digits of its
@@ -173,7 +185,7 @@ class DirectSolver:
 SOLVERS = {"cvxpy": CvxpySolver, "direct": DirectSolver}
 
 
-def solver_class(method: str):
+def solver_class(method: str) -> type:
     """The solver class of a method's name."""
     if not isinstance(method, str) or method not in SOLVERS:
         raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")

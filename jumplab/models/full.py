@@ -7,6 +7,7 @@ axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -112,7 +113,7 @@ class FullTerms(NamedTuple):
         return np.arctan2(-self.foot_rotation[:, 2, 0], self.foot_rotation[:, 0, 0])
 
 
-def force_target(mass: float, gravity: float, com_acceleration, momentum_rate) -> np.ndarray:
+def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, momentum_rate: np.ndarray) -> np.ndarray:
     """B_f (6,): what A_f F must be for a CoM acceleration (3,) and a rate of centroidal angular momentum (3,)."""
     lift = np.array([0.0, 0.0, gravity])
     return np.concatenate([mass * (np.asarray(com_acceleration) + lift), momentum_rate])
@@ -214,11 +215,11 @@ class FullBody:
             )
         return sign
 
-    def pair_names(self, groups) -> list[str]:
+    def pair_names(self, groups: Sequence[str]) -> list[str]:
         """Left joints of the pairs of some groups, in the order of :meth:`symmetry_rows`."""
         return [self.robot.joint_names[self.pairs[i][0] - 6] for g in groups for i in self.groups[g]]
 
-    def symmetry_rows(self, groups=("hip", "knee", "ankle", "shoulder")) -> np.ndarray:
+    def symmetry_rows(self, groups: Sequence[str] = ("hip", "knee", "ankle", "shoulder")) -> np.ndarray:
         """Rows (k, nv) with row @ theta'' = 0 for mirrored motion: right - sign * left, one row per joint pair.
 
         The paper's "sum of both hip joints = 0" holds for the joints with sign -1 (yaw and roll with axes that are not

@@ -62,7 +62,7 @@ class PlanarState:
             acceleration.append(((p, q), (-q, p)))
         return place, velocity, acceleration
 
-    def point(self, name_or_arms, order: int = 0):
+    def point(self, name_or_arms: str | np.ndarray, order: int = 0) -> ca.SX:
         """(x, z) of a named point or (5, 2) arms from the toe; ``order`` 1, 2 gives velocity, acceleration."""
         arms = name_or_arms
         if isinstance(name_or_arms, str):
@@ -75,17 +75,17 @@ class PlanarState:
         return [_dot(arms, turn) for turn in self._turn]
 
     @property
-    def com(self):
+    def com(self) -> ca.SX:
         """CoM from the toe [m] (2,)."""
         return ca.vertcat(*self._com[0])
 
     @property
-    def com_velocity(self):
+    def com_velocity(self) -> ca.SX:
         """CoM velocity relative to the toe [m/s] (2,)."""
         return ca.vertcat(*self._com[1])
 
     @property
-    def com_acceleration(self):
+    def com_acceleration(self) -> ca.SX:
         """CoM acceleration relative to the toe [m/s^2] (2,)."""
         return ca.vertcat(*self._com[2])
 
@@ -149,39 +149,39 @@ class PlanarState:
         return np.einsum("i,ij,ik->jk", self.model.mass, np.conj(arms), arms)
 
     @cached_property
-    def angular_momentum(self):
+    def angular_momentum(self) -> ca.SX:
         """Centroidal angular momentum L about +y [kg m^2/s]."""
         factors = {(j, k): (c * self.rates[k], -s * self.rates[k]) for (j, k), (c, s) in self._differences.items()}
         return ca.dot(ca.DM(self.model.inertia), self.rates) + self._sum(self._central(), factors)
 
     @cached_property
-    def angular_momentum_rate(self):
+    def angular_momentum_rate(self) -> ca.SX:
         """dL/dt [N m]."""
         return self._moment(self._com_arms(), range(5), True)
 
     @cached_property
-    def inertia(self):
+    def inertia(self) -> ca.SX:
         """Pitch inertia about the CoM, rho = rho_R + rho_I [kg m^2]; rho_I, the links' own, is constant."""
         factors = {(j, k): (c, -s) for (j, k), (c, s) in self._differences.items()}
         return float(self.model.inertia.sum()) + self._sum(self._central(), factors)
 
     @cached_property
-    def inertia_rate(self):
+    def inertia_rate(self) -> ca.SX:
         """d rho / dt [kg m^2/s]."""
         factors = {(j, k): (s * self.rates[k], c * self.rates[k]) for (j, k), (c, s) in self._differences.items()}
         return 2 * self._sum(self._central(), factors)
 
     @cached_property
-    def joints(self):
+    def joints(self) -> ca.SX:
         """Joint angles hip, knee, ankle, shoulder [rad] (4,)."""
         return ca.DM(JOINT_OF_ANGLES) @ self.angles
 
     @cached_property
-    def joint_rates(self):
+    def joint_rates(self) -> ca.SX:
         """Joint rates [rad/s] (4,)."""
         return ca.DM(JOINT_OF_ANGLES) @ self.rates
 
-    def torques(self, toe_acceleration=(0.0, 0.0)):
+    def torques(self, toe_acceleration: tuple[float, float] | None = (0.0, 0.0)) -> ca.SX:
         """Joint torques hip, knee, ankle, shoulder, both sides summed [N m] (4,); needs no ground wrench.
 
         ``toe_acceleration`` (x, z) [m/s^2]; None if the CoM falls freely.
@@ -198,7 +198,7 @@ class PlanarState:
         # lower joints of the links: toe, ankle, knee, hip, shoulder
         return ca.vertcat(-moment(3, (3, 4)), -moment(2, (2, 3, 4)), -moment(1, (1, 2, 3, 4)), moment(4, (4,)))
 
-    def ground_wrench(self):
+    def ground_wrench(self) -> ca.SX:
         """(3,) F_x, F_z [N] and moment about the toe [N m] on the robot while the toe stands still."""
         m, toe = self.model.total_mass, np.zeros(5)
         ax, az = self._com[2]

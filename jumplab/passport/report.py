@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -41,7 +42,18 @@ class Check:
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
-def worst(group, name, values, t, limit, unit, note, *, at_least=False, labels=None) -> Check:
+def worst(
+    group: str,
+    name: str,
+    values: np.ndarray,
+    t: np.ndarray,
+    limit: float,
+    unit: str,
+    note: str,
+    *,
+    at_least: bool = False,
+    labels: Sequence[str] | None = None,
+) -> Check:
     """Check of the worst entry of ``values`` (N,) or (N, M) over the times ``t`` (N,).
 
     ``labels`` (M,) name the columns; the worst one's is added to the note. Not a number counts as worst; no rows at all

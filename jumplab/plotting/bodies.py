@@ -108,8 +108,15 @@ def draw_robot(ax: Axes, body: Silhouette, q: np.ndarray, color: str, *, strengt
                                     edgecolor=edge, linewidth=0.5, zorder=zorder))  # fmt: skip
 
 
-def strobe(ax: Axes, body: Silhouette, frames: Sequence[np.ndarray], colors: Sequence[str], *, strengths=None,
-           shift: float = 0.0) -> None:  # fmt: skip
+def strobe(
+    ax: Axes,
+    body: Silhouette,
+    frames: Sequence[np.ndarray],
+    colors: Sequence[str],
+    *,
+    strengths: Sequence[float] | None = None,
+    shift: float = 0.0,
+) -> None:
     """Several frames at their true places, later ones in front; strengths and shift as in :func:`draw_robot`."""
     strengths = np.linspace(0.55, 1.0, len(frames)) if strengths is None else strengths
     for k, (q, color, strength) in enumerate(zip(frames, colors, strengths, strict=True)):
@@ -117,8 +124,16 @@ def strobe(ax: Axes, body: Silhouette, frames: Sequence[np.ndarray], colors: Seq
     equal_scales(ax)
 
 
-def film_strip(ax: Axes, body: Silhouette, frames: Sequence[np.ndarray], times: Sequence[float], color, *,
-               pitch_m: float = 0.62, start_m: float = 0.0) -> None:  # fmt: skip
+def film_strip(
+    ax: Axes,
+    body: Silhouette,
+    frames: Sequence[np.ndarray],
+    times: Sequence[float],
+    color: str | Sequence[str],
+    *,
+    pitch_m: float = 0.62,
+    start_m: float = 0.0,
+) -> None:
     """Frames side by side, ``pitch_m`` apart, each with its time below; the first one's origin at ``start_m``.
 
     ``color`` is one colour, or one per frame.
@@ -131,9 +146,18 @@ def film_strip(ax: Axes, body: Silhouette, frames: Sequence[np.ndarray], times: 
     equal_scales(ax)
 
 
-def draw_five_link(ax: Axes, model: SagittalModel, angles: np.ndarray, toe=(0.0, 0.0), color: str = INK, *,
-                   linewidth: float = 1.6, shift: float = 0.0, zorder: float = 2.0,
-                   alpha: float = 1.0) -> dict[str, np.ndarray]:  # fmt: skip
+def draw_five_link(
+    ax: Axes,
+    model: SagittalModel,
+    angles: np.ndarray,
+    toe: tuple[float, float] | np.ndarray = (0.0, 0.0),
+    color: str = INK,
+    *,
+    linewidth: float = 1.6,
+    shift: float = 0.0,
+    zorder: float = 2.0,
+    alpha: float = 1.0,
+) -> dict[str, np.ndarray]:
     """One frame of the five-link model as sticks; returns the places (2,) of its points by name.
 
     Parameters
@@ -155,7 +179,9 @@ def draw_five_link(ax: Axes, model: SagittalModel, angles: np.ndarray, toe=(0.0,
     return p
 
 
-def five_link_points(model: SagittalModel, angles: np.ndarray, toe=(0.0, 0.0)) -> dict[str, np.ndarray]:
+def five_link_points(
+    model: SagittalModel, angles: np.ndarray, toe: tuple[float, float] | np.ndarray = (0.0, 0.0)
+) -> dict[str, np.ndarray]:
     """Places (2,) [m] of toe, heel, ankle, knee, hip, shoulder, hand and com for link angles (5,)."""
     c, s = np.cos(angles), np.sin(angles)
     turns = np.array([[c, s], [-s, c]]).transpose(2, 0, 1)  # (5, 2, 2)
@@ -170,8 +196,16 @@ def five_link_points(model: SagittalModel, angles: np.ndarray, toe=(0.0, 0.0)) -
                 hand=shoulder + steps[4], com=com)  # fmt: skip
 
 
-def draw_srmp(ax: Axes, coordinates: np.ndarray, color: str, *, pivot=(0.0, 0.0), ellipse: bool = True,
-              strength: float = 1.0, zorder: float = 2.0) -> dict[str, np.ndarray]:  # fmt: skip
+def draw_srmp(
+    ax: Axes,
+    coordinates: np.ndarray,
+    color: str,
+    *,
+    pivot: tuple[float, float] = (0.0, 0.0),
+    ellipse: bool = True,
+    strength: float = 1.0,
+    zorder: float = 2.0,
+) -> dict[str, np.ndarray]:
     """The pendulum at one instant: rod, barbell with its two end masses, and the light-green inertia ellipse.
 
     Parameters

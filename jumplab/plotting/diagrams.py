@@ -29,7 +29,7 @@ from jumplab.robot.stance import stance_angles, stance_configuration
 ARROW = dict(arrowstyle="-|>", mutation_scale=7, linewidth=0.9, shrinkA=0, shrinkB=0)
 
 
-def arrow(ax: Axes, start, end, color: str = INK, **kwargs) -> None:
+def arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], color: str = INK, **kwargs) -> None:
     """A straight arrow in data coordinates."""
     ax.add_patch(FancyArrowPatch(start, end, **(ARROW | {"color": color, "zorder": 5} | kwargs)))
 

@@ -1,4 +1,4 @@
-"""The three experiments (Figs. 13 and 14), a jump in its scene, and what makes perturbed robots fall."""
+"""The three experiments (Figs. 13 and 14), a jump in its scene, and what makes robots fall."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
@@ -16,6 +17,7 @@ from jumplab.plotting.bodies import Silhouette, draw_robot, equal_scales
 from jumplab.plotting.render import ABOVE_M, BELOW_M, TITLE_IN, Camera, Renderer
 from jumplab.plotting.simulation import frame_rows
 from jumplab.plotting.style import (
+    COLUMN_IN,
     GROUND,
     INK,
     LANDING,
@@ -38,7 +40,7 @@ from jumplab.robot import Robot
 from jumplab.trajectory import Tape
 
 if TYPE_CHECKING:  # pictures need no simulator
-    from jumplab.experiments import Trial
+    from jumplab.experiments import BasinReport, Trial
     from jumplab.experiments.measurement import Measurement
     from jumplab.simulation import Scene, SimulationResult
 
@@ -49,8 +51,10 @@ LABEL_ROOM_M = 0.14  # our choice: for a frame's time above a head
 LABEL_SIDES = {"launch": "right", "flight": "center", "landing": "left"}  # away from the neighbour's head
 LEGEND_IN, TALLEST_IN = 0.3, 3.2
 WIDE_FRAME_M = 1.5  # our choice: wide enough for a ditch of 0.8 m and its edges
+WIDE_PIXELS_PER_M = 180  # our choice: 235 pixels per inch of a page-wide line, where a PNG has 200
 FRAMES = (0, 1, 3, 5, 8, 11)  # of the twelve of frame_rows: start, crouch, lift-off, flight, touchdown, end
 ROW_LABEL_IN = 0.25
+BASIN_SINGLE_IN, BASIN_ROW_IN = 2.4, 1.55  # our choice: height of a single map, of each of several rows
 PER_BIN = 10  # our choice: robots per bin of the map; fewer would make its intervals meaningless
 MAX_BINS = 5
 # feature, label, factor to the label's unit
@@ -159,7 +163,8 @@ def _camera(result: SimulationResult, scene: Scene) -> Camera:
     rows = frame_rows(result)[list(FRAMES)]
     floor = 0.0 if result.landed else min(0.0, scene.top_at(float(result.com[-1, 0])))
     below = DITCH_SHOWN_M if floor == 0 and any(b.top < 0 for b in scene.blocks) else BELOW_M
-    return Camera(width=WIDE_FRAME_M, bottom=floor - below, top=float(result.q[rows, 2].max()) + ABOVE_M)
+    top = float(result.q[rows, 2].max()) + ABOVE_M
+    return Camera(width=WIDE_FRAME_M, bottom=floor - below, top=top, pixels_per_m=WIDE_PIXELS_PER_M)
 
 
 # Fig. 14 ---------------------------------------------------------------------------------------------------------
@@ -201,11 +206,11 @@ def trial_map(trials: Sequence[Trial]) -> Figure:
     for ax, (name, label, factor) in zip(axes.flat, FEATURES, strict=True):
         values = factor * np.array([t.features[name] for t in trials])
         _rates(ax, values, landed)
-        for mask, height, marker, color in ((landed, 1.12, "o", LANDING), (~landed, -0.12, "x", VERMILION)):
+        for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
             ax.plot(values[mask], np.full(mask.sum(), height), linestyle="none", marker=marker, color=color,
                     markersize=3.0, markeredgewidth=0.8, alpha=0.7)  # fmt: skip
         ax.margins(x=0.04)
-        ax.set(xlabel=label, ylim=(-0.22, 1.22), yticks=[-0.12, 0, 0.5, 1, 1.12],
+        ax.set(xlabel=label, ylim=(-0.3, 1.3), yticks=[-0.2, 0, 0.5, 1, 1.2],
                yticklabels=["fell", "0 %", "50 %", "100 %", "landed"])  # fmt: skip
     panel_letters(axes.flat)
     return fig
@@ -222,3 +227,45 @@ def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
             start, end = values[part].min(), values[part].max()
             ax.fill_between([start, end], low, high, color=tint(INK, 0.15), linewidth=0, zorder=1)
             ax.plot([start, end], [landed[part].mean()] * 2, color=INK, linewidth=1.2, zorder=2)
+
+
+# Wrong states in flight ------------------------------------------------------------------------------------------
+@styled
+def basin_map(basin: BasinReport) -> Figure:
+    """The landing basin: which wrong states at the apex land (dots) or fall (crosses).
+
+    Across: error of the horizontal speed, up: error of the pitch. One panel for each height (columns) and friction
+    (rows) of the grid; its title counts.
+    """
+    heights, frictions = sorted(set(basin.grid.height_m)), sorted(set(basin.grid.friction))
+    shape = len(frictions), len(heights)
+    width, height = (COLUMN_IN, BASIN_SINGLE_IN) if shape == (1, 1) else (PAGE_IN, BASIN_ROW_IN * shape[0])
+    fig = new_figure(width, height)
+    axes = fig.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    for line, friction in zip(axes, frictions, strict=True):
+        for ax, rise in zip(line, heights, strict=True):
+            states = [t for t in basin.trials if (t.features["height_m"], t.features["friction"]) == (rise, friction)]
+            _basin_panel(ax, states)
+            ax.set_title(f"{_height_text(rise)}, friction {friction:g}: {sum(t.landed for t in states)}/{len(states)}")
+    for ax in axes[-1]:
+        ax.set(xlabel="horizontal speed [%]", xticks=[100 * (x - 1) for x in sorted(set(basin.grid.speed_factor))])
+    for ax in axes[:, 0]:
+        ax.set(ylabel="pitch [deg]", yticks=sorted(set(basin.grid.pitch_deg)))
+    marks = ((LANDING, "o", "lands"), (VERMILION, "x", "falls"))
+    legend_above(fig, [Line2D([], [], color=c, marker=m, linestyle="none", label=text) for c, m, text in marks])
+    return fig
+
+
+def _height_text(rise_m: float) -> str:
+    """How far the CoM is off its planned height, in words."""
+    return f"{abs(rise_m):g} m {'higher' if rise_m > 0 else 'lower'}" if rise_m else "planned height"
+
+
+def _basin_panel(ax: Axes, states: Sequence[Trial]) -> None:
+    """States of one height and friction; a ring around the planned one."""
+    for landed, marker, color in ((True, "o", LANDING), (False, "x", VERMILION)):
+        found = [t.features for t in states if t.landed == landed]
+        x, y = [100 * (f["speed_factor"] - 1) for f in found], [f["pitch_deg"] for f in found]
+        ax.plot(x, y, linestyle="none", marker=marker, color=color, markersize=5, markeredgewidth=1.2)
+    ax.plot(0, 0, marker="o", markersize=9, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=0.7)
+    ax.margins(0.15)

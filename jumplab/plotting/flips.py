@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
+from jumplab.plotting.simulation import AFTER_TOUCHDOWN_S
+from jumplab.plotting.simulation import trunk_pitch as trunk_angle  # of a flip: whole turns count
 from jumplab.plotting.style import (
     FLIGHT,
     PAGE_IN,
@@ -25,13 +28,6 @@ from jumplab.trajectory import Tape
 
 if TYPE_CHECKING:  # pictures of a plan need no simulator
     from jumplab.simulation import SimulationResult
-
-AFTER_TOUCHDOWN_S = 0.25  # our choice: how much of the landing is shown
-
-
-def trunk_angle(q: np.ndarray) -> np.ndarray:
-    """Pitch (N,) of the trunk from configurations (N, nq) of a motion in the sagittal plane, whole turns counted."""
-    return np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
 
 
 @styled
@@ -70,6 +66,7 @@ def flip_shaping(srmp: SrmpPlan, tape: Tape, result: SimulationResult, robot: Ro
     for ax in axes[1]:
         ax.set_xlabel("time [s]")
     panel_letters(axes.flat)
-    legend_above(fig, phase_handles("launch", "flight", "landing"))
+    handles = phase_handles("launch", "flight", "landing", reference="plan")
+    legend_above(fig, [*handles, Line2D([], [], **thin, label="stage 1")])
     fig.align_ylabels()
     return fig

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
@@ -147,16 +147,18 @@ def panel_letters(axes: Iterable[Axes]) -> None:
 
 def bare(ax: Axes) -> None:
     """No frame, ticks or grid: for pictures rather than plots."""
+    ax.set(xticks=[], yticks=[])  # hidden ticks would still be laid out, which takes longer than the picture
     ax.set_axis_off()
     ax.grid(False)
 
 
 # saving ---------------------------------------------------------------------------------------------------------
-def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *, task: JumpTask | None = None,
-                robot: Robot | None = None) -> Figure:  # fmt: skip
-    """Write NAME.png, NAME.pdf and NAME.txt (caption, target, robot, versions) into ``folder``; return the figure.
+def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *,
+                task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> Figure:  # fmt: skip
+    """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
 
     The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
+    It is laid out once, for the PNG; the PDF and what a notebook shows keep that layout. Returns the figure.
 
     Raises
     ------
@@ -170,6 +172,7 @@ def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *
         folder.mkdir(parents=True, exist_ok=True)
         with style_context():
             fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
+            fig.set_layout_engine("none")
             fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
         (folder / f"{name}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
     except OSError as e:
@@ -177,11 +180,12 @@ def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *
     return fig
 
 
-def caption_text(caption: str, task: JumpTask | None = None, robot: Robot | None = None) -> str:
-    """What NAME.txt says: the caption, then target, robot and versions, one line each."""
+def caption_text(caption: str, task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> str:
+    """What NAME.txt says: the caption, then target or targets, robot and versions, one line each."""
     lines = [caption.strip() or "No caption."]
-    if task is not None:
-        lines.append(f"Target: {describe_task(task)}.")
+    tasks = [task] if isinstance(task, JumpTask) else list(task or ())
+    if tasks:
+        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {'; '.join(map(describe_task, tasks))}.")
     if robot is not None:
         lines.append(f"Robot: {robot.name}, {robot.total_mass:.1f} kg, description {robot.hash}.")
     known = [f"{name} {version}" for name, version in versions().items() if version != "not installed"]

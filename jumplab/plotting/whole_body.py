@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -125,7 +127,7 @@ def snapshots(tape: Tape, robot: Robot) -> Figure:
     return fig
 
 
-def draw_flight(ax: Axes, tape: Tape, body: Silhouette, rows, *, shift: float = 0.0) -> float:
+def draw_flight(ax: Axes, tape: Tape, body: Silhouette, rows: Sequence[int], *, shift: float = 0.0) -> float:
     """Frames ``rows`` of the flight in their true places, moved by ``shift`` [m], with the CoM's path and the ground.
 
     Returns

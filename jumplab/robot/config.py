@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ def read_toml(text: str, where: str) -> dict:
         raise RobotError(f"{where}: not a TOML file: {e}") from e
 
 
-def entry(config: dict, *path: str, kind: type = float, count: int | None = None):
+def entry(config: dict, *path: str, kind: type = float, count: int | None = None) -> Any:
     """One checked entry of the configuration: a finite number or a text, or ``count`` of them."""
     where, value = ".".join(path), config
     for key in path:
@@ -40,7 +41,7 @@ def entry(config: dict, *path: str, kind: type = float, count: int | None = None
     return clean if count else clean[0]
 
 
-def optional(config: dict, default, *path: str, kind: type = float, count: int | None = None):
+def optional(config: dict, default: Any, *path: str, kind: type = float, count: int | None = None) -> Any:
     """As :func:`entry`, or ``default`` where the entry is missing."""
     value = config
     for key in path:

@@ -6,6 +6,7 @@ frames parallel in the neutral pose, boxes for shapes. Names, zeros and directio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +65,7 @@ def held_angles(tree: Tree, config: dict) -> dict[str, float]:
     return {name: angle for name, angle in out.items() if angle}
 
 
-def moving_joints(tree: Tree, roles: dict, trunk: str, feet) -> list[str]:
+def moving_joints(tree: Tree, roles: dict, trunk: str, feet: Sequence[str]) -> list[str]:
     """Names of the joints that jump: those of the roles, and every revolute joint between trunk and feet."""
     moving = [name for pair in roles.values() for name in pair]
     for name in moving:

@@ -89,7 +89,9 @@ def _turned(angle, vector):
     return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
 
 
-def postures(robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RAD, com_x_m=COM_X_M) -> dict:
+def postures(
+    robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RAD, com_x_m: tuple[float, float] = COM_X_M
+) -> dict:
     """Sampled postures within joint ranges, toe on the ground, heel up by at most ``heel_up_rad``.
 
     Returns arrays angles (n, 5), com (n, 2) from mid-sole, shoulder, rho, force, speed.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -85,7 +86,7 @@ class SagittalModel:
         arms[4, 4] = self.com[4]
         return arms  # (link, angle, xz)
 
-    def point_arms(self, link: int, point) -> np.ndarray:
+    def point_arms(self, link: int, point: np.ndarray) -> np.ndarray:
         """(5, 2) array d: a point fixed in ``link`` sits at sum over j of R(a_j) d[j] from the toe."""
         arms = np.zeros((5, 2))
         arms[: min(link, 4)] = self.span[: min(link, 4)]
@@ -96,7 +97,7 @@ class SagittalModel:
         """Joint angles (..., 4) hip, knee, ankle, shoulder from absolute link angles (..., 5); also for their rates."""
         return np.asarray(angles) @ JOINT_OF_ANGLES.T
 
-    def link_angles(self, joints: np.ndarray, trunk_pitch) -> np.ndarray:
+    def link_angles(self, joints: np.ndarray, trunk_pitch: float | np.ndarray) -> np.ndarray:
         """Absolute link angles (..., 5) from joint angles (..., 4) and trunk pitch; also for their rates."""
         hip, knee, ankle, shoulder = np.moveaxis(np.asarray(joints, float), -1, 0)
         thigh = trunk_pitch + hip
@@ -157,7 +158,7 @@ def _limb_tip(model: pin.Model, data: pin.Data, urdf: str, members: list[int], r
     return along * (max(reach) if reach else 2 * np.linalg.norm(com - root))
 
 
-def reduce(model: pin.Model, joints: dict, foot, actuators: dict, urdf: str) -> SagittalModel:
+def reduce(model: pin.Model, joints: dict, foot: Any, actuators: dict, urdf: str) -> SagittalModel:
     """Merge the full robot into its sagittal five-link model.
 
     Parameters

@@ -74,7 +74,7 @@ def check_stance(robot: Robot) -> np.ndarray:
     return angles
 
 
-def configuration(robot: Robot, angles: np.ndarray, toe=(0.0, 0.0)) -> np.ndarray:
+def configuration(robot: Robot, angles: np.ndarray, toe: tuple[float, float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
     """Pinocchio configuration of the full robot for absolute link angles and the toe's (x, z) [m].
 
     One posture, (5,) and (2,) -> (nq,), or many, (n, 5) and (n, 2) -> (n, nq).

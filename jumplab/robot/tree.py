@@ -24,7 +24,7 @@ class Shape:
     place: pin.SE3
     mesh: str = ""
 
-    def corners(self, vertices=None) -> np.ndarray:
+    def corners(self, vertices: np.ndarray | None = None) -> np.ndarray:
         """(n, 3) points in the link frame whose hull holds the shape; a mesh needs its ``vertices`` (m, 3)."""
         if self.kind == "mesh":
             local = np.asarray(vertices) * self.size

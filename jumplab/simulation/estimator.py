@@ -166,7 +166,9 @@ class Perception:
         return {"state": "estimated", "worst_tilt_error_rad": self._tilt, "worst_velocity_error": self._speed}
 
 
-def estimation_error(q, v, believed_q, believed_v) -> tuple[float, float]:
+def estimation_error(
+    q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
+) -> tuple[float, float]:
     """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
     true, believed = (pin.Quaternion(x[6], x[3], x[4], x[5]).toRotationMatrix() for x in (q, believed_q))
     tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))  # between the two ideas of up, in the trunk's axes

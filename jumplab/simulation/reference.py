@@ -121,7 +121,9 @@ class Forecast:
             left = (vz + np.sqrt(root)) / GRAVITY
         return float(left)
 
-    def state(self, q: np.ndarray, v: np.ndarray, pitch_error: float, correction: np.ndarray | None = None):
+    def state(
+        self, q: np.ndarray, v: np.ndarray, pitch_error: float, correction: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured state in flight.
 
         Parameters
@@ -165,7 +167,7 @@ class LandingAhead:
     solve_s: float | None = None
     reason: str | None = None
 
-    def plan(self, robot: Robot, q, v, time: float, time_left: float) -> LandingPlan | None:
+    def plan(self, robot: Robot, q: np.ndarray, v: np.ndarray, time: float, time_left: float) -> LandingPlan | None:
         """Stage 1's landing from the forecast touchdown (q, v), None if there is none."""
         planner = landing_planner(robot)
         self.planned_s, self.time_left_s, began = time, time_left, thread_time()

@@ -43,7 +43,9 @@ class Contacts:
     colliding: frozenset[tuple[str, str]]
 
 
-def base_to_bullet(q: np.ndarray, v: np.ndarray, lever: np.ndarray):
+def base_to_bullet(
+    q: np.ndarray, v: np.ndarray, lever: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pinocchio base state to Bullet's: position and orientation of the base's CoM, world velocity of it, world rate.
 
     Parameters
@@ -60,7 +62,9 @@ def base_to_bullet(q: np.ndarray, v: np.ndarray, lever: np.ndarray):
     return q[:3] + rotation @ lever, q[3:7].copy(), velocity, rotation @ v[3:6]
 
 
-def base_from_bullet(position, quaternion, velocity, rate, lever: np.ndarray):
+def base_from_bullet(
+    position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray, rate: np.ndarray, lever: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
     x, y, z, w = quaternion
     rotation = pin.Quaternion(w, x, y, z).toRotationMatrix()
@@ -221,7 +225,9 @@ class World:
         bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau.tolist(),
                                          physicsClientId=self._client)  # fmt: skip
 
-    def command_position(self, q, rate, limit, position_gain: float, velocity_gain: float) -> None:
+    def command_position(
+        self, q: np.ndarray, rate: np.ndarray, limit: np.ndarray, position_gain: float, velocity_gain: float
+    ) -> None:
         """Position servo of every joint for the next steps: target angle, its rate, largest torque (each (nv - 6,))."""
         n = len(self._joints)
         bullet.setJointMotorControlArray(

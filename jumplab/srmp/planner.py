@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -67,8 +69,15 @@ class SrmpPlanner:
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **options})
 
-    def plan(self, task: JumpTask, *, guess=None, weights=None, off: tuple[str, ...] = SYMMETRY_OFF,
-             near: SrmpPlan | None = None) -> SrmpPlan:  # fmt: skip
+    def plan(
+        self,
+        task: JumpTask,
+        *,
+        guess: dict[str, PhaseGuess] | None = None,
+        weights: Mapping[str, float] | None = None,
+        off: tuple[str, ...] = SYMMETRY_OFF,
+        near: SrmpPlan | None = None,
+    ) -> SrmpPlan:
         """Solve for a target; ``near`` is a plan for one close by to begin with, if that works.
 
         Raises

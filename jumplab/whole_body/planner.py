@@ -203,7 +203,15 @@ class WholeBodyPlanner:
         }
 
     def guess_from_motion(
-        self, t, angles, rates, accels, takeoff_s: float, toe_s: float, com, com_velocity
+        self,
+        t: np.ndarray,
+        angles: np.ndarray,
+        rates: np.ndarray,
+        accels: np.ndarray,
+        takeoff_s: float,
+        toe_s: float,
+        com: np.ndarray,
+        com_velocity: np.ndarray,
     ) -> dict[str, PhaseGuess]:
         """Start values from a sampled planar motion: absolute link angles (n, 5) with derivatives, take-off time and
         length of the toe phase [s].

@@ -83,7 +83,7 @@ class PaperCoordinates:
     def _from_toe(self, turns):
         return [x.full().T for x in self._base.map(len(turns[0]))(*(x.T for x in turns))]
 
-    def links(self, theta, rate, accel) -> dict[str, np.ndarray]:
+    def links(self, theta: np.ndarray, rate: np.ndarray, accel: np.ndarray) -> dict[str, np.ndarray]:
         """(n, 7) each -> angles, rates, accels (n, 5), toe, toe_velocity, toe_acceleration (n, 2)."""
         turns = [x @ LINK_OF_THETA.T for x in (theta, rate, accel)]
         toes = [x[:, :2] - b for x, b in zip((theta, rate, accel), self._from_toe(turns), strict=True)]
@@ -115,24 +115,24 @@ class PrintedTerms(WholeBodyTerms):
             p.memo["state"] = PlanarState(self.model, *turns, p.p.gravity)
         return p.memo["state"]
 
-    def toe(self, p: Point, order: int = 0):
+    def toe(self, p: Point, order: int = 0) -> ca.SX:
         """Tiptoe (2,), its velocity J theta', its acceleration."""
         return (p.q, p.v, p.a)[order][:2] - self.state(p).point(self.base, order)
 
-    def com(self, p: Point, order: int = 0):
+    def com(self, p: Point, order: int = 0) -> ca.SX:
         """CoM (2,), its velocity, its acceleration."""
         s = self.state(p)
         return self.toe(p, order) + (s.com, s.com_velocity, s.com_acceleration)[order]
 
-    def heel_rate(self, p: Point):
+    def heel_rate(self, p: Point) -> ca.SX:
         """J_heel theta' in z [m/s]."""
         return self.toe(p, 1)[1] + self.state(p).point("heel", 1)[1]
 
-    def tau_y(self, p: Point):
+    def tau_y(self, p: Point) -> ca.SX:
         """WL-D1: the ground's moment at the toe [N m] that gives the reference's dL/dt."""
         return p.ref.L_rate - _moment(self.toe(p) - self.com(p), p.z)
 
-    def base_rows(self, p: Point, flying: bool):
+    def base_rows(self, p: Point, flying: bool) -> ca.SX:
         """WL-D3, WF-D1: the first three rows of M theta'' + H - J' F_ext, (3,) [N, N, N m]."""
         inertial = self.model.total_mass * (self.com(p, 2) + ca.vertcat(0, p.p.gravity))
         turning = self.state(p).angular_momentum_rate + _moment(self.com(p) - p.q[:2], inertial)
@@ -140,7 +140,7 @@ class PrintedTerms(WholeBodyTerms):
             return ca.vertcat(inertial, turning)
         return ca.vertcat(inertial - p.z, turning - self.tau_y(p) - _moment(self.toe(p) - p.q[:2], p.z))
 
-    def foot_ahead(self, p: Point):
+    def foot_ahead(self, p: Point) -> ca.SX:
         """p_foot - c in x [m]; p_foot is read as the middle of the sole, stage 1's pivot."""
         s = self.state(p)
         return s.point(self.model.point_arms(0, self.model.sole_center))[0] - s.com[0]

@@ -29,32 +29,32 @@ class WholeBodyTerms:
             p.memo["state"] = PlanarState(self.model, angles, rates, accels, p.p.gravity)
         return p.memo["state"]
 
-    def wrench(self, p: Point):
+    def wrench(self, p: Point) -> ca.SX:
         """The ground's wrench (3,): F_x, F_z [N], moment about the toe [N m]; made once per point."""
         if "wrench" not in p.memo:
             p.memo["wrench"] = self.state(p).ground_wrench()
         return p.memo["wrench"]
 
-    def torques(self, p: Point, flying: bool):
+    def torques(self, p: Point, flying: bool) -> ca.SX:
         """Joint torques (4,) of both sides together [N m]; made once per point."""
         if "torques" not in p.memo:
             p.memo["torques"] = self.state(p).torques(None if flying else (0.0, 0.0))
         return p.memo["torques"]
 
-    def ballistic_com(self, p: Point):
+    def ballistic_com(self, p: Point) -> ca.SX:
         """Place of the CoM (2,) on its parabola [m]."""
         t = p.time
         return ca.vertcat(p.c.com_x + p.c.vel_x * t, p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2)
 
-    def ballistic_velocity(self, p: Point):
+    def ballistic_velocity(self, p: Point) -> ca.SX:
         """Velocity of the CoM (2,) on its parabola [m/s]."""
         return ca.vertcat(p.c.vel_x, p.c.vel_z - p.p.gravity * p.time)
 
-    def toe(self, p: Point):
+    def toe(self, p: Point) -> ca.SX:
         """Place of the toe (2,) in flight [m]: the parabola less the CoM from the toe."""
         return self.ballistic_com(p) - self.state(p).com
 
-    def ground(self, p: Point, x):
+    def ground(self, p: Point, x: ca.SX) -> ca.SX:
         """Height of the surface below x: a step of the platform's height at the edge, smoothed."""
         return p.p.platform * (1 + ca.tanh((x - p.p.edge) / self.limits.edge_smoothing_m)) / 2
 

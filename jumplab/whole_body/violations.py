@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from jumplab.errors import InputError
@@ -17,7 +19,7 @@ CONTACT_M, PLACE_M = 0.001, 0.01  # of slip and of height over the ground; of Co
 FREE_FALL, RESIDUAL_PERCENT, DRIFT, PITCH_RAD = 0.1, 0.5, 0.01, 0.01  # [m/s^2], of m g, of L [kg m^2/s], of the foot
 
 
-def violations(plan, robot: Robot) -> tuple[dict, ...]:
+def violations(plan: Any, robot: Robot) -> tuple[dict, ...]:
     """What no physics would play back, found by evaluating a motion again at every millisecond.
 
     Parameters

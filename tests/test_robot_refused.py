@@ -1,0 +1,91 @@
+"""Descriptions that are no robot, each with the sentence that says so."""
+
+import pytest
+
+from jumplab.errors import RobotError
+from jumplab.robot import Robot, load_robot
+from jumplab.robot.description import SHIPPED
+from jumplab.robot.stance import stance_angles
+
+
+# descriptions that are no robot ---------------------------------------------------------------------------------
+def test_unknown_robot(tmp_path):
+    with pytest.raises(RobotError) as e:
+        load_robot("atlas")
+    known = ", ".join(SHIPPED)
+    assert str(e.value) == f"robot 'atlas': neither a shipped robot ({known}) nor a readable TOML file"
+    assert e.value.exit_code == 2
+    for name in (str(tmp_path), "", "a\0b", "x" * 5000):
+        with pytest.raises(RobotError, match=r"neither a shipped robot \(bhr, .*\) nor a readable TOML file$"):
+            load_robot(name)
+
+
+def changed(robot, old, new=""):
+    assert old in robot.config_text
+    return Robot.from_text(robot.urdf, robot.config_text.replace(old, new, 1))
+
+
+@pytest.mark.parametrize("line, entry", [
+    ('name = "bhr"', "name"),
+    ('knee = ["left_knee", "right_knee"]', "joints.knee"),
+    ("sole_x_m = [-0.10, 0.14]", "feet.sole_x_m"),
+    ("knee_rad = 0.5", "stance.knee_rad"),
+    ("corner_speed_ratio = 0.5", "actuators.corner_speed_ratio"),
+])  # fmt: skip
+def test_missing_entries(bhr, line, entry):
+    with pytest.raises(RobotError) as e:
+        changed(bhr, line)
+    assert str(e.value) == f"robot configuration: the entry {entry!r} is missing"
+
+
+WRONG = [
+    ('"left_knee"', '"left_elbow"', "robot bhr: role knee names the joint 'left_elbow', which the URDF lacks"),
+    ('"left_foot"', '"left_shoe"', "robot bhr: the foot link 'left_shoe' is not in the URDF"),
+    ("corner_speed_ratio = 0.5", "corner_speed_ratio = 1.0",
+     "robot configuration: corner_speed_ratio = 1 must lie between 0 and 1"),
+    ("[-0.10, 0.14]", "[0.14, -0.10]",
+     "robot configuration: the sole [0.14, -0.1] x [-0.05, 0.05] m has no area; give [heel, toe] and [right, left]"),
+    ("knee_rad = 0.5", "knee_rad = nan", "robot configuration: 'stance.knee_rad' = nan, must be a finite number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("old, new, sentence", WRONG)
+def test_wrong_entries(bhr, old, new, sentence):
+    with pytest.raises(RobotError) as e:
+        changed(bhr, old, new)
+    assert str(e.value) == sentence
+
+
+def test_files_that_cannot_be_read(bhr, tmp_path):
+    config = tmp_path / "robot.toml"
+    config.write_text("name = ")
+    with pytest.raises(RobotError, match=r"robot\.toml: not a TOML file: "):
+        load_robot(str(config))
+    config.write_text(bhr.config_text)
+    with pytest.raises(RobotError) as e:
+        load_robot(str(config))
+    assert str(e.value) == f"{tmp_path / 'bhr.urdf'}: there is no such file; give the path of a URDF"
+    (tmp_path / "bhr.urdf").write_text("<robot")
+    with pytest.raises(RobotError, match=r"^robot bhr: the URDF is no well-formed XML: "):
+        load_robot(str(config))
+    (tmp_path / "bhr.urdf").write_text(bhr.urdf)
+    assert load_robot(str(config)).hash == bhr.hash
+
+
+def test_a_posture_that_cannot_stand(bhr):
+    with pytest.raises(RobotError) as e:
+        stance_angles(changed(bhr, "[-0.10, 0.14]", "[2.0, 2.2]"))
+    assert str(e.value) == (
+        "robot bhr: with the knee at 0.5 rad and the trunk at 0.05 rad no lean of the shank brings the CoM above the "
+        "middle of the sole; change [stance] in its configuration"
+    )
+
+
+def test_a_stance_beyond_the_joint_range_is_refused(bhr):
+    with pytest.raises(RobotError, match="knee"):
+        stance_angles(changed(bhr, "knee_rad = 0.5", "knee_rad = 3.0"))
+
+
+def test_a_role_must_turn_about_the_pitch_axis(bhr):
+    with pytest.raises(RobotError, match="left_hip_roll"):
+        _ = changed(bhr, '["left_knee", "right_knee"]', '["left_hip_roll", "right_hip_roll"]').sagittal
