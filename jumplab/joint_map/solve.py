@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from proxsuite import proxqp
-from scipy.linalg import LinAlgError, lu_factor, lu_solve
+from scipy.linalg.lapack import dgetrf, dgetrs
 
 from jumplab.errors import InputError, SolverError
 from jumplab.joint_map.explain import ADVICE, conflict, lines, row_scale, sentence
@@ -130,12 +130,11 @@ def polished(hessian, linear, equal, right, rows, low, high, x, multipliers) -> 
     want, answer = np.concatenate([-linear, d]), np.zeros(n + m)
     soft = kkt.copy()
     soft[range(n, n + m), range(n, n + m)] = -POLISH_SOFTNESS
-    try:
-        factors = lu_factor(soft, check_finite=False)
-    except (LinAlgError, ValueError):
+    factors, pivots, singular = dgetrf(soft.T, overwrite_a=True)  # symmetric; its transpose is in LAPACK's order
+    if singular:
         return x
     for _ in range(POLISH_ROUNDS):
-        answer += lu_solve(factors, want - kkt @ answer, check_finite=False)
+        answer += dgetrs(factors, pivots, want - kkt @ answer)[0]
     moved = np.abs(answer[:n] - x).max(initial=0.0)
     return answer[:n] if moved <= POLISH_REACH * max(1.0, np.abs(x).max(initial=0.0)) else x
 
