@@ -324,4 +324,4 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
         for name in ("launch", "flight"):
             part = getattr(srmp, name)
             extra |= {f"srmp_{name}_{k}": np.array(v) for k, v in vars(part).items()}
-    return expand(motion, robot, gravity, extra)
+    return expand(motion, robot, gravity, extra, values["ground_wrench"])

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from proxsuite import proxqp
-from scipy.linalg.lapack import dgetrf, dgetrs
 
 from jumplab.errors import InputError, SolverError
 from jumplab.joint_map.explain import ADVICE, conflict, lines, row_scale, sentence
@@ -130,11 +129,12 @@ def polished(hessian, linear, equal, right, rows, low, high, x, multipliers) -> 
     want, answer = np.concatenate([-linear, d]), np.zeros(n + m)
     soft = kkt.copy()
     soft[range(n, n + m), range(n, n + m)] = -POLISH_SOFTNESS
-    factors, pivots, singular = dgetrf(soft.T, overwrite_a=True)  # symmetric; its transpose is in LAPACK's order
-    if singular:
+    try:
+        inverse = np.linalg.inv(soft)  # scipy could keep the factors; importing it costs more than a plan's inverses
+    except np.linalg.LinAlgError:
         return x
     for _ in range(POLISH_ROUNDS):
-        answer += dgetrs(factors, pivots, want - kkt @ answer)[0]
+        answer += inverse @ (want - kkt @ answer)
     moved = np.abs(answer[:n] - x).max(initial=0.0)
     return answer[:n] if moved <= POLISH_REACH * max(1.0, np.abs(x).max(initial=0.0)) else x
 

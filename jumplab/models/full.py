@@ -24,7 +24,7 @@ CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
 
-# turns D (4 x 4, row by row) into the slope (6,) of D_xx + D_zz along a twist (linear, angular) about the origin, halved
+# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
 SLOPE = np.zeros((16, 6))
 SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
 SLOPE[1, 5] = -1.0

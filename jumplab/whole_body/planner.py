@@ -93,12 +93,15 @@ class WholeBodyPlanner:
         self.stance = stance_angles(robot)
         options = dict(options or {})
 
-        def build(mesh: Mesh, extra: Mapping) -> Nlp:
-            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options},
-                       f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None)  # fmt: skip
+        problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
 
-        self.nlp = build(mesh, FINE)
-        self._coarse = build(mesh.coarse(), COARSE) if (tracking if refine is None else refine) else None
+        def build(mesh: Mesh, extra: Mapping, like: Nlp | None = None) -> Nlp:
+            key = f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None
+            return Nlp(problem.on_mesh(mesh.intervals()), {**extra, **options}, key, like)
+
+        self.nlp, self._coarse = build(mesh, FINE), None
+        if tracking if refine is None else refine:
+            self._coarse = build(mesh.coarse(), COARSE, self.nlp)
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
