@@ -22,6 +22,8 @@ from jumplab.task import JumpTask
 # ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
 # iterations instead of 22 in the middle, and 40 instead of 43 at most
 CURVATURE = {"neg_curv_test_tol": 1e-12}
+# our choice: small multipliers at the start, and tolerances as in stage 3 (that of the rows stays): 14 iterations
+SEARCH = {"bound_mult_init_method": "mu-based", "mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5}
 
 
 def parameters(task: JumpTask, envelope: Reach) -> dict:
@@ -62,7 +64,7 @@ class SrmpPlanner:
                  keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
-        options = {**CURVATURE, **(options or {})}
+        options = {**CURVATURE, **SEARCH, **(options or {})}
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **options})
 
