@@ -22,9 +22,6 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 
 METHODS = ("three-step", "direct")
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
-# our choice: over so much of a phase, angles and rates of stage 2 are averaged; they jump from one QP to the next, and
-# stage 3's coarse mesh took 34 iterations instead of 26 to forget it
-GUESS_WIDTHS = (0.05, 0.2)
 QP = Options()  # of stage 2, as every plan uses them
 SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
@@ -284,7 +281,7 @@ def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> Ju
 def guess_from_joints(
     joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float
 ) -> Mapping[str, PhaseGuess]:
-    """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles, then over time."""
+    """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles."""
     robot = planner.robot
     angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)
     for values in (angles, rates, accels):
@@ -292,10 +289,8 @@ def guess_from_joints(
     takeoff = int(np.argmax(joints.phase == "flight"))
     rel = planar_quantities(robot, *(x[takeoff : takeoff + 1] for x in (angles, rates, accels)), np.zeros((1, 2)),
                             task.gravity, ("com", "com_velocity"))  # fmt: skip
-    guess = planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s, rel["com"],
-                                      rel["com_velocity"])  # fmt: skip
-    turns_over = bool(task.rotation_rad)  # its postures are far apart: means of them would be none
-    return guess if turns_over else {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
+    return planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s, rel["com"],
+                                     rel["com_velocity"])  # fmt: skip
 
 
 def to_link_angles(robot: Robot, q, v, a) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

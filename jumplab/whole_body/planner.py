@@ -26,6 +26,9 @@ POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0)
 FINE = {"tol": 1e-4, "compl_inf_tol": 1e-5}
 # our choice: the coarse solution is only a start, digits beyond these would be lost on the finer mesh
 COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
+# our choice: over so much of a phase, angles and rates of a roll-out's guess are averaged before the coarse mesh; they
+# jump from one QP to the next, and it took 34 iterations instead of 26 to forget that
+GUESS_WIDTHS = (0.05, 0.2)
 # our choice: stage 2's motion is near enough for small multipliers; over 16 targets the coarse mesh then takes 22
 # iterations instead of 26. From the naive guess the direct planner takes more with them, so it keeps ipopt's own
 NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
@@ -146,6 +149,8 @@ class WholeBodyPlanner:
 
     def _refine(self, task, srmp, guess, parameters, how) -> WholeBodyPlan:
         mesh = self.mesh.coarse()
+        if self.tracking:
+            guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
         first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
