@@ -13,6 +13,7 @@ import pinocchio as pin
 import pybullet
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics
+from scipy.stats import qmc
 
 import jumplab
 from jumplab.errors import RobotError
@@ -21,7 +22,7 @@ from jumplab.models.planar import evaluator
 from jumplab.robot import SAGITTAL_LINKS, Robot, load_robot
 from jumplab.robot.bhr import table
 from jumplab.robot.description import GRAVITY, SHIPPED
-from jumplab.robot.reach import postures, reach
+from jumplab.robot.reach import postures, reach, sobol
 from jumplab.robot.stance import com_from_toe, configuration, stance_angles, stance_configuration
 from jumplab.task import GRAVITY as TASK_GRAVITY
 
@@ -530,3 +531,7 @@ def test_limits_come_signed_and_doubled(bhr):
     assert np.all(s.lower < s.upper)
     assert s.lower[1] == table.value("knee_lower") and s.upper[1] == table.value("knee_upper")
     assert isinstance(evaluator(s), ca.Function)
+
+
+def test_sobols_sequence_is_scipys():
+    np.testing.assert_array_equal(sobol(2**10), qmc.Sobol(5, scramble=False).random(2**10))
