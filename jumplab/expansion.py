@@ -12,6 +12,7 @@ from jumplab.solver import PhaseSolution
 from jumplab.trajectory import RATE_HZ, Tape
 
 SHORTEST_STEP = 0.05  # our choice: share of a sample; a shorter last step is joined to the one before
+COM = ("com", "com_velocity", "com_acceleration")
 _EVALUATORS: dict = {}
 
 
@@ -22,11 +23,16 @@ def planar_quantities(
     accels: np.ndarray,
     toe_acceleration: np.ndarray,
     gravity: float,
+    names: tuple[str, ...] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Every planar quantity at n instants: name -> (n, size) or (n,); inputs are (n, 5), (n, 5), (n, 5), (n, 2)."""
-    key = (robot.hash, gravity)
+    """Planar quantities, all or some, at n instants: name -> (n, size) or (n,).
+
+    Inputs are (n, 5), (n, 5), (n, 5), (n, 2); names as in :func:`jumplab.models.planar.evaluator`.
+    """
+    key = (robot.hash, gravity, names)
     if key not in _EVALUATORS:
-        _EVALUATORS[key] = evaluator(robot.sagittal, gravity)
+        full = evaluator(robot.sagittal, gravity)
+        _EVALUATORS[key] = full if names is None else full.factory("some", full.name_in(), list(names))
     out = _EVALUATORS[key].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
     return {k: v.full().T.squeeze() for k, v in out.items()}
 
@@ -55,7 +61,7 @@ def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot
     com = np.stack([c["com_x"] + c["vel_x"] * t_flight,
                     c["com_z"] + c["vel_z"] * t_flight - gravity * t_flight**2 / 2], -1)  # fmt: skip
     com_v = np.stack([np.full_like(t_flight, c["vel_x"]), c["vel_z"] - gravity * t_flight], -1)
-    rel = planar_quantities(robot, qf, vf, af, np.zeros((len(qf), 2)), gravity)
+    rel = planar_quantities(robot, qf, vf, af, np.zeros((len(qf), 2)), gravity, COM)
     toe_f = com - rel["com"], com_v - rel["com_velocity"], np.array([0.0, -gravity]) - rel["com_acceleration"]
     start = t_launch[0]
     zeros = np.zeros((len(t_launch), 2))
@@ -76,9 +82,16 @@ def _launch_samples(flat, toe, t):
     return [np.concatenate([np.hstack([still, x]), y]) for x, y in zip(flat.sample(t[first]), later, strict=True)]
 
 
-def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: dict | None = None) -> Tape:
+def expand(
+    motion: dict[str, np.ndarray],
+    robot: Robot,
+    gravity: float,
+    extra: dict | None = None,
+    wrench: np.ndarray | None = None,
+) -> Tape:
     """Full-robot tape from a sampled planar motion (see :func:`planar_motion`); x is zero mid-sole at the start.
 
+    ``wrench`` (n, 3) is the planar ground wrench if it is known already; in flight it is not looked at.
     Foot wrenches are half of the planar ground wrench each; joint torques follow from inverse dynamics of the full
     robot, whose base rows are left for the audit to judge.
     """
@@ -96,9 +109,11 @@ def expand(motion: dict[str, np.ndarray], robot: Robot, gravity: float, extra: d
     # derivative of the body-frame velocity: R' (a - w x v)
     cross = np.stack([w * base_v[:, 1], -w * base_v[:, 0]], -1)
     a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), alpha
-    wrench = planar_quantities(robot, angles, rates, accels, motion["toe_acceleration"], gravity)["ground_wrench"]
+    if wrench is None:
+        some = planar_quantities(robot, angles, rates, accels, motion["toe_acceleration"], gravity, ("ground_wrench",))
+        wrench = some["ground_wrench"]
     wrench = np.where(motion["flying"][:, None], 0.0, wrench)
-    f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, motion["toe"] + origin)
+    f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, motion["toe"] + origin, ~motion["flying"])
     phase = np.where(motion["flying"], "flight", "launch")
     planar = {f"planar_{k}": x for k, x in motion.items() if k not in ("t", "flying")}
     return Tape(motion["t"], q, v, a, tau, phase, np.array(robot.foot.frames), f, np.array(robot.joint_names),
@@ -125,17 +140,36 @@ def _base_motion(robot, motion):
     return v, a
 
 
-def _forces(robot, q, v, a, wrench, toe):
+def _forces(robot, q, v, a, wrench, toe, on_ground):
     """Wrenches on the feet (n, K, 6), half of the planar one (n, 3) each, and the joint torques that go with them."""
     model = robot.model
     data = model.createData()
+    f, external = _foot_wrenches(robot, data, q[on_ground], wrench[on_ground], toe[on_ground])
+    wrenches, tau = np.zeros((len(q), *f.shape[1:])), np.empty((len(q), model.nv - 6))
+    wrenches[on_ground] = f
+    forces = pin.StdVec_Force()
+    forces.extend([pin.Force.Zero() for _ in range(model.njoints)])
+    joints = [model.frames[model.getFrameId(name)].parentJoint for name in robot.foot.frames]
+    for k, local in zip(np.flatnonzero(on_ground), external, strict=True):
+        for joint, one in zip(joints, local, strict=True):
+            forces[joint] = pin.Force(one)
+        tau[k] = pin.rnea(model, data, q[k], v[k], a[k], forces)[6:]
+    for k in np.flatnonzero(~on_ground):
+        tau[k] = pin.rnea(model, data, q[k], v[k], a[k])[6:]
+    return wrenches, tau
+
+
+def _foot_wrenches(robot, data, q, wrench, toe):
+    """Wrenches (n, K, 6) on the feet: at the frames' origins in world axes, and at their joints in the joints' axes."""
+    model = robot.model
     frames = [model.frames[model.getFrameId(name)] for name in robot.foot.frames]
     joints = [frame.parentJoint for frame in frames]
-    turn, place = np.empty((len(q), len(frames), 3, 3)), np.empty((len(q), len(frames), 3))  # of the feet's joints
+    seen = [(data.oMi[joint].rotation, data.oMi[joint].translation) for joint in joints]  # follow the scratch data
+    turn, place = np.empty((len(q), len(frames), 3, 3)), np.empty((len(q), len(frames), 3))
     for k, x in enumerate(q):
         pin.forwardKinematics(model, data, x)
-        for i, joint in enumerate(joints):
-            turn[k, i], place[k, i] = data.oMi[joint].rotation, data.oMi[joint].translation
+        for i, (rotation, translation) in enumerate(seen):
+            turn[k, i], place[k, i] = rotation, translation
     offset = np.einsum("kiab,ib->kia", turn, np.array([frame.placement.translation for frame in frames]))
     lever = np.zeros_like(place)  # frame to toe
     lever[..., [0, 2]] = toe[:, None] - (place + offset)[..., [0, 2]]
@@ -144,11 +178,4 @@ def _forces(robot, q, v, a, wrench, toe):
     moment[..., 1] = wrench[:, None, 2] / 2 + lever[..., 2] * force[..., 0] - lever[..., 0] * force[..., 2]
     at_joint = np.concatenate([force, moment + np.cross(offset, force)], -1)
     local = np.einsum("kiba,kicb->kica", turn, at_joint.reshape(*place.shape[:2], 2, 3)).reshape(*place.shape[:2], 6)
-    external = pin.StdVec_Force()
-    external.extend([pin.Force.Zero() for _ in range(model.njoints)])
-    tau = np.empty((len(q), model.nv - 6))
-    for k in range(len(q)):
-        for i, joint in enumerate(joints):
-            external[joint] = pin.Force(local[k, i])
-        tau[k] = pin.rnea(model, data, q[k], v[k], a[k], external)[6:]
-    return np.concatenate([force, moment], -1), tau
+    return np.concatenate([force, moment], -1), local

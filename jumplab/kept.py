@@ -39,14 +39,15 @@ def _sources() -> str:
     return found.hexdigest()
 
 
-def assembled(problem: Problem, key: str | None = None) -> Assembled:
+def assembled(problem: Problem, key: str | None = None, like: Assembled | None = None) -> Assembled:
     """The problem assembled, from the file of ``key`` if there is a sound one, else anew and then kept.
 
-    ``key`` says everything that the problem was made of besides the sources; None keeps nothing.
+    ``key`` says everything that the problem was made of besides the sources; None keeps nothing. ``like`` is the same
+    problem on another mesh, which saves work.
     """
     place = None if key is None else folder()
     if place is None:
-        return Assembled(problem)
+        return Assembled(problem, like=like)
     path = place / (hashlib.sha256(f"{_sources()} {problem.name} {key}".encode()).hexdigest()[:32] + ".casadi")
     known = _read(path)
     if known is not None:
@@ -54,7 +55,7 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
             return Assembled(problem, known)
         except (KeyError, TypeError, ValueError):
             pass  # sound but not of this problem
-    fresh = Assembled(problem)
+    fresh = Assembled(problem, like=like)
     _write(path, fresh)
     return fresh
 

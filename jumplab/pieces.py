@@ -40,47 +40,66 @@ class Piece:
         self.g = ca.vertcat(ca.SX(0, 1), *(c for _, c in element.constraints))
         self.total = ca.dot(self.w, self.cost_parts) if element.costs else ca.SX(0)
 
-    def _map(self, name, extra_symbols, output, extra_values):
-        function = ca.Function(name, [*self.arguments, *extra_symbols], [output], {"cse": True})
-        return function.map(self.n)(*self.inputs, *extra_values)
+    def _made(self, name, make):
+        """(function, rows, columns), made once for all meshes.
+
+        ``make`` returns the symbols besides the arguments, the column of values, and its sparsity or None.
+        """
+        if name not in self.e.made:
+            symbols, output, sparsity = make()
+            function = ca.Function(name, [*self.arguments, *symbols], [output], {"cse": True})
+            places = sparsity.get_triplet() if sparsity is not None else ((), ())
+            self.e.made[name] = (function, *(np.array(z, int) for z in places))
+        return self.e.made[name]
+
+    def _map(self, function, values):
+        return function.map(self.n)(*self.inputs, *values)
 
     def costs(self) -> tuple[ca.MX, ca.MX] | None:
         """(weighted sum, unweighted parts) or None."""
         if not self.e.costs:
             return None
-        parts = ca.sum2(self._map("costs", [], self.cost_parts, []))
+        parts = ca.sum2(self._map(self._made("costs", lambda: ([], self.cost_parts, None))[0], []))
         return ca.dot(self.weights[:, 0], parts), parts
 
     def gradient(self) -> ca.MX:
         """Local gradients, one under the other."""
-        return ca.vec(self._map("gradient", [self.w], ca.gradient(self.total, self.e.local), [self.weights]))
+        function, *_ = self._made("gradient", lambda: ([self.w], ca.gradient(self.total, self.e.local), None))
+        return ca.vec(self._map(function, [self.weights]))
 
     def rows(self) -> ca.MX:
         """Kept constraint rows."""
-        return ca.vec(self._map("rows", [], self.g, []))[self.keep.tolist()]
+        return ca.vec(self._map(self._made("rows", lambda: ([], self.g, None))[0], []))[self.keep.tolist()]
 
     def jacobian(self) -> tuple:
         """(values, rows, columns) of the kept rows' Jacobian."""
-        j = ca.jacobian(self.g, self.e.local)
-        rows, cols = (np.array(z, int) for z in j.sparsity().get_triplet())
+
+        def make():
+            j = ca.jacobian(self.g, self.e.local)
+            return [], ca.vertcat(*j.nonzeros()), j.sparsity()
+
+        function, rows, cols = self._made("jacobian", make)
         row_of = np.full(self.g.numel() * self.n, -1)
         row_of[self.keep] = self.first_row + np.arange(len(self.keep))
         i = row_of[(np.arange(self.n)[:, None] * self.g.numel() + rows[None]).ravel()]
         used = i >= 0
-        values = ca.vec(self._map("jacobian", [], ca.vertcat(*j.nonzeros()), []))[np.flatnonzero(used).tolist()]
+        values = ca.vec(self._map(function, []))[np.flatnonzero(used).tolist()]
         return values, i[used], self.e.index[:, cols].ravel()[used]
 
     def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple | None:
         """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
-        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
-        h = ca.triu(self._curvature(lam, scale))
-        rows, cols = (np.array(z, int) for z in h.sparsity().get_triplet())
+
+        def make():
+            lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
+            h = ca.triu(self._curvature(lam, scale))
+            return [self.w, lam, scale], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
+
+        function, rows, cols = self._made("hessian", make)
         if not len(rows):
             return None
         mine = lam_g[self.first_row : self.first_row + len(self.keep)]
         spread = ca.reshape(scatter(self.keep, self.g.numel() * self.n) @ mine, self.g.numel(), self.n)
-        values = self._map("hessian", [self.w, lam, scale], ca.vertcat(*h.nonzeros()),
-                           [self.weights, spread, ca.repmat(lam_f, 1, self.n)])  # fmt: skip
+        values = self._map(function, [self.weights, spread, ca.repmat(lam_f, 1, self.n)])
         i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
         return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
 

@@ -290,9 +290,10 @@ def guess_from_joints(
     for values in (angles, rates, accels):
         values[:, -1] *= GUESS_ARM_SHARE
     takeoff = int(np.argmax(joints.phase == "flight"))
-    rel = planar_quantities(robot, angles, rates, accels, np.zeros((len(angles), 2)), task.gravity)
-    return planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s,
-                                     rel["com"][takeoff], rel["com_velocity"][takeoff])  # fmt: skip
+    rel = planar_quantities(robot, *(x[takeoff : takeoff + 1] for x in (angles, rates, accels)), np.zeros((1, 2)),
+                            task.gravity, ("com", "com_velocity"))  # fmt: skip
+    return planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s, rel["com"],
+                                     rel["com_velocity"])  # fmt: skip
 
 
 def to_link_angles(
@@ -329,4 +330,4 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
         for name in ("launch", "flight"):
             part = getattr(srmp, name)
             extra |= {f"srmp_{name}_{k}": np.array(v) for k, v in vars(part).items()}
-    return expand(motion, robot, gravity, extra)
+    return expand(motion, robot, gravity, extra, values["ground_wrench"])

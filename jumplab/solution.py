@@ -35,6 +35,17 @@ class PhaseGuess:
 
         return PhaseGuess(self.duration, *(at_nodes(x) for x in (self.q, self.v, self.a, self.z)), self.constants)
 
+    def smoothed(self, width: float, rate_width: float) -> PhaseGuess:
+        """The same guess with a Gaussian mean over that share of the phase: of q, and of the rates v and a."""
+        s = np.linspace(0, 1, len(self.q))
+
+        def mean(x, width):
+            weights = np.exp(-(((s[:, None] - s) / width) ** 2) / 2)
+            return None if x is None else weights / weights.sum(axis=1, keepdims=True) @ x
+
+        values = mean(self.q, width), mean(self.v, rate_width), mean(self.a, rate_width)
+        return PhaseGuess(self.duration, *values, self.z, self.constants)
+
 
 @dataclass(frozen=True)
 class PhaseSolution:

@@ -55,12 +55,14 @@ class Nlp:
     """A problem ready to be solved for any target.
 
     Building is pure and done once; :meth:`solve` may be called for any parameters, weights and switches. With a ``key``
-    its functions are kept for later processes, see :mod:`jumplab.kept`.
+    its functions are kept for later processes, see :mod:`jumplab.kept`; ``like`` is the same problem, ready on another
+    mesh, and saves most of the building.
     """
 
-    def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None):
+    def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None,
+                 like: Nlp | None = None):  # fmt: skip
         began = time.perf_counter()
-        self.problem, self.assembled = problem, assembled(problem, key)
+        self.problem, self.assembled = problem, assembled(problem, key, like and like.assembled)
         self.groups = group_rows(self.assembled)
         self._solver = self._new_solver(options)
         self.build_s = time.perf_counter() - began

@@ -7,7 +7,7 @@ exactly. Costs and constraints are :class:`Term` objects that a notebook can lis
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
@@ -183,6 +183,10 @@ class Problem:
             raise InputError(f"{self.name}: no phase {phase!r}; it has {', '.join(p.name for p in self.phases)}")
         phases = tuple(replace(p, terms=p.terms + extra) if p.name == phase else p for p in self.phases)
         return replace(self, phases=phases)
+
+    def on_mesh(self, intervals: Mapping[str, int]) -> Problem:
+        """A copy with other numbers of intervals, phase name -> intervals; the terms are the same objects."""
+        return replace(self, phases=tuple(replace(p, intervals=intervals[p.name]) for p in self.phases))
 
     def table(self) -> list[dict]:
         """One row per term and bound: phase, name, kind, at, unit, equation, weight or bounds."""

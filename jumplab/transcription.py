@@ -8,6 +8,7 @@ shared by all targets, weights and switches, which are parameters.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -38,13 +39,33 @@ class Row:
 
 
 class Element:
-    """One small function, repeated: its terms, its variables in each repetition, its data columns."""
+    """One small function, repeated: its terms, its variables in each repetition, its nodes.
 
-    def __init__(self, local, data, outputs, terms, index, data_columns, owner, nodes):
-        self.local, self.data, self.index, self.data_columns = local, data, index, data_columns  # index (n, ny)
-        self.owner, self.nodes = owner, nodes
+    ``place`` is where it stands in the phase ``owner``, as in :class:`~jumplab.terms.Term`; ``made`` keeps what was
+    derived from it, for this mesh and others.
+    """
+
+    def __init__(self, owner, place, local, data, outputs, terms):
+        self.owner, self.place, self.local, self.data = owner, place, local, data
+        self.made: dict = {}
         self.costs = [(t, *e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]  # term, share, column
         self.constraints = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
+
+    def on(self, layouts: dict[str, PhaseLayout]) -> Element:
+        """The same functions on a mesh: their variables ``index`` (n, ny), their ``nodes``, ``share`` of a step."""
+        new = copy(self)
+        if self.place == "problem":
+            parts = [(x.constants(), x.node(0), x.node(x.phase.intervals)) for x in layouts.values()]
+            new.index, new.nodes, new.share = np.concatenate([x for part in parts for x in part])[None], [0], None
+            return new
+        layout = layouts[self.owner]
+        n = layout.phase.intervals
+        new.nodes = {"node": range(n + 1), "start": (0,), "end": (n,), "interval": range(n)}[self.place]
+        new.share, ends = 1 / n, [(layout.constants(), layout.node(k)) for k in new.nodes]
+        if self.place == "interval":
+            ends = [(*e, layout.jerk(k), layout.node(k + 1)) for e, k in zip(ends, new.nodes, strict=True)]
+        new.index = np.array([np.concatenate(e) for e in ends])
+        return new
 
 
 def _columns(expression):
@@ -52,7 +73,7 @@ def _columns(expression):
 
 
 class ElementBuilder:
-    """Makes the symbolic points of each phase and evaluates the terms on them."""
+    """Makes the symbolic points of each phase and evaluates the terms on them; how many nodes there are is open."""
 
     def __init__(self, problem: Problem, layouts: dict[str, PhaseLayout]):
         self.problem, self.layouts = problem, layouts
@@ -82,27 +103,23 @@ class ElementBuilder:
         )
 
     def _phase(self, layout):
-        phase, n = layout.phase, layout.phase.intervals
+        phase = layout.phase
         nx, nref = 3 * layout.nq + layout.nz, sum(layout.phase.references.values())
         constants, refs, s = ca.SX.sym("const", layout.n_const), ca.SX.sym("ref", nref), ca.SX.sym("s")
         state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
-        step = constants[0] / n
-        node_index = [np.concatenate([layout.constants(), layout.node(k)]) for k in range(n + 1)]
-        data = ca.vertcat(s, refs)
+        share = ca.SX.sym("share")  # of the phase, between two nodes
+        step, data = constants[0] * share, ca.vertcat(s, refs, share)
         at_node = self._point(layout, state, None, constants, s, refs)
-        for place, nodes in (("node", range(n + 1)), ("start", (0,)), ("end", (n,))):
+        for place in ("node", "start", "end"):
             terms = [t for t in phase.terms if t.at == place]
             if terms:
-                share = step * _trapezoid(s) if place == "node" else 1.0
-                out = [self._weighted(t, _columns(t.expression(at_node)), share) for t in terms]
-                index = np.array([node_index[k] for k in nodes])
-                yield Element(
-                    ca.vertcat(constants, state), data, out, terms, index, list(nodes), phase.name, list(nodes)
-                )
+                part = step * _trapezoid(s) if place == "node" else 1.0
+                out = [self._weighted(t, _columns(t.expression(at_node)), part) for t in terms]
+                yield Element(phase.name, place, ca.vertcat(constants, state), data, out, terms)
         left = self._point(layout, state, jerk, constants, s, refs)
-        after = self._point(layout, right, None, constants, s + 1 / n, refs)
+        after = self._point(layout, right, None, constants, s + share, refs)
         q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
-        mid = Point(q, v, a, left.j, left.z, left.duration, s + 0.5 / n, left.c, left.p, left.ref)
+        mid = Point(q, v, a, left.j, left.z, left.duration, s + share / 2, left.c, left.p, left.ref)
         terms, out = [_defect_term()], [_defect(layout, left, after, step)]
         for t in phase.terms:
             if t.at == "mid":
@@ -111,12 +128,10 @@ class ElementBuilder:
             elif t.at == "interval":
                 terms.append(t)
                 out.append(self._weighted(t, _columns(t.expression(left, after, step)), 1.0))
-        index = np.array([np.concatenate([node_index[k], layout.jerk(k), layout.node(k + 1)]) for k in range(n)])
-        local = ca.vertcat(constants, state, jerk, right)
-        yield Element(local, data, out, terms, index, list(range(n)), phase.name, list(range(n)))
+        yield Element(phase.name, "interval", ca.vertcat(constants, state, jerk, right), data, out, terms)
 
     def _joints(self):
-        ends, symbols, index = {}, [], []
+        ends, symbols = {}, []
         for name, layout in self.layouts.items():
             nx = 3 * layout.nq + layout.nz
             constants, first, last = ca.SX.sym("const", layout.n_const), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
@@ -126,11 +141,9 @@ class ElementBuilder:
                 end=self._point(layout, last, None, constants, 1.0, refs),
             )
             symbols += [constants, first, last]
-            index += [layout.constants(), layout.node(0), layout.node(layout.phase.intervals)]
         terms = list(self.problem.joints)
         out = [self._weighted(t, _columns(t.expression(ends)), 1.0) for t in terms]
-        return Element(ca.vertcat(*symbols), ca.SX(0, 1), out, terms, np.concatenate(index)[None], None,
-                       self.problem.name, [0])  # fmt: skip
+        return Element(self.problem.name, "problem", ca.vertcat(*symbols), ca.SX(0, 1), out, terms)
 
     @staticmethod
     def _weighted(term, expression, step):
@@ -158,8 +171,11 @@ def _defect(layout, left, right, step):
 class Assembled:
     """The NLP's sparse functions of (x, p), gathered from the elements."""
 
-    def __init__(self, problem: Problem, known: dict | None = None):
-        """``known`` are the functions of this very problem, its rows and cost terms, from an earlier process."""
+    def __init__(self, problem: Problem, known: dict | None = None, like: Assembled | None = None):
+        """``known`` are the functions of this very problem, its rows and cost terms, from an earlier process.
+
+        ``like`` is the same problem on another mesh, whose small functions are taken over.
+        """
         self.problem = problem
         self.layouts, at = {}, 0
         for phase in problem.phases:
@@ -167,7 +183,8 @@ class Assembled:
             at += self.layouts[phase.name].size
         self.size = at
         self.n_par = sum(problem.parameters.values())
-        builder = ElementBuilder(problem, self.layouts) if known is None else None
+        builder = _builder(problem, self.layouts, like) if known is None else None
+        self.builder = builder
         self.cost_terms: list[tuple[str, Term]] = []
         if known is None:
             self.cost_terms = [(e.owner, term) for e in builder.elements for term, *_ in e.costs]
@@ -201,7 +218,7 @@ class Assembled:
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", self.p_size)
         lam_f, rows, weight_at = ca.MX.sym("lam_f"), 0, 0
         pieces = []
-        for e in builder.elements:
+        for e in (e.on(self.layouts) for e in builder.elements):
             keep = self._add_rows(e)
             weights = p[self.n_par + weight_at : self.n_par + weight_at + len(e.costs)]
             inputs = [
@@ -241,8 +258,18 @@ class Assembled:
         return np.array(keep, int)
 
     def _data(self, p, e):
-        if e.data_columns is None:
+        if e.share is None:
             return ca.MX(0, len(e.nodes))
         first, rows = self.data_first[e.owner]
-        index = np.concatenate([first + k * rows + np.arange(rows) for k in e.data_columns])
-        return ca.reshape(p[index.tolist()], rows, len(e.data_columns))
+        index = np.concatenate([first + k * rows + np.arange(rows) for k in e.nodes])
+        columns = ca.reshape(p[index.tolist()], rows, len(e.nodes))
+        return ca.vertcat(columns, ca.DM.ones(1, len(e.nodes)) * e.share)
+
+
+def _builder(problem: Problem, layouts, like: Assembled | None) -> ElementBuilder:
+    """A builder of this problem; that of ``like`` if it is the same problem but for the mesh."""
+    if like is None or like.builder is None:
+        return ElementBuilder(problem, layouts)
+    if problem.on_mesh({name: x.phase.intervals for name, x in like.layouts.items()}) != like.problem:
+        raise ValueError(f"{problem.name}: functions of another problem")
+    return like.builder

@@ -19,15 +19,16 @@ NODES = [dict(intervals=n, iteration_s=1e-3 + 2e-4 * n, iterations=20, solve_s=1
 
 def made(**other) -> dict:
     """A report of made-up times."""
-    growth = {"nodes": NODES, "targets_cpu_s": {"1": 0.5}}
+    growth = {"nodes": NODES, "targets_cpu_s": {"1": 0.5},
+              "spread": [dict(ratio=r, clean=True) for r in (0.4, 0.7, 0.5)]}  # fmt: skip
     return report({"repeats": 2}, {**TIMES, **other}, TIMES, {"plan": [True, False]}, {"plan": {"1 SRMP": 9}},
                   {"plan": 0.1}, growth, [0.4, 0.5] if "cold" in other else [])  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def found():
-    return benchmark.bench("bhr", JumpTask(0.4, 0.3), 1, Mesh(9, 6, 9), nodes=(20, 24, 28), cold=False,
-                           say=lambda word: None)  # fmt: skip
+    return benchmark.bench("bhr", JumpTask(0.4, 0.3), 1, Mesh(9, 6, 9), nodes=(20, 24, 28),
+                           spread=((0.5, 1.0),), cold=False, say=lambda word: None)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -40,6 +41,8 @@ def test_the_report_is_plain_and_complete(found):
     assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
     assert again["cold_over_direct"] is None and again["goals"]["cold_over_direct"]["reached"] is None
     assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
+    (other,) = again["growth"]["spread"]
+    assert (other["distance_m"], other["height_m"]) == (0.2, 0.3) and other["ratio"] > 0
     assert sum(again["where"].values()) == pytest.approx(1.0)
 
 
@@ -63,6 +66,7 @@ def test_what_is_not_reached_is_said():
     assert "where the time of the three steps goes" in said and "3 whole body" in said
     assert "plans that were timed and are clean in the audit: plan 1 of 2" in said
     assert "not measured" in text(made())
+    assert "over 3 other targets" in said and "0.500  (median; 0.40 to 0.70), 3 clean" in said
 
 
 def test_growth_is_the_distance_from_a_line():

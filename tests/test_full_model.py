@@ -158,3 +158,14 @@ def test_crooked_robots_are_named():
     turned = load_robot().urdf.replace(straight, straight.replace("0 0 0", "0 0 0.1"))
     with pytest.raises(RobotError, match=r"axes of 'left_foot' are not parallel"):
         FullBody(Robot.from_text(turned, load_robot().config_text))
+
+
+def test_motion_is_terms_without_jacobians(body):
+    """The quantities that feedback reads are the same by both ways, and the next call leaves them alone."""
+    random = np.random.default_rng(5)
+    q, v = stance_configuration(body.robot), random.normal(size=body.nv)
+    q[7:] += 0.2 * random.normal(size=body.nq - 7)
+    motion, terms = body.motion(q, v), body.terms(q, v)
+    body.motion(stance_configuration(body.robot), 0 * v)
+    for name in (*motion._fields, "foot_pitch"):
+        np.testing.assert_allclose(getattr(motion, name), getattr(terms, name), rtol=1e-12, atol=1e-12, err_msg=name)

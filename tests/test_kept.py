@@ -22,10 +22,10 @@ def counted(monkeypatch):
     fresh = []
 
     class Counting(Assembled):
-        def __init__(self, problem, known=None):
+        def __init__(self, problem, known=None, like=None):
             if known is None:
                 fresh.append(problem.name)
-            super().__init__(problem, known)
+            super().__init__(problem, known, like)
 
     monkeypatch.setattr(kept, "Assembled", Counting)
     return fresh

@@ -12,11 +12,13 @@ import pinocchio as pin
 import pybullet
 import pytest
 from fixtures_core import LIMBS
+from scipy.stats import qmc
 
 import jumplab
 from jumplab.robot import Robot, load_robot
 from jumplab.robot.bhr import table
 from jumplab.robot.description import GRAVITY
+from jumplab.robot.reach import sobol
 from jumplab.task import GRAVITY as TASK_GRAVITY
 
 MASSIVE = {"trunk", *(f"{side}_{part}" for side in ("left", "right") for part in ("thigh", "shank", "foot", "arm"))}
@@ -204,3 +206,7 @@ def test_sole_is_the_bottom_of_the_foots_box(bhr, shapes):
         np.testing.assert_allclose(place - half, want[0], atol=1e-12)
         np.testing.assert_allclose((place + half)[:2], want[1], atol=1e-12)
     assert foot.toe - foot.heel == pytest.approx(0.24) and 2 * foot.half_width == pytest.approx(0.10)
+
+
+def test_sobols_sequence_is_scipys():
+    np.testing.assert_array_equal(sobol(2**10), qmc.Sobol(5, scramble=False).random(2**10))

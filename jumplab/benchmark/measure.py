@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from jumplab.benchmark.report import report
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, JumplabError, SolverError
 from jumplab.joint_map import map_to_joints
 from jumplab.passport.audit import audit
 from jumplab.pipeline import JumpPlan, Planner, body_rows, guess_from_joints, make_tape
@@ -32,6 +32,8 @@ TASK, MESH = JumpTask(1.0, 0.5), Mesh()  # the paper's target, the usual mesh
 NEIGHBOUR_M = 0.05  # our choice: how much farther the re-planned target is
 NODES = (20, 40, 60, 80, 100, 120)  # intervals of the three phases together
 TARGETS = (1, 2, 4, 8)
+# our choice: shares of the target's distance and rise; how many iterations one target takes is a matter of luck
+SPREAD = ((0.0, 0.8), (0.2, 0.6), (0.3, 1.0), (0.4, 0.4), (0.6, 1.0), (0.8, 0.6), (1.0, 0.6), (1.1, 0.8))
 NODE_REPEATS = 3  # our choice: the growth is a fit over many meshes
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
 COLD = """
@@ -70,7 +72,8 @@ class Stopwatch:
 
 
 def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh: Mesh = MESH,
-          nodes: tuple[int, ...] = NODES, cold: bool = True, say: Callable[[str], None] = print) -> dict:  # fmt: skip
+          nodes: tuple[int, ...] = NODES, spread: tuple = SPREAD, cold: bool = True,
+          say: Callable[[str], None] = print) -> dict:  # fmt: skip
     """Measure everything.
 
     Parameters
@@ -79,6 +82,7 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
     repeats : how often each thing is done; at least 1.
     mesh : of stage 3 and of the direct NLP; ``cold`` processes know only the default.
     nodes : numbers of intervals for the growth with nodes.
+    spread : further targets, as shares of the target's distance and rise, planned once in both ways.
     cold : also time new processes.  say : is told what goes on.
 
     Returns
@@ -111,7 +115,8 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
             if cold:
                 peaks.append(_cold(watch, robot_name, task, audits, kept))
     say("growth with nodes and targets")
-    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
+    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task),
+              "spread": _spread(planner, task, spread)}  # fmt: skip
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
     iterations = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
     functions = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
@@ -179,6 +184,29 @@ def _nodes(planner: Planner, task: JumpTask, nodes) -> list[dict]:
         rows.append(dict(intervals=mesh.flat + mesh.toe + mesh.flight, variables=s.variables,
                          iterations=s.iterations, build_s=watch.cpu["build"][0], solve_s=solve_s,
                          iteration_s=solve_s / s.iterations))  # fmt: skip
+    return rows
+
+
+def _spread(planner: Planner, task: JumpTask, spread) -> list[dict]:
+    """Other targets, each planned once in both ways: CPU times [s], and their ratio; those without a plan are left out.
+
+    The peer's time is that of its solve alone, as everywhere.
+    """
+    rows = []
+    for distance, height in spread:
+        other, watch = (
+            replace(task, distance_m=distance * task.distance_m, height_m=height * task.height_m),
+            Stopwatch(),
+        )
+        try:
+            plan = watch("plan", planner.plan, other)
+            watch("direct", planner.stage("direct").plan, other)
+        except JumplabError:
+            continue
+        plan_s, direct_s = watch.cpu["plan"][0], watch.cpu["direct"][0]
+        clean = audit(plan.tape, planner.robot, other).passed
+        rows.append(dict(distance_m=other.distance_m, height_m=other.height_m, plan_s=plan_s, direct_s=direct_s,
+                         ratio=plan_s / direct_s, clean=clean))  # fmt: skip
     return rows
 
 

@@ -108,6 +108,11 @@ def text(found: dict) -> str:
     kept = found["cold_kept_over_direct"]
     if kept is not None:
         lines.append(f"  {'the same with functions kept from an earlier process':<76} {kept:.3f}")
+    spread = found["growth"]["spread"]
+    if spread:
+        ratios, words = [row["ratio"] for row in spread], f"plan / direct NLP at once, over {len(spread)} other targets"
+        lines.append(f"  {words:<76} {np.median(ratios):.3f}  (median; {min(ratios):.2f} to {max(ratios):.2f}), "
+                     f"{sum(row['clean'] for row in spread)} clean")  # fmt: skip
     lines += ["", f"medians of {found['repeats']} repeats [s]" + " " * 24 + "CPU      wall"]
     cpu, wall = found["median_s"]["cpu"], found["median_s"]["wall"]
     for name in cpu:

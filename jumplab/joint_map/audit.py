@@ -73,18 +73,25 @@ def audit(mapper: Any, data: dict, held: np.ndarray, nodes: list, steps: list) -
 
 
 def _base_force(body, steps, accelerations, wrenches) -> float:
-    """Largest base row of pin.rnea with the wrenches as external forces of the foot joints."""
-    model, scratch, worst = body.model, body.model.createData(), 0.0
-    frames = [model.frames[model.getFrameId(name)] for name in body.robot.foot.frames]
-    for x, a, f in zip(steps, accelerations, wrenches, strict=True):
-        pin.forwardKinematics(model, scratch, x.q)
-        forces = [pin.Force.Zero() for _ in range(model.njoints)]
-        for frame, wrench in zip(frames, f, strict=True):
-            placement = scratch.oMi[frame.parentJoint]
-            here = pin.SE3(np.eye(3), placement.act(frame.placement.translation))
-            forces[frame.parentJoint] += placement.actInv(here.act(pin.Force(wrench)))
-        worst = max(worst, float(np.abs(pin.rnea(model, scratch, x.q, x.v, a, forces)[:6]).max()))
-    return worst
+    """Largest base row of pin.rnea less the wrenches (N, 2, 6) at the origins of the foot frames, about the base."""
+    model, scratch, foot = body.model, body.model.createData(), body.robot.foot
+    needed = np.array([pin.rnea(model, scratch, x.q, x.v, a)[:6] for x, a in zip(steps, accelerations, strict=True)])
+    turn, base = np.array([x.base_rotation for x in steps]), np.array([x.q[:3] for x in steps])
+    toe, force = np.array([x.toe for x in steps]), wrenches[..., :3]
+    origin = toe - _arms(steps, foot)
+    moment = (wrenches[..., 3:] + np.cross(origin - base[:, None], force)).sum(1)
+    given = np.concatenate([_into(turn, force.sum(1)), _into(turn, moment)], 1)
+    return float(np.abs(needed - given).max())
+
+
+def _into(turn, x) -> np.ndarray:
+    """World vectors (N, 3) in frames turned by (N, 3, 3)."""
+    return np.einsum("nij,ni->nj", turn, x)
+
+
+def _arms(terms, foot) -> np.ndarray:
+    """From the origins of the foot frames to the tiptoes (N, 2, 3), world axes."""
+    return np.array([x.foot_rotation for x in terms]) @ np.array([foot.toe, 0.0, foot.sole_z])
 
 
 def _joints(robot, angles, rates, tau, tau_rates) -> dict[str, float]:
@@ -103,18 +110,15 @@ def _joints(robot, angles, rates, tau, tau_rates) -> dict[str, float]:
 
 def _ground(robot, wrenches, terms, contact) -> dict[str, float]:
     """Unilaterality, friction and CoP of each foot, from the wrenches at the foot frames."""
-    foot = robot.foot
-    offset = np.array([foot.toe, 0.0, foot.sole_z])
-    pull, friction, outside = 0.0, 0.0, 0.0
-    for f, x, where in zip(wrenches, terms, contact, strict=True):
-        for k in range(2):
-            force, arm = f[k, :3], x.foot_rotation[k] @ offset
-            pull = max(pull, -force[2])
-            if force[2] < LOADED_N:
-                continue
-            moment = f[k, 3:] - np.cross(arm, force)  # about the tiptoe
-            friction = max(friction, np.hypot(force[0], force[1]) / force[2])
-            along, across = -moment[1] / force[2], moment[0] / force[2]  # from the tiptoe
-            back = 0.0 if where == "toe" else foot.heel - foot.toe
-            outside = max(outside, along, back - along, abs(across) - foot.half_width)
-    return {"pull": float(max(pull, 0.0)), "friction": float(friction), "cop_outside": float(max(outside, 0.0))}
+    foot, force = robot.foot, wrenches[..., :3]
+    moment = wrenches[..., 3:] - np.cross(_arms(terms, foot), force)  # about the tiptoes
+    loaded = force[..., 2] >= LOADED_N
+    back = np.where(contact == "toe", 0.0, foot.heel - foot.toe)[:, None]
+    lift = np.where(loaded, force[..., 2], 1.0)
+    along, across = -moment[..., 1] / lift, moment[..., 0] / lift  # from the tiptoe
+    beyond = np.maximum(np.maximum(along, back - along), np.abs(across) - foot.half_width)
+    return {
+        "pull": float(max(-force[..., 2].min(initial=0.0), 0.0)),
+        "friction": float((np.hypot(force[..., 0], force[..., 1]) / lift)[loaded].max(initial=0.0)),
+        "cop_outside": float(beyond[loaded].max(initial=0.0)),
+    }

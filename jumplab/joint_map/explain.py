@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
 
 from jumplab.joint_map.problem import StepQp
@@ -67,6 +66,8 @@ def conflict(qp: StepQp) -> Conflict | None:
     Minimise the sum of the slacks, each in its row's own size. A row's multiplier is then the price that the others
     pay for it: an inequality that binds at a price is one side of the conflict, a row with slack the other.
     """
+    import cvxpy as cp  # slow to import, and rarely needed
+
     x, scale = cp.Variable(qp.A.shape[1]), row_scale(qp)
     give = {k: cp.Variable(len(scale[k]), nonneg=True) for k in "EGR" if len(scale[k])}
     g = {k: cp.multiply(scale[k], give[k]) if k in give else np.zeros(0) for k in "EGR"}

@@ -9,7 +9,7 @@ import numpy as np
 from jumplab.joint_map.options import Options
 from jumplab.joint_map.problem import SIDES, JointRows, Layout, State, StepQp, accelerations
 from jumplab.joint_map.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
-from jumplab.models.full import FullBody, FullTerms, skew
+from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,9 @@ class FlightQp:
 
     name = "flight"
 
-    def __init__(self, body: FullBody, nominal, start: FullTerms, reference: FlightReference, options: Options, ground):
+    def __init__(
+        self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground
+    ):
         self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
         self.t, self.ground = reference.t, ground
         self.step = float(self.t[1])
@@ -94,7 +96,7 @@ class FlightQp:
         R[nv - 6 :, 6:] = np.eye(nv - 6)
         return A, E, G, R
 
-    def target(self, k: int, terms: FullTerms) -> FlightTarget:
+    def target(self, k: int, terms: FullMotion) -> FlightTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
         gain = self.options.gains
         foot = self.foot.command(k, terms.foot_com, terms.foot_com_rate, gain.foot)
@@ -111,7 +113,7 @@ class FlightQp:
             mirror = -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
         return FlightTarget(foot, rho, self._drift(k, terms), level, self._floor(k, terms), joints, trunk, mirror)
 
-    def _drift(self, k: int, terms: FullTerms) -> np.ndarray:
+    def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what integration lost."""
         body, t, c = self.body, self.t[k], self.options.gains.momentum_drift
         fall = np.array([0.0, 0.0, -body.gravity])
@@ -124,7 +126,7 @@ class FlightQp:
         arm = skew(terms.com - terms.q[:3])
         return np.concatenate([turn.T @ force, turn.T @ (moment + arm @ force)])
 
-    def _floor(self, k: int, terms: FullTerms) -> np.ndarray:
+    def _floor(self, k: int, terms: FullMotion) -> np.ndarray:
         gain, near = self.options.gains.ground, self.options.limits.near_ground_m
         if self.t[k] > self.t[-1] / 2:  # coming down: the surface there is the landing's business
             return np.full(4, -np.inf)

@@ -9,7 +9,7 @@ import numpy as np
 from jumplab.joint_map.options import Options
 from jumplab.joint_map.problem import SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
 from jumplab.joint_map.reference import LaunchReference
-from jumplab.models.full import FullBody, FullTerms, force_target
+from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
 
 WRENCH = 12
 FOOT_ROWS = ("F_z >= 0", "friction +x", "friction -x", "friction +y", "friction -y", "CoP left of right edge",
@@ -139,7 +139,7 @@ class LaunchQp:
                 one[10, 4], one[10, 2] = 1.0, -(foot.toe - foot.heel - lim.cop_margin_m)
         return np.kron(np.eye(2), one)
 
-    def target(self, k: int, terms: FullTerms) -> LaunchTarget:
+    def target(self, k: int, terms: FullMotion) -> LaunchTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
         ref, gain, form = self.reference, self.options.gains, self.options.form
         com = ref.com.command(k, terms.com - self.pivot, terms.com_velocity, gain.com)
@@ -162,7 +162,7 @@ class LaunchQp:
         weight = float(self.inertia_weights[k])
         return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight)
 
-    def _heel_floor(self, terms: FullTerms, on_toes: bool) -> np.ndarray:
+    def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
         gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
         if form.contact == "consistent" and not on_toes:
             return np.full(2, -np.inf)  # the flat foot's own row holds the heel

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jumplab.joint_map.options import Gain, Limits
-from jumplab.models.full import FullBody, FullTerms, skew
+from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
 from jumplab.robot import SAGITTAL_JOINTS
 
 OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # our choice: [N m], [rad/s] bounds of a row that is switched off, beyond all motion
@@ -178,7 +178,7 @@ def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
     return q
 
 
-def accelerations(terms: FullTerms, nominal: np.ndarray, posture: Gain, trunk: Gain) -> tuple[np.ndarray, np.ndarray]:
+def accelerations(terms: FullMotion, nominal: np.ndarray, posture: Gain, trunk: Gain) -> tuple[np.ndarray, np.ndarray]:
     """PD accelerations of the joints (nv - 6,) towards ``nominal`` (nq,), and of the trunk (3,), in base axes."""
     joints = posture.stiffness * (nominal[7:] - terms.q[7:]) - posture.damping * terms.v[6:]
     vector, scalar, wish, wish_scalar = terms.q[3:6], terms.q[6], nominal[3:6], nominal[6]

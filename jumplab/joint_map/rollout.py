@@ -113,7 +113,7 @@ class JointMapper:
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
         ground = float(self.launch.toe0[:, 2].mean())
-        start = self.body.terms(takeoff.q, takeoff.v)
+        start = self.body.motion(takeoff.q, takeoff.v)
         return FlightQp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
 
     def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
@@ -130,7 +130,7 @@ class JointMapper:
         ``qp`` is :attr:`launch` or one from :meth:`flight_from`; ``start.a`` guesses the step's accelerations. With
         ``start = plan.state(row)`` it is the QP that made the plan, up to what its prediction missed.
         """
-        target = qp.target(k, self.body.terms(start.q, start.v))
+        target = qp.target(k, self.body.motion(start.q, start.v))
         terms = self.middle(start, start.a, qp.step)
         return terms, target, qp.matrices(terms, target, start)
 
@@ -141,7 +141,7 @@ class JointMapper:
         solver, build_s, solve_s, before = None, 0.0, 0.0, state.a
         for k in range(len(qp.t) - 1):
             began = clock()
-            node = self.body.terms(state.q, state.v)
+            node = self.body.motion(state.q, state.v)
             target = qp.target(k, node)
             guess = 2 * state.a - before
             for share in CORRECTIONS:
@@ -160,7 +160,7 @@ class JointMapper:
             values = (state, node, terms, answer.x[:first], answer)
             for name, value in zip(out, values, strict=True):
                 out[name].append(value)
-        out["nodes"].append(self.body.terms(state.q, state.v))
+        out["nodes"].append(self.body.motion(state.q, state.v))
         return {**out, "build_s": build_s, "solve_s": solve_s}
 
     def run(self, method: str = "cvxpy") -> JointPlan:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from proxsuite import proxqp
-from scipy.linalg import LinAlgError, lu_factor, lu_solve
 
 from jumplab.errors import InputError, SolverError
 from jumplab.joint_map.explain import ADVICE, conflict, lines, row_scale, sentence
@@ -143,11 +142,11 @@ def polished(
     soft = kkt.copy()
     soft[range(n, n + m), range(n, n + m)] = -POLISH_SOFTNESS
     try:
-        factors = lu_factor(soft, check_finite=False)
-    except (LinAlgError, ValueError):
+        inverse = np.linalg.inv(soft)  # scipy could keep the factors; importing it costs more than a plan's inverses
+    except np.linalg.LinAlgError:
         return x
     for _ in range(POLISH_ROUNDS):
-        answer += lu_solve(factors, want - kkt @ answer, check_finite=False)
+        answer += inverse @ (want - kkt @ answer)
     moved = np.abs(answer[:n] - x).max(initial=0.0)
     return answer[:n] if moved <= POLISH_REACH * max(1.0, np.abs(x).max(initial=0.0)) else x
 

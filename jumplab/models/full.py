@@ -8,115 +8,23 @@ axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.models.full_terms import FullMotion, FullTerms, force_target, skew
 from jumplab.robot import Robot
 
 LATERAL = np.array([0.0, 1.0, 0.0])  # the pitch axis, world
 PARALLEL_TOLERANCE = 1e-6  # our choice: how far an axis may be off before a robot counts as crooked
 POINTS = ("toe", "heel", "sole")
+__all__ = ["FullBody", "FullMotion", "FullTerms", "force_target", "skew"]
 
-
-CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
-
-
-def skew(x: np.ndarray) -> np.ndarray:
-    """Matrices (..., 3, 3) with skew(x) @ y = x cross y, for vectors (..., 3)."""
-    return (x @ CROSS).reshape(*x.shape, 3)
-
-
-class FullTerms(NamedTuple):
-    """Every quantity of the nine-link robot that the QPs need, at one (q, v); feet are ordered left, right.
-
-    In each "drift" the acceleration is that of theta'' = 0, so ``x'' = J_x theta'' + drift``.
-
-    Attributes
-    ----------
-    q, v : configuration (nq,) and rates (nv,).
-    base_rotation : of the base link (3, 3).
-    M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
-    com, com_velocity : c and its rate (3,) [m, m/s].
-    A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
-    momentum : linear then centroidal angular momentum (6,) [kg m/s, kg m^2/s]; ``momentum[4]`` is L.
-    A_h, B_h : centroidal momentum matrix (6, nv) and drift (6,).
-    rho : pitch inertia about the CoM, rho_total [kg m^2].
-    J_rho, drift_rho : its Jacobian (nv,) and drift [kg m^2/s^2].
-    toe, heel, sole : places of the middles of the soles' front edge, rear edge, and of the sole itself (2, 3) [m].
-    toe_velocity, heel_velocity, sole_velocity : (2, 3) [m/s].
-    J_toe, drift_toe : Jacobian (2, 6, nv), linear then angular, and drift (2, 6) of the tiptoes; J^js of the paper.
-    J_heel, drift_heel : linear Jacobian (2, 3, nv) and drift (2, 3) of the heels.
-    foot_com, foot_com_rate : sole minus CoM, p_rd, and its rate (2, 3).
-    J_rd, drift_rd : Jacobian (2, 3, nv) and drift (2, 3) of p_rd.
-    foot_rotation : rotation matrices of the feet (2, 3, 3).
-    foot_spin : angular velocity of the feet, world axes (2, 3) [rad/s].
-    """
-
-    q: np.ndarray
-    v: np.ndarray
-    base_rotation: np.ndarray
-    M: np.ndarray
-    H: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    A_c: np.ndarray
-    B_c: np.ndarray
-    momentum: np.ndarray
-    A_h: np.ndarray
-    B_h: np.ndarray
-    rho: float
-    J_rho: np.ndarray
-    drift_rho: float
-    toe: np.ndarray
-    heel: np.ndarray
-    sole: np.ndarray
-    toe_velocity: np.ndarray
-    heel_velocity: np.ndarray
-    sole_velocity: np.ndarray
-    J_toe: np.ndarray
-    drift_toe: np.ndarray
-    J_heel: np.ndarray
-    drift_heel: np.ndarray
-    foot_com: np.ndarray
-    foot_com_rate: np.ndarray
-    J_rd: np.ndarray
-    drift_rd: np.ndarray
-    foot_rotation: np.ndarray
-    foot_spin: np.ndarray
-
-    @property
-    def J(self) -> np.ndarray:
-        """J^js (12, nv): both tiptoes, so that the ground acts on the robot as J^T F."""
-        return self.J_toe.reshape(12, -1)
-
-    @property
-    def A_f(self) -> np.ndarray:
-        """A_f (6, 12): A_f F is the rate of linear momentum without gravity, then of centroidal angular momentum."""
-        left, right = skew(self.toe - self.com)
-        out = np.concatenate([np.eye(6), np.eye(6)], 1)
-        out[3:, :3], out[3:, 6:9] = left, right
-        return out
-
-    @property
-    def rho_rate(self) -> float:
-        """d rho / dt [kg m^2/s]."""
-        return float(self.J_rho @ self.v)
-
-    @property
-    def foot_pitch(self) -> np.ndarray:
-        """Pitch of the feet (2,) [rad]; positive is heel up."""
-        return np.arctan2(-self.foot_rotation[:, 2, 0], self.foot_rotation[:, 0, 0])
-
-
-def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, momentum_rate: np.ndarray) -> np.ndarray:
-    """B_f (6,): what A_f F must be for a CoM acceleration (3,) and a rate of centroidal angular momentum (3,)."""
-    lift = np.array([0.0, 0.0, gravity])
-    return np.concatenate([mass * (np.asarray(com_acceleration) + lift), momentum_rate])
+# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
+SLOPE = np.zeros((16, 6))
+SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
+SLOPE[1, 5] = -1.0
 
 
 class FullBody:
@@ -162,6 +70,10 @@ class FullBody:
             self._pseudo[i] = body.mass * np.outer(lever, lever)
             self._pseudo[i, :3, :3] += about_com
         self._carries = self._above[:, self._column_joint]  # (n, nv): column moves body
+        self._place = np.tile(np.eye(4), (n, 1, 1))
+        # views of what Pinocchio computes: they follow its scratch data
+        self._rotations = [self.data.oMi[j].rotation for j in range(1, n + 1)]
+        self._translations = [self.data.oMi[j].translation for j in range(1, n + 1)]
 
     def _read_feet(self):
         model, foot, data = self.model, self.robot.foot, self.data
@@ -171,7 +83,8 @@ class FullBody:
         self._points = np.array([[f.placement.act(np.array(middle[p], float)) for p in POINTS] for f in frames])
         self._foot_turn = np.array([f.placement.rotation for f in frames])
         self.foot_origin = np.array([f.placement.translation for f in frames])  # (2, 3), in the foot joint
-        self._foot_carries = self._carries[[j - 1 for j in self.foot_joints]]  # (2, nv)
+        self._foot_bodies = [j - 1 for j in self.foot_joints]
+        self._foot_carries = self._carries[self._foot_bodies]  # (2, nv)
         pin.framesForwardKinematics(model, data, pin.neutral(model))
         for name in foot.frames:
             turn = data.oMf[model.getFrameId(name)].rotation
@@ -236,56 +149,86 @@ class FullBody:
         model, data = self.model, self.data
         pin.dccrba(model, data, q, v)
         J, dJ = data.J.copy(), data.dJ.copy()  # (6, nv) about the world origin
-        A_h, B_h = data.Ag.copy(), data.dAg @ v
-        A_c, B_c, com = A_h[:3] / self.mass, B_h[:3] / self.mass, data.com[0].copy()
-        momentum = A_h @ v
-        velocity = momentum[:3] / self.mass
+        A_h, B_h, com = data.Ag.copy(), data.dAg @ v, data.com[0].copy()
+        A_c, B_c, momentum = A_h[:3] / self.mass, B_h[:3] / self.mass, A_h @ v
+        velocity, place = momentum[:3] / self.mass, self._placements()
         H = pin.nonLinearEffects(model, data, q, v).copy()
         M = pin.crba(model, data, q) * self._upper  # Pinocchio leaves the lower triangle to chance
         M += (M * self._above_diagonal).T
-        place = np.array([x.homogeneous for x in data.oMi])[1:]  # (bodies, 4, 4)
         # linear and angular velocity, and both at theta'' = 0 differentiated, about the world origin, of each body
         twist = (self._carries @ np.concatenate([J * v, dJ * v]).T).reshape(-1, 4, 3)
-        inertia = self._inertia(J, place, twist, com, velocity, A_c, B_c)
+        D, rho, slope = self._moments(place, com)
+        J_rho = 2 * ((J * slope).sum(0) - self.mass * (com[::2] @ A_c[::2]))  # (nv,)
+        centre = self.mass * (velocity[::2] @ velocity[::2] + com[::2] @ B_c[::2])
+        drift_rho = 2 * (_half_second(D, twist) - centre)
         feet = self._feet(J, place, twist, v, com, velocity, A_c, B_c)
-        base = place[0, :3, :3]
-        return FullTerms(q, v, base, M, H, com, velocity, A_c, B_c, momentum, A_h, B_h, *inertia, *feet)
+        return FullTerms(q, v, place[0, :3, :3].copy(), M, H, com, velocity, A_c, B_c, momentum, A_h, B_h,
+                         rho, J_rho, drift_rho, *feet)  # fmt: skip
 
-    def _inertia(self, J, place, twist, com, com_velocity, A_c, B_c):
-        """rho, J_rho, drift. With D, the integral of [x; 1][x; 1]^T dm: rho = D_xx + D_zz - m (c_x^2 + c_z^2)."""
-        D = place @ self._pseudo @ place.transpose(0, 2, 1)  # (n, 4, 4)
-        n, m, c, w = len(D), self.mass, com[::2], com_velocity[::2]  # x and z
-        sub = (self._above.T @ D.reshape(n, 16)).reshape(n, 4, 4)  # of everything a joint carries
-        rho = sub[0, 0, 0] + sub[0, 2, 2] - m * (c @ c)
-        g = np.zeros((6, n))  # gradient of D_xx + D_zz along a twist (linear, angular) about the origin
-        g[0], g[2], g[3], g[5] = sub[:, 0, 3], sub[:, 2, 3], sub[:, 2, 1], -sub[:, 0, 1]
-        J_rho = 2 * ((J * g[:, self._column_joint]).sum(0) - m * (c @ A_c[::2]))  # (nv,)
-        x = np.empty((n, 2, 3, 4))  # x' = x[:, 0] [x; 1], and at theta'' = 0 x'' = x[:, 1] [x; 1]
-        x[..., :3], x[..., 3] = skew(twist[:, 1::2]), twist[:, ::2]
-        rate, second = x[:, 0], x[:, 1]
-        second += rate[..., :3] @ rate
-        twice = ((rate @ D) * rate + D[:, :3] * second)[:, ::2].sum()
-        return rho, J_rho, 2 * (twice - m * (w @ w + c @ B_c[::2]))
+    def motion(self, q: np.ndarray, v: np.ndarray) -> FullMotion:
+        """What feedback needs at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
+        data, m = self.data, self.mass
+        pin.ccrba(self.model, data, q, v)
+        moving, momentum, com = data.J * v, data.Ag @ v, data.com[0].copy()
+        velocity, place = momentum[:3] / m, self._placements()
+        _, rho, slope = self._moments(place, com)
+        rho_rate = 2 * ((moving * slope).sum() - m * (com[::2] @ velocity[::2]))
+        turn, points = self._soles(place)
+        foot = self._foot_carries @ moving.T  # (2, 6)
+        speed = foot[:, None, :3] + points @ skew(foot[:, 3:]).transpose(0, 2, 1)  # (2, 3 points, 3)
+        return FullMotion(q, v, place[0, :3, :3].copy(), com, velocity, momentum, rho, float(rho_rate),
+                          points[:, 0], points[:, 1], speed[:, 0], speed[:, 1], points[:, 2] - com,
+                          speed[:, 2] - velocity, turn @ self._foot_turn, foot[:, 3:])  # fmt: skip
+
+    def _placements(self) -> np.ndarray:
+        """Placements of all bodies (n, 4, 4) as Pinocchio last left them; the next call overwrites the array."""
+        place, n = self._place, len(self._place)
+        place[:, :3, :3] = np.concatenate(self._rotations).reshape(n, 3, 3)
+        place[:, :3, 3] = np.concatenate(self._translations).reshape(n, 3)
+        return place
+
+    def _moments(self, place, com):
+        """D (n, 4, 4), rho, and half the slope of D_xx + D_zz along every column's twist (6, nv).
+
+        With D, the integral of [x; 1][x; 1]^T dm: rho = D_xx + D_zz - m (c_x^2 + c_z^2).
+        """
+        D = place @ self._pseudo @ place.transpose(0, 2, 1)
+        carried = self._above.T @ D.reshape(len(D), 16)  # by each joint
+        rho = carried[0, 0] + carried[0, 10] - self.mass * (com[::2] @ com[::2])
+        return D, rho, (carried @ SLOPE)[self._column_joint].T
+
+    def _soles(self, place):
+        """Rotations (2, 3, 3) of the feet's joints, and places of tiptoes, heels and soles (2, 3 points, 3)."""
+        at = place[self._foot_bodies, :3]  # (2, 3, 4)
+        turn = at[..., :3]
+        return turn, self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]
 
     def _feet(self, J, place, twist, v, com, com_velocity, A_c, B_c):
         """Places, velocities, Jacobians and drifts of tiptoes, heels and soles, and p_rd = sole - CoM."""
-        bodies = [j - 1 for j in self.foot_joints]
-        at, moving = place[bodies, :3], twist[bodies]  # (2, 3, 4), (2, 4, 3)
-        turn, spin, drift, alpha = at[..., :3], moving[:, 1], moving[:, 2], moving[:, 3]
-        points = self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]  # (2, 3 points, 3)
+        turn, points = self._soles(place)
+        moving = twist[self._foot_bodies]  # (2, 4, 3)
+        spin, drift, alpha = moving[:, 1], moving[:, 2], moving[:, 3]
         own = J * self._foot_carries[:, None]  # (2, 6, nv)
         linear = own[:, None, :3] - skew(points) @ own[:, None, 3:]  # (2, 3 points, 3, nv)
         speed = linear @ v  # (2, 3 points, 3)
-        spin_x = skew(moving[:, 1::2])[:, :, None]  # (2, spin and alpha, 1, 3, 3)
-        turning = spin_x[:, 1] @ points[..., None] + spin_x[:, 0] @ speed[..., None]  # (2, 3 points, 3, 1)
-        bias = drift[:, None] + turning[..., 0]  # (2, 3 points, 3)
+        turning, spinning = skew(alpha).transpose(0, 2, 1), skew(spin).transpose(0, 2, 1)  # (2, 3, 3)
+        bias = drift[:, None] + points @ turning + speed @ spinning  # (2, 3 points, 3)
         J_toe = np.concatenate([linear[:, 0], own[:, 3:]], 1)  # (2, 6, nv)
         drift_toe = np.concatenate([bias[:, 0], alpha], 1)  # (2, 6)
-        sole = points[:, 2]
         return (
             *(points[:, i] for i in range(3)),
             *(speed[:, i] for i in range(3)),
             J_toe, drift_toe, linear[:, 1], bias[:, 1],
-            sole - com, speed[:, 2] - com_velocity, linear[:, 2] - A_c, bias[:, 2] - B_c,
+            points[:, 2] - com, speed[:, 2] - com_velocity, linear[:, 2] - A_c, bias[:, 2] - B_c,
             turn @ self._foot_turn, spin,
         )  # fmt: skip
+
+
+def _half_second(D, twist) -> float:
+    """Half of the second derivative of D_xx + D_zz, summed over the bodies, at theta'' = 0."""
+    x = np.empty((len(D), 2, 3, 4))  # x' = x[:, 0] [x; 1], and at theta'' = 0 x'' = x[:, 1] [x; 1]
+    x[..., :3], x[..., 3] = skew(twist[:, 1::2]), twist[:, ::2]
+    rate, second = x[:, 0], x[:, 1]
+    second += rate[..., :3] @ rate
+    rate, second = rate[:, ::2], second[:, ::2]  # of x and z
+    return ((rate @ D) * rate + D[:, :3:2] * second).sum()

@@ -7,10 +7,10 @@ those outside the joint ranges are dropped, and the extremes over each CoM dista
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import qmc
 
 from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS
@@ -35,6 +35,9 @@ LOW_COM_QUANTILE = 0.003  # our choice: not the deepest squat that exists
 EASY_COM_QUANTILE = 0.05  # our choice: below, hardly a posture keeps the hip off its stop
 FORCE_CAP = 1.5  # our choice: nearly straight legs carry any load; the fit shall not chase that
 SPEED_QUANTILE = 0.98  # our choice: as for the force; a good posture for extending the leg fast
+# degree, coefficients and first directions of the primitive polynomials of Sobol's sequence, by S. Joe and F. Y. Kuo
+SOBOL = ((1, 0, (1,)), (2, 1, (1, 3)), (3, 1, (1, 3, 1)), (3, 2, (1, 1, 1)))
+SOBOL_BITS = 30
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,37 @@ class Reach:
 
 
 def _turned(angle, vector):
-    c, s = np.cos(angle), np.sin(angle)
+    return _along((np.cos(angle), np.sin(angle)), vector)
+
+
+def _along(turn, vector):
+    c, s = turn
     return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
+
+
+@cache
+def sobol(count: int) -> np.ndarray:
+    """The first ``count`` points (count, 5) in [0, 1) of Sobol's sequence, read-only.
+
+    The same numbers as scipy.stats.qmc.Sobol(5, scramble=False), whose import takes longer than all of this module.
+    """
+    directions = np.empty((5, SOBOL_BITS), np.int64)
+    directions[0] = 1 << np.arange(SOBOL_BITS - 1, -1, -1)
+    for row, (degree, coefficients, first) in zip(directions[1:], SOBOL, strict=True):
+        m = list(first)
+        for k in range(degree, SOBOL_BITS):
+            new = m[k - degree] ^ (m[k - degree] << degree)
+            for i in range(1, degree):
+                new ^= ((coefficients >> (degree - 1 - i)) & 1) * (m[k - i] << i)
+            m.append(new)
+        row[:] = [x << (SOBOL_BITS - 1 - k) for k, x in enumerate(m)]
+    index = np.arange(count)
+    gray, points = index ^ (index >> 1), np.zeros((count, 5), np.int64)
+    for k in range(max(count - 1, 1).bit_length()):
+        points ^= ((gray >> k) & 1)[:, None] * directions[:, k]
+    unit = points / 2.0**SOBOL_BITS
+    unit.setflags(write=False)
+    return unit
 
 
 def postures(
@@ -97,14 +129,15 @@ def postures(
     Returns arrays angles (n, 5), com (n, 2) from mid-sole, shoulder, rho, force, speed.
     """
     m = robot.sagittal
-    unit = qmc.Sobol(5, scramble=False).random(count)
+    unit = sobol(count)
     foot, trunk = unit[:, 0] * heel_up_rad, TRUNK_RAD[0] + unit[:, 1] * (TRUNK_RAD[1] - TRUNK_RAD[0])
     joints = m.lower + unit[:, 2:][:, [0, 1, 1, 2]] * (m.upper - m.lower)
     hip, knee, shoulder = joints[:, 0], joints[:, 1], joints[:, 3]
     angles = np.stack([foot, trunk + hip + knee, trunk + hip, trunk, trunk + shoulder], -1)  # (n, 5)
     ankle = angles[:, 0] - angles[:, 1]
     com_arms, mass = m.com_arms(), m.mass
-    links = np.stack([sum(_turned(angles[:, j], com_arms[i, j]) for j in range(5)) for i in range(5)], 1)  # (n, 5, 2)
+    turn = [(np.cos(x), np.sin(x)) for x in angles.T]
+    links = np.stack([sum(_along(turn[j], com_arms[i, j]) for j in range(5)) for i in range(5)], 1)  # (n, 5, 2)
     com = np.einsum("i,nik->nk", mass, links) / mass.sum()
     rho = m.inertia.sum() + np.einsum("i,nik->n", mass, (links - com[:, None]) ** 2)
     from_sole = com - m.sole_center

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import brentq
 
 from jumplab.errors import RobotError
 from jumplab.robot.description import Robot
@@ -39,16 +38,7 @@ def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits:
     def angles(shank):
         return np.array([0.0, shank, shank - knee, pitch, pitch + shoulder])
 
-    def offset(shank):
-        return com_from_toe(robot, angles(shank))[0] - robot.sagittal.sole_center[0]
-
-    try:
-        found = angles(brentq(offset, *SHANK_LEAN_RAD))
-    except ValueError:
-        raise RobotError(
-            f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {pitch:g} rad no lean of the shank "
-            f"brings the CoM above the middle of the sole; change [stance] in its configuration"
-        ) from None
+    found = angles(_level(robot, knee, pitch, pitch + shoulder))
     if not within_limits:
         return found
     joints = robot.sagittal.joint_angles(found)
@@ -59,6 +49,30 @@ def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits:
                 f"its range {low:g} ... {high:g}; change [stance] in its configuration"
             )
     return found
+
+
+def _level(robot: Robot, knee: float, trunk: float, arm: float) -> float:
+    """Lean of the shank [rad] with the CoM above the middle of the sole.
+
+    Shank and thigh turn together, so the CoM's x is a wave in the lean: x = mean + size cos(lean - peak).
+    """
+
+    def ahead(lean):
+        return com_from_toe(robot, np.array([0.0, lean, lean - knee, trunk, arm]))[0] - robot.sagittal.sole_center[0]
+
+    at_zero, quarter, half = ahead(0.0), ahead(np.pi / 2), ahead(np.pi)
+    mean = (at_zero + half) / 2
+    size, peak = np.hypot(at_zero - mean, quarter - mean), np.arctan2(quarter - mean, at_zero - mean)
+    low, high = SHANK_LEAN_RAD
+    turn = np.arccos(-mean / size) if abs(mean) < size else np.nan
+    leans = [(lean - low) % (2 * np.pi) + low for lean in (peak - turn, peak + turn)]
+    found = [float(lean) for lean in leans if lean <= high]
+    if len(found) == 1:
+        return found[0]
+    raise RobotError(
+        f"robot {robot.name}: with the knee at {knee:g} rad and the trunk at {trunk:g} rad no lean of the shank "
+        f"brings the CoM above the middle of the sole; change [stance] in its configuration"
+    )
 
 
 def check_stance(robot: Robot) -> np.ndarray:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
@@ -23,8 +23,8 @@ from jumplab.task import JumpTask
 # ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
 # iterations instead of 22 in the middle, and 40 instead of 43 at most
 CURVATURE = {"neg_curv_test_tol": 1e-12}
-# our choice: the barrier stays above a tenth of the tolerance; below, iterations polish what nobody asked for
-BARRIER = {"mu_min": 1e-7}
+# our choice: small multipliers at the start, and tolerances as in stage 3 (that of the rows stays): 14 iterations
+SEARCH = {"bound_mult_init_method": "mu-based", "mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5}
 
 
 def parameters(task: JumpTask, envelope: Reach) -> dict:
@@ -65,7 +65,7 @@ class SrmpPlanner:
                  keep: bool = False):  # fmt: skip
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
-        options = {**CURVATURE, **BARRIER, **(options or {})}
+        options = {**CURVATURE, **SEARCH, **(options or {})}
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **options})
 
@@ -126,6 +126,7 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
                     flight.constants["leg"])  # fmt: skip
 
 
+@cache
 def launch_function(mass: float, gravity: float) -> ca.Function:
     """The pendulum's CoM, momentum, inertia (each with rates), ground force and pivot torque from (q, v, a), 4 each."""
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
@@ -141,7 +142,7 @@ def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
     c, ones = flight.constants, np.ones_like(t)
     nodes = flight.t
     # theta between nodes: the cubic through the node values with the exact rates L / rho
-    theta = CubicHermiteSpline(nodes, flight.z[:, 0], c["L"] / flight.q[:, 0])(t)
+    theta = _cubic(nodes, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
     rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
     # leg length from take-off to touchdown: smooth, only the ends matter (the rod has no mass)
     s = t / flight.duration
@@ -158,3 +159,13 @@ def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
     com_v = np.stack([c["vel_x"] * ones, c["vel_z"] - task.gravity * t], -1)
     com_a = np.stack([0 * ones, -task.gravity * ones], -1)
     return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)
+
+
+def _cubic(nodes, values, rates, t):
+    """The cubic pieces through values and rates at nodes, at times ``t``."""
+    k = np.clip(np.searchsorted(nodes, t, side="right") - 1, 0, len(nodes) - 2)
+    h = nodes[k + 1] - nodes[k]
+    s = (t - nodes[k]) / h
+    rise = values[k + 1] - values[k]
+    first, last = h * rates[k], h * rates[k + 1]
+    return values[k] + s * (first + s * (3 * rise - 2 * first - last + s * (first + last - 2 * rise)))

@@ -58,7 +58,7 @@ def capability(envelope: Reach, gravity: float, settings: SrmpSettings = SrmpSet
     square, step, reached = 0.0, phi[1] - phi[0], np.zeros_like(phi)
     for k in range(1, len(phi)):
         fade = (speed[k] - reached[k - 1]) / ((1 - settings.corner_speed) * speed[k])
-        push = force[k] * float(np.clip(fade, 0.0, 1.0)) / envelope.mass - gravity
+        push = force[k] * min(max(fade, 0.0), 1.0) / envelope.mass - gravity
         square = max(square + 2 * step * push, 0.0)
         reached[k] = math.sqrt(square)
     best = float(np.max(np.minimum(reached, settings.speed_share * speed)))

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
@@ -104,6 +103,8 @@ class FlipPlanner(WholeBodyPlanner):
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""
+        from scipy.interpolate import PchipInterpolator  # a third of a second that other jumps need not wait for
+
         way = 1 if task.rotation_rad > 0 else -1
         knots = np.array([self.stance, *POSTURES[way]])
         knots[-1] += task.rotation_rad - way * 2 * np.pi

@@ -26,6 +26,15 @@ POSTURES = {"crouch": (1.6, 0.65, 0.0, 0.5), "take-off": (0.4, 0.25, 0.35, -1.0)
 FINE = {"tol": 1e-4, "compl_inf_tol": 1e-5}
 # our choice: the coarse solution is only a start, digits beyond these would be lost on the finer mesh
 COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
+# our choice: over so much of a phase, angles and rates of a roll-out's guess are averaged before the coarse mesh; they
+# jump from one QP to the next, and it took 34 iterations instead of 26 to forget that
+GUESS_WIDTHS = (0.05, 0.2)
+# our choice: stage 2's motion is near enough for small multipliers; over 16 targets the coarse mesh then takes 22
+# iterations instead of 26. From the naive guess the direct planner takes more with them, so it keeps ipopt's own
+NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
+# our choice: the coarse motion is a good start on the fine mesh, its multipliers are not: 8 iterations instead of 10
+REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-3, "bound_push": 1e-3, "bound_frac": 1e-3,
+           "slack_bound_push": 1e-3, "slack_bound_frac": 1e-3}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,12 +102,16 @@ class WholeBodyPlanner:
         self.stance = stance_angles(robot)
         options = dict(options or {})
 
-        def build(mesh: Mesh, extra: Mapping) -> Nlp:
-            return Nlp(build_problem(robot, mesh, limits, weights, tracking=tracking), {**extra, **options},
-                       f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None)  # fmt: skip
+        problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
 
-        self.nlp = build(mesh, FINE)
-        self._coarse = build(mesh.coarse(), COARSE) if (tracking if refine is None else refine) else None
+        def build(mesh: Mesh, extra: Mapping, like: Nlp | None = None) -> Nlp:
+            key = f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None
+            return Nlp(problem.on_mesh(mesh.intervals()), {**extra, **options}, key, like)
+
+        self.nlp, self._coarse = build(mesh, FINE), None
+        if tracking if refine is None else refine:
+            self._coarse = build(mesh.coarse(), {**COARSE, **(NEAR if tracking else {})}, self.nlp)
+            self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
@@ -122,7 +135,7 @@ class WholeBodyPlanner:
         guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
         if near is not None:
             try:
-                return WholeBodyPlan(task, self._from(near.solution, srmp, parameters, how))
+                return WholeBodyPlan(task, self._from(near.solution, self._warm, srmp, parameters, how))
             except SolverError:
                 pass  # as if there had been none
         if self._coarse is not None:
@@ -136,14 +149,16 @@ class WholeBodyPlanner:
 
     def _refine(self, task, srmp, guess, parameters, how) -> WholeBodyPlan:
         mesh = self.mesh.coarse()
+        if self.tracking:
+            guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
         first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
-        return WholeBodyPlan(task, self._from(first, srmp, parameters, how), first.statistics)
+        return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
 
-    def _from(self, known: Solution, srmp, parameters, how) -> Solution:
+    def _from(self, known: Solution, nlp: Nlp, srmp, parameters, how) -> Solution:
         """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
-        return self._warm.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
+        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
                                 references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
