@@ -14,6 +14,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan, SrmpPlanner
+from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
@@ -143,6 +144,7 @@ class Planner:
             build = {
                 "reach": lambda: reach(self.robot),
                 "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
+                "srmp flip": lambda: SrmpPlanner(self.robot, SrmpSettings().of_flip(), keep=self.keep),
                 "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
                 "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
                 "whole body flip": lambda: FlipPlanner(self.robot),
@@ -189,7 +191,7 @@ class Planner:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
-        srmp, joints, skipped = self.stage("srmp").plan(task), None, None
+        srmp, joints, skipped = self.stage("srmp flip").plan(task), None, None
         last = self.stage("whole body flip")
         rows = [_row("1 SRMP", srmp.solution.statistics)]
         try:
@@ -198,7 +200,7 @@ class Planner:
         except SolverError as e:
             skipped = f"{e}; stage 3 began from postures of a flip instead"
         guess = None if joints is None else guess_from_joints(joints, last, task, srmp.toe_s)
-        body = last.plan(task, srmp, guess=guess)
+        body = last.plan(task, srmp, guess=guess, stage1=self.stage("srmp flip").plan)
         rows = (*rows, *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
                         skipped)  # fmt: skip

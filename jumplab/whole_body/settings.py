@@ -33,7 +33,9 @@ class Limits:
     capture_slope_s: float = 0.13
     capture_window_m: tuple[float, float] = (-0.02, 0.02)
     capture_moment: float | None = None  # if set, [kg m^2/s] about the sole's middle at touchdown, not the window
-    jerk: float | None = None  # if set, box on the links' jerk in toe phase and flight [rad/s^3]
+    envelope_between: bool = False  # torque against speed is looked at between the nodes too
+    cop_reserve_m: float = 0.0  # kept from both ends of the sole besides, until the last of the flat-foot phase
+    jerk_step: float | None = None  # if set, most that the jerk of a joint or of the trunk jumps by [rad/s^3]
     flight_clear: tuple[str, ...] = ("hand", "mid-arm", "knee")  # points that stay clear in flight ...
     flight_clearance_m: float = 0.05  # ... by this much
     momentum_share: float = 0.01  # L at take-off within this share of stage 1's
@@ -50,7 +52,7 @@ class Limits:
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
-                       jerk=13_500.0, momentum_share=0.15)  # fmt: skip
+                       jerk_step=30_000.0, envelope_between=True, toe_s=(0.06, 0.30), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Weights:
 
     def of_flip(self) -> Weights:
         """The same for a jump that turns over: limbs in haste, whose jerk must not jump between nodes."""
-        return replace(self, jerk=5 * self.jerk)
+        return replace(self, jerk=2.5 * self.jerk)
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Mesh:
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over: the wrench changes faster while the heel is up, the tuck in flight."""
-        return replace(self, flat=3 * self.flat // 2, toe=3 * self.toe // 2, flight=3 * self.flight // 2)
+        return replace(self, flat=3 * self.flat // 2, toe=2 * self.toe, flight=3 * self.flight // 2)
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
