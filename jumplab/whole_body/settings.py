@@ -52,7 +52,7 @@ class Limits:
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, capture_moment=4.0, flight_clear=points, flight_clearance_m=0.06,
-                       jerk_step=30_000.0, envelope_between=True, toe_s=(0.06, 0.30), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
+                       jerk_step=31_000.0, envelope_between=True, toe_s=(0.06, 0.45), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Mesh:
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over: the wrench changes faster while the heel is up, the tuck in flight."""
-        return replace(self, flat=3 * self.flat // 2, toe=2 * self.toe, flight=3 * self.flight // 2)
+        return replace(self, flat=3 * self.flat // 2, toe=2 * self.toe, flight=2 * self.flight)
 
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
