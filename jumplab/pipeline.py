@@ -25,6 +25,7 @@ METHODS = ("three-step", "direct")
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
 QP = Options()  # of stage 2, as every plan uses them
 SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
+OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -198,9 +199,14 @@ class Planner:
             joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", options=QP)
             rows.append(_joint_row(joints))
         except SolverError as e:
-            skipped = f"{e}; stage 3 began from postures of a flip instead"
-        guess = None if joints is None else guess_from_joints(joints, last, task, srmp.toe_s)
-        body = last.plan(task, srmp, guess=guess, stage1=self.stage("srmp flip").plan)
+            skipped = f"{e}; {OTHERWISE}"
+        body, climb = None, self.stage("srmp flip").plan
+        if joints is not None:
+            try:
+                body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
+            except SolverError as e:
+                skipped, joints = f"stage 2: its motion led nowhere ({e}); {OTHERWISE}", None
+        body = body or last.plan(task, srmp, stage1=climb)
         rows = (*rows, *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
                         skipped)  # fmt: skip

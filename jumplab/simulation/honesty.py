@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from jumplab.simulation.result import SimulationResult
 
 STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
-WINDOW = 100  # [steps] our choice: over 0.1 s the engine's error in quick swings and impacts, first order, cancels
-# our choice: at least 1.7 times the engine's own error in honest jumps (8.6 N, 3.1 N m and 0.6 N m were seen with
-# re-aimed legs; 25 N if averaged over 20 ms). What can hide below is 4 % of the weight, or 0.04 m/s once
-UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 15.0, 6.0, 3.0
+WINDOW = 100  # [steps] our choice: 0.1 s; a push shorter than that counts by its mean
+# our choice: honest jumps and flips, perturbed or not, leave 2e-11 N, 0.02 N m and 0.1 N m, the last two where the servo's
+# torque is averaged over an impact. What can hide below is 0.3 % of the weight
+UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 1.0, 0.5, 1.0
 NUMERIC = 1e-6  # [N m] rounding
 JUMP_M = 1e-4  # [m, rad] our choice: the engine's own step is kept to 1e-5
 STOP_RAD = 0.02  # our choice: this close to its stop, a joint may lean on it
@@ -112,8 +112,8 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
 def _accelerations(result: SimulationResult, robot: Robot) -> np.ndarray:
     """Accelerations (N - 1, nv) of the engine's steps.
 
-    The engine steps the velocity of the base's CoM in world axes. Differences of the base twist in its own, turning axes
-    would be off by half a step's turn: 17 N in a flip.
+    The engine steps the velocity of the base's CoM in world axes. Differences of the base twist in its own axes, which
+    turn within the step, would be off by 17 N in a flip.
     """
     arm = robot.model.inertias[1].lever  # from the base's origin to its CoM, base axes
     turn = np.array([pin.Quaternion(w, x, y, z).toRotationMatrix() for x, y, z, w in result.q[:, 3:7]])

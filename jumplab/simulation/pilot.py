@@ -13,8 +13,8 @@ from jumplab.simulation.playback import Command, Playback
 from jumplab.simulation.reaim import Reaim, pitch_of
 from jumplab.simulation.reference import LEAD_S, Forecast, LandingAhead, LandingSource, landing_planner
 from jumplab.simulation.scene import Scene
-from jumplab.simulation.world import STEP_S
 from jumplab.simulation.tuck import FROM_SHARE, Tuck, is_flip
+from jumplab.simulation.world import STEP_S
 from jumplab.trajectory import Tape
 
 LANDINGS = ("planned", "spring")

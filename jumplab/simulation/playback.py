@@ -75,7 +75,7 @@ class Playback:
         self._corrected = self._rest
 
     def shifted(self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction) -> Command:
-        """As :meth:`command` in flight, the tape read ``shift_s`` later than ``step`` says, ``1 + pace`` times as fast."""
+        """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
         at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
         if at >= self.steps:
             return self.command(self.steps, q, v, correction)

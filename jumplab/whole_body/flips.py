@@ -21,7 +21,7 @@ from jumplab.whole_body.settings import Limits, Mesh, Weights
 from jumplab.whole_body.terms import WholeBodyTerms
 
 # our choice: a solve that needs more is lost; of 36 plans the coarse mesh took 107 iterations at most, the fine one 126
-EFFORT = {"max_iter": 150, "max_wall_time": 15.0}
+EFFORT = {"max_iter": 150, "max_wall_time": 30.0}
 # our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
 # Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
@@ -41,8 +41,8 @@ POSTURES = {
 }  # fmt: skip
 FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # our choice: how long the phases of the launch last in those solutions
 FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # our choice: of the flat foot, when its postures are
-EASY_M = 0.5  # our choice: searches from postures end well up to here; beyond, two in three of 0.7 m did not
-CLIMB_M = 0.07  # our choice: from flip to flip on the way up; steps of 0.1 m lost one in four
+EASY_M = 0.5  # our choice: searches from postures end well up to here; of those at 0.7 m two in three did not
+CLIMB_M = 0.04  # our choice: from flip to flip on the way up; with steps of 0.07 m two in six of 0.7 m got lost
 LOW_M = 0.03  # our choice: the CoM touches down this much above its take-off height
 
 

@@ -13,7 +13,6 @@ from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
 from jumplab.whole_body.settings import Limits, Weights
 
-
 JERK_SCALE = 2000.0  # [rad/s^3] our choice: as in SCALES of the problem
 RESERVE_SHARE = 0.1, 0.15  # our choice: of the flat-foot phase, over which the CoP's reserve comes and goes
 
