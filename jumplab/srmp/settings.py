@@ -47,7 +47,7 @@ class SrmpSettings:
         """The same for a jump that turns over.
 
         Trunk and arms swing upward with the legs' extension, so a flip leaves the ground faster than legs alone would:
-        whole-body plans within the motors' limits rise 0.7 m, where the legs' line refuses 0.68 m. No whole-body plan had
-        more than 29 kg m^2/s: the turn is had by folding, not by more momentum in an open body.
+        whole-body plans within the motors' limits rise 0.7 m, where the legs' line refuses 0.68 m. No whole-body plan
+        had more than 29 kg m^2/s: the turn is had by folding, not by more momentum in an open body.
         """
         return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0))
