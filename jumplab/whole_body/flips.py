@@ -79,7 +79,7 @@ class FlipPlanner(WholeBodyPlanner):
             After some seconds, if a search ends without a plan; it says at which height.
         """
         how = dict(weights=weights, off=off, explain=False)
-        way = [task] if guess is not None or (self.tracking and stage1 is None) else _heights(task)
+        way = [task] if guess is not None or (self.tracking and stage1 is None) else climb(task)
         plans = [srmp if t is task or not self.tracking else stage1(t) for t in way]
         try:
             solution, first = self._search(way[0], plans[0], guess or self.naive_guess(way[0]), how)
@@ -141,7 +141,7 @@ class FlipPlanner(WholeBodyPlanner):
         return out
 
 
-def _heights(task: JumpTask) -> list[JumpTask]:
+def climb(task: JumpTask) -> list[JumpTask]:
     """The target, preceded by lower ones if it is high: the first is as high as a guess is good for."""
     steps = max(0, math.ceil((task.height_m - EASY_M) / CLIMB_M - 1e-9))
     return [replace(task, height_m=EASY_M + (task.height_m - EASY_M) * k / steps) for k in range(steps)] + [task]
