@@ -20,8 +20,8 @@ from jumplab.whole_body.problem import build_problem
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 from jumplab.whole_body.terms import WholeBodyTerms
 
-# our choice: a solve that needs more is lost; of 36 plans the coarse mesh took 107 iterations at most, the fine one 126
-EFFORT = {"max_iter": 150, "max_wall_time": 30.0}
+# our choice: a solve that needs more is lost; of 36 plans the coarse mesh took 94 iterations at most, the fine one 112
+EFFORT = {"max_iter": 150, "max_wall_time": 15.0}
 # our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
 # Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
@@ -66,7 +66,7 @@ class FlipPlanner(WholeBodyPlanner):
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
              stage1: Callable[[JumpTask], SrmpPlan] | None = None) -> WholeBodyPlan:  # fmt: skip
-        """Solve for a target: two searches on the coarse mesh, then the fine one; a high flip by way of lower ones.
+        """Solve for a target: searches on the coarse mesh, then the fine one; a high flip by way of lower ones.
 
         Parameters
         ----------
@@ -82,7 +82,9 @@ class FlipPlanner(WholeBodyPlanner):
         way = [task] if guess is not None or (self.tracking and stage1 is None) else climb(task)
         plans = [srmp if t is task or not self.tracking else stage1(t) for t in way]
         try:
-            solution, first = self._search(way[0], plans[0], guess or self.naive_guess(way[0]), how)
+            searches = self._searches if guess is None else self._searches[:1]
+            start = guess or self.naive_guess(way[0])
+            solution, first = self._search(way[0], plans[0], start, searches, how)
             for easier, one in zip(way[1:], plans[1:], strict=True):
                 solution = self.nlp.solve(self.parameters(easier, one), solution.guess(),
                                           references=self.references(one, self.mesh), **how)  # fmt: skip
@@ -95,11 +97,11 @@ class FlipPlanner(WholeBodyPlanner):
             ) from e  # fmt: skip
         return WholeBodyPlan(task, solution, first)
 
-    def _search(self, task: JumpTask, srmp, guess, how) -> tuple[Solution, Statistics]:
+    def _search(self, task: JumpTask, srmp, guess, searches, how) -> tuple[Solution, Statistics]:
         """The fine solution from a guess, and what the coarse one before it cost."""
         parameters, failure = self.parameters(task, srmp), None
         start = {name: guess[name].resampled(n) for name, n in self.rough.intervals().items()}
-        for search in self._searches:
+        for search in searches:
             try:
                 first = search.solve(parameters, start, references=self.references(srmp, self.rough), **how)
                 fine = self.nlp.solve(parameters, self._refined(first), references=self.references(srmp, self.mesh),

@@ -129,7 +129,11 @@ class WholeBodyTerms:
 
     def ground_contact(self) -> list[Term]:
         """The ground only pushes, within the friction cone; the body stays clear of it. All ours."""
-        mu, mg = self.limits.friction, self.mg
+        mu, mg, least = self.limits.friction, self.mg, self.limits.least_push
+
+        def push(p):
+            flat = p.q.numel() == 4
+            return self.wrench(p)[1] - least * mg if least and flat else self.wrench(p)[1]
 
         def cone(p):
             f = self.wrench(p)
@@ -140,7 +144,7 @@ class WholeBodyTerms:
             suffix = "" if at == "node" else " (mid)"
             last = (0, 1) if at == "node" else (0, 0)
             rows += [
-                Term(f"unilateral{suffix}", "ours", "N", at, lambda p: self.wrench(p)[1], lower=0.0, upper=np.inf,
+                Term(f"unilateral{suffix}", "ours", "N", at, push, lower=0.0, upper=np.inf,
                      scale=mg, skip=last),
                 Term(f"friction{suffix}", "ours", "N", at, cone, lower=0.0, upper=np.inf, scale=mg, skip=last),
             ]  # fmt: skip
@@ -280,5 +284,5 @@ class WholeBodyTerms:
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
                  upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
             Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
-                 lower=-lim.capture_moment, upper=lim.capture_moment, scale=10.0),
+                 lower=lim.capture_moment[0], upper=lim.capture_moment[1], scale=10.0),
         ]  # fmt: skip
