@@ -49,7 +49,7 @@ class Limits:
         The trunk cannot stop before touchdown while L stays what the turn needed, so it may still turn (5 rad/s). Where
         the soles belong then depends on that momentum as much as on v_x: what counts is the angular momentum about the
         middle of the soles, which the impact does not change. Up to 4 kg m^2/s forward are caught; with 4 backward, to
-        the near heel, 3 of 22 playbacks fell. Flat feet keep a tenth of the weight: else flips of 0.7 m hop first.
+        the near heel, 3 of 22 playbacks fell. Flat feet keep 4 % of the weight: else flips of 0.7 m hop first.
         Torques would jump from node to node were the steps of the jerk not bounded; 32,000 rad/s^3 is what the audit's
         tape can follow. Stage 1's rod turns with other inertia than the body, so its L is followed to 15 %.
 
@@ -59,7 +59,7 @@ class Limits:
         need more than 0.9 s to wind up.
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
-        return replace(self, touchdown_trunk_rate=5.0, capture_moment=(0.0, 4.0), least_push=0.1, flight_clear=points,
+        return replace(self, touchdown_trunk_rate=5.0, capture_moment=(0.0, 4.0), least_push=0.04, flight_clear=points,
                        flight_clearance_m=0.06, jerk_step=31_000.0, envelope_between=True, flat_s=(0.25, 1.3),
                        toe_s=(0.06, 0.45), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
 
