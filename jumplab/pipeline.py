@@ -15,6 +15,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.solver import PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan, SrmpPlanner
+from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 from jumplab.trajectory import Tape
@@ -24,6 +25,7 @@ from jumplab.whole_body.planner import check_platform, platform_edge_m
 METHODS = ("three-step", "direct")
 GUESS_ARM_SHARE = 0.5  # our choice: stage 2's arms swing two to three times as far as stage 3's, one way or the other
 SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
+OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -146,6 +148,7 @@ class Planner:
             build = {
                 "reach": lambda: reach(self.robot),
                 "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
+                "srmp flip": lambda: SrmpPlanner(self.robot, SrmpSettings().of_flip(), keep=self.keep),
                 "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
                 "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
                 "whole body flip": lambda: FlipPlanner(self.robot),
@@ -192,16 +195,21 @@ class Planner:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
-        srmp, joints, skipped = self.stage("srmp").plan(task), None, None
+        srmp, joints, skipped = self.stage("srmp flip").plan(task), None, None
         last = self.stage("whole body flip")
         rows = [_row("1 SRMP", srmp.solution.statistics)]
         try:
             joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
             rows.append(_joint_row(joints))
         except SolverError as e:
-            skipped = f"{e}; stage 3 began from postures of a flip instead"
-        guess = None if joints is None else guess_from_joints(joints, last, task, srmp.toe_s)
-        body = last.plan(task, srmp, guess=guess)
+            skipped = f"{e}; {OTHERWISE}"
+        body, climb = None, self.stage("srmp flip").plan
+        if joints is not None:
+            try:
+                body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
+            except SolverError as e:
+                skipped, joints = f"stage 2: its motion led nowhere ({e}); {OTHERWISE}", None
+        body = body or last.plan(task, srmp, stage1=climb)
         rows = (*rows, *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
                         skipped)  # fmt: skip

@@ -1,18 +1,24 @@
 """Flips: the guess turns, the plan turns, its physics is looked at by other code, and the robot lands it."""
 
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from jumplab import passport
 from jumplab.errors import InputError, SolverError
+from jumplab.expansion import planar_quantities
+from jumplab.experiments.trial import TrialKey
 from jumplab.pipeline import Planner
 from jumplab.plotting.flips import trunk_angle
 from jumplab.robot import load_robot
-from jumplab.simulation import simulate_jump
+from jumplab.simulation import Perturbation, simulate_jump
+from jumplab.simulation.tuck import Tuck, is_flip
 from jumplab.task import JumpTask
 from jumplab.whole_body import FlipPlanner, Limits, Mesh, Weights
+from jumplab.whole_body.flips import CLIMB_M, EASY_M, climb
+from jumplab.whole_body.terms import RESERVE_SHARE, WholeBodyTerms
 
 TURN = 2 * np.pi
 
@@ -41,12 +47,21 @@ def test_guess_turns_as_asked_and_goes_where_it_should(turns):
 
 def test_a_jump_keeps_its_own_limits():
     """What flips need is a copy: jumps without rotation have another planner and the settings of before."""
-    assert Limits().capture_moment is None and Limits().jerk is None
+    assert Limits().capture_moment is None and Limits().jerk_step is None and Limits().cop_reserve_m == 0
     assert Limits().touchdown_trunk_rate == 1.0 and Limits().of_flip().touchdown_trunk_rate == 5.0
     assert Limits().of_flip().torque_share == Limits().torque_share == 0.85  # the stated margin
     assert Mesh() == Mesh(25, 20, 30) and Weights().jerk < Weights().of_flip().jerk
     assert isinstance(planner().stage("direct flip"), FlipPlanner)
     assert not isinstance(planner().stage("direct"), FlipPlanner)
+
+
+def test_a_high_flip_is_reached_by_lower_ones():
+    task = JumpTask(0.2, 0.7, rotation_rad=TURN)
+    way = climb(task)
+    assert way[0].height_m == EASY_M and way[-1] is task
+    assert max(b.height_m - a.height_m for a, b in pairwise(way)) <= CLIMB_M + 1e-9
+    assert all((t.distance_m, t.rotation_rad) == (0.2, TURN) for t in way)
+    assert climb(JumpTask(0.2, EASY_M, rotation_rad=TURN)) == [JumpTask(0.2, EASY_M, rotation_rad=TURN)]
 
 
 def test_rotation_is_whole_turns():
@@ -61,6 +76,51 @@ def test_backflip_passes_the_audit():
     assert [c.name for c in audit.checks if not c.passed] == []
     turned = np.ptp(trunk_angle(plan.tape.q)[[0, -1]])
     assert abs(turned - TURN) < 0.35  # the trunk may lean by 0.3 rad at touchdown
+
+
+@pytest.mark.slow
+def test_launch_keeps_its_cop_off_the_edges_and_its_jerks_even():
+    """From the solution's own nodes: 3 cm while nothing else holds the robot, and bounded steps of jerk."""
+    plan = backflip()
+    limits, phases, sagittal = Limits().of_flip(), plan.whole_body.solution.phases, plan.robot.sagittal
+    n = len(phases["flat"].j)
+    angles, rates, accels = (np.insert(getattr(phases["flat"], k), 0, 0.0, axis=1) for k in "qva")
+    wrench = planar_quantities(plan.robot, angles, rates, accels, np.zeros((n + 1, 2)), 9.8)["ground_wrench"]
+    cop = -wrench[:, 2] / wrench[:, 1]  # from the toe
+    held = slice(int(RESERVE_SHARE[0] * n) + 1, int((1 - RESERVE_SHARE[1]) * n))
+    assert cop[held].max() < -limits.cop_reserve_m + 1e-4
+    assert cop[held].min() > sagittal.heel[0] + limits.cop_margin_m + limits.cop_reserve_m - 1e-4
+    jerks = np.concatenate([np.insert(phases["flat"].j, 0, 0.0, axis=1), phases["toe"].j, phases["flight"].j])
+    relative = np.array([WholeBodyTerms.relative(j).full().ravel() for j in jerks])
+    assert np.abs(np.diff(relative, axis=0)).max() <= limits.jerk_step * 1.001
+
+
+@pytest.mark.slow
+def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
+    """With the plan's own L the forecast, int (L - h) / I dt, ends where the tape does."""
+    plan = backflip()
+    tape, tuck = plan.tape, Tuck(plan.robot, plan.tape)
+    assert is_flip(tape)
+    L = float(np.ravel(tape.extra["planar_L"])[-1])
+    row = tape.takeoff_index + 1
+    turn = tuck._left(0.0, float(tape.t[row]), float(tape.t[-1] - tape.t[row]), L)
+    assert abs(turn - (trunk_angle(tape.q)[-1] - trunk_angle(tape.q)[row])) < 0.02
+    at = row + 280
+    now, left = float(tape.t[at]), float(tape.t[-1] - tape.t[at])
+    longer, shorter = (abs(tuck._left(size, now, left, L)) for size in (-0.03, 0.03))
+    assert longer > abs(tuck._left(0.0, now, left, L)) + 0.05 > shorter + 0.1
+    shift, _ = tuck.shift(round(now * 1000), tape.q[at], tape.v[at], left)
+    assert abs(shift) <= 1e-3 and abs(tuck.miss) < 0.02  # nothing to mend
+
+
+@pytest.mark.slow
+def test_a_perturbed_backflip_arrives_as_planned_and_lands():
+    """A robot that over-rotates by 0.4 rad and falls if its tuck opens by the clock."""
+    plan = backflip()
+    seed = TrialKey(0, 2, "", "").robot_seed
+    result = simulate_jump(plan.tape, plan.robot, perturbation=Perturbation.draw(plan.robot, seed), reaim=True)
+    assert result.landed and result.honest, result.reason
+    assert abs(result.metrics.touchdown_trunk_pitch_rad - trunk_angle(plan.tape.q)[-1]) < 0.15
 
 
 @pytest.mark.slow
@@ -85,6 +145,7 @@ def test_backflip_lands(mode):
     assert result.landed, result.reason
     down = int(np.searchsorted(result.t, result.metrics.touchdown_s))
     assert abs(trunk_angle(result.q)[down] - trunk_angle(plan.tape.q)[-1]) <= 0.15
+    assert result.metrics.touchdown_trunk_pitch_rad == pytest.approx(trunk_angle(result.q)[down])  # turns counted
     assert abs(result.metrics.com_rise_m - 0.5) < 0.03
 
 
@@ -103,5 +164,5 @@ def test_three_steps_say_what_they_skipped():
 def test_a_flip_beyond_the_robot_is_refused_in_words():
     """Little effort stands for a hard target: no plan, and no minute of searching."""
     flips = FlipPlanner(load_robot(), tracking=False, options={"max_iter": 3})
-    with pytest.raises(SolverError, match="two searches from a flip's postures ended so"):
+    with pytest.raises(SolverError, match="every search from a flip's postures ended so"):
         flips.plan(JumpTask(0.0, 0.5, rotation_rad=TURN))

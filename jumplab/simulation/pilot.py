@@ -13,6 +13,7 @@ from jumplab.simulation.playback import Command, Playback
 from jumplab.simulation.reaim import Reaim, pitch_of
 from jumplab.simulation.reference import LEAD_S, Forecast, LandingAhead, LandingSource, landing_planner
 from jumplab.simulation.scene import Scene
+from jumplab.simulation.tuck import FROM_SHARE, Tuck, is_flip
 from jumplab.simulation.world import STEP_S
 from jumplab.trajectory import Tape
 
@@ -52,7 +53,9 @@ class Pilot:
         if self.ahead.source == "planned":
             self._prepare()
         self._reaim = Reaim(robot, tape, scene) if reaim else None
+        self._tuck = Tuck(robot, tape) if reaim and is_flip(tape) else None
         flight = tape.t[-1] - tape.takeoff_time
+        self._tucked = round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S)
         self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
         self._none = np.zeros(len(robot.joint_names))
         self._tau = self._none
@@ -74,9 +77,9 @@ class Pilot:
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` from measured state and vertical foot forces."""
         if self.touchdown is None:
-            if step < self._earliest:
+            if step < (self._earliest if self._tuck is None else min(self._earliest, self._tucked)):
                 return self._playback.command(step, q, v, self._none)
-            if force.sum() <= TOUCHDOWN_FORCE_N:
+            if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, q, v)
             self._touch(step, q, v)
         since = step - self.touchdown
@@ -85,13 +88,16 @@ class Pilot:
         return Command(tau=self._tau)
 
     def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
-        left = self._forecast.time_left(q, v)
+        left, shift = self._forecast.time_left(q, v), None
+        if self._tuck is not None:
+            shift = self._tuck.shift(step, q, v, left)
         if left <= LEAD_S:
             self._look_ahead(step, q, v, left)
         aimed = self._none
         if self._reaim is not None:
-            aimed = self._reaim.correction(q, v, self._playback.trunk_pitch(step))
-        command = self._playback.command(step, q, v, aimed)
+            aimed = self._reaim.correction(q, v, self._error(step, q))
+        command = (self._playback.command(step, q, v, aimed) if shift is None
+                   else self._playback.shifted(step, *shift, q, v, aimed))  # fmt: skip
         return replace(command, share=YIELD_SHARE) if left <= YIELD_S else command
 
     def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
@@ -100,11 +106,15 @@ class Pilot:
             return
         there = q, v
         if left > 0:
-            error = pitch_of(q) - self._playback.trunk_pitch(step)
-            error = float(np.arctan2(np.sin(error), np.cos(error)))
+            error = self._error(step, q)
             correction = None if self._reaim is None else self._reaim.wish(q, v, error)
             there = self._forecast.state(q, v, error, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
+
+    def _error(self, step: int, q: np.ndarray) -> float:
+        """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
+        error = pitch_of(q) - self._playback.trunk_pitch(step) if self._tuck is None else self._tuck.miss
+        return float(np.arctan2(np.sin(error), np.cos(error)))
 
     def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         self.touchdown = step

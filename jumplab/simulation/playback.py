@@ -74,6 +74,19 @@ class Playback:
         self._takeoff = round(tape.takeoff_time / STEP_S)
         self._corrected = self._rest
 
+    def shifted(self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction) -> Command:
+        """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
+        at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
+        if at >= self.steps:
+            return self.command(self.steps, q, v, correction)
+        ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
+        rate = (1 + pace) * rate
+        if self.mode == "position":
+            return Command(q=ahead + correction, rate=rate)
+        change, self._corrected = (correction - self._corrected) / STEP_S, correction
+        wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * (angles + correction - q[7:]) + rate + change - v[6:])
+        return Command(tau=tau + self._inertia(q) @ wish)
+
     def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
         """Command for one step; the measured state is read in "pd" mode only, ``correction`` is added to the angles."""
         now = min(step, self.steps)
@@ -128,6 +141,12 @@ class Motors:
 
 def _resample(grid: np.ndarray, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(grid, t, c) for c in columns.T], axis=1)
+
+
+def _between(rows: np.ndarray, at: float) -> np.ndarray:
+    """The row (k,) at a place between two."""
+    low = min(int(at), len(rows) - 2)
+    return rows[low] + (at - low) * (rows[low + 1] - rows[low])
 
 
 def _pitch(q: np.ndarray) -> np.ndarray:

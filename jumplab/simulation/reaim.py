@@ -62,18 +62,16 @@ class Reaim:
         tilt = np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])
         return np.array([middle[0] - com[0], tilt, com[2] - middle[2]])
 
-    def correction(self, q: np.ndarray, v: np.ndarray, planned_pitch: float) -> np.ndarray:
+    def correction(self, q: np.ndarray, v: np.ndarray, error: float) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
 
         Parameters
         ----------
         q, v : measured state.
-        planned_pitch : of the trunk, now [rad].
+        error : of the trunk's pitch at touchdown, as now or as forecast [rad], within half a turn.
         """
         middle = self._sole_middle(q)
         if middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M:
-            error = pitch_of(q) - planned_pitch
-            error = np.arctan2(np.sin(error), np.cos(error))
             most = RATE * STEP_S
             self._now = self._now + np.clip(self.wish(q, v, error) - self._now, -most, most)
         return self._now

@@ -82,7 +82,7 @@ class Recorder:
         soles_ahead = pitch = None
         if down:
             soles_ahead = float(self._feet_middle(log["q"][touchdown])[0] - com[touchdown, 0])
-            pitch = _pitch(log["q"][touchdown])
+            pitch = _counted(np.array([_pitch(q) for q in log["q"][: touchdown + 1]]))
         return Metrics(
             foot_distance_m=self._toe_at(log, -1) - start if down else None,
             foot_distance_touchdown_m=self._toe_at(log, touchdown) - start if down else None,
@@ -186,3 +186,9 @@ def _xz(vector: np.ndarray) -> tuple[float, float]:
 def _pitch(q: np.ndarray) -> float:
     x, y, z, w = q[3:7]
     return float(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
+
+
+def _counted(pitch: np.ndarray) -> float:
+    """The last of pitches (N,) within half a turn [rad], with the whole turns since the first added."""
+    turns = round((float(np.unwrap(pitch)[-1]) - float(pitch[-1])) / (2 * np.pi))
+    return float(pitch[-1]) + turns * 2 * np.pi

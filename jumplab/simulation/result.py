@@ -34,7 +34,7 @@ class Metrics:
         sole's first edge stops within one step, which turns the light foot faster than any motor for some milliseconds.
     self_collision_s : time during which links of the robot pressed on each other [s].
     stray_contacts : links other than the feet that touched ground or platform before touchdown.
-    touchdown_trunk_pitch_rad, touchdown_com_velocity : at touchdown [rad], (x, z) [m/s].
+    touchdown_trunk_pitch_rad, touchdown_com_velocity : at touchdown [rad], whole turns counted; (x, z) [m/s].
     sole_ahead_m : middle of the soles minus CoM at touchdown.
     launch_impulse, landing_impulse : ground impulse (x, z) until lift-off, and in the 0.1 s after touchdown [N s].
     qp_solves, qp_failures : of the landing controller.

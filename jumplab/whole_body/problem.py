@@ -6,13 +6,19 @@ from dataclasses import replace
 
 import casadi as ca
 
+from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot import SAGITTAL_LINKS as LINKS
-from jumplab.robot import Robot
 from jumplab.terms import Bound, Phase, Problem, Term
 from jumplab.whole_body.settings import Limits, Mesh, Weights
 from jumplab.whole_body.terms import WholeBodyTerms
 
-SCALES = {"q": 1.0, "v": 10.0, "a": 100.0, "j": 2000.0}  # our choice: peaks seen in solutions, for conditioning
+SCALES = {
+    "q": 1.0,
+    "v": 10.0,
+    "a": 100.0,
+    "j": 2000.0,
+    "z": 2000.0,
+}  # our choice: peaks seen in solutions, for conditioning
 
 
 TRACKED = {"rho": 1, "rho_rate": 1, "velocity": 2, "L": 1}  # references in launch; the first two also in flight
@@ -32,7 +38,8 @@ def _continuity(left: str, right: str) -> Term:
     def jump(ends):
         a, b = ends[left].end, ends[right].start
         scaled = ((a.q, b.q, "q"), (a.v, b.v, "v"), (a.a, b.a, "a"))
-        return ca.vertcat(*((_with_foot(x) - _with_foot(y)) / SCALES[key] for x, y, key in scaled))
+        rows = [(_with_foot(x) - _with_foot(y)) / SCALES[key] for x, y, key in scaled]
+        return ca.vertcat(*rows, *([(a.z - b.z) / SCALES["z"]] if a.z.numel() else []))
 
     return Term(f"{left} to {right}", "WF-L1..L3", "scaled", "problem", jump, identity=True)
 
@@ -48,19 +55,12 @@ def _flat_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     return Phase("flat", LINKS[1:], mesh.flat, limits.flat_s, tuple(terms), start, scales=SCALES)
 
 
-def _jerk_box(limits: Limits) -> tuple[Bound, ...]:
-    """None for jumps that do not turn over."""
-    if limits.jerk is None:
-        return ()
-    return (Bound("jerk box", "ours: flips", "rad/s^3", "j", -limits.jerk, limits.jerk),)
-
-
 def _toe_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     # inner: at the first node the flat foot before it says so already, and a bound on top has multipliers without limit
     low, high = [0.0] + 4 * [-ANGLE_BOX_RAD], [limits.heel_up_rad] + 4 * [ANGLE_BOX_RAD]
     heel = Bound("heel not below ground", "WL-K2", "rad", "q", low, high, "inner")
     terms = b.smoothness(False) + b.limits_of_joints(False) + b.ground_contact() + b.toe_rows()
-    return Phase("toe", LINKS, mesh.toe, limits.toe_s, tuple(terms), (heel, *_jerk_box(limits)), scales=SCALES)
+    return Phase("toe", LINKS, mesh.toe, limits.toe_s, tuple(terms), (heel,), scales=SCALES)
 
 
 def _flight_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
@@ -68,8 +68,7 @@ def _flight_phase(b: WholeBodyTerms, mesh: Mesh, limits: Limits) -> Phase:
     constants = {"com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0), "vel_x": (*SPEED_BOX_M_S, 1.0),
                  "vel_z": (*SPEED_BOX_M_S, 1.0)}  # fmt: skip
     terms = b.smoothness(True) + b.limits_of_joints(True) + b.flight_rows()
-    bounds = (box, *_jerk_box(limits))
-    return Phase("flight", LINKS, mesh.flight, FLIGHT_S, tuple(terms), bounds, constants=constants, scales=SCALES)
+    return Phase("flight", LINKS, mesh.flight, FLIGHT_S, tuple(terms), (box,), constants=constants, scales=SCALES)
 
 
 def _ballistic(b: WholeBodyTerms) -> Term:
@@ -78,6 +77,21 @@ def _ballistic(b: WholeBodyTerms) -> Term:
         return ca.vertcat(s.com - ca.vertcat(c.com_x, c.com_z), s.com_velocity - ca.vertcat(c.vel_x, c.vel_z))
 
     return Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff, identity=True)
+
+
+def _even_jerk(b: WholeBodyTerms, *phases: Phase) -> list[Phase]:
+    """The phases with the jerks of joints and trunk as further states, which bound how far a jerk may jump."""
+    rest = Bound("no jerk before", "ours: flips", "rad/s^3", "z", 0.0, 0.0, "start")
+    names = tuple(f"jerk of {name}" for name in (*SAGITTAL_JOINTS, "trunk"))
+    return [
+        replace(
+            p,
+            states=names,
+            terms=p.terms + tuple(b.jerk_steps()),
+            bounds=p.bounds + ((rest,) if p is phases[0] else ()),
+        )
+        for p in phases
+    ]
 
 
 def _durations(weights: Weights) -> Term:
@@ -94,6 +108,8 @@ def build_problem(robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), 
     """Flat foot, toe and flight in one problem: stage 3 with ``tracking``, the direct planner without."""
     b = WholeBodyTerms(robot, limits, weights)
     flat, toe, flight = _flat_phase(b, mesh, limits), _toe_phase(b, mesh, limits), _flight_phase(b, mesh, limits)
+    if limits.jerk_step is not None:
+        flat, toe, flight = _even_jerk(b, flat, toe, flight)
     joints = (_continuity("flat", "toe"), _continuity("toe", "flight"), _ballistic(b))
     parameters = dict(stance=5, distance=1, platform=1, edge=1, takeoff_speed=1, rotation=1, gravity=1)
     if not tracking:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -10,6 +12,9 @@ from jumplab.robot import Robot
 from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
 from jumplab.whole_body.settings import Limits, Weights
+
+JERK_SCALE = 2000.0  # [rad/s^3] our choice: as in SCALES of the problem
+RESERVE_SHARE = 0.1, 0.15  # our choice: of the flat-foot phase, over which the CoP's reserve comes and goes
 
 
 class WholeBodyTerms:
@@ -84,16 +89,37 @@ class WholeBodyTerms:
                              lower=-peak, upper=peak, scale=100.0))  # fmt: skip
         rows.append(Term("torque-speed", "ours: motor line", "N m", "node", envelope, lower=-np.inf,
                          upper=np.concatenate([top, top]), scale=100.0))  # fmt: skip
+        if lim.envelope_between:
+            rows.append(replace(rows[-1], name="torque-speed (mid)", at="mid"))
         return rows
+
+    @staticmethod
+    def relative(x):
+        """Hip, knee, ankle, shoulder and trunk (5,) from absolute links' accelerations or jerks, (5,) or (4,)."""
+        x = ca.vertcat(0, x) if x.shape[0] == 4 else x
+        return ca.vertcat(x[2] - x[3], x[1] - x[2], x[0] - x[1], x[4] - x[3], x[3])
+
+    def jerk_steps(self) -> list[Term]:
+        """Jerks of joints and trunk, carried on in the states z, do not jump farther than they may."""
+        most = self.limits.jerk_step
+
+        def carried(left, right, step):
+            return right.z - self.relative(left.j)
+
+        def jump(left, right, step):
+            return self.relative(left.j) - left.z
+
+        return [
+            Term("jerk carried on", "ours: flips", "rad/s^3", "interval", carried, scale=JERK_SCALE, identity=True),
+            Term("jerk step", "ours: flips", "rad/s^3", "interval", jump, lower=-most, upper=most, scale=JERK_SCALE),
+        ]
 
     def smoothness(self, flying: bool) -> list[Term]:
         """Costs on joint accelerations and jerk (WL-J2, WF-J2), and ours on torques."""
         w = self.weights
 
         def accelerations(p):
-            s = self.state(p)
-            a = s.accels
-            return ca.vertcat(a[2] - a[3], a[1] - a[2], a[0] - a[1], a[4] - a[3], a[3])
+            return self.relative(self.state(p).accels)
 
         return [
             Term("joint acceleration", "WL-J2, WF-J2", "rad/s^2", "node", accelerations, weight=w.joint_acceleration),
@@ -103,7 +129,11 @@ class WholeBodyTerms:
 
     def ground_contact(self) -> list[Term]:
         """The ground only pushes, within the friction cone; the body stays clear of it. All ours."""
-        mu, mg = self.limits.friction, self.mg
+        mu, mg, least = self.limits.friction, self.mg, self.limits.least_push
+
+        def push(p):
+            flat = p.q.numel() == 4
+            return self.wrench(p)[1] - least * mg if least and flat else self.wrench(p)[1]
 
         def cone(p):
             f = self.wrench(p)
@@ -114,7 +144,7 @@ class WholeBodyTerms:
             suffix = "" if at == "node" else " (mid)"
             last = (0, 1) if at == "node" else (0, 0)
             rows += [
-                Term(f"unilateral{suffix}", "ours", "N", at, lambda p: self.wrench(p)[1], lower=0.0, upper=np.inf,
+                Term(f"unilateral{suffix}", "ours", "N", at, push, lower=0.0, upper=np.inf,
                      scale=mg, skip=last),
                 Term(f"friction{suffix}", "ours", "N", at, cone, lower=0.0, upper=np.inf, scale=mg, skip=last),
             ]  # fmt: skip
@@ -136,10 +166,14 @@ class WholeBodyTerms:
     def flat_rows(self) -> list[Term]:
         """Foot flat: the CoP stays within the sole (SL-P2 for the whole body)."""
         heel, margin, mg = self.model.heel[0], self.limits.cop_margin_m, self.mg
+        reserve, share = self.limits.cop_reserve_m, RESERVE_SHARE
 
         def cop(p):
             f = self.wrench(p)
-            return ca.vertcat(f[2], (-heel - margin) * f[1] - f[2])  # CoP behind the toe, ahead of the heel
+            rows = ca.vertcat(f[2], (-heel - margin) * f[1] - f[2])  # CoP behind the toe, ahead of the heel
+            if not reserve:
+                return rows
+            return rows - reserve * f[1] * ca.fmax(0, ca.fmin(1, ca.fmin(p.s / share[0], (1 - p.s) / share[1])))
 
         rows = []
         for at in ("node", "mid"):
@@ -253,5 +287,5 @@ class WholeBodyTerms:
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
                  upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
             Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
-                 lower=-lim.capture_moment, upper=lim.capture_moment, scale=10.0),
+                 lower=lim.capture_moment[0], upper=lim.capture_moment[1], scale=10.0),
         ]  # fmt: skip
