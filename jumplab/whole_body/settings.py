@@ -62,9 +62,10 @@ class Limits:
         need more than 0.9 s to wind up.
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
-        return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, capture_moment=(0.0, 4.0), least_push=0.04,
-                       flight_clear=points, flight_clearance_m=0.06, jerk_step=31_000.0, envelope_between=True, flat_s=(0.25, 1.3),
-                       toe_s=(0.06, 0.45), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
+        return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, capture_moment=(0.0, 4.0),
+                       least_push=0.04, flight_clear=points, flight_clearance_m=0.06, jerk_step=31_000.0,
+                       envelope_between=True, flat_s=(0.25, 1.3), toe_s=(0.06, 0.45), cop_reserve_m=0.03,
+                       momentum_share=0.15)  # fmt: skip
 
 
 @dataclass(frozen=True)
