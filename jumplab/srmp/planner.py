@@ -23,8 +23,9 @@ from jumplab.task import JumpTask
 # ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
 # iterations instead of 22 in the middle, and 40 instead of 43 at most
 CURVATURE = {"neg_curv_test_tol": 1e-12}
-# our choice: small multipliers at the start, and tolerances as in stage 3 (that of the rows stays): 14 iterations
-SEARCH = {"bound_mult_init_method": "mu-based", "mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5}
+# our choice: tolerances as in stage 3 (that of the rows stays), and a barrier that stays above a hundredth of them: 16
+# iterations in the middle, 43 at most
+SEARCH = {"mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5, "mu_min": 1e-6}
 
 
 def parameters(task: JumpTask, envelope: Reach) -> dict:
