@@ -40,8 +40,8 @@ class Gains:
 class LaunchWeights:
     """Weights of the launch QP's squared terms."""
 
-    com: float = 0.3  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
-    force: float = 3e-4  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
+    com: float = 1.0  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
+    force: float = 1e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
     # both forwards, feet flat: on the toes the CoP cannot move and an error in x grows as in a falling pendulum, so x
     # must be right when the heel rises
     com_x: float = 900.0
@@ -50,9 +50,9 @@ class LaunchWeights:
     # [cost] / [kg m^2/s^2]^2, feet flat; not printed: without it rho is left to chance. Where the hip is at its stop
     # the robot can have either rho or the CoM's height; this much keeps rho, and the height returns before take-off
     # because the weight fades to that on the toes over the last inertia_fade_s before the heel rises
-    inertia: float = 0.1
-    inertia_toe: float = 1.6e-4  # the same on the toes: more drives the ankle to its speed limit and costs speed
-    inertia_fade_s: float = 0.12  # [s]
+    inertia: float = 0.05
+    inertia_toe: float = 1.2e-4  # the same on the toes: more drives the ankle to its speed limit and costs speed
+    inertia_fade_s: float = 0.2  # [s]
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
