@@ -1,0 +1,186 @@
+"""Who commands in a chain: the standing controller between jumps, and one jump's pilot after the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jumplab.chains.foresight import Ahead, Foresight
+from jumplab.chains.posture import Gauge
+from jumplab.robot import Robot
+from jumplab.simulation.honesty import STAND_S
+from jumplab.simulation.landing import PERIOD_STEPS, LandingController
+from jumplab.simulation.pilot import Pilot
+from jumplab.simulation.playback import Command
+from jumplab.simulation.reaim import pitch_of
+from jumplab.simulation.reference import Forecast
+from jumplab.simulation.scene import Scene
+from jumplab.simulation.world import STEP_S
+
+FIRST_STAND_S = (
+    0.5  # our choice: the first plan, too, is made from a measured posture, once a push of the start is gone
+)
+# our choice: still enough to begin, found by measuring: the tape begins at rest, and what is left fades within BLEND_S
+STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25
+STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
+BLEND_S = 0.25  # our choice: a third of the launch, over before the push begins
+PATIENCE_S = 3.0  # our choice: who is not still this long after touchdown will not be
+
+
+class ChainPilot:
+    """Commands of a whole chain.
+
+    Parameters
+    ----------
+    foresight : makes the plans.
+    robot : as planned, crouching.
+    scene : ground of the course.
+    landing : "planned" or "spring", as for a single jump.
+    look_s : when the next jump is planned, from touchdown on [s]; negative: so long before it is due.
+
+    Attributes
+    ----------
+    ahead : plans so far, in the order of the jumps.
+    began : step at which each jump began.
+    over : why the chain goes on no more; empty while it does.
+    """
+
+    def __init__(self, foresight: Foresight, robot: Robot, scene: Scene, landing: str, look_s: float):
+        self._foresight, self._robot, self._scene, self._landing = foresight, robot, scene, landing
+        self._look_s, self._gauge = look_s, Gauge(robot)
+        self._stand, self._tau = LandingController(robot), np.zeros(len(robot.joint_names))
+        self._not_arms = _legs(robot)
+        self.ahead: list[Ahead] = []
+        self.began: list[int] = []
+        self.over = ""
+        self.pilot: Pilot | None = None
+        self.pilots: list[Pilot] = []
+        self._offset = None
+
+    @property
+    def current(self) -> int:
+        """Number of the jump that is under way, -1 before the first."""
+        return len(self.began) - 1
+
+    @property
+    def landed(self) -> bool:
+        """Whether the robot stands: before the first jump, or after a touchdown."""
+        return self.pilot is None or self.pilot.touchdown is not None
+
+    def since_touchdown(self, step: int) -> float:
+        """Time since the last touchdown, or since the chain began [s]; negative in the air."""
+        if self.pilot is None:
+            return step * STEP_S
+        return -1.0 if self.pilot.touchdown is None else (step - self.began[-1] - self.pilot.touchdown) * STEP_S
+
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
+        """Command at ``step`` of the chain from measured state and vertical foot forces."""
+        if self.current + 1 < self._foresight.course.count and not self.over:
+            self._think(step, q, v)
+        if self.pilot is None:
+            if step % PERIOD_STEPS == 0:
+                self._tau = self._stand.torque(step * STEP_S, q, v, force)
+            return Command(tau=self._tau)
+        now = step - self.began[-1]
+        command = self.pilot.command(now, q, v, force)
+        if self.pilot.touchdown is None and now > self.pilot.last_step:
+            self.over = self.over or f"jump {self.current + 1} never touched down"
+        return command if command.q is None else self._blended(command, now * STEP_S)
+
+    # deciding --------------------------------------------------------------------------------------------------
+
+    def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
+        """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
+        number, time = self.current + 1, step * STEP_S
+        if len(self.ahead) == number:
+            self._look(number, step, q, v)
+            return
+        ahead = self.ahead[number]
+        if not self.landed:
+            return
+        if ahead.needed_s is None and self._still(ahead, q, v):
+            ahead.needed_s = time
+        if ahead.failure:
+            self.over = f"no plan for jump {number + 1}: {ahead.failure}"
+        elif time >= ahead.ready_s - STEP_S / 2 and self._still(ahead, q, v):
+            self._begin(ahead, step, q, v)
+        elif self.since_touchdown(step) > PATIENCE_S + ahead.solve_s:
+            self.over = f"the robot did not come to rest for jump {number + 1}"
+
+    def _look(self, number: int, step: int, q: np.ndarray, v: np.ndarray) -> None:
+        """Measure and plan, if it is time to."""
+        if self.pilot is None:
+            if step * STEP_S >= FIRST_STAND_S:
+                self._foresight.learn_posture(q)
+                self.ahead.append(self._foresight.look(number, step * STEP_S, self._gauge.toe(q)))
+            return
+        flying = not self.landed
+        if self.since_touchdown(step) >= max(self._look_s, 0.0):
+            toe = self._gauge.toe(q)
+        elif flying and self._look_s < 0 and self._airborne(step):
+            left = self._forecast.time_left(q, v)
+            if left > -self._look_s:
+                return
+            toe = self._gauge.toe(self._at_touchdown(step, q, v, left))
+        else:
+            return
+        last = self.ahead[-1], self._from
+        self.ahead.append(self._foresight.look(number, step * STEP_S, toe, last, flying))
+
+    def _airborne(self, step: int) -> bool:
+        return (step - self.began[-1]) * STEP_S > self.ahead[-1].plan.tape.takeoff_time
+
+    def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
+        """Configuration (nq,) of the touchdown to come: the posture of the tape, turned as far as the trunk is off its
+        pitch now, on the ballistic CoM."""
+        tape = self.ahead[-1].plan.tape
+        row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
+        turned = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)])
+        end, _ = self._forecast.state(q, v, turned)
+        end[:3] += self._gauge.com_ahead(q, v, left) - self._gauge.com(end)
+        return end
+
+    def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
+        """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
+        if ahead.plan is None:
+            return True
+        off, legs = np.abs(q[7:] - ahead.plan.tape.q[0, 7:]), self._not_arms
+        near = off[legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
+        slow = np.abs(v[6:]).max() <= STILL_RATE and np.linalg.norm(self._gauge.com_velocity(q, v)) <= STILL_COM
+        return bool(near and slow)
+
+    def _begin(self, ahead: Ahead, step: int, q: np.ndarray, v: np.ndarray) -> None:
+        ahead.began_s = step * STEP_S
+        toe = self._gauge.toe(q)
+        if self.began:
+            self._foresight.learn_place(self.ahead[-2], self._from, ahead, toe)
+        self._from = float(toe[0])
+        tape = ahead.plan.tape
+        self._offset = q[7:] - tape.q[0, 7:], v[6:].copy()
+        self.pilot = Pilot(tape, self._robot, "position", self._scene, self._landing, None, True)
+        self.pilots.append(self.pilot)
+        self._forecast = Forecast(self._robot, tape, self._scene)
+        self.began.append(step)
+
+    def _blended(self, command: Command, time: float) -> Command:
+        """The tape's command plus what was left of posture and rates when it began, fading smoothly."""
+        if time >= BLEND_S:
+            return command
+        s, (error, rate) = time / BLEND_S, self._offset
+        angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
+        speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
+        return replace(command, q=command.q + angle, rate=command.rate + speed)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last jump of the course is under way, or over."""
+        return self.current + 1 == self._foresight.course.count
+
+
+def _legs(robot: Robot) -> np.ndarray:
+    """Which joints (nv - 6,) are not the arms' pitch joints."""
+    return ~np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
+
+
+__all__ = ["STAND_S", "ChainPilot"]
