@@ -57,7 +57,8 @@ class Ahead:
     place_m : the same, less what such forecasts were wrong by in this chain.
     start : (5,) link angles in which the plan begins.
     bias_m : what was added to the distance because earlier jumps of this chain missed by it.
-    solve_s : what planning took, and was charged.  measured_s : wall clock of the same.
+    solve_s : what planning was charged: its wall clock, in whole steps, unless another number was given.
+    cpu_s : processor time of the same, which an idle core would need.
     plan : None if there is none; ``failure`` says why.
     needed_s : when the robot was first still enough to begin; None if it never was.
     began_s : when it began the jump; None if it never did.
@@ -71,7 +72,7 @@ class Ahead:
     start: np.ndarray
     bias_m: float
     solve_s: float
-    measured_s: float
+    cpu_s: float
     plan: JumpPlan | None
     failure: str = ""
     needed_s: float | None = None
@@ -138,7 +139,7 @@ class Foresight:
 
         ``last`` is the plan of the jump before, and the place from where it began.
         """
-        began, plan, failure = time.perf_counter(), None, ""
+        began, cpu, plan, failure = time.perf_counter(), time.process_time(), None, ""
         if self._zero is None:  # where the chain began, by its own measurement
             self._zero = float(toe[0])
         foretold = float(toe[0]) - self._zero
@@ -154,7 +155,7 @@ class Foresight:
                 plan = self.planner.replan(self.rehearsal.plans[number], task, start=start)
         except JumplabError as e:
             failure = str(e)
-        took = time.perf_counter() - began
+        took, cpu = time.perf_counter() - began, time.process_time() - cpu
         charged = took if self.solve_s is None else self.solve_s
         steps = math.ceil(charged / STEP_S - 1e-9)
-        return Ahead(number, time_s, air, foretold, place, start, bias, steps * STEP_S, took, plan, failure)
+        return Ahead(number, time_s, air, foretold, place, start, bias, steps * STEP_S, cpu, plan, failure)

@@ -178,7 +178,7 @@ class ChainResult:
         for j, travel, error in zip(self.jumps, self.travels_m, self.errors_m, strict=True):
             a, m = j.ahead, j.simulation.metrics
             told = {name: None if a is None else getattr(a, name) for name in (
-                "looked_s", "air", "bias_m", "solve_s", "measured_s", "ready_s", "needed_s", "began_s")}  # fmt: skip
+                "looked_s", "air", "bias_m", "solve_s", "cpu_s", "ready_s", "needed_s", "began_s")}  # fmt: skip
             out.append({
                 "jump": j.number + 1, "asked_m": self.course.distances_m[j.number],
                 "planned_m": None if a is None or a.plan is None else a.plan.task.distance_m, "travel_m": float(travel),

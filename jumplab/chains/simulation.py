@@ -38,7 +38,7 @@ def run_chain(
     perturbation: Perturbation | None = None,
     solve_s: float | None = None,
     look_s: float = LOOK_S,
-    landing: str = "planned",
+    landing: str = "spring",
     method: str = "three-step",
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.

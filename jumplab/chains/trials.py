@@ -31,7 +31,7 @@ class ChainTrial:
     ----------
     seed : of the robot.
     stood, reason : the verdict, and why not.
-    errors_m, travels_m, air_s, solve_s : per jump that began; ``air_s`` None where it never touched down.
+    errors_m, travels_m, air_s, solve_s, cpu_s : per jump that began; ``air_s`` None where it never touched down.
     spare_s : per re-plan, how long before it was needed it was there; negative if late, None if never needed.
     """
 
@@ -42,6 +42,7 @@ class ChainTrial:
     travels_m: tuple[float, ...] = ()
     air_s: tuple[float | None, ...] = ()
     solve_s: tuple[float, ...] = ()
+    cpu_s: tuple[float, ...] = ()
     spare_s: tuple[float | None, ...] = ()
 
     @classmethod
@@ -51,7 +52,7 @@ class ChainTrial:
         spare = tuple(None if a.needed_s is None else a.needed_s - a.ready_s for a in result.replans)
         return cls(seed, result.stood, result.reason, tuple(map(float, result.errors_m)),
                    tuple(map(float, result.travels_m)), tuple(j.air_s for j in result.jumps),
-                   tuple(a.solve_s for a in plans), spare)  # fmt: skip
+                   tuple(a.solve_s for a in plans), tuple(a.cpu_s for a in plans), spare)  # fmt: skip
 
 
 @dataclass(frozen=True)
