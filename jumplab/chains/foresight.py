@@ -106,7 +106,7 @@ class Foresight:
     solve_s: float | None = None
     method: str = "three-step"
     _offset: np.ndarray = field(default_factory=lambda: np.zeros(5))
-    _missed: list = field(default_factory=list)  # by how much jumps fell short [m]
+    _missed: dict = field(default_factory=dict)  # jump: by how much it fell short [m]
     _misjudged: list = field(default_factory=list)  # by how much places foretold in the air were too far ahead [m]
     _zero: float | None = None
 
@@ -122,19 +122,21 @@ class Foresight:
         offset = self._gauge.posture(q) - self._crouch
         self._offset = np.clip(offset, -LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD)
 
-    def learn_place(self, last: Ahead, began_x: float, ahead: Ahead, toe: np.ndarray) -> None:
-        """Jump ``last`` began with the toes at ``began_x`` of the world and has brought them to ``toe``."""
-        self._missed[-1] = last.plan.task.distance_m - (float(toe[0]) - began_x)
-        if ahead.air:
-            self._misjudged.append(ahead.foretold_m - (float(toe[0]) - self._zero))
+    def learn_place(self, last: Ahead, began_x: float, plans: list[Ahead], toe: np.ndarray) -> None:
+        """Jump ``last`` began with the toes at ``began_x`` of the world and has brought them to ``toe``.
+
+        ``plans`` are those of the next jump: what they foretold in the air can now be compared.
+        """
+        self._missed[last.number] = last.plan.task.distance_m - (float(toe[0]) - began_x)
+        self._misjudged += [p.foretold_m - (float(toe[0]) - self._zero) for p in plans if p.air]
 
     @property
     def bias_m(self) -> float:
         """Mean of what the jumps so far fell short by [m]."""
-        return float(np.clip(np.mean(self._missed or [0.0]), -LARGEST_BIAS_M, LARGEST_BIAS_M))
+        return float(np.clip(np.mean([*self._missed.values()] or [0.0]), -LARGEST_BIAS_M, LARGEST_BIAS_M))
 
-    def look(self, number: int, time_s: float, toe: np.ndarray, last: tuple[Ahead, float] | None = None,
-             air: bool = False) -> Ahead:  # fmt: skip
+    def look(self, number: int, time_s: float, toe: np.ndarray, air: bool = False,
+             last: tuple[Ahead, float] | None = None) -> Ahead:  # fmt: skip
         """Plan jump ``number`` for toes that stand, or in the ``air`` will stand, at ``toe`` (3,) of the world.
 
         ``last`` is the plan of the jump before, and the place from where it began.
@@ -145,7 +147,7 @@ class Foresight:
         foretold = float(toe[0]) - self._zero
         place = foretold - (float(np.mean(self._misjudged)) if air and self._misjudged else 0.0)
         if last is not None:
-            self._missed.append(last[0].plan.task.distance_m - (place + self._zero - last[1]))
+            self._missed[last[0].number] = last[0].plan.task.distance_m - (place + self._zero - last[1])
         start, bias = self._crouch + self._offset, self.bias_m
         try:
             task = self.course.task(number, self.course.goals_m[number] - place + bias)

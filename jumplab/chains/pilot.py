@@ -9,7 +9,7 @@ import numpy as np
 from jumplab.chains.foresight import Ahead, Foresight
 from jumplab.chains.posture import Gauge
 from jumplab.robot import Robot
-from jumplab.simulation.honesty import STAND_S
+from jumplab.robot.stance import configuration
 from jumplab.simulation.landing import PERIOD_STEPS, LandingController
 from jumplab.simulation.pilot import Pilot
 from jumplab.simulation.playback import Command
@@ -38,20 +38,24 @@ class ChainPilot:
     scene : ground of the course.
     landing : "planned" or "spring", as for a single jump.
     look_s : when the next jump is planned, from touchdown on [s]; negative: so long before it is due.
+    revise_s : when it is planned again if it was planned in the air, from touchdown on [s]; never if None.
 
     Attributes
     ----------
-    ahead : plans so far, in the order of the jumps.
+    plans : plans made for each jump, in the order in which they were made.
+    used : the plan with which each jump began.
     began : step at which each jump began.
     over : why the chain goes on no more; empty while it does.
     """
 
-    def __init__(self, foresight: Foresight, robot: Robot, scene: Scene, landing: str, look_s: float):
+    def __init__(self, foresight: Foresight, robot: Robot, scene: Scene, landing: str, look_s: float,
+                 revise_s: float | None):  # fmt: skip
         self._foresight, self._robot, self._scene, self._landing = foresight, robot, scene, landing
-        self._look_s, self._gauge = look_s, Gauge(robot)
+        self._look_s, self._revise_s, self._gauge = look_s, revise_s, Gauge(robot)
         self._stand, self._tau = LandingController(robot), np.zeros(len(robot.joint_names))
-        self._not_arms = _legs(robot)
-        self.ahead: list[Ahead] = []
+        self._not_arms = ~np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
+        self.plans: list[list[Ahead]] = []
+        self.used: list[Ahead] = []
         self.began: list[int] = []
         self.over = ""
         self.pilot: Pilot | None = None
@@ -93,48 +97,61 @@ class ChainPilot:
     def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
         number, time = self.current + 1, step * STEP_S
-        if len(self.ahead) == number:
-            self._look(number, step, q, v)
+        if len(self.plans) == number:
+            self.plans.append([])
+        plans = self.plans[number]
+        if plans and self.landed and self._begun(plans, step, q, v):
             return
-        ahead = self.ahead[number]
-        if not self.landed:
-            return
-        if ahead.needed_s is None and self._still(ahead, q, v):
-            ahead.needed_s = time
-        if ahead.failure:
-            self.over = f"no plan for jump {number + 1}: {ahead.failure}"
-        elif time >= ahead.ready_s - STEP_S / 2 and self._still(ahead, q, v):
-            self._begin(ahead, step, q, v)
-        elif self.since_touchdown(step) > PATIENCE_S + ahead.solve_s:
-            self.over = f"the robot did not come to rest for jump {number + 1}"
+        seen = self._sight(step, q, v, plans)
+        if seen is not None:
+            last = (self.used[-1], self._from) if self.used else None
+            plans.append(self._foresight.look(number, time, *seen, last))
+        elif plans and self.landed:
+            if all(p.failure for p in plans) and not self._may_revise(plans):
+                self.over = f"no plan for jump {number + 1}: {plans[-1].failure}"
+            elif self.since_touchdown(step) > PATIENCE_S + sum(p.solve_s for p in plans):
+                self.over = f"the robot did not come to rest for jump {number + 1}"
 
-    def _look(self, number: int, step: int, q: np.ndarray, v: np.ndarray) -> None:
-        """Measure and plan, if it is time to."""
+    def _begun(self, plans: list[Ahead], step: int, q: np.ndarray, v: np.ndarray) -> bool:
+        """Begin with the latest plan that is there, if the robot is still enough; notes when it was."""
+        time, still = step * STEP_S, self._still(plans[0], q, v)
+        for plan in plans:
+            plan.needed_s = plans[0].needed_s
+            if still and plan.needed_s is None:
+                plan.needed_s = time
+        there = [p for p in plans if p.plan is not None and time >= p.ready_s - STEP_S / 2]
+        if still and there:
+            self._begin(there[-1], step, q, v)
+        return still and bool(there)
+
+    def _may_revise(self, plans: list[Ahead]) -> bool:
+        return plans[-1].air and self._revise_s is not None
+
+    def _sight(self, step: int, q: np.ndarray, v: np.ndarray, plans: list[Ahead]) -> tuple[np.ndarray, bool] | None:
+        """Where the toes (3,) stand, or will stand, and whether the robot flies; None unless it is time to plan."""
         if self.pilot is None:
-            if step * STEP_S >= FIRST_STAND_S:
-                self._foresight.learn_posture(q)
-                self.ahead.append(self._foresight.look(number, step * STEP_S, self._gauge.toe(q)))
-            return
-        flying = not self.landed
-        if self.since_touchdown(step) >= max(self._look_s, 0.0):
-            toe = self._gauge.toe(q)
-        elif flying and self._look_s < 0 and self._airborne(step):
-            left = self._forecast.time_left(q, v)
-            if left > -self._look_s:
-                return
-            toe = self._gauge.toe(self._at_touchdown(step, q, v, left))
-        else:
-            return
-        last = self.ahead[-1], self._from
-        self.ahead.append(self._foresight.look(number, step * STEP_S, toe, last, flying))
+            if plans or step * STEP_S < FIRST_STAND_S:
+                return None
+            self._foresight.learn_posture(q)
+            return self._gauge.toe(q), False
+        since = self.since_touchdown(step)
+        if plans:  # one core plans: a correction waits until the draft is done
+            due = self._may_revise(plans) and since >= self._revise_s and step * STEP_S >= plans[-1].ready_s
+            return (self._gauge.toe(q), False) if due else None
+        if since >= max(self._look_s, 0.0):
+            return self._gauge.toe(q), False
+        if self.landed or self._look_s >= 0 or not self._airborne(step):
+            return None
+        left = self._forecast.time_left(q, v)
+        return None if left > -self._look_s else (self._gauge.toe(self._at_touchdown(step, q, v, left)), True)
 
     def _airborne(self, step: int) -> bool:
-        return (step - self.began[-1]) * STEP_S > self.ahead[-1].plan.tape.takeoff_time
+        return (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Configuration (nq,) of the touchdown to come: the posture of the tape, turned as far as the trunk is off its
         pitch now, on the ballistic CoM."""
-        tape = self.ahead[-1].plan.tape
+        tape = self.used[-1].plan.tape
         row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
         turned = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)])
         end, _ = self._forecast.state(q, v, turned)
@@ -143,9 +160,7 @@ class ChainPilot:
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
         """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
-        if ahead.plan is None:
-            return True
-        off, legs = np.abs(q[7:] - ahead.plan.tape.q[0, 7:]), self._not_arms
+        off, legs = np.abs(q[7:] - configuration(self._robot, ahead.start)[7:]), self._not_arms
         near = off[legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
         slow = np.abs(v[6:]).max() <= STILL_RATE and np.linalg.norm(self._gauge.com_velocity(q, v)) <= STILL_COM
         return bool(near and slow)
@@ -153,9 +168,10 @@ class ChainPilot:
     def _begin(self, ahead: Ahead, step: int, q: np.ndarray, v: np.ndarray) -> None:
         ahead.began_s = step * STEP_S
         toe = self._gauge.toe(q)
-        if self.began:
-            self._foresight.learn_place(self.ahead[-2], self._from, ahead, toe)
+        if self.used:
+            self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
         self._from = float(toe[0])
+        self.used.append(ahead)
         tape = ahead.plan.tape
         self._offset = q[7:] - tape.q[0, 7:], v[6:].copy()
         self.pilot = Pilot(tape, self._robot, "position", self._scene, self._landing, None, True)
@@ -176,11 +192,3 @@ class ChainPilot:
     def finished(self) -> bool:
         """Whether the last jump of the course is under way, or over."""
         return self.current + 1 == self._foresight.course.count
-
-
-def _legs(robot: Robot) -> np.ndarray:
-    """Which joints (nv - 6,) are not the arms' pitch joints."""
-    return ~np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
-
-
-__all__ = ["STAND_S", "ChainPilot"]

@@ -18,6 +18,18 @@ from jumplab.simulation.scene import Scene
 from jumplab.simulation.world import STEP_S
 
 SCHEMA = "jumplab-chain-1"
+PLAN_NAMES = (
+    "looked_s",
+    "air",
+    "foretold_m",
+    "place_m",
+    "bias_m",
+    "solve_s",
+    "cpu_s",
+    "ready_s",
+    "needed_s",
+    "began_s",
+)
 
 
 @dataclass(frozen=True)
@@ -28,13 +40,14 @@ class ChainedJump:
     ----------
     number : from 0.
     start_s : time of the chain at which ``simulation`` begins [s]; the stand before the first jump belongs to it.
-    ahead : its plan and the plan's story; None if none was made.
+    ahead : the plan with which it began; None if it did not.  plans : all that were made for it.
     simulation : log from there to the beginning of the next jump, its time counted from zero.
     """
 
     number: int
     start_s: float
     ahead: Ahead | None
+    plans: tuple[Ahead, ...]
     simulation: SimulationResult
 
     @property
@@ -122,8 +135,8 @@ class ChainResult:
 
     @property
     def replans(self) -> tuple[Ahead, ...]:
-        """Plans made on the way: all but the first, for which the robot stands still and nothing is late."""
-        return tuple(j.ahead for j in self.jumps[1:] if j.ahead is not None)
+        """Plans made on the way, in the air and on the ground: all but the first jump's, for which nothing waits."""
+        return tuple(p for j in self.jumps[1:] for p in j.plans)
 
     @property
     def in_time(self) -> int:
@@ -177,14 +190,16 @@ class ChainResult:
         out = []
         for j, travel, error in zip(self.jumps, self.travels_m, self.errors_m, strict=True):
             a, m = j.ahead, j.simulation.metrics
-            told = {name: None if a is None else getattr(a, name) for name in (
-                "looked_s", "air", "bias_m", "solve_s", "cpu_s", "ready_s", "needed_s", "began_s")}  # fmt: skip
+            told = {name: None if a is None else getattr(a, name) for name in PLAN_NAMES}
+            first = j.plans[0] if j.plans else None
             out.append({
                 "jump": j.number + 1, "asked_m": self.course.distances_m[j.number],
-                "planned_m": None if a is None or a.plan is None else a.plan.task.distance_m, "travel_m": float(travel),
-                "error_m": float(error), "rise_m": m.com_rise_m,
-                "air_s": j.air_s, **told, "in_time": None if not j.number or a is None else a.in_time,
+                "planned_m": None if a is None else a.plan.task.distance_m, "travel_m": float(travel),
+                "error_m": float(error), "rise_m": m.com_rise_m, "air_s": j.air_s, **told,
+                "first_solve_s": first and first.solve_s, "first_ready_s": first and first.ready_s,
+                "in_time": None if not j.number or a is None else a.in_time,
                 "on_feet": j.on_feet(self.robot), "honest": j.simulation.honest,
+                "plans": [{"failure": p.failure, **{name: getattr(p, name) for name in PLAN_NAMES}} for p in j.plans],
             })  # fmt: skip
         return out
 

@@ -20,11 +20,13 @@ from jumplab.simulation.actuation import Delay
 from jumplab.simulation.estimator import Perception
 from jumplab.simulation.jump import AFTER_FALL_S, EXTRA_S
 from jumplab.simulation.perturbation import Perturbation
+from jumplab.simulation.pilot import LANDINGS
 from jumplab.simulation.playback import Motors
 from jumplab.simulation.recorder import Recorder
 from jumplab.simulation.world import STEP_S, World
 
 LOOK_S = -0.3  # our choice: just before the apex of a rise of 0.3 m; foretells the toes' place to 2 mm
+REVISE_S = 0.1  # our choice: the impact is over, the feet lie flat and still
 EARLIEST_LOOK_S = -1.0  # our choice: longer than any flight
 
 
@@ -38,6 +40,7 @@ def run_chain(
     perturbation: Perturbation | None = None,
     solve_s: float | None = None,
     look_s: float = LOOK_S,
+    revise_s: float | None = REVISE_S,
     landing: str = "spring",
     method: str = "three-step",
 ) -> ChainResult:
@@ -55,6 +58,8 @@ def run_chain(
         also refuses jumps that have no plan before anything moves. Without, every plan begins from nothing.
     solve_s : what each plan is charged [s]; its own wall clock if None.
     look_s : when the next jump is planned, after touchdown [s]; negative: so long before the touchdown that is due.
+    revise_s : when a plan made in the air is made again, from where the feet have really come down, after touchdown
+        [s]. The robot waits for neither: it begins with the latest plan that is there. Never if None.
     landing : "planned" or "spring", see :func:`jumplab.simulation.simulate_jump`.
     method : "three-step" or "direct".
 
@@ -68,7 +73,8 @@ def run_chain(
     InputError, InfeasibleError
         If the course cannot be jumped, or the robot or a setting makes no sense; nothing has moved then.
     """
-    _check(course, robot, perturbation, solve_s, look_s, method)
+    _check(course, robot, perturbation, landing, method)
+    _check_times(solve_s, look_s, revise_s)
     waiting = crouched(robot)
     planner = planner or Planner(waiting, keep=True)
     if planner.robot.hash != waiting.hash:
@@ -77,22 +83,27 @@ def run_chain(
     if rehearsal is None and rehearse:
         rehearsal = Rehearsal.of(course, planner, method)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s, method)
-    settings = {"look_s": look_s, "landing": landing, "solve_s": solve_s, "method": method,
+    settings = {"look_s": look_s, "revise_s": revise_s, "landing": landing, "solve_s": solve_s, "method": method,
                 "rehearsed": rehearsal is not None}  # fmt: skip
     return _Chain(course, waiting, foresight, perturbation or Perturbation(), settings).run()
 
 
-def _check(course, robot, perturbation, solve_s, look_s, method) -> None:
+def _check(course, robot, perturbation, landing, method) -> None:
     needs(course, Course, "the course")
     needs(robot, Robot, "the robot")
     if perturbation is not None:
         needs(perturbation, Perturbation, "the perturbation")
+    for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
+        if not isinstance(value, str) or value not in known:
+            raise InputError(f"{name} {said(value)}: choose one of {', '.join(known)}")
+
+
+def _check_times(solve_s, look_s, revise_s) -> None:
     for name, value, low, high in (("solve_s", 0.0 if solve_s is None else solve_s, 0.0, 60.0),
-                                   ("look_s", look_s, EARLIEST_LOOK_S, 2.0)):  # fmt: skip
+                                   ("look_s", look_s, EARLIEST_LOOK_S, 2.0),
+                                   ("revise_s", 0.0 if revise_s is None else revise_s, 0.0, 2.0)):  # fmt: skip
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise InputError(f"{name} = {said(value)} s is outside {low:g} ... {high:g} s")
-    if method not in METHODS:
-        raise InputError(f"method {said(method)}: choose one of {', '.join(METHODS)}")
 
 
 class _Chain:
@@ -101,7 +112,8 @@ class _Chain:
     def __init__(self, course: Course, robot: Robot, foresight: Foresight, perturbation: Perturbation, settings: dict):
         self.course, self.robot, self.perturbation, self.settings = course, robot, perturbation, settings
         self.real, self.scene = perturbation.robot(robot), course.scene(robot)
-        self.pilot = ChainPilot(foresight, robot, self.scene, settings["landing"], settings["look_s"])
+        self.pilot = ChainPilot(foresight, robot, self.scene, settings["landing"], settings["look_s"],
+                                settings["revise_s"])  # fmt: skip
         self.recorders: list[Recorder] = []
 
     def run(self) -> ChainResult:
@@ -153,7 +165,8 @@ class _Chain:
             }  # fmt: skip
             result = recorder.result((0, 0) if pilot is None else pilot.solves, settings)
             result = replace(result, honesty=honesty.check(result, self.real))
-            ahead = self.pilot.ahead[k] if k < len(self.pilot.ahead) else None
-            jumps.append(ChainedJump(k, start * STEP_S, ahead, result))
+            plans = tuple(self.pilot.plans[k]) if k < len(self.pilot.plans) else ()
+            used = self.pilot.used[k] if k < len(self.pilot.used) else None
+            jumps.append(ChainedJump(k, start * STEP_S, used, plans, result))
         settings = {**self.settings, "perturbation": self.perturbation.to_json(), "perception": perception}
         return ChainResult(self.course, self.robot, self.scene, tuple(jumps), reason, settings)

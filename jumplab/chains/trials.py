@@ -31,8 +31,9 @@ class ChainTrial:
     ----------
     seed : of the robot.
     stood, reason : the verdict, and why not.
-    errors_m, travels_m, air_s, solve_s, cpu_s : per jump that began; ``air_s`` None where it never touched down.
-    spare_s : per re-plan, how long before it was needed it was there; negative if late, None if never needed.
+    errors_m, travels_m, air_s : per jump that began; ``air_s`` None where it never touched down.
+    plans : made on the way, each with its jump (from 0), whether it was made in the air, what it took by the clock and
+        of a processor [s], and how long before it was needed it was there [s], negative if late, None if never needed.
     """
 
     seed: int
@@ -41,18 +42,16 @@ class ChainTrial:
     errors_m: tuple[float, ...] = ()
     travels_m: tuple[float, ...] = ()
     air_s: tuple[float | None, ...] = ()
-    solve_s: tuple[float, ...] = ()
-    cpu_s: tuple[float, ...] = ()
-    spare_s: tuple[float | None, ...] = ()
+    plans: tuple[dict[str, Any], ...] = ()
 
     @classmethod
     def of(cls, seed: int, result: ChainResult) -> ChainTrial:
         """What is kept of a chain."""
-        plans = [j.ahead for j in result.jumps if j.ahead is not None]
-        spare = tuple(None if a.needed_s is None else a.needed_s - a.ready_s for a in result.replans)
+        plans = tuple({"jump": p.number, "air": p.air, "solve_s": p.solve_s, "cpu_s": p.cpu_s,
+                       "spare_s": None if p.needed_s is None else p.needed_s - p.ready_s}
+                      for p in result.replans)  # fmt: skip
         return cls(seed, result.stood, result.reason, tuple(map(float, result.errors_m)),
-                   tuple(map(float, result.travels_m)), tuple(j.air_s for j in result.jumps),
-                   tuple(a.solve_s for a in plans), tuple(a.cpu_s for a in plans), spare)  # fmt: skip
+                   tuple(map(float, result.travels_m)), tuple(j.air_s for j in result.jumps), plans)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -80,12 +79,12 @@ class ChainReport:
     @property
     def replans(self) -> int:
         """How many plans were made on the way."""
-        return sum(len(t.spare_s) for t in self.trials)
+        return sum(len(t.plans) for t in self.trials)
 
     @property
     def in_time(self) -> int:
         """How many of them were there when they were needed."""
-        return sum(s is not None and s >= 0 for t in self.trials for s in t.spare_s)
+        return sum(p["spare_s"] is not None and p["spare_s"] >= 0 for t in self.trials for p in t.plans)
 
     @property
     def errors_m(self) -> np.ndarray:

@@ -28,6 +28,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     chain.add_argument("--ranges", choices=("slight", "wide"), default="slight", help="how much they differ")
     chain.add_argument("--look-s", default="-0.3", metavar="S",
                        help="when the next jump is planned, from touchdown on [s]; negative: in the air")  # fmt: skip
+    chain.add_argument("--revise-s", default="0.1", metavar="S",
+                       help="when it is planned again, from touchdown on [s], or 'never'")  # fmt: skip
     chain.add_argument("--solve-s", metavar="S", help="charge each plan this [s] instead of its wall clock")
     chain.add_argument("--landing", choices=("planned", "spring"), default="spring", help="how it lands")
     chain.add_argument("--method", choices=("three-step", "direct"), default="three-step", help="of planning")
@@ -49,8 +51,10 @@ def _chain(args: argparse.Namespace) -> None:
         values and [number(option, x) for x in values] for option, values in (
             ("--distances-m", args.distances_m), ("--height-m", args.height_m), ("--platforms-m", args.platforms_m))
     )  # fmt: skip
-    how = {"look_s": number("--look-s", args.look_s), "landing": args.landing, "method": args.method,
-           "solve_s": None if args.solve_s is None else number("--solve-s", args.solve_s)}  # fmt: skip
+    revise = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
+    how = {"look_s": number("--look-s", args.look_s), "revise_s": revise, "landing": args.landing,
+           "solve_s": None if args.solve_s is None else number("--solve-s", args.solve_s),
+           "method": args.method}  # fmt: skip
     runs = _whole("--runs", args.runs, 1, MOST_RUNS)
     jobs = None if args.jobs is None else _whole("--jobs", args.jobs, 1, 4096)
     seed = None if args.seed is None and runs == 1 else _whole("--seed", args.seed or "0", 0, 2**31 - 1)
@@ -83,7 +87,9 @@ def _print(result: Any, report: Any) -> None:
     print(f"{'jump':<5}" + "".join(f"{head:>9}" for head in heads))
     for row in result.rows():
         print(_line(row))
-    print(f"plans made on the way: {result.in_time} of {len(result.replans)} there when the robot was ready for them")
+    print(
+        f"plans made on the way: {result.in_time} of {len(result.replans)} were there when the robot was ready for them"
+    )
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
     if report is not None:
         low, high = report.interval

@@ -41,6 +41,7 @@ BELOW_M = 0.05
 WAITING, FLYING = 0.55, 1.0  # strength of the frames: the robot between jumps, and in the air
 TOLERANCE_M = 0.03  # what a jump of a chain may miss by
 LEGEND_IN, TALLEST_IN = 0.3, 4.2
+CORRECTION = 0.5  # strength of what is planned on the ground
 BAR = 0.62  # height of a bar of the timeline
 
 
@@ -115,18 +116,21 @@ def chain_timeline(result: ChainResult) -> Figure:
     for part in np.split(np.arange(len(result.phase)), cuts):
         start, end = result.t[part[0]], result.t[part[-1]]
         ax.barh(1, end - start, BAR, left=start, color=PHASE_COLORS[str(result.phase[part[0]])])
-    for plan in (j.ahead for j in result.jumps if j.ahead is not None):
-        late = plan.number and not plan.in_time
-        ax.barh(0, plan.solve_s, BAR, left=plan.looked_s, color=VERMILION if late else PURPLE)
-        ax.text(plan.ready_s + 0.03, 0, f"{1000 * plan.solve_s:.0f} ms", va="center", fontsize=6.5)
-        if plan.needed_s is not None and plan.number:
-            ax.plot([plan.needed_s] * 2, [-0.5, 1.5], color=INK, linewidth=0.7)
-        if plan.began_s is not None:
-            ax.text(plan.began_s, 1.38, str(plan.number + 1), ha="left", va="bottom", fontsize=6.5)
-    ax.set_yticks([0, 1], ["planning", "robot"])
-    ax.set(xlabel="time [s]", ylim=(-0.55, 1.75), xlim=(0.0, float(result.t[-1])))
+    for jump in result.jumps:
+        for plan in jump.plans:
+            late = jump.number and not plan.in_time
+            ax.barh(0, plan.solve_s, BAR, left=plan.looked_s, color=VERMILION if late else tint(PURPLE, 1.0 if plan.air
+                    else CORRECTION))  # fmt: skip
+            ax.text(plan.looked_s, -0.36, f"{1000 * plan.solve_s:.0f}", va="top", fontsize=6.5)
+            if plan.needed_s is not None and jump.number:
+                ax.plot([plan.needed_s] * 2, [-BAR / 2, 1.5], color=INK, linewidth=0.7)
+            if plan.began_s is not None:
+                ax.text(plan.began_s + 0.03, 1.38, str(jump.number + 1), ha="left", va="bottom", fontsize=6.5)
+    ax.set_yticks([0, 1], ["planning [ms]", "robot"])
+    ax.set(xlabel="time [s]", ylim=(-0.75, 1.75), xlim=(0.0, float(result.t[-1])))
     ax.grid(False, axis="y")
-    handles = [Patch(color=PURPLE, label="planning"), Line2D([], [], color=INK, linewidth=0.7, label="still enough")]
+    handles = [Patch(color=PURPLE, label="planned in the air"), Patch(color=tint(PURPLE, CORRECTION), label="standing"),
+               Line2D([], [], color=INK, linewidth=0.7, label="still enough")]  # fmt: skip
     legend_above(fig, [*phase_handles("launch", "flight", "landing"), *handles])
     return fig
 
@@ -140,15 +144,19 @@ def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figu
     for trial in trials:
         grey = dict(color=tint(INK, 0.45), linewidth=0.7, marker=".", markersize=3)
         error.plot(1 + np.arange(len(trial.errors_m)), 1000 * np.array(trial.errors_m), **grey)
-        clock.plot(1 + np.arange(len(trial.solve_s)), trial.solve_s, **grey | {"linestyle": "none"})
+        clock.plot(
+            [1 + p["jump"] for p in trial.plans], [p["solve_s"] for p in trial.plans], **grey | {"linestyle": ""}
+        )
     error.plot(number, 1000 * result.errors_m, color=shade(PHASE_COLORS["landing"], 0.9), marker="o", markersize=4)
     for sign in (-1, 1):
         error.axhline(sign * 1000 * TOLERANCE_M, **LIMIT_STYLE)
     error.set(xlabel="jump", ylabel="distance error [mm]")
-    air, planning = [j.air_s for j in result.jumps], [j.ahead and j.ahead.solve_s for j in result.jumps]
-    for values, color, label in ((air, FLIGHT, "in the air"), (planning, PURPLE, "planning")):
-        known = np.array([np.nan if x is None else x for x in values], float)
-        clock.plot(number, known, color=color, marker="o", markersize=4, label=label)
+    air = np.array([np.nan if j.air_s is None else j.air_s for j in result.jumps])
+    clock.plot(number, air, color=FLIGHT, marker="o", markersize=4, label="in the air")
+    for in_air, face, label in ((True, PURPLE, "planned in the air"), (False, "white", "planned standing")):
+        known = [(1 + p.number, p.solve_s) for j in result.jumps for p in j.plans if p.air == in_air]
+        clock.plot(*np.reshape(known, (-1, 2)).T, color=PURPLE, linestyle="", marker="o", markersize=4,
+                   markerfacecolor=face, label=label)  # fmt: skip
     clock.set(xlabel="jump", ylabel="time [s]", ylim=(0.0, None))
     for ax in (error, clock):
         ax.set_xticks(number)
