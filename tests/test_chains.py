@@ -253,7 +253,7 @@ def test_a_failure_of_the_planner_is_kept_as_words(bhr):
 
 def test_in_time_means_before_it_was_needed():
     def plan(needed):
-        return Ahead(1, 2.0, True, 0.6, 0.6, np.zeros(5), 0.0, 0.5, 0.5, object(), needed_s=needed)
+        return Ahead(1, 2.0, True, 0.6, 0.6, np.zeros(5), np.zeros(14), 0.0, 0.5, 0.5, object(), needed_s=needed)
 
     assert plan(2.5).in_time and not plan(2.499).in_time and not plan(None).in_time
 

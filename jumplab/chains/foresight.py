@@ -13,6 +13,7 @@ from jumplab.chains.posture import Gauge
 from jumplab.errors import InfeasibleError, JumplabError, SolverError
 from jumplab.pipeline import JumpPlan, Planner
 from jumplab.robot import Robot
+from jumplab.robot.stance import configuration
 from jumplab.simulation.world import STEP_S
 
 LARGEST_BIAS_M = 0.10  # our choice: a robot that misses by more than this has another problem than a wrong model
@@ -55,7 +56,7 @@ class Ahead:
     looked_s : when the state was measured.  air : whether the robot was in the air then.
     foretold_m : where the toes stood, or were going to stand, by that measurement, from where the chain began.
     place_m : the same, less what such forecasts were wrong by in this chain.
-    start : (5,) link angles in which the plan begins.
+    start : (5,) link angles in which the plan begins.  joints : (nv - 6,) the same as joint angles [rad].
     bias_m : what was added to the distance because earlier jumps of this chain missed by it.
     solve_s : what planning was charged: its wall clock, in whole steps, unless another number was given.
     cpu_s : processor time of the same, which an idle core would need.
@@ -70,6 +71,7 @@ class Ahead:
     foretold_m: float
     place_m: float
     start: np.ndarray
+    joints: np.ndarray
     bias_m: float
     solve_s: float
     cpu_s: float
@@ -160,4 +162,5 @@ class Foresight:
         took, cpu = time.perf_counter() - began, time.process_time() - cpu
         charged = took if self.solve_s is None else self.solve_s
         steps = math.ceil(charged / STEP_S - 1e-9)
-        return Ahead(number, time_s, air, foretold, place, start, bias, steps * STEP_S, cpu, plan, failure)
+        joints = configuration(self.robot, start)[7:]
+        return Ahead(number, time_s, air, foretold, place, start, joints, bias, steps * STEP_S, cpu, plan, failure)

@@ -9,7 +9,6 @@ import numpy as np
 from jumplab.chains.foresight import Ahead, Foresight
 from jumplab.chains.posture import Gauge
 from jumplab.robot import Robot
-from jumplab.robot.stance import configuration
 from jumplab.simulation.landing import PERIOD_STEPS, LandingController
 from jumplab.simulation.pilot import Pilot
 from jumplab.simulation.playback import Command
@@ -160,7 +159,7 @@ class ChainPilot:
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
         """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
-        off, legs = np.abs(q[7:] - configuration(self._robot, ahead.start)[7:]), self._not_arms
+        off, legs = np.abs(q[7:] - ahead.joints), self._not_arms
         near = off[legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
         slow = np.abs(v[6:]).max() <= STILL_RATE and np.linalg.norm(self._gauge.com_velocity(q, v)) <= STILL_COM
         return bool(near and slow)

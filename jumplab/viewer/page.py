@@ -109,11 +109,7 @@ def page(
         "fps": fps,
         "clips": clips,
         "ruler": _ruler(scene, span, toe),
-        "view": {
-            "x": span,
-            "z": _heights(scene, span, motions),
-            "width": 2 * stage.TRACK_HALF_WIDTH_M,
-        },
+        "view": {"x": span, "z": _heights(scene, span, motions), "width": 2 * stage.TRACK_HALF_WIDTH_M},
         "colors": {
             p: {"trunk": tint(c, 1.0), "limb": tint(c, LIMB_SHARE), "rest": tint(stage.REST_COLOR, 1.0)}
             for p, c in PHASE_COLORS.items()
