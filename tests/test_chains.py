@@ -6,14 +6,17 @@ from functools import cache
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from jumplab import __main__ as cli
 from jumplab import store
-from jumplab.chains import Course, Rehearsal, crouched, run_chain, write_chain
+from jumplab.chains import ChainReport, ChainTrial, Course, Rehearsal, crouched, run_chain, write_chain
 from jumplab.chains.foresight import Ahead, Foresight
 from jumplab.chains.posture import CROUCH, Gauge
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.pipeline import Planner
+from jumplab.plotting import chains as pictures
+from jumplab.plotting.style import MIN_FONT_PT, PAGE_IN
 from jumplab.robot import Robot, load_robot
 from jumplab.robot.stance import configuration, stance_angles, stance_configuration
 from jumplab.simulation import SLIGHT, Perturbation
@@ -300,6 +303,7 @@ def test_a_late_plan_is_waited_for_in_the_crouch():
     assert ahead.air and late.jumps[1].plans == (ahead,)  # a correction would have come later still
     assert ahead.ready_s > ahead.needed_s + 0.5
     assert ahead.began_s == pytest.approx(ahead.ready_s, abs=2e-3)
+    assert late.waits_s == pytest.approx([ahead.ready_s - ahead.needed_s], abs=2e-3) and chain().waits_s == (0.0,)
     assert np.abs(late.errors_m).max() < 0.01
     held = late.jumps[0].simulation
     still = held.com_velocity[-200:]
@@ -342,6 +346,32 @@ def test_folder_is_whole_and_replaced_as_a_whole(tmp_path, odd_folder):
     with np.load(out / "chain.npz") as log:
         assert np.array_equal(log["q"], result.q) and set(log["jump"]) == {0, 1}
     assert len(tape.t) == len(result.jumps[1].ahead.plan.tape.t)
+
+
+@pytest.mark.slow
+def test_report_of_many_counts_what_the_chains_say():
+    trial, late = ChainTrial.of(3, chain()), ChainTrial.of(4, chain(2.0))
+    report = ChainReport(chain().course, (trial, late, ChainTrial(5, False, "fell")))
+    assert (report.stood, report.replans, report.in_time) == (2, 3, 2)
+    assert len(report.errors_m) == 4 and list(report.waits_s <= 0) == [True, False]
+    low, high = report.interval
+    assert 0.2 < low < 2 / 3 < high < 0.95
+    data = json.loads(store.to_json(report.to_json()))
+    assert data["begun_without_waiting"] == 1 and data["trials"][2]["reason"] == "fell"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["chain_strobe", "chain_path", "chain_timeline", "chain_errors"])
+@pytest.mark.parametrize("solve_s", [0.2, 2.0])
+def test_figures_are_legible_in_print(name, solve_s):
+    result, more = chain(solve_s), ()
+    if name == "chain_errors":
+        more = ((ChainTrial.of(0, result),),)
+    fig = getattr(pictures, name)(result, *more)
+    fig.canvas.draw()
+    texts = [t for t in fig.findobj(Text) if t.get_text().strip() and t.get_visible()]
+    assert fig.get_size_inches()[0] == PAGE_IN and min(t.get_fontsize() for t in texts) >= MIN_FONT_PT
+    assert not [t for ax in fig.axes for t in (ax.get_xlabel(), ax.get_ylabel()) if t and t != "jump" and "[" not in t]
 
 
 # ------------------------------------------------------------------------------------------ the command line

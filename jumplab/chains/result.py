@@ -143,6 +143,11 @@ class ChainResult:
         """How many of the :attr:`replans` were there when the robot was ready for them."""
         return sum(a.in_time for a in self.replans)
 
+    @property
+    def waits_s(self) -> tuple[float, ...]:
+        """How long the robot, still enough, waited for a plan before each jump but the first [s]."""
+        return tuple(j.ahead.began_s - j.ahead.needed_s for j in self.jumps[1:] if j.ahead is not None)
+
     # the whole log ---------------------------------------------------------------------------------------------
 
     def _joined(self, name: str) -> np.ndarray:
@@ -208,5 +213,6 @@ class ChainResult:
         return {
             "schema": SCHEMA, "target": asdict(self.course),
             "robot": {"name": self.robot.name, "hash": self.robot.hash}, "stood": self.stood, "reason": self.reason,
-            "replans": len(self.replans), "in_time": self.in_time, "jumps": self.rows(), "settings": self.settings,
+            "replans": len(self.replans), "in_time": self.in_time, "waits_s": self.waits_s,
+            "jumps": self.rows(), "settings": self.settings,
         }  # fmt: skip

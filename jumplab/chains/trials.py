@@ -32,6 +32,7 @@ class ChainTrial:
     seed : of the robot.
     stood, reason : the verdict, and why not.
     errors_m, travels_m, air_s : per jump that began; ``air_s`` None where it never touched down.
+    waits_s : before each jump but the first, how long the robot waited for its plan [s].
     plans : made on the way, each with its jump (from 0), whether it was made in the air, what it took by the clock and
         of a processor [s], and how long before it was needed it was there [s], negative if late, None if never needed.
     """
@@ -42,6 +43,7 @@ class ChainTrial:
     errors_m: tuple[float, ...] = ()
     travels_m: tuple[float, ...] = ()
     air_s: tuple[float | None, ...] = ()
+    waits_s: tuple[float, ...] = ()
     plans: tuple[dict[str, Any], ...] = ()
 
     @classmethod
@@ -50,8 +52,9 @@ class ChainTrial:
         plans = tuple({"jump": p.number, "air": p.air, "solve_s": p.solve_s, "cpu_s": p.cpu_s,
                        "spare_s": None if p.needed_s is None else p.needed_s - p.ready_s}
                       for p in result.replans)  # fmt: skip
-        return cls(seed, result.stood, result.reason, tuple(map(float, result.errors_m)),
-                   tuple(map(float, result.travels_m)), tuple(j.air_s for j in result.jumps), plans)  # fmt: skip
+        numbers = (tuple(map(float, x)) for x in (result.errors_m, result.travels_m))
+        air = tuple(j.air_s for j in result.jumps)
+        return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, plans)
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,11 @@ class ChainReport:
         return sum(p["spare_s"] is not None and p["spare_s"] >= 0 for t in self.trials for p in t.plans)
 
     @property
+    def waits_s(self) -> np.ndarray:
+        """How long robots waited for a plan before each jump but the first [s]."""
+        return np.array([w for t in self.trials for w in t.waits_s])
+
+    @property
     def errors_m(self) -> np.ndarray:
         """Distance errors of all jumps of the chains that stood [m]."""
         return np.array([e for t in self.trials if t.stood for e in t.errors_m])
@@ -97,6 +105,7 @@ class ChainReport:
         return {
             "target": asdict(self.course), "runs": len(self.trials), "stood": self.stood, "interval": self.interval,
             "confidence": CONFIDENCE, "replans": self.replans, "in_time": self.in_time,
+            "jumps": len(self.waits_s), "begun_without_waiting": int(np.sum(self.waits_s <= 0)),
             "largest_error_m": float(np.abs(errors).max()) if len(errors) else None,
             "trials": [asdict(t) for t in self.trials],
         }  # fmt: skip

@@ -97,6 +97,7 @@ def _print(result: Any, report: Any) -> None:
         worst = f"{abs(errors).max():.3f} m" if len(errors) else "none"
         print(f"{report.stood} of {len(report.trials)} robots stand to the end, 95 % interval {low:.1%} ... {high:.1%}")
         print(f"largest distance error {worst}; {report.in_time} of {report.replans} plans in time")
+        print(f"{(report.waits_s <= 0).sum()} of {len(report.waits_s)} next jumps began without waiting for a plan")
         for trial in report.trials:
             if not trial.stood:
                 print(f"  seed {trial.seed}: {trial.reason}")

@@ -131,6 +131,8 @@ def chain_timeline(result: ChainResult) -> Figure:
     ax.grid(False, axis="y")
     handles = [Patch(color=PURPLE, label="planned in the air"), Patch(color=tint(PURPLE, CORRECTION), label="standing"),
                Line2D([], [], color=INK, linewidth=0.7, label="still enough")]  # fmt: skip
+    if result.in_time < len(result.replans):
+        handles.append(Patch(color=VERMILION, label="late"))
     legend_above(fig, [*phase_handles("launch", "flight", "landing"), *handles])
     return fig
 
