@@ -54,6 +54,8 @@ def run_chain(
     ----------
     robot : as planned; the simulated one differs from it by ``perturbation``.
     planner : of :func:`jumplab.chains.crouched` ``(robot)``; a new one if None.
+    perturbation : of the simulated robot. With its sensors' noise, where the feet stand is odometry through impacts,
+        which drifts by centimetres in every jump; without, it is the truth.
     rehearsal : the course's plans from the crouch, with which re-plans begin; made now if None and ``rehearse``, which
         also refuses jumps that have no plan before anything moves. Without, every plan begins from nothing.
     solve_s : what each plan is charged [s]; its own wall clock if None.
