@@ -12,7 +12,8 @@ from jumplab.errors import InfeasibleError, InputError, SolverError, needs, said
 from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.joint_map import JointPlan, map_to_joints
 from jumplab.robot import Robot
-from jumplab.robot.reach import reach
+from jumplab.robot.reach import reach, rod_of
+from jumplab.robot.stance import configuration
 from jumplab.solver import PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan, SrmpPlanner
 from jumplab.srmp.settings import SrmpSettings
@@ -158,8 +159,9 @@ class Planner:
         return self._stages[name]
 
     def plan(
-        self, task: JumpTask, method: str = "three-step", *, weights: Mapping[str, float] | None = None
-    ) -> JumpPlan:
+        self, task: JumpTask, method: str = "three-step", *, weights: Mapping[str, float] | None = None,
+        start: np.ndarray | None = None,
+    ) -> JumpPlan:  # fmt: skip
         """Plan one jump.
 
         Parameters
@@ -167,6 +169,8 @@ class Planner:
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
         weights : of stage 3's cost terms, instead of their own; name -> weight.
+        start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
+            None. Not for flips.
 
         Raises
         ------
@@ -177,17 +181,19 @@ class Planner:
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {said(method)}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
+        where = _from(start, task)
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
-            body = planner.plan(task, weights=weights)
+            body = planner.plan(task, weights=weights, **where)
             rows = body_rows("direct", body)
             return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
         if task.rotation_rad:
             return self._flip(task)
-        srmp, joints = self._first_two(task)
+        srmp, joints = self._first_two(task, start)
         last = self.stage("whole body")
-        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights)
+        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights,
+                         **where)  # fmt: skip
         rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
         return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
 
@@ -214,19 +220,23 @@ class Planner:
         return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
                         skipped)  # fmt: skip
 
-    def _first_two(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
+    def _first_two(self, task: JumpTask, start=None) -> tuple[SrmpPlan, JointPlan]:
         """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
         try:
-            return self._pass(task)
+            return self._pass(task, start)
         except SolverError as e:
             nearest = self._nearest(task) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
             if not nearest:
                 raise
             raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
 
-    def _pass(self, task: JumpTask) -> tuple[SrmpPlan, JointPlan]:
-        srmp = self.stage("srmp").plan(task)
-        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
+    def _pass(self, task: JumpTask, start: np.ndarray | None = None) -> tuple[SrmpPlan, JointPlan]:
+        q0 = None if start is None else configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
+        srmp = self.stage("srmp").plan(task, start=self._rod(start))
+        return srmp, map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct", q0=q0)
+
+    def _rod(self, start: np.ndarray | None) -> np.ndarray | None:
+        return None if start is None else rod_of(self.robot, start)
 
     def _nearest(self, task: JumpTask) -> str:
         """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
@@ -243,11 +253,12 @@ class Planner:
                 return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
         return ""
 
-    def replan(self, previous: JumpPlan, task: JumpTask) -> JumpPlan:
+    def replan(self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None) -> JumpPlan:
         """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
 
         Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
         out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
+        ``start`` as in :meth:`plan`.
 
         Raises
         ------
@@ -259,14 +270,21 @@ class Planner:
         check_platform(task, self.robot)
         if previous.method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
-            body, srmp, rows = self.stage("direct").plan(task, near=previous.whole_body), None, ()
+            body, srmp, rows = self.stage("direct").plan(task, near=previous.whole_body, start=start), None, ()
         else:
-            srmp = self.stage("srmp").plan(task, near=previous.srmp)
-            body = self.stage("whole body").plan(task, srmp, near=previous.whole_body)
+            srmp = self.stage("srmp").plan(task, near=previous.srmp, start=self._rod(start))
+            body = self.stage("whole body").plan(task, srmp, near=previous.whole_body, start=start)
             rows = (_row("1 SRMP", srmp.solution.statistics),)
         rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
         tape = make_tape(body, self.robot, srmp)
         return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
+
+
+def _from(start: np.ndarray | None, task: JumpTask) -> dict[str, np.ndarray]:
+    """The argument ``start`` of stage 3, which has none for flips."""
+    if start is not None and task.rotation_rad:
+        raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
+    return {} if start is None else {"start": start}
 
 
 def _row(stage: str, s: Statistics) -> StageRow:

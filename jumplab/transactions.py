@@ -169,6 +169,8 @@ def _finish(folder: Path) -> None:
             shutil.rmtree(folder / name)
         (folder / name).unlink(missing_ok=True)
     for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
+        if (folder / name).is_dir() and not (folder / name).is_symlink():  # a folder takes no other's place
+            shutil.rmtree(folder / name)
         os.replace(commit / name, folder / name)
     commit.rmdir()
 

@@ -3,7 +3,7 @@
 A command imports the heavy libraries only once its input has been read, so that a mistake is told at once.
 """
 
-from jumplab.commands import audit, bench, envelope, export, plan, robot, run, simulate, sweep, trials, view
+from jumplab.commands import audit, bench, chain, envelope, export, plan, robot, run, simulate, sweep, trials, view
 
 # in the order of ``jumplab --help``
-COMMANDS = (run, plan, audit, simulate, trials, view, export, robot, envelope, sweep, bench)
+COMMANDS = (run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep, bench)

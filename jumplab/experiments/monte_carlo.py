@@ -167,7 +167,7 @@ def run_series(
         missing = [task for key, task in work.items() if key not in done]
         hide = not (sys.stderr.isatty() if progress is None else progress)
         with tqdm(total=len(work), initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
-            for trial in _in_parallel(missing, min(jobs or joblib.cpu_count(), max(len(missing), 1))):
+            for trial in in_parallel(missing, min(jobs or joblib.cpu_count(), max(len(missing), 1))):
                 log.add(trial)
                 done[trial.key] = trial
                 bar.set_postfix_str(f"{sum(t.landed for t in done.values())} of {len(done)} landed", refresh=False)
@@ -189,10 +189,10 @@ def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = 
     """
     work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
     jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
-    return dict(zip(jumps, _in_parallel(work, jobs, "list"), strict=True))
+    return dict(zip(jumps, in_parallel(work, jobs, "list"), strict=True))
 
 
-def _in_parallel(work: Iterable[Task], jobs: int, order: str = "generator_unordered") -> Iterable[Any]:
+def in_parallel(work: Iterable[Task], jobs: int, order: str = "generator_unordered") -> Iterable[Any]:
     """Results, as they come unless ``order`` says otherwise."""
     options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
     return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)

@@ -97,7 +97,7 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
                 fontsize=7, color=shade(color, 0.8), zorder=6, path_effects=[halo])  # fmt: skip
     flight = result.phase == "flight"
     ax.plot(result.com[flight, 0], result.com[flight, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=5)
-    _draw_scene(ax, scene, left, right, bottom)
+    draw_scene(ax, scene, left, right, bottom)
     equal_scales(ax)
     ax.set(xlim=(left, right), ylim=(bottom, top))
     legend_above(fig, phase_handles("launch", "flight", "landing"))
@@ -118,7 +118,7 @@ def _strobe_rows(result: SimulationResult) -> list[tuple[int, float]]:
     return rows
 
 
-def _draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float) -> None:
+def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float) -> None:
     """Cross-section of the ground from ``left`` to ``right``, cut off at ``bottom`` [m]."""
     for block in sorted(scene.blocks, key=lambda b: b.top):
         start, end = max(left, block.x_from), min(right, block.x_to)

@@ -212,6 +212,21 @@ def _around_stance(lower: np.ndarray, upper: np.ndarray, length: float, inertia:
     return lower, upper
 
 
+def _rod(m, angles: np.ndarray) -> tuple[np.ndarray, float]:
+    """Lean, length, turn and radius (4,) of stage 1's rod in a posture with flat feet, and its inertia."""
+    arms, mass = m.com_arms(), m.mass
+    links = np.array([sum(_turned(angles[j], arms[i, j]) for j in range(5)) for i in range(5)])
+    com = mass @ links / mass.sum()
+    from_sole = com - m.sole_center
+    rho = m.inertia.sum() + mass @ np.sum((links - com) ** 2, axis=1)
+    return np.array([np.arctan2(*from_sole), np.hypot(*from_sole), angles[3], np.sqrt(rho / mass.sum())]), rho
+
+
+def rod_of(robot: Robot, angles: np.ndarray) -> np.ndarray:
+    """Lean, length, turn, radius (4,) of stage 1's rod for absolute link angles (5,) of a posture with flat feet."""
+    return _rod(robot.sagittal, angles)[0]
+
+
 def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     """Sample the robot and fit its envelopes (Sec. III: "proper range respecting to the actual robot")."""
     m, p = robot.sagittal, postures(robot, count)
@@ -225,13 +240,8 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
         rows.append([*np.quantile(rho[inside], [EDGE, 1 - EDGE]), np.quantile(force[inside], 1 - EDGE),
                      np.quantile(speed[inside], SPEED_QUANTILE)])  # fmt: skip
     lower, upper, strongest, fastest = np.array(rows).T
-    stance = stance_angles(robot)
-    arms, mass = m.com_arms(), m.mass
-    links = np.array([sum(_turned(stance[j], arms[i, j]) for j in range(5)) for i in range(5)])
-    com = mass @ links / mass.sum()
-    from_sole = com - m.sole_center
-    stance_rho = m.inertia.sum() + mass @ np.sum((links - com) ** 2, axis=1)
-    start = np.array([np.arctan2(*from_sole), np.hypot(*from_sole), stance[3], np.sqrt(stance_rho / mass.sum())])
+    start, stance_rho = _rod(m, stance_angles(robot))
+    mass = m.mass
     half = -m.heel[0] / 2
     flat, toe = postures(robot, count, 0.0, FLAT_COM_X_M), postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M)
     capped = np.minimum(strongest, FORCE_CAP * strongest[0])

@@ -28,9 +28,9 @@ CURVATURE = {"neg_curv_test_tol": 1e-12}
 SEARCH = {"mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5, "mu_min": 1e-6}
 
 
-def parameters(task: JumpTask, envelope: Reach) -> dict:
-    """Parameter values of the stage-1 problem for a target."""
-    return dict(start=envelope.start, distance=task.distance_m, platform=task.platform_m,
+def parameters(task: JumpTask, envelope: Reach, start: np.ndarray | None = None) -> dict:
+    """Parameter values of the stage-1 problem for a target; ``start`` (4,) instead of the stance."""
+    return dict(start=envelope.start if start is None else start, distance=task.distance_m, platform=task.platform_m,
                 takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
 
 
@@ -78,8 +78,12 @@ class SrmpPlanner:
         weights: Mapping[str, float] | None = None,
         off: tuple[str, ...] = SYMMETRY_OFF,
         near: SrmpPlan | None = None,
+        start: np.ndarray | None = None,
     ) -> SrmpPlan:
         """Solve for a target; ``near`` is a plan for one close by to begin with, if that works.
+
+        ``start`` is the rod (4,) that the jump begins with, at rest, see :func:`jumplab.robot.reach.rod_of`; that of
+        the stance if None.
 
         Raises
         ------
@@ -91,18 +95,18 @@ class SrmpPlanner:
         check_reachable(task, self.reach, self.robot, self.settings)
         if near is not None:
             try:
-                return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers)
+                return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)
             except SolverError:
                 pass  # as if there had been none
         try:
-            return self._solve(task, guess, weights, off)
+            return self._solve(task, guess, weights, off, start=start)
         except SolverError as failure:
             raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
 
-    def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None) -> SrmpPlan:
+    def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
         nlp = self.nlp if multipliers is None else self._warm
-        solution = nlp.solve(parameters(task, self.reach), guess, weights=weights, off=off, explain=explain,
+        solution = nlp.solve(parameters(task, self.reach, start), guess, weights=weights, off=off, explain=explain,
                              multipliers=multipliers)  # fmt: skip
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
 

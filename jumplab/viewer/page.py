@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -66,6 +66,8 @@ def page(
     simulation: Record | Motion | None = None,
     task: JumpTask | None = None,
     scene: Scene | None = None,
+    marks_m: Sequence[float] = (),
+    title: str | None = None,
     fps: float = FPS,
 ) -> Page:
     """The page of one jump: to play, to scrub, to look at from all sides.
@@ -76,6 +78,8 @@ def page(
         offers each alone and both together.
     task : what was asked, for the title and the line where the toes should land.
     scene : ground; flat if None.
+    marks_m : further places where the toes should land, from where they start [m].
+    title : instead of the task's.
     fps : frames a second.
 
     Raises
@@ -96,20 +100,16 @@ def page(
         clips.append({"name": name, **painted, **_clip(motion, robot)})
     start, end = (float(f(p[:, 0])) for f, p in ((min, np.concatenate(paths)), (max, np.concatenate(paths))))
     toe = robot.foot.toe - float(robot.foot.center[0])
-    marks = [toe, toe + task.distance_m] if task else [toe]
+    marks = [toe, *(toe + x for x in ([task.distance_m] if task else []) + list(marks_m))]
     span = min(start, *marks) - AHEAD_M, max(end, *marks) + AHEAD_M
     stage.lay_ground(vis, scene, span, marks)
     facts: dict[str, Any] = {  # what player.js reads
-        "title": describe_task(task) if task else "A jump",
+        "title": title or (describe_task(task) if task else "A jump"),
         "note": f"robot {robot.name}, {robot.total_mass:.0f} kg · {fps:g} frames per second",
         "fps": fps,
         "clips": clips,
         "ruler": _ruler(scene, span, toe),
-        "view": {
-            "x": span,
-            "z": _heights(scene, span, motions),
-            "width": 2 * stage.TRACK_HALF_WIDTH_M,
-        },
+        "view": {"x": span, "z": _heights(scene, span, motions), "width": 2 * stage.TRACK_HALF_WIDTH_M},
         "colors": {
             p: {"trunk": tint(c, 1.0), "limb": tint(c, LIMB_SHARE), "rest": tint(stage.REST_COLOR, 1.0)}
             for p, c in PHASE_COLORS.items()

@@ -116,7 +116,7 @@ class WholeBodyPlanner:
 
     def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
              weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
-             near: WholeBodyPlan | None = None) -> WholeBodyPlan:  # fmt: skip
+             near: WholeBodyPlan | None = None, start: np.ndarray | None = None) -> WholeBodyPlan:  # fmt: skip
         """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
 
         Parameters
@@ -125,6 +125,7 @@ class WholeBodyPlanner:
         weights, off : as in :meth:`jumplab.solver.Nlp.solve`.
         near : this planner's plan for a target close by, to begin with instead of ``guess``; if that leads nowhere, the
             target is solved from ``guess`` all the same.
+        start : absolute link angles (5,) in which the robot waits at rest, soles flat; the stance if None.
 
         Raises
         ------
@@ -132,7 +133,7 @@ class WholeBodyPlanner:
             If there is no plan; names the terms in conflict.
         """
         how = {"weights": weights, "off": off}
-        guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp)
+        guess, parameters = guess or self.naive_guess(task), self.parameters(task, srmp, start)
         if near is not None:
             try:
                 return WholeBodyPlan(task, self._from(near.solution, self._warm, srmp, parameters, how))
@@ -161,11 +162,15 @@ class WholeBodyPlanner:
         return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
                                 references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
-    def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None) -> dict:
-        """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
+    def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:
+        """Parameter values of the problem for a target and a ``start`` (see :meth:`plan`).
+
+        Raises :class:`InfeasibleError` for an impossible platform.
+        """
         check_platform(task, self.robot, self.limits)
         edge = platform_edge_m(task, self.robot, self.limits) - np.sign(task.platform_m) * self.limits.edge_step_m
-        values = dict(stance=self.stance, distance=task.distance_m, platform=task.platform_m, edge=edge,
+        stance = self.stance if start is None else start
+        values = dict(stance=stance, distance=task.distance_m, platform=task.platform_m, edge=edge,
                       takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
         if self.tracking:
             values |= dict(momentum=srmp.launch.L[-1], launch_s=[srmp.launch_s - srmp.toe_s, srmp.toe_s])
