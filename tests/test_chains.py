@@ -1,51 +1,17 @@
 """Chained jumps: what is refused before any solve, what enters a plan, and chains that stand, wait, and fail."""
 
-import json
-import re
-from functools import cache
-
 import numpy as np
 import pytest
-from matplotlib.text import Text
+from fixtures_chains import planner, rehearsal, waiting
 
-from jumplab import __main__ as cli
-from jumplab import store
-from jumplab.chains import ChainReport, ChainTrial, Course, Rehearsal, crouched, run_chain, write_chain
+from jumplab.chains import Course, crouched, run_chain
 from jumplab.chains.foresight import Ahead, Foresight
 from jumplab.chains.posture import CROUCH, Gauge
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.pipeline import Planner
-from jumplab.plotting import chains as pictures
-from jumplab.plotting.style import MIN_FONT_PT, PAGE_IN
-from jumplab.robot import Robot, load_robot
-from jumplab.robot.stance import configuration, stance_angles, stance_configuration
-from jumplab.simulation import SLIGHT, Perturbation
+from jumplab.robot import load_robot
+from jumplab.robot.stance import configuration, stance_angles
 from jumplab.task import JumpTask
-
-
-@cache
-def waiting() -> Robot:
-    """The default robot in its crouch."""
-    return crouched(load_robot())
-
-
-@cache
-def planner() -> Planner:
-    return Planner(waiting())
-
-
-@cache
-def rehearsal() -> Rehearsal:
-    return Rehearsal.of(Course.of([0.6, 0.6], 0.3), planner())
-
-
-@cache
-def chain(solve_s: float = 0.2, seed: int | None = None):
-    """Two jumps of 0.6 m, planning charged with a given time."""
-    drawn = None if seed is None else Perturbation.draw(load_robot(), seed, SLIGHT)
-    return run_chain(Course.of([0.6, 0.6], 0.3), load_robot(), planner=planner(), rehearsal=rehearsal(),
-                     solve_s=solve_s, perturbation=drawn)  # fmt: skip
-
 
 # ------------------------------------------------------------------------------------------ courses
 
@@ -259,157 +225,3 @@ def test_in_time_means_before_it_was_needed():
         return Ahead(1, 2.0, True, 0.6, 0.6, np.zeros(5), np.zeros(14), 0.0, 0.5, 0.5, object(), needed_s=needed)
 
     assert plan(2.5).in_time and not plan(2.499).in_time and not plan(None).in_time
-
-
-# ------------------------------------------------------------------------------------------ in the simulation
-
-
-@pytest.mark.slow
-def test_a_chain_stands_and_hits():
-    result = chain()
-    assert result.stood, result.reason
-    assert np.abs(result.errors_m).max() < 0.01
-    assert result.travels_m.sum() == pytest.approx(result.places_m[-1, 0])
-    assert len(result.replans) == 2 == result.in_time and result.jumps[1].ahead is result.replans[-1]
-    (ahead, revised), first = result.jumps[1].plans, result.jumps[0]
-    # planned in the air: after lift-off and before touchdown of the first jump, for where that came down
-    assert first.simulation.metrics.liftoff_s < ahead.looked_s < first.simulation.metrics.touchdown_s
-    assert ahead.air and ahead.place_m == pytest.approx(result.places_m[1, 0], abs=0.01)
-    assert ahead.ready_s == pytest.approx(ahead.looked_s + 0.2) and ahead.began_s is None
-    # and again from where the feet stand: 0.1 s after touchdown, begun as soon as the robot was still enough
-    assert revised.looked_s - first.simulation.metrics.touchdown_s == pytest.approx(0.1, abs=0.01)
-    assert not revised.air and revised.place_m == pytest.approx(result.places_m[1, 0], abs=0.002)
-    assert revised.began_s == revised.needed_s > revised.ready_s > ahead.ready_s
-
-
-@pytest.mark.slow
-def test_nothing_is_reset_between_jumps():
-    """The log goes on from jump to jump as the engine's own step has it, and every part passes the honesty checks."""
-    result = chain()
-    assert all(j.simulation.honest for j in result.jumps)
-    assert np.all(np.diff(result.t) > 0) and result.t[1] == pytest.approx(0.001)
-    seam = len(result.jumps[0].simulation.t)
-    assert result.jumps[1].start_s == pytest.approx(result.t[seam])
-    assert np.abs(np.diff(result.q[:, 7:], axis=0)[seam - 1]).max() < 0.02  # [rad] in one millisecond
-    assert result.com[seam] - result.com[seam - 1] == pytest.approx(np.zeros(3), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_a_late_plan_is_waited_for_in_the_crouch():
-    """Charged two seconds, the plan is late: the robot holds its crouch, then jumps as well as before."""
-    late = chain(2.0)
-    ahead = late.jumps[1].ahead
-    assert late.stood and late.in_time == 0 and not ahead.in_time
-    assert ahead.air and late.jumps[1].plans == (ahead,)  # a correction would have come later still
-    assert ahead.ready_s > ahead.needed_s + 0.5
-    assert ahead.began_s == pytest.approx(ahead.ready_s, abs=2e-3)
-    assert late.waits_s == pytest.approx([ahead.ready_s - ahead.needed_s], abs=2e-3) and chain().waits_s == (0.0,)
-    assert np.abs(late.errors_m).max() < 0.01
-    held = late.jumps[0].simulation
-    still = held.com_velocity[-200:]
-    assert np.abs(still).max() < 0.05 and held.com[-1, 2] == pytest.approx(
-        Gauge(waiting()).com(stance_configuration(waiting()))[2], abs=0.02)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_chain_made_twice_is_the_same(tmp_path):
-    a = chain(0.2, 3)
-    b = run_chain(a.course, load_robot(), planner=planner(), rehearsal=rehearsal(), solve_s=0.2,
-                  perturbation=Perturbation.draw(load_robot(), 3, SLIGHT))  # fmt: skip
-    assert np.array_equal(a.q, b.q) and np.array_equal(a.tau, b.tau)
-    assert a.stood and np.abs(a.errors_m).max() < 0.03
-
-
-@pytest.mark.slow
-def test_a_plan_that_does_not_come_ends_the_chain(monkeypatch):
-    def fail(previous, task, start):
-        raise SolverError("no plan today")
-
-    monkeypatch.setattr(planner(), "replan", fail)
-    result = run_chain(Course.of([0.6], 0.3), load_robot(), planner=planner(), rehearsal=rehearsal(), solve_s=0.0)
-    assert not result.stood and result.reason == "no plan for jump 1: no plan today"
-
-
-@pytest.mark.slow
-def test_folder_is_whole_and_replaced_as_a_whole(tmp_path, odd_folder):
-    result, out = chain(), odd_folder / "chain"
-    audits = write_chain(out, result, {"chain.html": "<p>"})
-    assert len(audits) == 2 and all(c.passed for a in audits for c in a.checks)
-    write_chain(out, result)
-    assert sorted(p.name for p in out.iterdir()) == ["chain.html", "chain.json", "chain.npz", "jumps"]
-    tape, robot, summary = store.read_plan(out / "jumps" / "2")
-    assert (
-        robot.hash == waiting().hash and summary["target"]["distance_m"] == result.jumps[1].ahead.plan.task.distance_m
-    )
-    data = json.loads((out / "chain.json").read_text())
-    assert data["stood"] is True and len(data["jumps"]) == 2 and data["jumps"][1]["in_time"] is True
-    with np.load(out / "chain.npz") as log:
-        assert np.array_equal(log["q"], result.q) and set(log["jump"]) == {0, 1}
-    assert len(tape.t) == len(result.jumps[1].ahead.plan.tape.t)
-
-
-@pytest.mark.slow
-def test_report_of_many_counts_what_the_chains_say():
-    trial, late = ChainTrial.of(3, chain()), ChainTrial.of(4, chain(2.0))
-    report = ChainReport(chain().course, (trial, late, ChainTrial(5, False, "fell")))
-    assert (report.stood, report.replans, report.in_time) == (2, 3, 2)
-    assert len(report.errors_m) == 4 and list(report.waits_s <= 0) == [True, False]
-    low, high = report.interval
-    assert 0.2 < low < 2 / 3 < high < 0.95
-    data = json.loads(store.to_json(report.to_json()))
-    assert data["begun_without_waiting"] == 1 and data["trials"][2]["reason"] == "fell"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["chain_strobe", "chain_path", "chain_timeline", "chain_errors"])
-@pytest.mark.parametrize("solve_s", [0.2, 2.0])
-def test_figures_are_legible_in_print(name, solve_s):
-    result, more = chain(solve_s), ()
-    if name == "chain_errors":
-        more = ((ChainTrial.of(0, result),),)
-    fig = getattr(pictures, name)(result, *more)
-    fig.canvas.draw()
-    texts = [t for t in fig.findobj(Text) if t.get_text().strip() and t.get_visible()]
-    assert fig.get_size_inches()[0] == PAGE_IN and min(t.get_fontsize() for t in texts) >= MIN_FONT_PT
-    assert not [t for ax in fig.axes for t in (ax.get_xlabel(), ax.get_ylabel()) if t and t != "jump" and "[" not in t]
-
-
-# ------------------------------------------------------------------------------------------ the command line
-
-HELP = "'jumplab chain --help' shows what is possible"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "sentence"),
-    [
-        ("--out x", 2, f"the following arguments are required: --distances-m; {HELP}"),
-        ("--distances-m --out x", 2, f"argument --distances-m: expected at least one argument; {HELP}"),
-        ("--distances-m 0.6 far --out x", 2, "--distances-m must be a number, got 'far'"),
-        ("--distances-m 0.6 --height-m tall --out x", 2, "--height-m must be a number, got 'tall'"),
-        ("--distances-m 0.6 0.6 --platforms-m 0.1 --out x", 2, "1 platforms for 2 distances: give one per jump"),
-        ("--distances-m 0.6 --seed -1 --out x", 2, "--seed must be a whole number from 0 to 2147483647, got '-1'"),
-        ("--distances-m 0.6 --runs 1.5 --out x", 2, "--runs must be a whole number from 1 to 10000, got '1.5'"),
-        ("--distances-m 0.6 --solve-s -1 --out x", 2, "solve_s = -1.0 s is outside 0 ... 60 s"),
-        ("--distances-m 0.6 0.2 --platforms-m 0 0.1 --out x", 2,
-         "jump 2 of 2: the surface 0.1 m high would begin under the sole that stands 0.2 m before it; place them "
-         "0.34 m apart or more, toe to toe"),
-        ("--distances-m 0.6 2.9 --out x", 3, "jump 2 of 2: distance = 2.9 m"),
-    ],
-)  # fmt: skip
-def test_refusals_of_the_command(capsys, tmp_path, monkeypatch, arguments, code, sentence):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["chain", *arguments.split()]) == code
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith(f"jumplab: {sentence}") and err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_the_command_tells_jump_by_jump(capsys, tmp_path):
-    out = tmp_path / "chain"
-    code = cli.main(["chain", "--distances-m", "0.5", "--solve-s", "0.2", "--seed", "4", "--out", str(out)])
-    told, err = capsys.readouterr()
-    assert code == 0, err
-    assert re.search(r"^1 +0\.500 m +0\.500 m +0\.\d{3} m +-?0\.0\d\d m +0\.4\d\d s +0\.200 s", told, re.M), told
-    assert "chain: stands after every jump" in told and "checks of 1 plans passed" in told
-    assert "A chain of jumps" in (out / "chain.html").read_text(encoding="utf-8")

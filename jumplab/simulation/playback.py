@@ -74,7 +74,9 @@ class Playback:
         self._takeoff = round(tape.takeoff_time / STEP_S)
         self._corrected = self._rest
 
-    def shifted(self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction) -> Command:
+    def shifted(
+        self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction: np.ndarray
+    ) -> Command:
         """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
         at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
         if at >= self.steps:

@@ -94,7 +94,7 @@ class WholeBodyTerms:
         return rows
 
     @staticmethod
-    def relative(x):
+    def relative(x: ca.SX) -> ca.SX:
         """Hip, knee, ankle, shoulder and trunk (5,) from absolute links' accelerations or jerks, (5,) or (4,)."""
         x = ca.vertcat(0, x) if x.shape[0] == 4 else x
         return ca.vertcat(x[2] - x[3], x[1] - x[2], x[0] - x[1], x[4] - x[3], x[3])

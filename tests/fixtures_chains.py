@@ -1,0 +1,32 @@
+"""Chained jumps that several tests look at, made once."""
+
+from functools import cache
+
+from jumplab.chains import ChainResult, Course, Rehearsal, crouched, run_chain
+from jumplab.pipeline import Planner
+from jumplab.robot import Robot, load_robot
+from jumplab.simulation import SLIGHT, Perturbation
+
+
+@cache
+def waiting() -> Robot:
+    """The default robot in its crouch."""
+    return crouched(load_robot())
+
+
+@cache
+def planner() -> Planner:
+    return Planner(waiting())
+
+
+@cache
+def rehearsal() -> Rehearsal:
+    return Rehearsal.of(Course.of([0.6, 0.6], 0.3), planner())
+
+
+@cache
+def chain(solve_s: float = 0.2, seed: int | None = None) -> ChainResult:
+    """Two jumps of 0.6 m, planning charged with a given time."""
+    drawn = None if seed is None else Perturbation.draw(load_robot(), seed, SLIGHT)
+    return run_chain(Course.of([0.6, 0.6], 0.3), load_robot(), planner=planner(), rehearsal=rehearsal(),
+                     solve_s=solve_s, perturbation=drawn)  # fmt: skip
