@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from fixtures_core import planner
@@ -33,6 +34,7 @@ def worst_difference(a, b):
 ELSEWHERE = """
 import sys
 sys.path[:0] = [{root!r}, {tests!r}]
+import cvxpy as cp
 import numpy as np
 from test_repeatable import TARGETS, JumpTask, planner
 litter = [np.empty(n) for n in range(1, 3000, 7)]  # another layout of the memory
@@ -93,3 +95,36 @@ def test_polishing_never_replaces_an_answer():
     data, multipliers = small_problem(False)
     x = np.array([0.5, 0.5, 1.0])
     assert solve.polished(*data, x, 0 * multipliers) is x
+
+
+# ------------------------------------------------------------------------------------------ rows known to bind
+
+
+@pytest.mark.parametrize("top, tries", [([True, False], 1), ([False, False], 2), ([True, True], 2)])
+def test_binding_rows_join_and_leave(top, tries):
+    """Known, missing, or one too many: the rows that bind are found, and with them the closed form."""
+    data, _ = small_problem(False)
+    x, at_top, at_bottom, count = solve.from_binding(*data, np.array(top), np.zeros(2, bool))
+    np.testing.assert_allclose(x, [0.5, 0.5, 1.0], rtol=0, atol=1e-14)
+    assert list(at_top) == [True, False] and not at_bottom.any() and count == tries
+
+
+def test_binding_rows_end_at_the_optimum_or_say_nothing():
+    """Programs that drift, warm from the last one's rows: where the method ends, Clarabel agrees; else it is None."""
+    rng, ended = np.random.default_rng(8), 0
+    rows, root, high = rng.normal(size=(6, 4)), rng.normal(size=(4, 4)), rng.uniform(0.05, 0.5, 6)
+    hessian, no_rows = root @ root.T + 0.1 * np.eye(4), (np.zeros((0, 4)), np.zeros(0))
+    linear, drift = rng.normal(size=4), 0.05 * rng.normal(size=4)
+    top = bottom = np.zeros(6, bool)
+    for k in range(40):
+        push = linear + k * drift
+        found = solve.from_binding(hessian, push, *no_rows, rows, -high, high, top, bottom)
+        if found is None:
+            continue
+        x, top, bottom, _ = found
+        y = cp.Variable(4)
+        cost = cp.quad_form(y, hessian) / 2 + push @ y
+        cp.Problem(cp.Minimize(cost), [cp.abs(rows @ y) <= high]).solve(cp.CLARABEL)
+        np.testing.assert_allclose(x, y.value, atol=1e-5)
+        ended += 1
+    assert ended > 20
