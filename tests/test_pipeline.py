@@ -179,7 +179,9 @@ def test_guess_is_stage_twos_motion(plan):
         own = np.mean([last[robot.model.idx_qs[robot.model.getJointId(n)]] for n in robot.joints[role]])
         assert angle == pytest.approx(own, abs=1e-9)
     arm = pipeline.to_link_angles(robot, plan.joints.q, plan.joints.v, plan.joints.a)[0][-1, 4]
-    assert guess["flight"].q[-1, 4] == pytest.approx(pipeline.GUESS_ARM_SHARE * arm, abs=1e-9)
+    naive = body.naive_guess(plan.task)["flight"].q[-1, 4]
+    mixed = pipeline.OWN_ARMS * arm + pipeline.NAIVE_ARMS * naive
+    assert guess["flight"].q[-1, 4] == pytest.approx(mixed, abs=1e-9)
     velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
     rows = plan.joints.rows("flight")
     np.testing.assert_allclose(velocity, plan.joints.actual["com_velocity"][rows][0][[0, 2]], atol=0.15)
