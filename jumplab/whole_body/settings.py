@@ -54,9 +54,10 @@ class Limits:
         the soles belong then depends on that momentum as much as on v_x: what counts is the angular momentum about the
         middle of the soles, which the impact does not change. A backflip lands with the CoM ahead of the toes; its
         ankles meet their stop while the knees bend, the heels rise, and for 0.1 s the ground pushes at the toes, which
-        takes 10 kg m^2/s and more: aimed at 4, 35 of 50 perturbed robots landed, the others tipped over backward or
-        sideways; aimed at 6, with the legs' aim begun earlier, 44 of 50. An ankle at its stop cannot keep a tilted
-        robot's soles flat either, 0.12 rad are left for that. Flat feet keep 4 % of the weight: else flips of 0.7 m hop first.
+        takes 10 kg m^2/s and more: aimed at 4, 35 of 50 perturbed robots landed, and the three falls traced went
+        backward; aimed at 6, with the legs' aim begun earlier, 44 of 50. An ankle at its stop cannot keep a tilted
+        robot's soles flat either, 0.12 rad are left for that. Flat feet keep 4 % of the weight: else flips of
+        0.7 m hop first.
         Torques would jump from node to node were the steps of the jerk not bounded; 32,000 rad/s^3 is what the audit's
         tape can follow. Stage 1's rod turns with other inertia than the body, so its L is followed to 15 %.
 
