@@ -48,6 +48,7 @@ def test_guess_turns_as_asked_and_goes_where_it_should(turns):
 def test_a_jump_keeps_its_own_limits():
     """What flips need is a copy: jumps without rotation have another planner and the settings of before."""
     assert Limits().capture_moment is None and Limits().jerk_step is None and Limits().cop_reserve_m == 0
+    assert Limits().touchdown_ankle_stroke is None
     assert Limits().touchdown_trunk_rate == 1.0 and Limits().of_flip().touchdown_trunk_rate == 5.0
     assert Limits().of_flip().torque_share == Limits().torque_share == 0.85  # the stated margin
     assert Mesh() == Mesh(25, 20, 30) and Weights().jerk < Weights().of_flip().jerk
@@ -133,7 +134,10 @@ def test_backflip_is_captured_by_momentum():
     z, dx = com[1] - sole[1], sole[0] - com[0]
     L = float(np.ravel(tape.extra["planar_L"])[-1])
     assert L < -15  # backward
-    assert abs(L + sagittal.total_mass * (z * speed[0] + dx * speed[1])) <= 4.0 + 0.1
+    low, high = Limits().of_flip().capture_moment
+    assert low - 0.1 <= L + sagittal.total_mass * (z * speed[0] + dx * speed[1]) <= high + 0.1
+    stroke = float(np.ravel(tape.extra["planar_joints"][-1])[2]) - sagittal.lower[2]
+    assert stroke >= Limits().of_flip().touchdown_ankle_stroke - 1e-3
     assert abs(plan.whole_body.solution.phases["flight"].v[-1, 3]) <= 5.0 + 1e-6
 
 

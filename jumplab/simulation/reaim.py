@@ -13,6 +13,9 @@ from jumplab.trajectory import Tape
 
 START_HEIGHT_M = 0.30  # our choice: soles this far above the ground; earlier, the correction fights the swing itself
 RATE = 12.0  # [rad/s] our choice: 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
+# our choice: in a flip the legs open at their speed limits and the touchdown is forecast, so the correction comes with
+# the opening and not after it: it begins this long before the ground is due, gently enough for hips at their limit
+FLIP_START_S, FLIP_RATE = 0.12, 4.0  # [s], [rad/s]
 LARGEST_RAD = 0.8  # our choice: beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] our choice: below it the foothold says little about the moment
 NEWTON_STEPS = 2  # two equations, nearly linear
@@ -62,17 +65,19 @@ class Reaim:
         tilt = np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])
         return np.array([middle[0] - com[0], tilt, com[2] - middle[2]])
 
-    def correction(self, q: np.ndarray, v: np.ndarray, error: float) -> np.ndarray:
+    def correction(self, q: np.ndarray, v: np.ndarray, error: float, opening: float | None = None) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
 
         Parameters
         ----------
         q, v : measured state.
         error : of the trunk's pitch at touchdown, as now or as forecast [rad], within half a turn.
+        opening : in a flip, the time until touchdown [s].
         """
         middle = self._sole_middle(q)
-        if middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M:
-            most = RATE * STEP_S
+        near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
+        if near or (opening is not None and opening < FLIP_START_S):
+            most = (RATE if near else FLIP_RATE) * STEP_S
             self._now = self._now + np.clip(self.wish(q, v, error) - self._now, -most, most)
         return self._now
 

@@ -17,7 +17,9 @@ from jumplab.simulation.world import STEP_S
 from jumplab.trajectory import Tape
 
 FROM_SHARE = 0.4  # our choice: of the flight; before, legs and arms are still folding at their speed limits
-LARGEST_SHIFT_S = 0.06  # our choice: the tape then runs at 0.5 to 1.5 times its speed, motors and their limits allowing
+# our choice: the tape then runs at 0.65 to 1.35 times its speed; with 60 ms the opening hips passed their speed limit,
+# where a servo has no torque left to stop them, and the soles came down tilted
+LARGEST_SHIFT_S = 0.045
 SHIFT_RATE = 0.5  # [1] our choice: seconds of shift per second, five 10 ms corrections per 100 ms
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
 BISECTIONS = 8  # of twice the largest shift: to half a millisecond, 3 mrad

@@ -275,6 +275,9 @@ class WholeBodyTerms:
             Term("foot flat at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[0] - p.p.rotation),
             Term("knee at touchdown", "ours: stroke", "rad", "end", lambda p: self.state(p).joints[1],
                  lower=lim.touchdown_knee[0], upper=lim.touchdown_knee[1]),
+            *([] if lim.touchdown_ankle_stroke is None else [
+                Term("ankle at touchdown", "ours, for flips: stroke", "rad", "end", lambda p: self.state(p).joints[2],
+                     lower=model.lower[2] + lim.touchdown_ankle_stroke, upper=np.inf)]),
             Term("trunk at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[3] - p.p.rotation,
                  lower=lim.touchdown_trunk[0], upper=lim.touchdown_trunk[1]),
             Term("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", lambda p: self.state(p).joint_rates,
