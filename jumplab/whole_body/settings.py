@@ -25,8 +25,8 @@ class Limits:
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
-    # [rad/s] if set: a foot that still turns meets the ground with toe or heel first, and the impact spins it; at
-    # 2.4 rad/s the ankle passed its speed limit by 11 %
+    # [rad/s] if set: a foot that still turns meets the ground with toe or heel first, and the impact spins it;
+    # what is left is the tilt of the simulated flight, 1 to 2 mrad, which no bound of the plan takes away
     touchdown_foot_rate: float | None = 0.3
     # [rad] stroke left to absorb the fall; the impact turns a straighter knee faster than its motor can (20 rad/s), at
     # 0.7 rad by 7 %
