@@ -19,7 +19,7 @@ import casadi as ca
 from jumplab.terms import Problem
 from jumplab.transcription import Assembled
 
-FUNCTIONS = ("nlp", "grad_f", "jac_g", "hess_lag", "cost_parts")
+FUNCTIONS = ("nlp", "grad_f", "jac_g", "hess_lag", "cost_parts", "gauss_newton")
 SOURCES = ("*.py", "models/*.py", "robot/*.py", "srmp/*.py", "whole_body/*.py")  # all that a problem is built by
 
 

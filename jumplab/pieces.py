@@ -103,20 +103,41 @@ class Piece:
         i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
         return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
 
+    def gauss_newton(self) -> tuple | None:
+        """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian, or None if it is zero."""
+
+        def make():
+            h = ca.triu(self._squares(1.0)[0])
+            return [self.w], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
+
+        if not self.e.costs:
+            return None
+        function, rows, cols = self._made("gauss_newton", make)
+        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
+        return ca.vec(self._map(function, [self.weights])), np.minimum(i, j), np.maximum(i, j)
+
+    def _squares(self, scale) -> tuple:
+        """(2 w J^T J summed over the costs w |y|^2, [(share, y, J, 2 w) of each])."""
+        total, parts = ca.SX(self.ny, self.ny), []
+        for k, (_, share, y) in enumerate(self.e.costs):
+            jacobian = ca.jacobian(y, self.e.local)
+            weight = 2 * scale * self.w[k] * share
+            total += weight * (jacobian.T @ jacobian)
+            parts.append((share, y, jacobian, weight))
+        return total, parts
+
     def _curvature(self, lam, scale):
         """Hessian of scale * cost + lam . g.
 
         A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
         everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
         """
-        x, ys, mus, extra = self.e.local, [], [], ca.SX(self.ny, self.ny)
-        for k, (_, share, y) in enumerate(self.e.costs):
-            weight = scale * self.w[k] * share
-            jacobian = ca.jacobian(y, x)
-            extra += 2 * weight * (jacobian.T @ jacobian)
+        x, ys, mus = self.e.local, [], []
+        extra, parts = self._squares(scale)
+        for k, (share, y, jacobian, weight) in enumerate(parts):
             mixed = ca.jacobian(share, x).T @ (2 * scale * self.w[k] * (y.T @ jacobian))
             extra += mixed + mixed.T
-            ys, mus = [*ys, y], [*mus, 2 * weight * y]
+            ys, mus = [*ys, y], [*mus, weight * y]
         y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
         held = ca.SX.sym("mu", y.numel())
         bent = ca.hessian(ca.dot(held, y) + ca.dot(lam, self.g), x)[0]

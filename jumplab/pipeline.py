@@ -28,7 +28,7 @@ METHODS = ("three-step", "direct")
 # Our choice: shares of the arms' swing in stage 3's guess. Stage 2's arms swing two to three times as far as stage 3's,
 # whichever way inertia and L ask for: from half of their swing alone, 13 of 24 targets ended in one that costs up
 # to 44 % more. From this mixture none does, after 24 coarse iterations instead of 42 from the naive guess
-OWN_ARMS, NAIVE_ARMS = 0.125, 0.5
+OWN_ARMS, NAIVE_ARMS = 0.25, 1.0
 SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 

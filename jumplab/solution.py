@@ -114,6 +114,18 @@ class Statistics:
 
 
 @dataclass(frozen=True)
+class Near:
+    """Phases near a solution: a start for a solve, no motion yet, because rows are still violated."""
+
+    phases: dict[str, PhaseSolution]
+    statistics: Statistics
+
+    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
+        """All phases as the start of a solve, on another mesh if asked."""
+        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
+
+
+@dataclass(frozen=True)
 class Solution:
     """Result of one solve; ``phases`` by name, tables for people."""
 

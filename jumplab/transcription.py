@@ -211,6 +211,7 @@ class Assembled:
         self.n_rows = len(self.rows)
         self.nlp, self.grad_f, self.jac_g = known["nlp"], known["grad_f"], known["jac_g"]
         self.hess_lag, self.cost_parts = known["hess_lag"], known["cost_parts"]
+        self.gauss_newton = known["gauss_newton"]
         if self.nlp.size1_in(0) != self.size or self.nlp.size1_out(1) != self.n_rows:
             raise ValueError(f"{self.problem.name}: functions of another problem")
 
@@ -242,6 +243,8 @@ class Assembled:
         self.hess_lag = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess], ["x", "p", "lam_f", "lam_g"],
                                     ["triu_hess_gamma_x_x"])  # fmt: skip
         self.cost_parts = ca.Function("cost_parts", [x, p], [parts])
+        squares = gather([h for h in (piece.gauss_newton() for piece in pieces) if h], (self.size, self.size))
+        self.gauss_newton = ca.Function("gauss_newton", [x, p], [squares], ["x", "p"], ["triu_hess_f"])
 
     def _add_rows(self, e) -> np.ndarray:
         """Record the constraint rows of an element; return which of its local rows are kept."""

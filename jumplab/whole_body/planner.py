@@ -10,7 +10,7 @@ import numpy as np
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
-from jumplab.solver import WARM, Nlp, PhaseGuess, Solution, Statistics
+from jumplab.solver import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
 from jumplab.whole_body.problem import build_problem
@@ -32,9 +32,9 @@ GUESS_WIDTHS = (0.05, 0.2)
 # our choice: stage 2's motion is near enough for small multipliers; over 16 targets the coarse mesh then takes 22
 # iterations instead of 26. From the naive guess the direct planner takes more with them, so it keeps ipopt's own
 NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
-# our choice: the coarse motion is a good start on the fine mesh, its multipliers are not: 8 iterations instead of 10
-REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-3, "bound_push": 1e-3, "bound_frac": 1e-3,
-           "slack_bound_push": 1e-3, "slack_bound_frac": 1e-3}  # fmt: skip
+# our choice: what a few steps on the coarse mesh lead to is a good start on the fine one but for its multipliers; over 12
+# targets the fine mesh then takes 9 iterations, with mu_init = 0.1 or 1e-3 or half-sized pushes 10 and more
+REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70}
 
 
 @dataclass(frozen=True)
@@ -154,12 +154,16 @@ class WholeBodyPlanner:
             guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
-        first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
-        return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
+        try:
+            first = self._coarse.approach(parameters, start, references=references, **how)
+            return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
+        except SolverError:  # too far away for linear rows; what begins inside all limits finds more, and takes longer
+            first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
+            return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
 
-    def _from(self, known: Solution, nlp: Nlp, srmp, parameters, how) -> Solution:
+    def _from(self, known: Solution | Near, nlp: Nlp, srmp, parameters, how) -> Solution:
         """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
-        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
+        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=getattr(known, "multipliers", None),
                                 references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:

@@ -1,0 +1,205 @@
+"""An assembled problem in the order of time, as solvers for optimal control want it.
+
+Stage by stage come states, then controls; the rows of a stage are first the links to the next one, x[k+1] - F(x[k], u[k]),
+then its other rows. What is constant in a phase, its duration say, becomes a state of all its stages, linked by equality.
+Nothing is derived anew: entries of the Jacobian and of the Hessian are only put elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from jumplab.transcription import Assembled
+
+PROBE = 0.3  # our choice: any point will do to read the constant slopes of links
+
+
+@dataclass
+class Stages:
+    """What belongs to which stage.
+
+    Attributes
+    ----------
+    states, controls : for each stage, indices into the problem's variables. A control that is a constant of the next
+        phase is that constant before it takes effect.
+    nodes : for each variable its stage; -1 for constants.
+    phase_of : for each variable the number of the phase whose constant it is; -1 for others.
+    starts : for each phase its first stage.
+    """
+
+    states: list[np.ndarray] = field(default_factory=list)
+    controls: list[list] = field(default_factory=list)
+    nodes: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    phase_of: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    starts: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, a: Assembled) -> Stages:
+        """The stages of a problem: its nodes, phase after phase."""
+        out = cls(nodes=np.full(a.size, -1), phase_of=np.full(a.size, -1))
+        for number, layout in enumerate(a.layouts.values()):
+            out.starts.append(len(out.states))
+            out.phase_of[layout.constants()] = number
+            n = layout.phase.intervals
+            for k in range(n + 1):
+                jerks = layout.jerk(k) if k < n else np.zeros(0, int)
+                out.nodes[np.concatenate([layout.node(k), jerks])] = len(out.states)
+                out.states.append(np.concatenate([layout.constants(), layout.node(k)]))
+                out.controls.append(jerks.tolist())
+        return out
+
+    def phase(self, stage: int | np.ndarray) -> np.ndarray:
+        """Number of the phase that a stage belongs to."""
+        return np.searchsorted(self.starts, stage, side="right") - 1
+
+
+class StagedOrder:
+    """Where the variables, rows and derivatives' entries of an assembled problem stand in the order of time.
+
+    Attributes
+    ----------
+    N, nx, nu, ng : last stage; numbers of states, controls and rows besides links, stage by stage.
+    source : (nw,) the problem's variable that each staged one copies.
+    copy : (n,) the staged place of each variable; of a constant, of its first copy.
+    place, sign : (n_rows,) where each row stands and by what it is multiplied; links read x[k+1] - F.
+    links : (n, 3) further rows, their next and their present variable: copies of what is constant.
+    """
+
+    def __init__(self, a: Assembled):
+        self.a, stages = a, Stages.of(a)
+        self._rows, self._cols = (np.array(z, int) for z in a.jac_g.sparsity_out(1).get_triplet())
+        stage = self._stage_of_rows(stages)
+        at = self._stage_of_columns(stages, stage)
+        known = self._link_rows(stages, stage, at)
+        where = self._number_variables(stages, known)
+        self._number_rows(stages, stage, known, where)
+        self._jac_at = self.place[self._rows], np.array([where[k, c] for k, c in zip(at, self._cols, strict=True)])
+        self._hess_at = self._place_hessian(stages, where)
+
+    def _stage_of_rows(self, stages) -> np.ndarray:
+        """The stage of each row: that of its node, and for rows that join phases, the last of the phase before."""
+        names = list(self.a.layouts)
+        stage = np.array([stages.starts[names.index(r.owner)] + r.node if r.owner in names else -1 for r in self.a.rows])
+        of_entry = stages.nodes[self._cols]
+        for row in np.flatnonzero(stage < 0):
+            found = of_entry[(self._rows == row) & (of_entry >= 0)].min()
+            stage[row] = found - 1 if self.a.rows[row].term.identity and found in stages.starts else found
+        return stage
+
+    def _stage_of_columns(self, stages, stage) -> np.ndarray:
+        """The stage whose copy each entry of the Jacobian belongs to."""
+        own, phase = stage[self._rows], stages.phase_of[self._cols]
+        at = np.where(phase < 0, stages.nodes[self._cols], np.where(phase == stages.phase(own), own, own + 1))
+        identity = np.array([row.term.identity for row in self.a.rows])
+        if np.any((at != own) & ~((at == own + 1) & identity[self._rows])):
+            raise ValueError(f"{self.a.problem.name}: a row joins more than two neighbouring nodes")
+        return at
+
+    def _link_rows(self, stages, stage, at) -> dict:
+        """(stage, variable) -> the row that says what it becomes; sets the rows' signs."""
+        a, self.sign, known = self.a, np.ones(self.a.n_rows), {}
+        slopes = np.array(a.jac_g(np.full(a.size, PROBE), np.full(a.p_size, PROBE))[1].nonzeros())
+        for e in np.flatnonzero(at == stage[self._rows] + 1):
+            if abs(abs(slopes[e]) - 1) > 1e-9:
+                raise ValueError(f"{a.problem.name}: {a.rows[self._rows[e]].term.name!r} is no link to the next node")
+            known[at[e], self._cols[e]] = self._rows[e]
+            self.sign[self._rows[e]] = np.sign(slopes[e])
+        return known
+
+    def _number_variables(self, stages, known) -> dict:
+        """(stage, variable) -> staged place; (stage, variable, "next") for constants that a control sets."""
+        for k in stages.starts[1:]:
+            free = [v for v in stages.states[k] if (k, v) not in known]
+            stages.controls[k - 1] = stages.controls[k - 1] + free
+        where, source = {}, []
+        for k, (states, controls) in enumerate(zip(stages.states, stages.controls, strict=True)):
+            for v in states:
+                where[k, v] = len(source)
+                source.append(v)
+            for v in controls:
+                where[(k, v) if stages.phase_of[v] < 0 else (k, v, "next")] = len(source)
+                source.append(v)
+        self.N = len(stages.states) - 1
+        self.nx, self.nu = [len(x) for x in stages.states], [len(x) for x in stages.controls]
+        self.source, self.copy = np.array(source, int), np.zeros(self.a.size, int)
+        self.copy[self.source[::-1]] = np.arange(len(source))[::-1]
+        for k in stages.starts:
+            for v in stages.states[k]:
+                self.copy[v] = where[k, v]
+        return where
+
+    def _number_rows(self, stages, stage, known, where) -> None:
+        """Sets the places of the rows and the links that copy constants."""
+        self.place, links, self.ng, at = np.full(self.a.n_rows, -1), [], [], 0
+        linking = set(known.values())
+        others = [[] for _ in range(self.N + 1)]
+        for row, k in enumerate(stage):
+            if row not in linking:
+                others[k].append(row)
+        for k in range(self.N + 1):
+            for v in stages.states[k + 1] if k < self.N else ():
+                if (k + 1, v) in known:
+                    self.place[known[k + 1, v]] = at
+                else:
+                    links.append((at, where[k + 1, v], where.get((k, v, "next"), where.get((k, v)))))
+                at += 1
+            self.place[others[k]] = at + np.arange(len(others[k]))
+            self.ng.append(len(others[k]))
+            at += len(others[k])
+        self.links, self.n_rows = np.array(links, int).reshape(-1, 3), at
+
+    def _place_hessian(self, stages, where) -> tuple:
+        """Staged (row, column) of each entry of the Gauss-Newton Hessian; between constants, at their first stage."""
+        i, j = (np.array(z, int) for z in self.a.gauss_newton.sparsity_out(0).get_triplet())
+        first = np.where(stages.phase_of >= 0, np.array(stages.starts)[stages.phase_of], stages.nodes)
+        both = (stages.phase_of[i] >= 0) & (stages.phase_of[j] >= 0)
+        k = np.where(both, first[i], np.maximum(stages.nodes[i], stages.nodes[j]))
+        try:
+            return tuple(np.array([where[s, v] for s, v in zip(k, x, strict=True)]) for x in (i, j))
+        except KeyError:
+            raise ValueError(f"{self.a.problem.name}: a cost joins different nodes") from None
+
+    # values -------------------------------------------------------------------------------------------------------
+    def spread(self, x: np.ndarray) -> np.ndarray:
+        """Values of the problem's variables (n,) as staged ones (nw,)."""
+        return x[self.source]
+
+    def rows(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
+        """Values of the problem's rows (n_rows,) in the order of time, not yet multiplied by their signs."""
+        out = np.full(self.n_rows, fill)
+        out[self.place] = values
+        return out
+
+    def box(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the variables as staged ones; of copies only the first is bound."""
+        out = np.full((2, len(self.source)), np.inf)
+        out[0] *= -1
+        out[0, self.copy], out[1, self.copy] = low, high
+        return out[0], out[1]
+
+    def jacobian(self, values: ca.MX) -> ca.MX:
+        """The staged Jacobian from the entries of the problem's own."""
+        n, rows, cols = len(self.links), *self._jac_at
+        one = ca.DM.ones(n)
+        values = ca.vertcat(ca.DM(self.sign[self._rows]) * values, one, -one)
+        rows = np.concatenate([rows, self.links[:, 0], self.links[:, 0]])
+        cols = np.concatenate([cols, self.links[:, 1], self.links[:, 2]])
+        return _matrix(values, rows, cols, (self.n_rows, len(self.source)))
+
+    def hessian(self, values: ca.MX) -> ca.MX:
+        """The staged symmetric Hessian from the entries of the problem's Gauss-Newton Hessian (upper triangle)."""
+        i, j = self._hess_at
+        off = np.flatnonzero(i != j)
+        values = ca.vertcat(values, values[off.tolist()])
+        nw = len(self.source)
+        return _matrix(values, np.concatenate([i, j[off]]), np.concatenate([j, i[off]]), (nw, nw))
+
+
+def _matrix(values: ca.MX, rows: np.ndarray, cols: np.ndarray, shape: tuple[int, int]) -> ca.MX:
+    """Sparse matrix of entries that do not meet."""
+    order = np.lexsort((rows, cols))
+    pattern = ca.Sparsity.triplet(*shape, rows[order].tolist(), cols[order].tolist())
+    return ca.MX(pattern, values[order.tolist()])
