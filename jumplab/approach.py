@@ -38,18 +38,17 @@ class Approach:
         row_low, row_high = ca.MX.sym("row_low", a.n_rows), ca.MX.sym("row_high", a.n_rows)
         (g, jac), (f, slope) = a.jac_g(x, p), a.grad_f(x, p)
         hess, jac = o.hessian(a.gauss_newton(x, p).nz[:]), o.jacobian(jac.nz[:])
-        put = ca.DM.triplet(o.place.tolist(), list(range(a.n_rows)), ca.DM(o.sign), o.n_rows, a.n_rows)
+        kept = np.flatnonzero(o.kept)
+        put = ca.DM.triplet(o.place[kept].tolist(), kept.tolist(), ca.DM.ones(len(kept)), o.n_rows, a.n_rows)
         spread = ca.DM.triplet(o.copy.tolist(), list(range(a.size)), ca.DM.ones(a.size), n, a.size)
         far = spread @ ca.DM.ones(a.size) - 1  # -1 for further copies of constants, which no bound is needed for
         qp = ca.conic("qp", "hpipm", {"h": hess.sparsity(), "a": jac.sparsity()}, {
             "N": o.N, "nx": o.nx, "nu": o.nu, "ng": o.ng, "inf": FREE, "hpipm": HPIPM, "error_on_fail": False,
             "print_time": False,
         })  # fmt: skip
-        turned = ca.DM(o.sign) < 0
-        first, last = (ca.if_else(turned, y, z) for y, z in ((row_high - g, row_low - g), (row_low - g, row_high - g)))
-        found = qp(h=hess, g=spread @ slope, a=jac, lba=put @ _finite(first), uba=put @ _finite(last),
+        found = qp(h=hess, g=spread @ slope, a=jac, lba=put @ _finite(row_low - g), uba=put @ _finite(row_high - g),
                    lbx=spread @ _finite(low - x) + FREE * far, ubx=spread @ _finite(high - x) - FREE * far)  # fmt: skip
-        step, lam = found["x"][o.copy.tolist()], ca.DM(o.sign) * found["lam_a"][o.place.tolist()]
+        step, lam = found["x"][o.copy.tolist()], put.T @ found["lam_a"]
         return ca.Function("step", [x, p, low, high, row_low, row_high], [step, lam, f, ca.dot(slope, step), g])
 
     def solve(self, x: np.ndarray, p: np.ndarray, box: tuple, rows: tuple) -> tuple[np.ndarray, int]:

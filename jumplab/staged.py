@@ -1,7 +1,7 @@
 """An assembled problem in the order of time, as solvers for optimal control want it.
 
-Stage by stage come states, then controls; the rows of a stage are first the links to the next one, x[k+1] - F(x[k], u[k]),
-then its other rows. What is constant in a phase, its duration say, becomes a state of all its stages, linked by equality.
+Stage by stage come states, then controls; the rows of a stage are first the links to the next one, D x[k+1] - F(x[k], u[k])
+with D diagonal, then its other rows. What is constant in a phase, its duration say, becomes a state of all its stages, linked by equality.
 Nothing is derived anew: entries of the Jacobian and of the Hessian are only put elsewhere.
 """
 
@@ -14,7 +14,8 @@ import numpy as np
 
 from jumplab.transcription import Assembled
 
-PROBE = 0.3  # our choice: any point will do to read the constant slopes of links
+PROBE = 0.3  # our choice: any point will do to see that links have a slope
+FLAT = 1e-6  # our choice: a smaller slope, scaled, links nothing
 
 
 @dataclass
@@ -64,7 +65,7 @@ class StagedOrder:
     N, nx, nu, ng : last stage; numbers of states, controls and rows besides links, stage by stage.
     source : (nw,) the problem's variable that each staged one copies.
     copy : (n,) the staged place of each variable; of a constant, of its first copy.
-    place, sign : (n_rows,) where each row stands and by what it is multiplied; links read x[k+1] - F.
+    kept, place : (n_rows,) whether a row can be told stage by stage, and where it stands then.
     links : (n, 3) further rows, their next and their present variable: copies of what is constant.
     """
 
@@ -76,7 +77,9 @@ class StagedOrder:
         known = self._link_rows(stages, stage, at)
         where = self._number_variables(stages, known)
         self._number_rows(stages, stage, known, where)
-        self._jac_at = self.place[self._rows], np.array([where[k, c] for k, c in zip(at, self._cols, strict=True)])
+        self._used = np.flatnonzero(self.kept[self._rows])
+        entries = zip(at[self._used], self._cols[self._used], strict=True)
+        self._jac_at = self.place[self._rows[self._used]], np.array([where[k, c] for k, c in entries])
         self._hess_at = self._place_hessian(stages, where)
 
     def _stage_of_rows(self, stages) -> np.ndarray:
@@ -94,19 +97,20 @@ class StagedOrder:
         own, phase = stage[self._rows], stages.phase_of[self._cols]
         at = np.where(phase < 0, stages.nodes[self._cols], np.where(phase == stages.phase(own), own, own + 1))
         identity = np.array([row.term.identity for row in self.a.rows])
-        if np.any((at != own) & ~((at == own + 1) & identity[self._rows])):
-            raise ValueError(f"{self.a.problem.name}: a row joins more than two neighbouring nodes")
+        far = (at != own) & ~((at == own + 1) & identity[self._rows])
+        self.kept = ~np.isin(np.arange(self.a.n_rows), self._rows[far])
+        if np.any(identity & ~self.kept):
+            raise ValueError(f"{self.a.problem.name}: a link joins more than two neighbouring nodes")
         return at
 
     def _link_rows(self, stages, stage, at) -> dict:
-        """(stage, variable) -> the row that says what it becomes; sets the rows' signs."""
-        a, self.sign, known = self.a, np.ones(self.a.n_rows), {}
+        """(stage, variable) -> the row that says what it becomes."""
+        a, known = self.a, {}
         slopes = np.array(a.jac_g(np.full(a.size, PROBE), np.full(a.p_size, PROBE))[1].nonzeros())
         for e in np.flatnonzero(at == stage[self._rows] + 1):
-            if abs(abs(slopes[e]) - 1) > 1e-9:
+            if abs(slopes[e]) < FLAT or (at[e], self._cols[e]) in known:
                 raise ValueError(f"{a.problem.name}: {a.rows[self._rows[e]].term.name!r} is no link to the next node")
             known[at[e], self._cols[e]] = self._rows[e]
-            self.sign[self._rows[e]] = np.sign(slopes[e])
         return known
 
     def _number_variables(self, stages, known) -> dict:
@@ -137,7 +141,7 @@ class StagedOrder:
         linking = set(known.values())
         others = [[] for _ in range(self.N + 1)]
         for row, k in enumerate(stage):
-            if row not in linking:
+            if row not in linking and self.kept[row]:
                 others[k].append(row)
         for k in range(self.N + 1):
             for v in stages.states[k + 1] if k < self.N else ():
@@ -154,37 +158,33 @@ class StagedOrder:
     def _place_hessian(self, stages, where) -> tuple:
         """Staged (row, column) of each entry of the Gauss-Newton Hessian; between constants, at their first stage."""
         i, j = (np.array(z, int) for z in self.a.gauss_newton.sparsity_out(0).get_triplet())
-        first = np.where(stages.phase_of >= 0, np.array(stages.starts)[stages.phase_of], stages.nodes)
-        both = (stages.phase_of[i] >= 0) & (stages.phase_of[j] >= 0)
-        k = np.where(both, first[i], np.maximum(stages.nodes[i], stages.nodes[j]))
         try:
-            return tuple(np.array([where[s, v] for s, v in zip(k, x, strict=True)]) for x in (i, j))
+            pairs = [self._meeting(stages, where, *sorted((v, w))) for v, w in zip(i, j, strict=True)]
         except KeyError:
             raise ValueError(f"{self.a.problem.name}: a cost joins different nodes") from None
+        return tuple(np.array(pairs).T)
+
+    @staticmethod
+    def _meeting(stages, where, v, w) -> tuple[int, int]:
+        """Staged places of two variables at the stage where both are known."""
+        first, second = stages.phase_of[v], stages.phase_of[w]
+        if first < 0 and second < 0:
+            k = stages.nodes[v]
+        elif first < 0 or second < 0:
+            k = stages.nodes[v if first < 0 else w]
+        elif first == second:
+            k = stages.starts[first]
+        else:  # constants of two phases: at the end of the first, where the second is set
+            k = stages.starts[second] - 1
+            return where[k, v], where[k, w, "next"]
+        return where[k, v], where[k, w]
 
     # values -------------------------------------------------------------------------------------------------------
-    def spread(self, x: np.ndarray) -> np.ndarray:
-        """Values of the problem's variables (n,) as staged ones (nw,)."""
-        return x[self.source]
-
-    def rows(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        """Values of the problem's rows (n_rows,) in the order of time, not yet multiplied by their signs."""
-        out = np.full(self.n_rows, fill)
-        out[self.place] = values
-        return out
-
-    def box(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the variables as staged ones; of copies only the first is bound."""
-        out = np.full((2, len(self.source)), np.inf)
-        out[0] *= -1
-        out[0, self.copy], out[1, self.copy] = low, high
-        return out[0], out[1]
-
     def jacobian(self, values: ca.MX) -> ca.MX:
         """The staged Jacobian from the entries of the problem's own."""
         n, rows, cols = len(self.links), *self._jac_at
         one = ca.DM.ones(n)
-        values = ca.vertcat(ca.DM(self.sign[self._rows]) * values, one, -one)
+        values = ca.vertcat(values[self._used.tolist()], one, -one)
         rows = np.concatenate([rows, self.links[:, 0], self.links[:, 0]])
         cols = np.concatenate([cols, self.links[:, 1], self.links[:, 2]])
         return _matrix(values, rows, cols, (self.n_rows, len(self.source)))

@@ -34,7 +34,8 @@ GUESS_WIDTHS = (0.05, 0.2)
 NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
 # our choice: what a few steps on the coarse mesh lead to is a good start on the fine one but for its multipliers; over 12
 # targets the fine mesh then takes 9 iterations, with mu_init = 0.1 or 1e-3 or half-sized pushes 10 and more
-REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70}
+REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70,
+           "quality_function_max_section_steps": 3}  # fmt: skip
 
 
 @dataclass(frozen=True)
