@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jumplab.elements import chain
 from jumplab.terms import Problem
-from jumplab.transcription import chain
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,8 @@ class Nlp:
     def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None,
                  like: Nlp | None = None):  # fmt: skip
         began = time.perf_counter()
-        self.problem, self.assembled = problem, assembled(problem, key, like and like.assembled)
+        self.problem = problem
+        self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
         self.groups, self._options = group_rows(self.assembled), {**IPOPT, **(options or {})}
         self.build_s = time.perf_counter() - began
 

@@ -1,8 +1,9 @@
 """An assembled problem in the order of time, as solvers for optimal control want it.
 
-Stage by stage come states, then controls; the rows of a stage are first the links to the next one, D x[k+1] - F(x[k], u[k])
-with D diagonal, then its other rows. What is constant in a phase, its duration say, becomes a state of all its stages, linked by equality.
-Nothing is derived anew: entries of the Jacobian and of the Hessian are only put elsewhere.
+Stage by stage come states, then controls; the rows of a stage are first the links to the next one, which read
+D x[k+1] - F(x[k], u[k]) with D diagonal, then its other rows. What is constant in a phase, its duration say, becomes a
+state of all its stages, linked by equality. Nothing is derived anew: entries of Jacobian and Hessian are only put
+elsewhere.
 """
 
 from __future__ import annotations
@@ -84,8 +85,8 @@ class StagedOrder:
 
     def _stage_of_rows(self, stages) -> np.ndarray:
         """The stage of each row: that of its node, and for rows that join phases, the last of the phase before."""
-        names = list(self.a.layouts)
-        stage = np.array([stages.starts[names.index(r.owner)] + r.node if r.owner in names else -1 for r in self.a.rows])
+        starts = dict(zip(self.a.layouts, stages.starts, strict=True))
+        stage = np.array([starts[r.owner] + r.node if r.owner in starts else -1 for r in self.a.rows])
         of_entry = stages.nodes[self._cols]
         for row in np.flatnonzero(stage < 0):
             found = of_entry[(self._rows == row) & (of_entry >= 0)].min()
@@ -107,8 +108,8 @@ class StagedOrder:
         """(stage, variable) -> the row that says what it becomes."""
         a, known = self.a, {}
         slopes = np.array(a.jac_g(np.full(a.size, PROBE), np.full(a.p_size, PROBE))[1].nonzeros())
-        for e in np.flatnonzero(at == stage[self._rows] + 1):
-            if abs(slopes[e]) < FLAT or (at[e], self._cols[e]) in known:
+        for e in np.flatnonzero((at == stage[self._rows] + 1) & self.kept[self._rows]):
+            if abs(slopes[e]) < FLAT or (at[e], self._cols[e]) in known or self._rows[e] in known.values():
                 raise ValueError(f"{a.problem.name}: {a.rows[self._rows[e]].term.name!r} is no link to the next node")
             known[at[e], self._cols[e]] = self._rows[e]
         return known
@@ -124,7 +125,7 @@ class StagedOrder:
                 where[k, v] = len(source)
                 source.append(v)
             for v in controls:
-                where[(k, v) if stages.phase_of[v] < 0 else (k, v, "next")] = len(source)
+                where[(k, v) if stages.nodes[v] == k else (k, v, "next")] = len(source)
                 source.append(v)
         self.N = len(stages.states) - 1
         self.nx, self.nu = [len(x) for x in stages.states], [len(x) for x in stages.controls]
@@ -148,12 +149,19 @@ class StagedOrder:
                 if (k + 1, v) in known:
                     self.place[known[k + 1, v]] = at
                 else:
-                    links.append((at, where[k + 1, v], where.get((k, v, "next"), where.get((k, v)))))
+                    links.append((at, where[k + 1, v], self._before(where, k, v)))
                 at += 1
             self.place[others[k]] = at + np.arange(len(others[k]))
             self.ng.append(len(others[k]))
             at += len(others[k])
         self.links, self.n_rows = np.array(links, int).reshape(-1, 3), at
+
+    def _before(self, where, k, v) -> int:
+        """The staged place at stage k of what is copied to the next."""
+        found = where.get((k, v, "next"), where.get((k, v)))
+        if found is None:
+            raise ValueError(f"{self.a.problem.name}: nothing says what a variable of stage {k + 1} follows from")
+        return found
 
     def _place_hessian(self, stages, where) -> tuple:
         """Staged (row, column) of each entry of the Gauss-Newton Hessian; between constants, at their first stage."""

@@ -32,8 +32,9 @@ GUESS_WIDTHS = (0.05, 0.2)
 # our choice: stage 2's motion is near enough for small multipliers; over 16 targets the coarse mesh then takes 22
 # iterations instead of 26. From the naive guess the direct planner takes more with them, so it keeps ipopt's own
 NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
-# our choice: what a few steps on the coarse mesh lead to is a good start on the fine one but for its multipliers; over 12
-# targets the fine mesh then takes 9 iterations, with mu_init = 0.1 or 1e-3 or half-sized pushes 10 and more
+# our choice: what a few steps on the coarse mesh lead to is a good start on the fine one but for its multipliers; over
+# 13 targets it then takes 8.5 iterations, with another mu_init (1e-3, 3e-2) 10.4. A rough choice of the next barrier
+# will do: with ipopt's 8 trials instead of 3 it took 9.5. No plan of 41 that began so took more than 65
 REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70,
            "quality_function_max_section_steps": 3}  # fmt: skip
 
@@ -106,7 +107,7 @@ class WholeBodyPlanner:
         problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
 
         def build(mesh: Mesh, extra: Mapping, like: Nlp | None = None) -> Nlp:
-            key = f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None
+            key = f"{robot.hash} {limits} {weights} {tracking}" if keep else None
             return Nlp(problem.on_mesh(mesh.intervals()), {**extra, **options}, key, like)
 
         self.nlp, self._coarse = build(mesh, FINE), None
@@ -164,8 +165,9 @@ class WholeBodyPlanner:
 
     def _from(self, known: Solution | Near, nlp: Nlp, srmp, parameters, how) -> Solution:
         """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
-        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=getattr(known, "multipliers", None),
-                                references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
+        multipliers = known.multipliers if isinstance(known, Solution) else None
+        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=multipliers,
+                         references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:
         """Parameter values of the problem for a target and a ``start`` (see :meth:`plan`).
