@@ -87,6 +87,11 @@ class Nlp:
         other.__dict__.pop("_solver", None)
         return other
 
+    def prepare(self) -> Nlp:
+        """Make the solver now; else the first :meth:`solve` does, which takes some ten milliseconds more."""
+        _ = self._solver
+        return self
+
     @cached_property
     def _solver(self):
         a = self.assembled

@@ -92,16 +92,16 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
 class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
 
-    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once. By
-    default whatever is faster, as measured: refining from the good guess that tracking has, at once from the naive one.
-    ``keep`` keeps what was built for later processes.
+    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
+    With ``approach`` the coarse mesh only takes the few steps of :meth:`jumplab.solver.Nlp.approach`; where they lead
+    nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes.
     """
 
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None, refine: bool | None = None,
-                 keep: bool = False):  # fmt: skip
+                 tracking: bool = True, options: Mapping | None = None, refine: bool = True,
+                 approach: bool = True, keep: bool = False):  # fmt: skip
         self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
-        self.stance = stance_angles(robot)
+        self.stance, self._steps = stance_angles(robot), approach
         options = dict(options or {})
 
         problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
@@ -111,7 +111,7 @@ class WholeBodyPlanner:
             return Nlp(problem.on_mesh(mesh.intervals()), {**extra, **options}, key, like)
 
         self.nlp, self._coarse = build(mesh, FINE), None
-        if tracking if refine is None else refine:
+        if refine:
             self._coarse = build(mesh.coarse(), {**COARSE, **(NEAR if tracking else {})}, self.nlp)
             self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
@@ -156,12 +156,14 @@ class WholeBodyPlanner:
             guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
-        try:
-            first = self._coarse.approach(parameters, start, references=references, **how)
-            return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
-        except SolverError:  # too far away for linear rows; what begins inside all limits finds more, and takes longer
-            first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
-            return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
+        if self._steps:
+            try:
+                first = self._coarse.approach(parameters, start, references=references, **how)
+                return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
+            except SolverError:
+                pass  # too far away for linear rows; what stays inside all limits finds more, and takes longer
+        first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
+        return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
 
     def _from(self, known: Solution | Near, nlp: Nlp, srmp, parameters, how) -> Solution:
         """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
