@@ -76,12 +76,11 @@ class StagedOrder:
         stage = self._stage_of_rows(stages)
         at = self._stage_of_columns(stages, stage)
         known = self._link_rows(stages, stage, at)
-        where = self._number_variables(stages, known)
-        self._number_rows(stages, stage, known, where)
+        self._number_variables(stages, known)
+        self._number_rows(stages, stage, known)
         self._used = np.flatnonzero(self.kept[self._rows])
-        entries = zip(at[self._used], self._cols[self._used], strict=True)
-        self._jac_at = self.place[self._rows[self._used]], np.array([where[k, c] for k, c in entries])
-        self._hess_at = self._place_hessian(stages, where)
+        self._jac_at = self.place[self._rows[self._used]], self._where(stages, at[self._used], self._cols[self._used])
+        self._hess_at = self._place_hessian(stages)
 
     def _stage_of_rows(self, stages) -> np.ndarray:
         """The stage of each row: that of its node, and for rows that join phases, the last of the phase before."""
@@ -106,37 +105,44 @@ class StagedOrder:
 
     def _link_rows(self, stages, stage, at) -> dict:
         """(stage, variable) -> the row that says what it becomes."""
-        a, known = self.a, {}
+        a = self.a
         slopes = np.array(a.jac_g(np.full(a.size, PROBE), np.full(a.p_size, PROBE))[1].nonzeros())
-        for e in np.flatnonzero((at == stage[self._rows] + 1) & self.kept[self._rows]):
-            if abs(slopes[e]) < FLAT or (at[e], self._cols[e]) in known or self._rows[e] in known.values():
-                raise ValueError(f"{a.problem.name}: {a.rows[self._rows[e]].term.name!r} is no link to the next node")
-            known[at[e], self._cols[e]] = self._rows[e]
+        ahead = np.flatnonzero((at == stage[self._rows] + 1) & self.kept[self._rows])
+        rows, known = self._rows[ahead], dict(zip(zip(at[ahead], self._cols[ahead], strict=True), self._rows[ahead],
+                                                  strict=True))  # fmt: skip
+        if np.any(np.abs(slopes[ahead]) < FLAT) or not len(set(rows)) == len(rows) == len(known):
+            raise ValueError(f"{a.problem.name}: a row meant as a link does not say what one variable becomes")
         return known
 
-    def _number_variables(self, stages, known) -> dict:
-        """(stage, variable) -> staged place; (stage, variable, "next") for constants that a control sets."""
-        for k in stages.starts[1:]:
-            free = [v for v in stages.states[k] if (k, v) not in known]
-            stages.controls[k - 1] = stages.controls[k - 1] + free
-        where, source = {}, []
-        for k, (states, controls) in enumerate(zip(stages.states, stages.controls, strict=True)):
-            for v in states:
-                where[k, v] = len(source)
-                source.append(v)
-            for v in controls:
-                where[(k, v) if stages.nodes[v] == k else (k, v, "next")] = len(source)
-                source.append(v)
-        self.N = len(stages.states) - 1
+    def _number_variables(self, stages, known) -> None:
+        """Sets the order of the variables."""
+        for k in stages.starts[1:]:  # constants that no link sets are chosen at the end of the phase before
+            constants = stages.states[k][stages.phase_of[stages.states[k]] >= 0]
+            stages.controls[k - 1] = stages.controls[k - 1] + [v for v in constants if (k, v) not in known]
         self.nx, self.nu = [len(x) for x in stages.states], [len(x) for x in stages.controls]
-        self.source, self.copy = np.array(source, int), np.zeros(self.a.size, int)
-        self.copy[self.source[::-1]] = np.arange(len(source))[::-1]
+        self.N, self._first = len(self.nx) - 1, np.cumsum([0, *np.add(self.nx, self.nu)])[:-1]
+        pieces = zip(stages.states, stages.controls, strict=True)
+        self.source = np.concatenate([np.concatenate([states, controls]).astype(int) for states, controls in pieces])
+        self.copy = np.zeros(self.a.size, int)
+        own = np.flatnonzero(stages.phase_of[self.source] < 0)
+        self.copy[self.source[own]] = own
         for k in stages.starts:
-            for v in stages.states[k]:
-                self.copy[v] = where[k, v]
-        return where
+            self.copy[stages.states[k]] = self._first[k] + np.arange(self.nx[k])
 
-    def _number_rows(self, stages, stage, known, where) -> None:
+    def _where(self, stages, k, v) -> np.ndarray:
+        """Staged places of variables ``v``, the constants among them as states of the stages ``k``."""
+        start = np.array(stages.starts)[stages.phase(k)]
+        return np.where(stages.phase_of[v] >= 0, self._first[k] + self.copy[v] - self._first[start], self.copy[v])
+
+    def _next(self, stages, k, v) -> int:
+        """The staged place at stage ``k`` of what is copied to the next."""
+        if stages.phase_of[v] < 0:
+            raise ValueError(f"{self.a.problem.name}: nothing says what a variable of stage {k + 1} follows from")
+        if stages.phase(k) == stages.phase_of[v]:
+            return int(self._where(stages, k, v))
+        return int(self._first[k] + self.nx[k] + stages.controls[k].index(v))
+
+    def _number_rows(self, stages, stage, known) -> None:
         """Sets the places of the rows and the links that copy constants."""
         self.place, links, self.ng, at = np.full(self.a.n_rows, -1), [], [], 0
         linking = set(known.values())
@@ -145,47 +151,39 @@ class StagedOrder:
             if row not in linking and self.kept[row]:
                 others[k].append(row)
         for k in range(self.N + 1):
-            for v in stages.states[k + 1] if k < self.N else ():
+            for i, v in enumerate(stages.states[k + 1] if k < self.N else ()):
                 if (k + 1, v) in known:
                     self.place[known[k + 1, v]] = at
                 else:
-                    links.append((at, where[k + 1, v], self._before(where, k, v)))
+                    links.append((at, self._first[k + 1] + i, self._next(stages, k, v)))
                 at += 1
             self.place[others[k]] = at + np.arange(len(others[k]))
             self.ng.append(len(others[k]))
             at += len(others[k])
         self.links, self.n_rows = np.array(links, int).reshape(-1, 3), at
 
-    def _before(self, where, k, v) -> int:
-        """The staged place at stage k of what is copied to the next."""
-        found = where.get((k, v, "next"), where.get((k, v)))
-        if found is None:
-            raise ValueError(f"{self.a.problem.name}: nothing says what a variable of stage {k + 1} follows from")
-        return found
+    def _place_hessian(self, stages) -> tuple:
+        """Staged (row, column) of each entry of the Gauss-Newton Hessian.
 
-    def _place_hessian(self, stages, where) -> tuple:
-        """Staged (row, column) of each entry of the Gauss-Newton Hessian; between constants, at their first stage."""
+        A constant meets a variable of a node there, another constant of its phase at their first stage, and one of the
+        next phase at the end of its own, where that is chosen.
+        """
         i, j = (np.array(z, int) for z in self.a.gauss_newton.sparsity_out(0).get_triplet())
-        try:
-            pairs = [self._meeting(stages, where, *sorted((v, w))) for v, w in zip(i, j, strict=True)]
-        except KeyError:
-            raise ValueError(f"{self.a.problem.name}: a cost joins different nodes") from None
-        return tuple(np.array(pairs).T)
-
-    @staticmethod
-    def _meeting(stages, where, v, w) -> tuple[int, int]:
-        """Staged places of two variables at the stage where both are known."""
-        first, second = stages.phase_of[v], stages.phase_of[w]
-        if first < 0 and second < 0:
-            k = stages.nodes[v]
-        elif first < 0 or second < 0:
-            k = stages.nodes[v if first < 0 else w]
-        elif first == second:
-            k = stages.starts[first]
-        else:  # constants of two phases: at the end of the first, where the second is set
-            k = stages.starts[second] - 1
-            return where[k, v], where[k, w, "next"]
-        return where[k, v], where[k, w]
+        nodes, phase = stages.nodes, stages.phase_of
+        k = np.maximum(nodes[i], nodes[j])
+        both = k < 0
+        k[both] = np.array(stages.starts)[phase[i[both]]]
+        if np.any((nodes[i] >= 0) & (nodes[j] >= 0) & (nodes[i] != nodes[j])) or np.any(
+            (phase[i] >= 0) & ~both & (phase[i] != stages.phase(k))
+            | (phase[j] >= 0) & ~both & (phase[j] != stages.phase(k))
+        ):
+            raise ValueError(f"{self.a.problem.name}: a cost joins different nodes")
+        at = [self._where(stages, k, i), self._where(stages, k, j)]
+        for e in np.flatnonzero(both & (phase[i] != phase[j])):
+            v, w = sorted((i[e], j[e]))
+            last = stages.starts[phase[w]] - 1
+            at[0][e], at[1][e] = self._where(stages, last, v), self._next(stages, last, w)
+        return tuple(at)
 
     # values -------------------------------------------------------------------------------------------------------
     def jacobian(self, values: ca.MX) -> ca.MX:
