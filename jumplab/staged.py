@@ -173,10 +173,10 @@ class StagedOrder:
         k = np.maximum(nodes[i], nodes[j])
         both = k < 0
         k[both] = np.array(stages.starts)[phase[i[both]]]
-        if np.any((nodes[i] >= 0) & (nodes[j] >= 0) & (nodes[i] != nodes[j])) or np.any(
-            (phase[i] >= 0) & ~both & (phase[i] != stages.phase(k))
-            | (phase[j] >= 0) & ~both & (phase[j] != stages.phase(k))
-        ):
+        apart = (nodes[i] >= 0) & (nodes[j] >= 0) & (nodes[i] != nodes[j])
+        for x in (i, j):
+            apart |= ~both & (phase[x] >= 0) & (phase[x] != stages.phase(k))
+        if apart.any():
             raise ValueError(f"{self.a.problem.name}: a cost joins different nodes")
         at = [self._where(stages, k, i), self._where(stages, k, j)]
         for e in np.flatnonzero(both & (phase[i] != phase[j])):
