@@ -7,6 +7,9 @@ the whole problem, and many limits may become active at once. It leaves the last
 
 from __future__ import annotations
 
+from contextlib import redirect_stdout
+from io import StringIO
+
 import casadi as ca
 import numpy as np
 
@@ -42,10 +45,7 @@ class Approach:
         put = ca.DM.triplet(o.place[kept].tolist(), kept.tolist(), ca.DM.ones(len(kept)), o.n_rows, a.n_rows)
         spread = ca.DM.triplet(o.copy.tolist(), list(range(a.size)), ca.DM.ones(a.size), n, a.size)
         far = spread @ ca.DM.ones(a.size) - 1  # -1 for further copies of constants, which no bound is needed for
-        qp = ca.conic("qp", "hpipm", {"h": hess.sparsity(), "a": jac.sparsity()}, {
-            "N": o.N, "nx": o.nx, "nu": o.nu, "ng": o.ng, "inf": FREE, "hpipm": HPIPM, "error_on_fail": False,
-            "print_time": False,
-        })  # fmt: skip
+        qp = _qp_solver(o, hess.sparsity(), jac.sparsity())
         found = qp(h=hess, g=spread @ slope, a=jac, lba=put @ _finite(row_low - g), uba=put @ _finite(row_high - g),
                    lbx=spread @ _finite(low - x) + FREE * far, ubx=spread @ _finite(high - x) - FREE * far)  # fmt: skip
         step, lam = found["x"][o.copy.tolist()], put.T @ found["lam_a"]
@@ -84,6 +84,14 @@ class Approach:
                 share /= 2
             x = np.clip(x + share * step, *box)
         return x, count
+
+
+def _qp_solver(order: StagedOrder, hess: ca.Sparsity, jac: ca.Sparsity) -> ca.Function:
+    """HPIPM for QPs of these patterns in that order."""
+    options = {"N": order.N, "nx": order.nx, "nu": order.nu, "ng": order.ng, "inf": FREE, "hpipm": HPIPM,
+               "error_on_fail": False, "print_time": False}  # fmt: skip
+    with redirect_stdout(StringIO()):  # making it, CasADi tells the stages' sizes
+        return ca.conic("qp", "hpipm", {"h": hess, "a": jac}, options)
 
 
 def _finite(values: ca.MX) -> ca.MX:
