@@ -140,8 +140,9 @@ def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
     InputError, InfeasibleError, SolverError
         If stage 1 refuses a target; what fails later is a row without numbers.
     """
-    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot)
-    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE)
+    # by ipopt alone, so that iterations are of one kind and as the paper counts them
+    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot, approach=False)
+    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE, approach=False)
     rows = []
     for task in tasks:
         first = stage1.plan(task)

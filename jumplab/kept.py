@@ -1,4 +1,5 @@
-"""Assembled problems kept between processes: CasADi's own serialised functions, in a folder that may be deleted.
+"""Problems kept between processes: the small functions they are made of, serialised by CasADi, in a folder that may be
+deleted.
 
 A file is found by a hash of everything that its content depends on: this package's sources, CasADi's version, the robot
 and the settings. It begins with a check sum; one that does not fit, for whatever reason, is passed over and replaced.
@@ -15,11 +16,12 @@ from functools import cache
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 
+from jumplab.elements import FUNCTIONS, Element, defect_term
 from jumplab.terms import Problem
 from jumplab.transcription import Assembled
 
-FUNCTIONS = ("nlp", "grad_f", "jac_g", "hess_lag", "cost_parts")
 SOURCES = ("*.py", "models/*.py", "robot/*.py", "srmp/*.py", "whole_body/*.py")  # all that a problem is built by
 
 
@@ -39,33 +41,36 @@ def _sources() -> str:
     return found.hexdigest()
 
 
-def assembled(problem: Problem, key: str | None = None, like: Assembled | None = None) -> Assembled:
+def assembled(problem: Problem, key: str | None = None) -> Assembled:
     """The problem assembled, from the file of ``key`` if there is a sound one, else anew and then kept.
 
-    ``key`` says everything that the problem was made of besides the sources; None keeps nothing. ``like`` is the same
-    problem on another mesh, which saves work.
+    ``key`` says everything that the problem was made of besides the sources and its mesh, which the file does not
+    depend on; None keeps nothing.
     """
     place = None if key is None else folder()
     if place is None:
-        return Assembled(problem, like=like)
+        return Assembled(problem)
     path = place / (hashlib.sha256(f"{_sources()} {problem.name} {key}".encode()).hexdigest()[:32] + ".casadi")
-    known = _read(path)
+    known = _read(path, problem)
     if known is not None:
-        try:
-            return Assembled(problem, known)
-        except (KeyError, TypeError, ValueError):
-            pass  # sound but not of this problem
-    fresh = Assembled(problem, like=like)
+        return Assembled(problem, known)
+    fresh = Assembled(problem)
     _write(path, fresh)
     return fresh
 
 
 def _write(path: Path, a: Assembled) -> None:
     """Whole or not at all; a folder that cannot be written is no reason to fail."""
-    texts = [getattr(a, name).serialize().encode() for name in FUNCTIONS]
-    rows = [(row.owner, row.term.name, row.node, row.component) for row in a.rows]
-    costs = [(owner, term.name) for owner, term in a.cost_terms]
-    head = json.dumps({"rows": rows, "costs": costs, "sizes": [len(text) for text in texts]}).encode()
+    head, texts = [], []
+    for e in a.elements:
+        made = [(name, *e.function(name)) for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
+        head.append({
+            "owner": e.owner, "place": e.place, "ny": e.ny, "costs": [t.name for t in e.costs],
+            "rows": [(t.name, count) for t, count in e.rows],
+            "made": [(name, rows.tolist(), cols.tolist()) for name, _, rows, cols in made],
+        })  # fmt: skip
+        texts += [function.serialize().encode() for _, function, *_ in made]
+    head = json.dumps({"elements": head, "sizes": [len(text) for text in texts]}).encode()
     body = b"\n".join([head, b"".join(texts)])
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -76,17 +81,26 @@ def _write(path: Path, a: Assembled) -> None:
         part.unlink(missing_ok=True) if part.parent.is_dir() else None
 
 
-def _read(path: Path) -> dict | None:
-    """Rows, cost terms and functions of a sound file, else None."""
+def _read(path: Path, problem: Problem) -> list[Element] | None:
+    """The elements of a sound file of this problem, else None."""
     try:
         total, _, body = path.read_bytes().partition(b"\n")
         if hashlib.sha256(body).hexdigest().encode() != total:
             return None
         head, _, texts = body.partition(b"\n")
-        known, at = json.loads(head), 0
-        for name, size in zip(FUNCTIONS, known["sizes"], strict=True):
-            known[name] = ca.Function.deserialize(texts[at : at + size].decode())
+        known, at, functions = json.loads(head), 0, []
+        for size in known["sizes"]:
+            functions.append(ca.Function.deserialize(texts[at : at + size].decode()))
             at += size
-        return known
+        terms = {(owner, t.name): t for owner, t in problem.terms()}
+        terms |= {(phase.name, defect_term().name): defect_term() for phase in problem.phases}
+        return [_element(e, terms, functions) for e in known["elements"]]
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):
         return None
+
+
+def _element(e: dict, terms: dict, functions: list[ca.Function]) -> Element:
+    """One element of a file; takes its functions from the front of the list."""
+    made = {name: (functions.pop(0), np.array(rows, int), np.array(cols, int)) for name, rows, cols in e["made"]}
+    rows = [(terms[e["owner"], name], count) for name, count in e["rows"]]
+    return Element(e["owner"], e["place"], e["ny"], [terms[e["owner"], name] for name in e["costs"]], rows, made=made)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import InputError
+from jumplab.layout import PhaseLayout
 from jumplab.solution import Multipliers, PhaseGuess, PhaseSolution
 from jumplab.terms import Bound, Problem, Term
-from jumplab.transcription import Assembled, PhaseLayout
+from jumplab.transcription import Assembled
 
 
 def resolve(value: Any, parameters: Any, size: int) -> np.ndarray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jumplab.elements import chain
 from jumplab.terms import Problem
-from jumplab.transcription import chain
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,18 @@ class Statistics:
     objective: float
     residual: float
     functions_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Near:
+    """Phases near a solution: a start for a solve, no motion yet, because rows are still violated."""
+
+    phases: dict[str, PhaseSolution]
+    statistics: Statistics
+
+    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
+        """All phases as the start of a solve, on another mesh if asked."""
+        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
+from jumplab.approach import Approach
 from jumplab.elastic import least_violation
 from jumplab.errors import InputError, SolverError
 from jumplab.kept import assembled
@@ -22,10 +25,10 @@ from jumplab.packing import (
     unpack_multipliers,
     variable_bounds,
 )
-from jumplab.solution import Multipliers, PhaseGuess, PhaseSolution, Solution, Statistics
+from jumplab.solution import Multipliers, Near, PhaseGuess, PhaseSolution, Solution, Statistics
 from jumplab.terms import Problem
 
-__all__ = ["GOOD_STATUSES", "IPOPT", "WARM", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
+__all__ = ["GOOD_STATUSES", "IPOPT", "WARM", "Near", "Nlp", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"]
 
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # our choice: scaled row error above which a "solved" status is not believed
@@ -51,6 +54,16 @@ WARM = {"warm_start_init_point": "yes", "warm_start_bound_push": 1e-6, "warm_sta
         "warm_start_mult_bound_push": 1e-6}  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Posed:
+    """A problem's numbers for one target: start, parameters, (lower, upper) of variables and of rows."""
+
+    x0: np.ndarray
+    p: np.ndarray
+    box: tuple[np.ndarray, np.ndarray]
+    rows: tuple[np.ndarray, np.ndarray]
+
+
 class Nlp:
     """A problem ready to be solved for any target.
 
@@ -62,21 +75,28 @@ class Nlp:
     def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None,
                  like: Nlp | None = None):  # fmt: skip
         began = time.perf_counter()
-        self.problem, self.assembled = problem, assembled(problem, key, like and like.assembled)
-        self.groups = group_rows(self.assembled)
-        self._solver = self._new_solver(options)
+        self.problem = problem
+        self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
+        self.groups, self._options = group_rows(self.assembled), {**IPOPT, **(options or {})}
         self.build_s = time.perf_counter() - began
 
     def with_options(self, options: Mapping) -> Nlp:
         """The same problem, already built, under other options of ipopt."""
         other = copy(self)
-        other._solver = self._new_solver(options)
+        other._options = {**IPOPT, **options}
+        other.__dict__.pop("_solver", None)
         return other
 
-    def _new_solver(self, options: Mapping | None):
+    def prepare(self) -> Nlp:
+        """Make the solver now; else the first :meth:`solve` does, which takes some ten milliseconds more."""
+        _ = self._solver
+        return self
+
+    @cached_property
+    def _solver(self):
         a = self.assembled
         return ca.nlpsol("solver", "ipopt", a.nlp, {
-            "ipopt": {**IPOPT, **(options or {})}, "print_time": False, "error_on_fail": False,
+            "ipopt": self._options, "print_time": False, "error_on_fail": False,
             "show_eval_warnings": False, "calc_lam_p": False,
             "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": a.hess_lag,
         })  # fmt: skip
@@ -134,7 +154,37 @@ class Nlp:
             columns.append(np.concatenate(rows).ravel(order="F"))
         return columns
 
+    def _posed(self, parameters, guess, references, weights, off) -> _Posed:
+        a, weights = self.assembled, dict(weights or {})
+        self.problem.check_names([*weights, *off], "weight or switch")
+        self._check_weights(weights)
+        p, box = self._parameter_vector(parameters, references or {}, weights, off), variable_bounds(a, parameters, off)
+        rows = row_bounds(self.groups, a.n_rows, parameters, off)
+        return _Posed(np.clip(pack(a, guess), *box), p, box, rows)
+
     # solving ----------------------------------------------------------------------------------------------------
+    @cached_property
+    def _approach(self) -> Approach:
+        return Approach(self.assembled)
+
+    def approach(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], *, references: Mapping | None = None,
+                 weights: Mapping[str, float] | None = None, off: tuple[str, ...] = ()) -> Near:  # fmt: skip
+        """Come near a solution in a few Gauss-Newton steps; arguments as of :meth:`solve`.
+
+        Raises
+        ------
+        SolverError
+            If a step is no number.
+        """
+        posed = self._posed(parameters, guess, references, weights, off)
+        method, began = self._approach, time.perf_counter()
+        x, steps = method.solve(posed.x0, posed.p, posed.box, posed.rows)
+        f, g = (y.full().ravel() for y in self.assembled.nlp(x, posed.p))
+        residual = float(np.max(np.maximum(posed.rows[0] - g, g - posed.rows[1]), initial=0.0))
+        statistics = Statistics(steps, "Approached", self.build_s, time.perf_counter() - began, len(x), len(g),
+                                float(f[0]), residual)  # fmt: skip
+        return Near(unpack(self.assembled, x), statistics)
+
     def solve(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], *, references: Mapping | None = None,
               weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
               multipliers: Multipliers | None = None, explain: bool = True) -> Solution:  # fmt: skip
@@ -156,14 +206,8 @@ class Nlp:
             If ipopt stops without an acceptable point or the re-evaluated rows contradict it; says which terms are
             violated, where and by how much.
         """
-        weights, references = dict(weights or {}), references or {}
-        self.problem.check_names([*weights, *off], "weight or switch")
-        self._check_weights(weights)
-        p = self._parameter_vector(parameters, references, weights, off)
-        a = self.assembled
-        low, high = variable_bounds(a, parameters, off)
-        row_low, row_high = row_bounds(self.groups, a.n_rows, parameters, off)
-        x0 = np.clip(pack(a, guess), low, high)
+        posed = self._posed(parameters, guess, references, weights, off)
+        a, x0, p, (low, high), (row_low, row_high) = self.assembled, posed.x0, posed.p, posed.box, posed.rows
         start = {}
         if multipliers is not None:
             start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, self.groups, multipliers), strict=True))

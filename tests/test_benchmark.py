@@ -12,7 +12,7 @@ from jumplab.task import JumpTask
 from jumplab.whole_body import Mesh
 
 TIMES = {"plan": [0.5, 0.6], "re-plan": [0.2, 0.2], "direct, at once": [1.0, 1.0], "direct, build": [0.5, 0.5],
-         "direct, over a coarse mesh": [2.0, 0.9], "plan: 1 SRMP": [0.1, 0.1],
+         "direct, over a coarse mesh": [2.0, 0.9], "direct, Gauss-Newton first": [0.5, 0.5], "plan: 1 SRMP": [0.1, 0.1],
          "plan: 3 whole body": [0.3, 0.5]}  # fmt: skip
 NODES = [dict(intervals=n, iteration_s=1e-3 + 2e-4 * n, iterations=20, solve_s=1.0) for n in (20, 40, 80)]
 
@@ -20,7 +20,7 @@ NODES = [dict(intervals=n, iteration_s=1e-3 + 2e-4 * n, iterations=20, solve_s=1
 def made(**other) -> dict:
     """A report of made-up times."""
     growth = {"nodes": NODES, "targets_cpu_s": {"1": 0.5},
-              "spread": [dict(ratio=r, clean=True) for r in (0.4, 0.7, 0.5)]}  # fmt: skip
+              "spread": [dict(ratio=r, ratio_approached=2 * r, clean=True) for r in (0.4, 0.7, 0.5)]}  # fmt: skip
     return report({"repeats": 2}, {**TIMES, **other}, TIMES, {"plan": [True, False]}, {"plan": {"1 SRMP": 9}},
                   {"plan": 0.1}, growth, [0.4, 0.5] if "cold" in other else [])  # fmt: skip
 
@@ -48,7 +48,7 @@ def test_the_report_is_plain_and_complete(found):
 
 @pytest.mark.slow
 def test_every_timed_plan_was_audited(found):
-    assert {"plan", "re-plan", *benchmark.DIRECT} == set(found["audits"])
+    assert {"plan", "re-plan", *benchmark.DIRECT, benchmark.APPROACHED} == set(found["audits"])
     assert all(a["of"] == 1 for a in found["audits"].values())
 
 
@@ -67,6 +67,7 @@ def test_what_is_not_reached_is_said():
     assert "plans that were timed and are clean in the audit: plan 1 of 2" in said
     assert "not measured" in text(made())
     assert "over 3 other targets" in said and "0.500  (median; 0.40 to 0.70), 3 clean" in said
+    assert slow["warm_over_approached"] == pytest.approx(1.1) and "Gauss-Newton steps" in said and "1.100" in said
 
 
 def test_growth_is_the_distance_from_a_line():

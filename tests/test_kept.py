@@ -22,10 +22,10 @@ def counted(monkeypatch):
     fresh = []
 
     class Counting(Assembled):
-        def __init__(self, problem, known=None, like=None):
-            if known is None:
+        def __init__(self, problem, elements=None):
+            if elements is None:
                 fresh.append(problem.name)
-            super().__init__(problem, known, like)
+            super().__init__(problem, elements)
 
     monkeypatch.setattr(kept, "Assembled", Counting)
     return fresh
@@ -37,7 +37,7 @@ def test_kept_is_the_same(place, counted):
     x, p, rng = random_point(first, 3)
     lam = rng.normal(size=first.n_rows)
     for name, arguments in {"nlp": (x, p), "grad_f": (x, p), "jac_g": (x, p), "hess_lag": (x, p, 1.0, lam),
-                            "cost_parts": (x, p)}.items():  # fmt: skip
+                            "cost_parts": (x, p), "gauss_newton": (x, p)}.items():  # fmt: skip
         one, two = (getattr(a, name).call(list(arguments)) for a in (first, again))
         for u, v in zip(one, two, strict=True):
             np.testing.assert_array_equal(u.full(), v.full())

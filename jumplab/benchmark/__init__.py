@@ -1,6 +1,6 @@
 """How long planning takes: measured against one direct NLP, and said as it is."""
 
 from jumplab.benchmark.measure import bench
-from jumplab.benchmark.report import DIRECT, GOALS, WORDS, text
+from jumplab.benchmark.report import APPROACHED, DIRECT, GOALS, WORDS, text
 
-__all__ = ["DIRECT", "GOALS", "WORDS", "bench", "text"]
+__all__ = ["APPROACHED", "DIRECT", "GOALS", "WORDS", "bench", "text"]

@@ -92,23 +92,27 @@ class JointMapper:
     Parameters
     ----------
     srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
-    step_s : step of the roll-out [s], at most; each phase is divided evenly.
+    step_s : step of the roll-out [s], at most, or one for the launch and one for the flight; each is divided evenly.
     options : gains, weights, limits, form.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
     """
 
-    def __init__(self, srmp_plan, robot: Robot, step_s: float = 0.01, options: Options | None = None, q0=None):
-        if not (isinstance(step_s, int | float) and SHORTEST_STEP_S <= step_s <= LONGEST_STEP_S):
-            limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
-            raise InputError(f"stage 2: step_s = {step_s!r} s, must be a number between {limits}")
+    def __init__(self, srmp_plan, robot: Robot, step_s: float | tuple[float, float] = 0.01,
+                 options: Options | None = None, q0=None):  # fmt: skip
+        launch_step_s, flight_step_s = step_s if isinstance(step_s, tuple) and len(step_s) == 2 else (step_s, step_s)
+        for step in (launch_step_s, flight_step_s):
+            if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
+                limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
+                raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
         self.robot, self.options = robot, options or Options()
         self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.flight_reference = FlightReference.sample(srmp_plan, step_s)
+        self.flight_reference = FlightReference.sample(srmp_plan, flight_step_s)
         toe_s = self.options.toe_s
         toe_s = getattr(srmp_plan, "toe_s", None) if toe_s is None else toe_s
-        self.launch = LaunchQp(self.body, self.q0, LaunchReference.sample(srmp_plan, step_s), self.options, toe_s)
+        launch = LaunchReference.sample(srmp_plan, launch_step_s)
+        self.launch = LaunchQp(self.body, self.q0, launch, self.options, toe_s)
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
@@ -239,7 +243,7 @@ class JointMapper:
 def map_to_joints(
     srmp_plan: Any,
     robot: Robot,
-    step_s: float = 0.01,
+    step_s: float | tuple[float, float] = 0.01,
     method: str = "cvxpy",
     options: Options | None = None,
     q0: np.ndarray | None = None,
@@ -249,7 +253,7 @@ def map_to_joints(
     Parameters
     ----------
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
-    robot : the robot.  step_s : step of the roll-out [s].
+    robot : the robot.  step_s : step of the roll-out [s], or one for the launch and one for the flight.
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
     options : gains, weights, limits, form; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
     q0 : (nq,) start at rest; the robot's stance by default.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from jumplab.elements import chain
 from jumplab.models.srmp import SrmpState
 from jumplab.robot.reach import Reach
 from jumplab.srmp.settings import SrmpSettings
 from jumplab.task import GRAVITY
 from jumplab.terms import Point, Term
-from jumplab.transcription import chain
 
 CROUCH_SMOOTHING_M = 0.02  # our choice: the positive part of a depth, rounded over this much
 QUARTERS = (0.25, 0.5, 0.75)

@@ -10,7 +10,7 @@ import numpy as np
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
-from jumplab.solver import WARM, Nlp, PhaseGuess, Solution, Statistics
+from jumplab.solver import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.srmp import SrmpPlan
 from jumplab.task import JumpTask
 from jumplab.whole_body.problem import build_problem
@@ -32,9 +32,11 @@ GUESS_WIDTHS = (0.05, 0.2)
 # our choice: stage 2's motion is near enough for small multipliers; over 16 targets the coarse mesh then takes 22
 # iterations instead of 26. From the naive guess the direct planner takes more with them, so it keeps ipopt's own
 NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
-# our choice: the coarse motion is a good start on the fine mesh, its multipliers are not: 8 iterations instead of 10
-REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-3, "bound_push": 1e-3, "bound_frac": 1e-3,
-           "slack_bound_push": 1e-3, "slack_bound_frac": 1e-3}  # fmt: skip
+# our choice: what a few steps on the coarse mesh lead to is a good start on the fine one but for its multipliers; over
+# 13 targets it then takes 8.5 iterations, with another mu_init (1e-3, 3e-2) 10.4. A rough choice of the next barrier
+# will do: with ipopt's 8 trials instead of 3 it took 9.5. No plan of 41 that began so took more than 65
+REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70,
+           "quality_function_max_section_steps": 3}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -90,26 +92,26 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
 class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
 
-    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once. By
-    default whatever is faster, as measured: refining from the good guess that tracking has, at once from the naive one.
-    ``keep`` keeps what was built for later processes.
+    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
+    With ``approach`` the coarse mesh only takes the few steps of :meth:`jumplab.solver.Nlp.approach`; where they lead
+    nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes.
     """
 
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None, refine: bool | None = None,
-                 keep: bool = False):  # fmt: skip
+                 tracking: bool = True, options: Mapping | None = None, refine: bool = True,
+                 approach: bool = True, keep: bool = False):  # fmt: skip
         self.robot, self.mesh, self.limits, self.tracking = robot, mesh, limits, tracking
-        self.stance = stance_angles(robot)
+        self.stance, self._steps = stance_angles(robot), approach
         options = dict(options or {})
 
         problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
 
         def build(mesh: Mesh, extra: Mapping, like: Nlp | None = None) -> Nlp:
-            key = f"{robot.hash} {mesh} {limits} {weights} {tracking}" if keep else None
+            key = f"{robot.hash} {limits} {weights} {tracking}" if keep else None
             return Nlp(problem.on_mesh(mesh.intervals()), {**extra, **options}, key, like)
 
         self.nlp, self._coarse = build(mesh, FINE), None
-        if tracking if refine is None else refine:
+        if refine:
             self._coarse = build(mesh.coarse(), {**COARSE, **(NEAR if tracking else {})}, self.nlp)
             self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
@@ -154,13 +156,20 @@ class WholeBodyPlanner:
             guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
         start = {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
         references = self.references(srmp, mesh)
+        if self._steps:
+            try:
+                first = self._coarse.approach(parameters, start, references=references, **how)
+                return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
+            except SolverError:
+                pass  # too far away for linear rows; what stays inside all limits finds more, and takes longer
         first = self._coarse.solve(parameters, start, references=references, explain=False, **how)
         return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
 
-    def _from(self, known: Solution, nlp: Nlp, srmp, parameters, how) -> Solution:
+    def _from(self, known: Solution | Near, nlp: Nlp, srmp, parameters, how) -> Solution:
         """Solve on the planner's mesh, beginning with a solution of the same problem on any mesh."""
-        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=known.multipliers,
-                                references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
+        multipliers = known.multipliers if isinstance(known, Solution) else None
+        return nlp.solve(parameters, known.guess(self.mesh.intervals()), multipliers=multipliers,
+                         references=self.references(srmp, self.mesh), explain=False, **how)  # fmt: skip
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:
         """Parameter values of the problem for a target and a ``start`` (see :meth:`plan`).

@@ -1,0 +1,107 @@
+"""Gauss-Newton steps in the order of time: the same derivatives in other places, and where a few steps lead."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_solver import flat_guess, move
+from test_transcription import random_point, toy
+
+from jumplab.approach import Approach
+from jumplab.errors import SolverError
+from jumplab.robot import load_robot
+from jumplab.solver import Nlp
+from jumplab.srmp import SrmpPlanner
+from jumplab.staged import StagedOrder
+from jumplab.transcription import Assembled
+from jumplab.whole_body import Mesh, WholeBodyPlanner
+
+
+def symmetric(upper: ca.DM) -> np.ndarray:
+    upper = np.triu(upper.full())
+    return upper + np.triu(upper, 1).T
+
+
+@pytest.fixture(scope="module", params=["move", "SRMP", "whole body"])
+def assembled(request):
+    if request.param == "move":
+        return Assembled(move())
+    if request.param == "SRMP":
+        return SrmpPlanner(load_robot()).nlp.assembled
+    return WholeBodyPlanner(load_robot(), Mesh(3, 2, 4), refine=False).nlp.assembled
+
+
+def staged(a: Assembled, order: StagedOrder, x, p):
+    """Jacobian and Hessian in the order of time, as numbers."""
+    jac, hess = ca.MX.sym("jac", a.jac_g.nnz_out(1)), ca.MX.sym("hess", a.gauss_newton.nnz_out(0))
+    put = ca.Function("put", [jac, hess], [order.jacobian(jac), order.hessian(hess)])
+    values = a.jac_g(x, p)[1].nonzeros(), a.gauss_newton(x, p).nonzeros()
+    return [y.full() for y in put(*values)]
+
+
+def test_a_step_means_the_same_in_the_order_of_time(assembled):
+    """J d and d H d do not depend on the order, and links of copies are met by copies."""
+    order, (x, p, rng) = StagedOrder(assembled), random_point(assembled, 4)
+    jac, hess = staged(assembled, order, x, p)
+    step = rng.normal(size=assembled.size)
+    copies = step[order.source]
+    rows = jac @ copies
+    kept = np.flatnonzero(order.kept)
+    np.testing.assert_allclose(rows[order.place[kept]], (assembled.jac_g(x, p)[1].full() @ step)[kept], atol=1e-9)
+    np.testing.assert_allclose(rows[order.links[:, 0]], 0.0, atol=1e-12)
+    own = symmetric(assembled.gauss_newton(x, p))
+    assert copies @ hess @ copies == pytest.approx(step @ own @ step, rel=1e-9)
+
+
+def test_every_row_and_variable_has_its_place(assembled):
+    order = StagedOrder(assembled)
+    np.testing.assert_array_equal(order.source[order.copy], np.arange(assembled.size))
+    places = np.concatenate([order.place[order.kept], order.links[:, 0]])
+    np.testing.assert_array_equal(np.sort(places), np.arange(order.n_rows))
+    assert len(order.source) == sum(order.nx) + sum(order.nu)
+    assert order.n_rows == sum(order.nx[1:]) + sum(order.ng)
+
+
+def test_a_variable_that_follows_from_nothing_is_refused():
+    """In the toy problem a row is nonlinear in the next node, so it is no link."""
+    with pytest.raises(ValueError, match="toy: nothing says what a variable of stage 1 follows from"):
+        StagedOrder(Assembled(toy()))
+
+
+def test_what_joins_far_nodes_is_left_out():
+    order = StagedOrder(SrmpPlanner(load_robot()).nlp.assembled)
+    assert [order.a.rows[i].term.name for i in np.flatnonzero(~order.kept)] == ["symmetric landing"]
+
+
+def test_gauss_newton_is_the_hessian_without_curvature(assembled):
+    """Sums of squares: 2 J^T W J, never indefinite; J by differences of the costs is too rough, so by the parts."""
+    x, p, _ = random_point(assembled, 5)
+    own = symmetric(assembled.gauss_newton(x, np.abs(p)))
+    x[[layout.first for layout in assembled.layouts.values()]] = 1.0  # durations are positive
+    own = symmetric(assembled.gauss_newton(x, np.abs(p)))
+    assert np.linalg.eigvalsh(own)[0] > -1e-8 * np.abs(own).max()
+
+
+def test_of_linear_residuals_it_is_the_hessian():
+    nlp = Nlp(move(duration=(1.0, 1.0)))
+    a, (x, p, _) = nlp.assembled, random_point(nlp.assembled, 6)
+    full = symmetric(a.hess_lag(x, p, 1.0, np.zeros(a.n_rows)))
+    free = np.setdiff1d(np.arange(a.size), [layout.first for layout in a.layouts.values()])
+    at = np.ix_(free, free)
+    np.testing.assert_allclose(symmetric(a.gauss_newton(x, p))[at], full[at], atol=1e-9)
+
+
+def test_a_linear_quadratic_problem_takes_one_step():
+    """Least jerk from rest to rest: with its duration fixed the QP is the problem."""
+    nlp = Nlp(move(duration=(1.0, 1.0)))
+    near, exact = nlp.approach({"goal": 2.0}, flat_guess()), nlp.solve({"goal": 2.0}, flat_guess())
+    assert near.statistics.status == "Approached" and near.statistics.residual < 1e-3
+    np.testing.assert_allclose(near.phases["go"].q, exact.phases["go"].q, atol=2e-3)
+
+
+def test_a_start_without_numbers_is_refused():
+    nlp = Nlp(move())
+    method, a = Approach(nlp.assembled), nlp.assembled
+    wide = np.full(a.size, -np.inf), np.full(a.size, np.inf)
+    rows = np.zeros(a.n_rows), np.zeros(a.n_rows)
+    with pytest.raises(SolverError, match="step 1 of the approach is no number"):
+        method.solve(np.full(a.size, np.nan), np.ones(a.p_size), wide, rows)
