@@ -13,6 +13,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from jumplab.commands import COMMANDS
@@ -58,8 +59,16 @@ def _names() -> str:
     return f"{', '.join(first)} or {last}"
 
 
-def _terminate(signum: int, frame: Any) -> NoReturn:
-    raise SystemExit(TERMINATED)
+def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
+    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
+    seen.append(signum)
+    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
+
+
+def _heed(seen: list[int]) -> dict:
+    """Handle the signals that end a command; returns the handlers before. An ignored Ctrl-C stays ignored."""
+    usual = {signal.SIGTERM: True, signal.SIGINT: signal.getsignal(signal.SIGINT) is signal.default_int_handler}
+    return {number: signal.signal(number, partial(_stop, seen)) for number, ours in usual.items() if ours}
 
 
 def _complain(text: str, debug: bool) -> None:
@@ -68,11 +77,17 @@ def _complain(text: str, debug: bool) -> None:
     print(f"jumplab: {' '.join(text.split())}", file=sys.stderr)
 
 
+def _interrupted(said: str, debug: bool) -> int:
+    _complain(said or "interrupted; what was there before is unchanged", debug)
+    return INTERRUPTED
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     debug = "--debug" in argv
-    before = signal.signal(signal.SIGTERM, _terminate)
+    seen: list[int] = []
+    before = _heed(seen)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
     try:
         parser = _parser()
@@ -87,22 +102,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             args.work(args)
         sys.stdout.flush()
-    except JumplabError as e:
-        _complain(str(e), debug)
-        return e.exit_code
     except KeyboardInterrupt as e:
-        _complain(str(e) or "interrupted; what was there before is unchanged", debug)
-        return INTERRUPTED
+        return _interrupted(str(e), debug)
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
     except Exception as e:
+        if seen:
+            return TERMINATED if seen[-1] == signal.SIGTERM else _interrupted("", debug)
+        if isinstance(e, JumplabError):
+            _complain(str(e), debug)
+            return e.exit_code
         first = (str(e).strip().splitlines() or ["no message"])[0]
         hint = "" if debug else "; run it again with --debug for the traceback"
         _complain(f"internal failure, {type(e).__name__}: {first}{hint}", debug)
         return INTERNAL
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0
 
 

@@ -113,7 +113,8 @@ class _Row:
 
     def __init__(self, robot: Robot):
         self.robot, self.reach = robot, reach(robot)
-        self.planner = WholeBodyPlanner(robot, tracking=False, options={"max_iter": MAX_ITERATIONS})
+        # on the fine mesh at once: most cells begin with a neighbour's solution, which is nearer than steps would lead
+        self.planner = WholeBodyPlanner(robot, tracking=False, options={"max_iter": MAX_ITERATIONS}, refine=False)
 
     def solve(self, height_m: float, distances: Sequence[float], folder: Path | None) -> list[Cell]:
         cells, guesses, guess, failed = [], {}, None, 0

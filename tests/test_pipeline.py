@@ -26,7 +26,7 @@ def test_three_steps_and_one(plan):
     direct = jump(1.0, 0.5, 0.0, "direct")
     assert (plan.method, direct.method) == METHODS
     assert [row.stage for row in plan.statistics] == ["1 SRMP", "2 joint map", "3 whole body, coarse", "3 whole body"]
-    assert [row.stage for row in direct.statistics] == ["direct"]
+    assert [row.stage for row in direct.statistics] == ["direct, coarse", "direct"]
     assert plan.srmp is not None and plan.joints is not None
     assert direct.srmp is None and direct.joints is None
     assert all(row.iterations > 0 and row.build_s >= 0 and row.solve_s > 0 for row in plan.statistics)
