@@ -38,6 +38,8 @@ class Limits:
     capture_window_m: tuple[float, float] = (-0.02, 0.02)
     # if set, angular momentum about the sole's middle at touchdown [kg m^2/s], from ... to; then not the window
     capture_moment: tuple[float, float] | None = None
+    # with it, for flips backward: how far beyond the toes [m] the capture point is left by an impact that pushes there
+    capture_beyond_toes_m: tuple[float, float] = tuple(float(x) for x in __import__("os").environ.get("CT", "-0.05:-0.03").split(":"))
     least_push: float = 0.0  # share of the weight that flat feet carry at least
     envelope_between: bool = False  # torque against speed is looked at between the nodes too
     cop_reserve_m: float = 0.0  # kept from both ends of the sole besides, until the last of the flat-foot phase

@@ -268,6 +268,16 @@ class WholeBodyTerms:
             arm, speed = self.state(p).com - self.state(p).point(sole), self.ballistic_velocity(p)
             return self.state(p).angular_momentum + model.total_mass * (arm[1] * speed[0] - arm[0] * speed[1])
 
+        def beyond_toes(p):
+            arm, speed = self.state(p).com - self.toe(p), self.ballistic_velocity(p)
+            left = self.state(p).angular_momentum / model.total_mass + arm[1] * speed[0] - arm[0] * speed[1]
+            return arm[0] + left / ca.sqrt(p.p.gravity * arm[1])
+
+        def caught(p):
+            forward, backward = lim.capture_moment, lim.capture_beyond_toes_m
+            return ca.if_else(p.p.rotation > 0, (moment(p) - forward[0]) / (forward[1] - forward[0]),
+                              (beyond_toes(p) - backward[0]) / (backward[1] - backward[0]))  # fmt: skip
+
         rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
         return [
             Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
@@ -289,6 +299,5 @@ class WholeBodyTerms:
                      lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
             Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
                  upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
-            Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
-                 lower=lim.capture_moment[0], upper=lim.capture_moment[1], scale=10.0),
+            Term("capture of a flip", "ours; replaces WF-E2", "1", "end", caught, lower=0.0, upper=1.0),
         ]  # fmt: skip
