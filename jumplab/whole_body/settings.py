@@ -39,7 +39,8 @@ class Limits:
     # if set, angular momentum about the sole's middle at touchdown [kg m^2/s], from ... to; then not the window
     capture_moment: tuple[float, float] | None = None
     # with it, for flips backward: how far beyond the toes [m] the capture point is left by an impact that pushes there
-    capture_beyond_toes_m: tuple[float, float] = tuple(float(x) for x in __import__("os").environ.get("CT", "-0.05:-0.03").split(":"))
+    capture_beyond_toes_m: tuple[float, float] | None = None
+    capture_beyond_slope_s: float = 0.04
     least_push: float = 0.0  # share of the weight that flat feet carry at least
     envelope_between: bool = False  # torque against speed is looked at between the nodes too
     cop_reserve_m: float = 0.0  # kept from both ends of the sole besides, until the last of the flat-foot phase
@@ -70,9 +71,9 @@ class Limits:
         """
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, touchdown_ankle_stroke=0.12,
-                       capture_moment=(6.0, 10.0), least_push=0.04, flight_clear=points, flight_clearance_m=0.06,
+                       capture_moment=(6.0, 10.0), capture_beyond_toes_m=tuple(float(x) for x in __import__("os").environ.get("CT", "0.062:0.082").split(":")), least_push=0.04, flight_clear=points, flight_clearance_m=0.06,
                        jerk_step=31_000.0, envelope_between=True, flat_s=(0.25, 1.3), toe_s=(0.06, 0.45),
-                       cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
+                       cop_reserve_m=0.03, momentum_share=0.15, speed_share=float(__import__("os").environ.get("SS","0.9")))  # fmt: skip
 
 
 @dataclass(frozen=True)

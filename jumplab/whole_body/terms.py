@@ -269,15 +269,27 @@ class WholeBodyTerms:
             return self.state(p).angular_momentum + model.total_mass * (arm[1] * speed[0] - arm[0] * speed[1])
 
         def beyond_toes(p):
-            arm, speed = self.state(p).com - self.toe(p), self.ballistic_velocity(p)
+            arm, speed = self.state(p).com - self.state(p).point(model.point_arms(0, 0.0)), self.ballistic_velocity(p)
             left = self.state(p).angular_momentum / model.total_mass + arm[1] * speed[0] - arm[0] * speed[1]
-            return arm[0] + left / ca.sqrt(p.p.gravity * arm[1])
+            point = arm[0] + left / ca.sqrt(p.p.gravity * arm[1])
+            return point + lim.capture_beyond_slope_s * p.p.takeoff_speed
 
-        def caught(p):
-            forward, backward = lim.capture_moment, lim.capture_beyond_toes_m
-            return ca.if_else(p.p.rotation > 0, (moment(p) - forward[0]) / (forward[1] - forward[0]),
-                              (beyond_toes(p) - backward[0]) / (backward[1] - backward[0]))  # fmt: skip
+        window, toes = lim.capture_moment, lim.capture_beyond_toes_m
 
+        def one_way(row, sign, middle):  # in flips of the other direction the row is a constant inside its bounds
+            return lambda p: ca.if_else(sign * p.p.rotation > 0, row(p), middle)
+
+        if window is None:
+            captures = [Term("capture window", "ours; replaces WF-E2", "m", "end", capture,
+                             lower=lim.capture_window_m[0], upper=lim.capture_window_m[1], scale=0.1)]  # fmt: skip
+        else:
+            forward = moment if toes is None else one_way(moment, 1, sum(window) / 2)
+            captures = [Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", forward,
+                             lower=window[0], upper=window[1], scale=10.0)]  # fmt: skip
+        if toes is not None:
+            captures.append(Term("capture beyond the toes", "ours, for flips backward; replaces WF-E2", "m", "end",
+                                 one_way(beyond_toes, -1, sum(toes) / 2), lower=toes[0], upper=toes[1],
+                                 scale=0.1))  # fmt: skip
         rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
         return [
             Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
@@ -297,7 +309,5 @@ class WholeBodyTerms:
             *([] if lim.touchdown_foot_rate is None else [
                 Term("foot rate at touchdown", "ours: toe and heel meet the ground together", "rad/s", "end",
                      lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
-            Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
-                 upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
-            Term("capture of a flip", "ours; replaces WF-E2", "1", "end", caught, lower=0.0, upper=1.0),
+            *captures,
         ]  # fmt: skip
