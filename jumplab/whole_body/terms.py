@@ -258,6 +258,31 @@ class WholeBodyTerms:
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: place, posture and rates of the landing, and the window in which the robot can be caught."""
         lim, model = self.limits, self.model
+        rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
+        return [
+            Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
+                 lambda p: self.toe(p) - ca.vertcat(p.p.distance, p.p.platform)),
+            Term("foot flat at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[0] - p.p.rotation),
+            Term("knee at touchdown", "ours: stroke", "rad", "end", lambda p: self.state(p).joints[1],
+                 lower=lim.touchdown_knee[0], upper=lim.touchdown_knee[1]),
+            *([] if lim.touchdown_ankle_stroke is None else [
+                Term("ankle at touchdown", "ours, for flips: stroke", "rad", "end", lambda p: self.state(p).joints[2],
+                     lower=model.lower[2] + lim.touchdown_ankle_stroke, upper=np.inf)]),
+            Term("trunk at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[3] - p.p.rotation,
+                 lower=lim.touchdown_trunk[0], upper=lim.touchdown_trunk[1]),
+            Term("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", lambda p: self.state(p).joint_rates,
+                 lower=-rate, upper=rate),
+            Term("trunk rate at touchdown", "ours", "rad/s", "end", lambda p: self.state(p).rates[3], lower=-trunk,
+                 upper=trunk),
+            *([] if lim.touchdown_foot_rate is None else [
+                Term("foot rate at touchdown", "ours: toe and heel meet the ground together", "rad/s", "end",
+                     lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
+            *self.capture_rows(),
+        ]  # fmt: skip
+
+    def capture_rows(self) -> list[Term]:
+        """Where the soles meet the ground, so that the robot can be caught; of a flip by its direction."""
+        lim, model = self.limits, self.model
         sole = model.point_arms(0, model.sole_center)
 
         def capture(p):
@@ -280,34 +305,11 @@ class WholeBodyTerms:
             return lambda p: ca.if_else(sign * p.p.rotation > 0, row(p), middle)
 
         if window is None:
-            captures = [Term("capture window", "ours; replaces WF-E2", "m", "end", capture,
-                             lower=lim.capture_window_m[0], upper=lim.capture_window_m[1], scale=0.1)]  # fmt: skip
-        else:
-            forward = moment if toes is None else one_way(moment, 1, sum(window) / 2)
-            captures = [Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", forward,
-                             lower=window[0], upper=window[1], scale=10.0)]  # fmt: skip
-        if toes is not None:
-            captures.append(Term("capture beyond the toes", "ours, for flips backward; replaces WF-E2", "m", "end",
-                                 one_way(beyond_toes, -1, sum(toes) / 2), lower=toes[0], upper=toes[1],
-                                 scale=0.1))  # fmt: skip
-        rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
+            return [Term("capture window", "ours; replaces WF-E2", "m", "end", capture,
+                         lower=lim.capture_window_m[0], upper=lim.capture_window_m[1], scale=0.1)]  # fmt: skip
         return [
-            Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
-                 lambda p: self.toe(p) - ca.vertcat(p.p.distance, p.p.platform)),
-            Term("foot flat at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[0] - p.p.rotation),
-            Term("knee at touchdown", "ours: stroke", "rad", "end", lambda p: self.state(p).joints[1],
-                 lower=lim.touchdown_knee[0], upper=lim.touchdown_knee[1]),
-            *([] if lim.touchdown_ankle_stroke is None else [
-                Term("ankle at touchdown", "ours, for flips: stroke", "rad", "end", lambda p: self.state(p).joints[2],
-                     lower=model.lower[2] + lim.touchdown_ankle_stroke, upper=np.inf)]),
-            Term("trunk at touchdown", "ours", "rad", "end", lambda p: self.state(p).angles[3] - p.p.rotation,
-                 lower=lim.touchdown_trunk[0], upper=lim.touchdown_trunk[1]),
-            Term("joint rates at touchdown", "WF-E1, relaxed", "rad/s", "end", lambda p: self.state(p).joint_rates,
-                 lower=-rate, upper=rate),
-            Term("trunk rate at touchdown", "ours", "rad/s", "end", lambda p: self.state(p).rates[3], lower=-trunk,
-                 upper=trunk),
-            *([] if lim.touchdown_foot_rate is None else [
-                Term("foot rate at touchdown", "ours: toe and heel meet the ground together", "rad/s", "end",
-                     lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
-            *captures,
+            Term("capture by momentum", "ours, for flips forward; replaces WF-E2", "kg m^2/s", "end",
+                 one_way(moment, 1, sum(window) / 2), lower=window[0], upper=window[1], scale=10.0),
+            Term("capture beyond the toes", "ours, for flips backward; replaces WF-E2", "m", "end",
+                 one_way(beyond_toes, -1, sum(toes) / 2), lower=toes[0], upper=toes[1], scale=0.1),
         ]  # fmt: skip
