@@ -125,17 +125,18 @@ def test_a_perturbed_backflip_arrives_as_planned_and_lands():
 
 
 @pytest.mark.slow
-def test_backflip_is_captured_by_momentum():
-    """Angular momentum about the middle of the soles at touchdown, from the tape: L + m (z v_x + dx v_z)."""
+def test_backflip_is_captured_beyond_the_toes():
+    """From the tape, once the toes have stopped the fall: dx + (L / m + z v_x - dx v_z) / sqrt(g z)."""
     plan = backflip()
-    tape, sagittal = plan.tape, plan.robot.sagittal
+    tape, limits = plan.tape, Limits().of_flip()
     com, speed = tape.extra["planar_com"][-1], tape.extra["planar_com_velocity"][-1]
-    sole = tape.extra["planar_toe"][-1] + sagittal.sole_center
-    z, dx = com[1] - sole[1], sole[0] - com[0]
-    L = float(np.ravel(tape.extra["planar_L"])[-1])
+    dx, z = com - tape.extra["planar_toe"][-1]
+    sagittal, L = plan.robot.sagittal, float(np.ravel(tape.extra["planar_L"])[-1])
     assert L < -15  # backward
-    low, high = Limits().of_flip().capture_moment
-    assert low - 0.1 <= L + sagittal.total_mass * (z * speed[0] + dx * speed[1]) <= high + 0.1
+    point = dx + (L / sagittal.total_mass + z * speed[0] - dx * speed[1]) / np.sqrt(9.8 * z)
+    point += limits.capture_beyond_slope_s * plan.task.takeoff_speed
+    low, high = limits.capture_beyond_toes_m
+    assert low - 1e-3 <= point <= high + 1e-3
     stroke = float(np.ravel(tape.extra["planar_joints"][-1])[2]) - sagittal.lower[2]
     assert stroke >= Limits().of_flip().touchdown_ankle_stroke - 1e-3
     assert abs(plan.whole_body.solution.phases["flight"].v[-1, 3]) <= 5.0 + 1e-6

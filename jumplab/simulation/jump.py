@@ -165,7 +165,8 @@ def _run(
             step += 1
         engine = world.read_back()
     settings = {
-        "mode": mode, "scene": scene.name, "reaim": reaim, "landing": pilot.ahead.to_json(),
+        "mode": mode, "scene": scene.name, "reaim": reaim,
+        "landing": pilot.ahead.to_json() | {"again": pilot.replanned},
         "perception": perceive.to_json(), "stand_s": stand_s, "step_s": STEP_S,
         "robot": robot.name, "robot_hash": robot.hash,
         "friction_read_back": min(engine["friction"]), "engine": engine,

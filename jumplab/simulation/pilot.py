@@ -12,6 +12,7 @@ from jumplab.simulation.landing import PERIOD_STEPS, LandingController
 from jumplab.simulation.playback import Command, Playback
 from jumplab.simulation.reaim import Reaim, pitch_of
 from jumplab.simulation.reference import LEAD_S, Forecast, LandingAhead, LandingSource, landing_planner
+from jumplab.simulation.replan import Replan
 from jumplab.simulation.scene import Scene
 from jumplab.simulation.tuck import FROM_SHARE, Tuck, is_flip
 from jumplab.simulation.world import STEP_S
@@ -60,6 +61,8 @@ class Pilot:
         self._tucked = round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S)
         self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
         self._yield_s = FLIP_YIELD_S if is_flip(tape) else YIELD_S
+        # other jumps land flat, within a centimetre or two of what was planned for them
+        self._replan = Replan(robot) if is_flip(tape) else None
         self._none = np.zeros(len(robot.joint_names))
         self._tau = self._none
         self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
@@ -77,6 +80,11 @@ class Pilot:
         """QPs posed by the landing controller, and how many of them failed."""
         return self._landing.solves, self._landing.failures
 
+    @property
+    def replanned(self) -> dict | None:
+        """How often the landing of a flip was planned anew, see :meth:`Replan.to_json`."""
+        return None if self._replan is None else self._replan.to_json()
+
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` from measured state and vertical foot forces."""
         if self.touchdown is None:
@@ -86,6 +94,8 @@ class Pilot:
                 return self._fly(step, q, v)
             self._touch(step, q, v)
         since = step - self.touchdown
+        if self._replan is not None and self.ahead.followed == "planned":
+            self._landing.reference = self._replan.follow(since * STEP_S, q, v, self._landing.reference)
         if since % PERIOD_STEPS == 0:
             self._tau = self._landing.torque(since * STEP_S, q, v, force)
         return Command(tau=self._tau)

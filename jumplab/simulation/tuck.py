@@ -17,12 +17,13 @@ from jumplab.simulation.world import STEP_S
 from jumplab.trajectory import Tape
 
 FROM_SHARE = 0.4  # our choice: of the flight; before, legs and arms are still folding at their speed limits
-# our choice: the tape then runs at 0.65 to 1.35 times its speed; with 60 ms the opening hips passed their speed limit,
-# where a servo has no torque left to stop them, and the soles came down tilted
-LARGEST_SHIFT_S = 0.045
+# our choice: how much sooner and how much later the tuck opens at most. Opened later the hips have to hurry: with 45 ms
+# they passed their speed limit, where a servo has no torque left to stop them, and the soles came down tilted. Opened
+# sooner they have time
+SOONER_S, LATER_S = 0.09, 0.03
 SHIFT_RATE = 0.5  # [1] our choice: seconds of shift per second, five 10 ms corrections per 100 ms
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
-BISECTIONS = 8  # of twice the largest shift: to half a millisecond, 3 mrad
+BISECTIONS = 8  # of the range of shifts: to half a millisecond, 3 mrad
 WHOLE_TURN = np.pi  # [rad] our choice: a tape that turns by more than half a turn in flight is a flip's
 
 
@@ -86,7 +87,7 @@ class Tuck:
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -LARGEST_SHIFT_S, LARGEST_SHIFT_S
+        low, high = -LATER_S, SOONER_S
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):

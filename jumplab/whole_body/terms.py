@@ -258,16 +258,6 @@ class WholeBodyTerms:
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: place, posture and rates of the landing, and the window in which the robot can be caught."""
         lim, model = self.limits, self.model
-        sole = model.point_arms(0, model.sole_center)
-
-        def capture(p):
-            ahead = self.state(p).point(sole)[0] - self.state(p).com[0]
-            return ahead - lim.capture_offset_m - lim.capture_slope_s * p.c.vel_x
-
-        def moment(p):
-            arm, speed = self.state(p).com - self.state(p).point(sole), self.ballistic_velocity(p)
-            return self.state(p).angular_momentum + model.total_mass * (arm[1] * speed[0] - arm[0] * speed[1])
-
         rate, trunk = lim.touchdown_joint_rate, lim.touchdown_trunk_rate
         return [
             Term("touchdown place", "WL-E1 and SL-E1: jump length; ours: height", "m", "end",
@@ -287,8 +277,39 @@ class WholeBodyTerms:
             *([] if lim.touchdown_foot_rate is None else [
                 Term("foot rate at touchdown", "ours: toe and heel meet the ground together", "rad/s", "end",
                      lambda p: self.state(p).rates[0], lower=-lim.touchdown_foot_rate, upper=lim.touchdown_foot_rate)]),
-            Term("capture window", "ours; replaces WF-E2", "m", "end", capture, lower=lim.capture_window_m[0],
-                 upper=lim.capture_window_m[1], scale=0.1) if lim.capture_moment is None else
-            Term("capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s", "end", moment,
-                 lower=lim.capture_moment[0], upper=lim.capture_moment[1], scale=10.0),
+            *self.capture_rows(),
+        ]  # fmt: skip
+
+    def capture_rows(self) -> list[Term]:
+        """Where the soles meet the ground, so that the robot can be caught; of a flip by its direction."""
+        lim, model = self.limits, self.model
+        sole = model.point_arms(0, model.sole_center)
+
+        def capture(p):
+            ahead = self.state(p).point(sole)[0] - self.state(p).com[0]
+            return ahead - lim.capture_offset_m - lim.capture_slope_s * p.c.vel_x
+
+        def moment(p):
+            arm, speed = self.state(p).com - self.state(p).point(sole), self.ballistic_velocity(p)
+            return self.state(p).angular_momentum + model.total_mass * (arm[1] * speed[0] - arm[0] * speed[1])
+
+        def beyond_toes(p):
+            arm, speed = self.state(p).com - self.state(p).point(model.point_arms(0, 0.0)), self.ballistic_velocity(p)
+            left = self.state(p).angular_momentum / model.total_mass + arm[1] * speed[0] - arm[0] * speed[1]
+            point = arm[0] + left / ca.sqrt(p.p.gravity * arm[1])
+            return point + lim.capture_beyond_slope_s * p.p.takeoff_speed
+
+        window, toes = lim.capture_moment, lim.capture_beyond_toes_m
+
+        def one_way(row, sign, middle):  # in flips of the other direction the row is a constant inside its bounds
+            return lambda p: ca.if_else(sign * p.p.rotation > 0, row(p), middle)
+
+        if window is None:
+            return [Term("capture window", "ours; replaces WF-E2", "m", "end", capture,
+                         lower=lim.capture_window_m[0], upper=lim.capture_window_m[1], scale=0.1)]  # fmt: skip
+        return [
+            Term("capture by momentum", "ours, for flips forward; replaces WF-E2", "kg m^2/s", "end",
+                 one_way(moment, 1, sum(window) / 2), lower=window[0], upper=window[1], scale=10.0),
+            Term("capture beyond the toes", "ours, for flips backward; replaces WF-E2", "m", "end",
+                 one_way(beyond_toes, -1, sum(toes) / 2), lower=toes[0], upper=toes[1], scale=0.1),
         ]  # fmt: skip
