@@ -29,11 +29,12 @@ def planar_quantities(
 
     Inputs are (n, 5), (n, 5), (n, 5), (n, 2); names as in :func:`jumplab.models.planar.evaluator`.
     """
-    key = (robot.hash, gravity, names)
-    if key not in _EVALUATORS:
-        full = evaluator(robot.sagittal, gravity)
-        _EVALUATORS[key] = full if names is None else full.factory("some", full.name_in(), list(names))
-    out = _EVALUATORS[key].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
+    known, whole = _EVALUATORS.setdefault((robot.hash, gravity), {}), None
+    if whole not in known:
+        known[whole] = evaluator(robot.sagittal, gravity)
+    if names not in known:
+        known[names] = known[whole].factory("some", known[whole].name_in(), list(names))
+    out = known[names].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
     return {k: v.full().T.squeeze() for k, v in out.items()}
 
 

@@ -43,15 +43,16 @@ def group_rows(a: Assembled) -> tuple[RowGroup, ...]:
     """The rows of an assembled problem by term."""
     found: dict[tuple, list] = {}
     for i, row in enumerate(a.rows):
-        found.setdefault((row.owner, row.term.name), []).append((i, row))
+        found.setdefault((row.owner, row.term.name), []).append(i)
     out = []
-    for (owner, _), rows in found.items():
-        count = 1 + max(row.component for _, row in rows)
-        index = np.array([i for i, _ in rows]).reshape(-1, count)
-        nodes = np.array([row.node for _, row in rows]).reshape(-1, count)[:, 0]
+    for (owner, _), places in found.items():
+        first = a.rows[places[0]]
+        count = 1 + max(a.rows[i].component for i in places)
+        index = np.array(places).reshape(-1, count)
+        nodes = np.array([a.rows[i].node for i in places[::count]])
         n = a.layouts[owner].phase.intervals if owner in a.layouts else 0
-        half = 0.5 if rows[0][1].term.at in ("mid", "interval") else 0.0
-        out.append(RowGroup(owner, rows[0][1].term, index, nodes, (nodes + half) / max(n, 1), n))
+        half = 0.5 if first.term.at in ("mid", "interval") else 0.0
+        out.append(RowGroup(owner, first.term, index, nodes, (nodes + half) / max(n, 1), n))
     return tuple(out)
 
 

@@ -122,11 +122,13 @@ def sobol(count: int) -> np.ndarray:
 
 
 def postures(
-    robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RAD, com_x_m: tuple[float, float] = COM_X_M
-) -> dict:
+    robot: Robot, count: int = SAMPLES, heel_up_rad: float = HEEL_UP_RAD, com_x_m: tuple[float, float] = COM_X_M,
+    *, strength: bool = True,
+) -> dict:  # fmt: skip
     """Sampled postures within joint ranges, toe on the ground, heel up by at most ``heel_up_rad``.
 
-    Returns arrays angles (n, 5), com (n, 2) from mid-sole, shoulder, rho, force, speed.
+    Returns arrays angles (n, 5), com (n, 2) from mid-sole, shoulder, rho; with ``strength`` also force and speed, and
+    the joints that limit them.
     """
     m = robot.sagittal
     unit = sobol(count)
@@ -143,12 +145,12 @@ def postures(
     from_sole = com - m.sole_center
     ok = (ankle > m.lower[2]) & (ankle < m.upper[2]) & (from_sole[:, 0] > com_x_m[0]) & (from_sole[:, 0] < com_x_m[1])
     ok &= from_sole[:, 1] > 0.15  # our choice: lower than this the robot sits
-    force, strong = _static_force(m, angles, com)
-    speed, quick = _extension_speed(m, angles, from_sole)
-    columns = {"force_joint": strong, "speed_joint": quick,
-               "angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho, "force": force,
-               "speed": speed}  # fmt: skip
-    return {name: x[ok] for name, x in columns.items()}
+    columns = {"angles": angles, "com": from_sole, "shoulder": shoulder, "rho": rho}
+    found = {name: x[ok] for name, x in columns.items()}
+    if strength:
+        found["force"], found["force_joint"] = _static_force(m, found["angles"], com[ok])
+        found["speed"], found["speed_joint"] = _extension_speed(m, found["angles"], found["com"])
+    return found
 
 
 def _usual_inertia(p: dict) -> np.ndarray:
@@ -243,7 +245,8 @@ def reach(robot: Robot, count: int = SAMPLES) -> Reach:
     start, stance_rho = _rod(m, stance_angles(robot))
     mass = m.mass
     half = -m.heel[0] / 2
-    flat, toe = postures(robot, count, 0.0, FLAT_COM_X_M), postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M)
+    flat = postures(robot, count, 0.0, FLAT_COM_X_M, strength=False)
+    toe = postures(robot, count, TOE_HEEL_UP_RAD, TOE_COM_X_M, strength=False)
     capped = np.minimum(strongest, FORCE_CAP * strongest[0])
     curves = ((capped, 3), (fastest, 3))
     envelope = _around_stance(np.polyfit(grid, lower, 2), np.polyfit(grid, upper, 2), start[1], stance_rho)
