@@ -153,13 +153,14 @@ def _stages(watch: Stopwatch, planner: Planner, task: JumpTask) -> None:
 
 def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict, kept: str) -> float:
     """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
-    in the folder ``kept``; returns the peak memory of the first [GiB]."""
+    in the folder ``kept``; returns the peak memory of the first [GiB]. Python's own bytecode is on file for both, as it
+    is after any first run, whatever the settings of this process."""
     peak = 0.0
+    environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     for name, how in (("cold", "fresh"), ("cold, functions kept", "keep")):
         command = [sys.executable, "-c", COLD, robot_name, repr(task.distance_m), repr(task.height_m), how]
-        done = subprocess.run(
-            command, capture_output=True, text=True, env={**os.environ, **ONE_THREAD, "JUMPLAB_CACHE": kept}
-        )
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
         if done.returncode:
             raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
         said = json.loads(done.stdout)
