@@ -16,6 +16,7 @@ from jumplab.layout import PhaseLayout
 from jumplab.terms import Point, Problem, Term
 
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
+RARE = ("gauss_newton",)  # evaluated seven times a plan: the search for what its entries share would not pay
 FUNCTIONS = ("costs", "gradient", "rows", "jacobian", "hessian", "gauss_newton")  # that an element may be asked for
 
 
@@ -42,7 +43,7 @@ class Formulas:
     def make(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS` as (function of a column of values, their rows, their columns)."""
         symbols, output, sparsity = getattr(self, f"_{name}")()
-        function = ca.Function(name, [*self.arguments, *symbols], [output], {"cse": True})
+        function = ca.Function(name, [*self.arguments, *symbols], [output], {"cse": name not in RARE})
         places = sparsity.get_triplet() if sparsity is not None else ((), ())
         return function, *(np.array(z, int) for z in places)
 
