@@ -55,7 +55,8 @@ class FlightQp:
     ):
         self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
         self.t, self.ground = reference.t, ground
-        self.step = float(self.t[1])
+        self.steps = np.diff(self.t)
+        self.step = float(self.steps[0])  # all alike
         self.joints = JointRows(body, nominal, options.limits)
         form = options.form
         pairs = ("hip",) if form.pairs == "hips" else ("hip", "knee", "ankle", "shoulder")

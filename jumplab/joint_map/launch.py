@@ -31,6 +31,7 @@ class LaunchTarget:
     symmetry : right side of the symmetry rows, zero but for the drift control (k,).
     on_toes : heel up, CoP at the toe.
     inertia_weight : of the inertia's term at this step, see :class:`~jumplab.joint_map.options.LaunchWeights`.
+    step : its length [s].
     """
 
     com_acceleration: np.ndarray
@@ -43,6 +44,7 @@ class LaunchTarget:
     symmetry: np.ndarray
     on_toes: bool
     inertia_weight: float
+    step: float
 
 
 class LaunchQp:
@@ -57,7 +59,7 @@ class LaunchQp:
     Attributes
     ----------
     roots : square roots of the weights of the CoM's rows (3,) and of the momentum's (6,), feet flat and on the toes.
-    inertia_weights : (n,) weight of the inertia's term by step.
+    inertia_weights : (n,) weight of the inertia's term by step.  steps : (n,) their lengths [s].
     """
 
     name = "launch"
@@ -66,7 +68,7 @@ class LaunchQp:
         self.body, self.reference, self.options = body, reference, options
         self.nominal = swung_arms(body, q0, options.arm_rad)
         self.t = reference.t
-        self.step = float(self.t[1])
+        self.steps = np.diff(self.t)
         start = body.terms(q0, np.zeros(body.nv))
         self.toe0, self.pivot = start.toe, start.sole.mean(0)
         self.joints = JointRows(body, q0, options.limits)
@@ -159,8 +161,8 @@ class LaunchQp:
             mirror = np.zeros(len(self.S))
         on_toes = bool(self.on_toes[k])
         floor = self._heel_floor(terms, on_toes)
-        weight = float(self.inertia_weights[k])
-        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight)
+        weight, step = float(self.inertia_weights[k]), float(self.steps[k])
+        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight, step)
 
     def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
         gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
@@ -198,7 +200,7 @@ class LaunchQp:
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
             G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
             h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
-        self.joints.fill(R, lower, upper, terms, start, self.step, WRENCH)
+        self.joints.fill(R, lower, upper, terms, start, target.step, WRENCH)
         return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
 
     def _contact(self, E, e, first, terms, target):

@@ -140,10 +140,13 @@ class LaunchReference:
     cop_x: np.ndarray
 
     @classmethod
-    def sample(cls, srmp: Any, step_s: float) -> LaunchReference:
-        """From stage 1's launch."""
+    def sample(cls, srmp: Any, step_s: float, toe: tuple[float, float] | None = None) -> LaunchReference:
+        """From stage 1's launch; ``toe`` is the length of its last part [s] that has another step, and that step [s]."""
         r = checked(srmp, "launch")
         t, grid = nodes(r["t"][-1], step_s), r["t"]
+        if toe is not None and 0 < toe[0] < grid[-1]:
+            split = grid[-1] - toe[0]
+            t = np.concatenate([nodes(split, step_s), split + nodes(*toe)[1:]])
         com = Track.sample(grid, planar(r["com"]), planar(r["com_velocity"]), planar(r["com_acceleration"]), t)
         # L is a rate of nothing that is followed: its "value" has no gain
         momentum = Track.of(t, np.zeros_like(t), hermite(grid, r["L"], r["L_rate"], None, t)[0])

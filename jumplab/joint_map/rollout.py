@@ -92,14 +92,14 @@ class JointMapper:
     Parameters
     ----------
     srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
-    step_s : step of the roll-out [s], at most, or one for the launch and one for the flight; each is divided evenly.
+    step_s : step of the roll-out [s], at most, or one each for flat feet, toes and flight; each is divided evenly.
     options : gains, weights, limits, form.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
     """
 
-    def __init__(self, srmp_plan, robot: Robot, step_s: float | tuple[float, float] = 0.01,
+    def __init__(self, srmp_plan, robot: Robot, step_s: float | tuple[float, float, float] = 0.01,
                  options: Options | None = None, q0=None):  # fmt: skip
-        launch_step_s, flight_step_s = step_s if isinstance(step_s, tuple) and len(step_s) == 2 else (step_s, step_s)
-        for step in (launch_step_s, flight_step_s):
+        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else None
+        for step in parts or (step_s,):
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
@@ -108,10 +108,11 @@ class JointMapper:
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.flight_reference = FlightReference.sample(srmp_plan, flight_step_s)
+        self.flight_reference = FlightReference.sample(srmp_plan, parts[2] if parts else step_s)
         toe_s = self.options.toe_s
         toe_s = getattr(srmp_plan, "toe_s", None) if toe_s is None else toe_s
-        launch = LaunchReference.sample(srmp_plan, launch_step_s)
+        toe = (toe_s, parts[1]) if parts and toe_s is not None else None
+        launch = LaunchReference.sample(srmp_plan, parts[0] if parts else step_s, toe)
         self.launch = LaunchQp(self.body, self.q0, launch, self.options, toe_s)
 
     def flight_from(self, takeoff: State) -> FlightQp:
@@ -135,15 +136,15 @@ class JointMapper:
         ``start = plan.state(row)`` it is the QP that made the plan, up to what its prediction missed.
         """
         target = qp.target(k, self.body.motion(start.q, start.v))
-        terms = self.middle(start, start.a, qp.step)
+        terms = self.middle(start, start.a, qp.steps[k])
         return terms, target, qp.matrices(terms, target, start)
 
     def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> dict:
         """Solve and integrate all steps of one phase; lists by name, and where the time went."""
-        h, first, clock = qp.step, WRENCH if qp is self.launch else 0, time.perf_counter
+        first, clock = WRENCH if qp is self.launch else 0, time.perf_counter
         out = {"states": [state], "nodes": [], "steps": [], "F": [], "answers": []}
         solver, build_s, solve_s, before = None, 0.0, 0.0, state.a
-        for k in range(len(qp.t) - 1):
+        for k, h in enumerate(qp.steps):
             began = clock()
             node = self.body.motion(state.q, state.v)
             target = qp.target(k, node)
@@ -243,7 +244,7 @@ class JointMapper:
 def map_to_joints(
     srmp_plan: Any,
     robot: Robot,
-    step_s: float | tuple[float, float] = 0.01,
+    step_s: float | tuple[float, float, float] = 0.01,
     method: str = "cvxpy",
     options: Options | None = None,
     q0: np.ndarray | None = None,
@@ -253,7 +254,7 @@ def map_to_joints(
     Parameters
     ----------
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
-    robot : the robot.  step_s : step of the roll-out [s], or one for the launch and one for the flight.
+    robot : the robot.  step_s : step of the roll-out [s], or one each for flat feet, toes and flight.
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
     options : gains, weights, limits, form; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
     q0 : (nq,) start at rest; the robot's stance by default.
