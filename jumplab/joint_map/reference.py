@@ -141,7 +141,7 @@ class LaunchReference:
 
     @classmethod
     def sample(cls, srmp: Any, step_s: float, toe: tuple[float, float] | None = None) -> LaunchReference:
-        """From stage 1's launch; ``toe`` is the length of its last part [s] that has another step, and that step [s]."""
+        """From stage 1's launch; ``toe`` is the length [s] of a last part that has another step, and that step [s]."""
         r = checked(srmp, "launch")
         t, grid = nodes(r["t"][-1], step_s), r["t"]
         if toe is not None and 0 < toe[0] < grid[-1]:
