@@ -9,10 +9,11 @@ from fixtures_core import jump, planner
 from test_solver import flat_guess, move
 from test_transcription import toy
 
-from jumplab import pipeline
+from jumplab import pipeline, whole_body
 from jumplab.errors import InputError
 from jumplab.packing import group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
 from jumplab.passport.audit import audit
+from jumplab.robot import load_robot
 from jumplab.solver import WARM, Nlp, PhaseGuess
 from jumplab.task import JumpTask
 from jumplab.terms import Term
@@ -112,3 +113,18 @@ def test_of_another_robot():
     with pytest.raises(InputError) as e:
         planner().replan(other, JumpTask(0.9, 0.5))
     assert str(e.value) == "the previous plan is for the robot other, not for bhr"
+
+
+@pytest.mark.slow
+def test_a_jerk_that_jumps_too_far_is_made_dearer(monkeypatch):
+    """The default jump's jerk jumps by 16,000 rad/s^3; allowed less, it is solved again, and moves more evenly."""
+    module, task = whole_body.planner, JumpTask(1.0, 0.5)
+    planner = whole_body.WholeBodyPlanner(load_robot(), tracking=False)
+    usual = planner.plan(task)
+    monkeypatch.setattr(module, "FOLLOWED_JERK_STEP", 0.8 * usual.jerk_step)
+    even = planner.plan(task)
+    assert even.jerk_step <= 0.8 * usual.jerk_step
+    jerk = {row["name"]: row["weight"] for row in even.solution.cost_shares}["jerk"]
+    assert jerk / planner.weights.jerk in module.EVENING
+    monkeypatch.setattr(module, "EVENING", ())
+    assert planner.plan(task).jerk_step == pytest.approx(usual.jerk_step, rel=1e-6)
