@@ -37,7 +37,9 @@ def test_the_report_is_plain_and_complete(found):
     assert {"warm_over_direct", "replan_over_direct", "cold_over_direct", "raw_s", "median_s", "growth"} <= set(again)
     cpu = again["raw_s"]["cpu"]
     assert all(len(times) == 1 and times[0] > 0 for times in cpu.values())
-    assert again["warm_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
+    steps = sum(times[0] for name, times in cpu.items() if name.startswith("plan: ") and name != "plan: tape")
+    assert again["warm_over_direct"] == pytest.approx(steps / cpu[again["peer"]][0])
+    assert again["tape_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
     assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
     assert again["cold_over_direct"] is None and again["goals"]["cold_over_direct"]["reached"] is None
     assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
@@ -62,12 +64,13 @@ def test_what_is_not_reached_is_said():
     said = text(slow)
     assert slow["goals"]["cold_over_direct"] == dict(value=3.0, limit=1.5, aim=None, reached=False)
     assert slow["cold_kept_over_direct"] == pytest.approx(2.0)
-    assert "3.000  (limit 1.5): not reached" in said and "0.550  (limit 0.6, aim 0.25): reached" in said
+    assert "3.000  (limit 1.5): not reached" in said and "0.500  (limit 0.6, aim 0.25): reached" in said
     assert "where the time of the three steps goes" in said and "3 whole body" in said
     assert "plans that were timed and are clean in the audit: plan 1 of 2" in said
     assert "not measured" in text(made())
     assert "over 3 other targets" in said and "0.500  (median; 0.40 to 0.70), 3 clean" in said
-    assert slow["warm_over_approached"] == pytest.approx(1.1) and "Gauss-Newton steps" in said and "1.100" in said
+    assert slow["warm_over_approached"] == pytest.approx(1.0) and "Gauss-Newton steps" in said and "1.000" in said
+    assert slow["tape_over_direct"] == pytest.approx(0.55) and "1 kHz tape" in said and "0.550" in said
 
 
 def test_growth_is_the_distance_from_a_line():

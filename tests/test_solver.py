@@ -58,7 +58,8 @@ def test_sample_is_what_was_optimised(nlp):
 def test_warm_start_on_the_same_and_on_a_finer_mesh(nlp):
     first = nlp.solve({"goal": 1.0}, flat_guess())
     again = nlp.solve({"goal": 1.0}, first.guess())
-    assert again.statistics.iterations <= first.statistics.iterations
+    # the problem is a QP: from anywhere one step, or two where the first is not exact to the last digits
+    assert again.statistics.iterations <= max(first.statistics.iterations, 2)
     assert again.statistics.objective == pytest.approx(first.statistics.objective, rel=1e-6)
     fine = first.guess({"go": 90})["go"]
     assert fine.q.shape == (91, 1)
