@@ -201,9 +201,10 @@ def _row(stage: str, s: Statistics) -> StageRow:
 
 
 def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
-    """What stage 3 or the direct planner cost: the coarse mesh, if there was one, and the fine one."""
-    fine = _row(stage, body.solution.statistics)
-    return (fine,) if body.coarse is None else (_row(f"{stage}, coarse", body.coarse), fine)
+    """What stage 3 or the direct planner cost: the coarse mesh, if there was one, and the fine one, each time."""
+    coarse = () if body.coarse is None else (_row(f"{stage}, coarse", body.coarse),)
+    uneven = (_row(f"{stage}, uneven", statistics) for statistics in body.uneven)
+    return (*coarse, *uneven, _row(stage, body.solution.statistics))
 
 
 def _joint_row(joints: JointPlan) -> StageRow:
@@ -221,7 +222,7 @@ def guess_from_joints(
 ) -> Mapping[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing halfway as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`.
+    The arms swing mostly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`.
     """
     robot = planner.robot
     angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)

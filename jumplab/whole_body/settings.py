@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+# our choice: [rad/s^3] by how much the jerk of a joint may jump from interval to interval; a tape of 1 kHz misses the
+# acceleration in the middle of such a step by an eighth of that times 1 ms, and the audit allows 4 rad/s^2
+FOLLOWED_JERK_STEP = 31_000.0
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -73,7 +77,8 @@ class Limits:
         points = ("hand", "mid-arm", "knee", "hip", "shoulder")
         return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, touchdown_ankle_stroke=0.12,
                        capture_moment=(6.0, 10.0), capture_beyond_toes_m=(0.09, 0.12), least_push=0.04,
-                       flight_clear=points, flight_clearance_m=0.06, jerk_step=31_000.0, envelope_between=True,
+                       flight_clear=points, flight_clearance_m=0.06, jerk_step=FOLLOWED_JERK_STEP,
+                       envelope_between=True,
                        flat_s=(0.25, 1.3), toe_s=(0.06, 0.45), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
 
 
