@@ -1,1 +1,69 @@
-"""A humanoid robot jumps: planned by three chained optimisations, audited, simulated, and drawn."""
+"""A humanoid robot jumps: planned by three chained optimisations, audited, simulated, and drawn.
+
+>>> import jumplab as jl
+>>> robot = jl.Robot.load("bhr")  # a name, a TOML, a URDF
+>>> plan = jl.plan(jl.JumpTask(distance_m=1.0, height_m=0.5), robot)
+>>> assert jl.audit(plan).passed
+>>> run = jl.simulate(plan)
+>>> jl.save("out", plan, run); jl.view(plan, run)
+
+Each name below is loaded when it is first used. Errors are in ``jl.errors``, pictures and tables in ``jl.plots``.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ loads what is asked for
+    from jumplab import errors as errors
+    from jumplab import show as plots
+    from jumplab.api import audit, load, plan, save, simulate, view
+    from jumplab.ocp import Term
+    from jumplab.robot import Robot
+    from jumplab.sim import Perturbation, Scene
+    from jumplab.stages.plan import JumpPlan
+    from jumplab.stages.planner import Planner
+    from jumplab.studies.chain import run_chain
+    from jumplab.studies.envelope import envelope
+    from jumplab.studies.trials import run_trials
+    from jumplab.task import JumpTask
+
+_PLACES = {
+    "JumpTask": "task",
+    "Robot": "robot",
+    "Planner": "stages.planner",
+    "JumpPlan": "stages.plan",
+    "Term": "ocp",
+    "plan": "api",
+    "audit": "api",
+    "simulate": "api",
+    "save": "api",
+    "load": "api",
+    "view": "api",
+    "Scene": "sim",
+    "Perturbation": "sim",
+    "run_trials": "studies.trials",
+    "run_chain": "studies.chain",
+    "envelope": "studies.envelope",
+}
+_MODULES = {"errors": "errors", "plots": "show"}
+
+__all__ = [*_PLACES, *_MODULES]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        value = import_module(f"jumplab.{_MODULES[name]}")
+    elif name in _PLACES:
+        value = getattr(import_module(f"jumplab.{_PLACES[name]}"), name)
+    elif name == "__version__":
+        from jumplab.io.folder import versions
+
+        value = versions()["jumplab"]
+    else:
+        raise AttributeError(f"module 'jumplab' has no attribute {name!r}; it has {', '.join(__all__)}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -55,19 +55,19 @@ class SolverError(JumplabError):
         self.stage, self.status, self.violations = stage, status, violations
 
 
-def said(value: Any) -> str:
+def quoted(value: Any) -> str:
     """A value as a message may quote it: one line, not long, whatever it is."""
     return " ".join(_SHORT.repr(value).split())
 
 
-def needs(value: Any, kind: type, what: str) -> None:
+def require_type(value: Any, kind: type, what: str) -> None:
     """Refuse (:class:`InputError`) a value of another type, before it fails somewhere inside."""
     if not isinstance(value, kind):
-        raise InputError(f"{what} must be a {kind.__name__}, got {said(value)}")
+        raise InputError(f"{what} must be a {kind.__name__}, got {quoted(value)}")
 
 
 def as_path(value: Any, what: str) -> Path:
     """A path from what the caller gave; refuses (:class:`InputError`) what names no file."""
     if isinstance(value, str | os.PathLike) and value != "" and isinstance(os.fspath(value), str):
         return Path(value)
-    raise InputError(f"{what} must be a path, got {said(value)}")
+    raise InputError(f"{what} must be a path, got {quoted(value)}")

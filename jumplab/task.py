@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from jumplab.errors import InputError, said
+from jumplab.errors import InputError, quoted
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
 MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
@@ -17,7 +17,7 @@ def _number(name: str, value, low: float, high: float, unit: str) -> float:
     try:
         x = float("" if isinstance(value, bool) else value)  # True is no number of metres
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must be a number in {unit}, got {said(value)}") from None
+        raise InputError(f"{name} must be a number in {unit}, got {quoted(value)}") from None
     if not math.isfinite(x):
         raise InputError(f"{name} must be finite, got {x}")
     if not low <= x <= high:

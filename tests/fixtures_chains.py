@@ -2,10 +2,10 @@
 
 from functools import cache
 
-from jumplab.chains import ChainResult, Course, Rehearsal, crouched, run_chain
-from jumplab.pipeline import Planner
 from jumplab.robot import Robot, load_robot
-from jumplab.simulation import SLIGHT, Perturbation
+from jumplab.sim import SLIGHT, Perturbation
+from jumplab.stages.planner import Planner
+from jumplab.studies.chain import ChainResult, Course, Rehearsal, crouched, run_chain
 
 
 @cache

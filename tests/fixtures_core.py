@@ -6,10 +6,10 @@ from functools import cache, cached_property
 import numpy as np
 import pinocchio as pin
 
-from jumplab.pipeline import JumpPlan, Planner
 from jumplab.robot import Robot, load_robot
 from jumplab.robot.stance import configuration
-from jumplab.srmp import SrmpPlan, SrmpPlanner
+from jumplab.stages.planner import JumpPlan, Planner
+from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.task import JumpTask
 
 LIMBS = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")

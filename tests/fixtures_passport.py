@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 from fixtures_core import jump
 
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot, load_robot
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 TASK = JumpTask(1.0, 0.5)
 ROBOT = load_robot()

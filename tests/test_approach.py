@@ -6,14 +6,13 @@ import pytest
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
-from jumplab.approach import Approach
 from jumplab.errors import SolverError
+from jumplab.ocp.assembly import Assembled
+from jumplab.ocp.nlp import Nlp
+from jumplab.ocp.sqp import Approach, StagedOrder
 from jumplab.robot import load_robot
-from jumplab.solver import Nlp
-from jumplab.srmp import SrmpPlanner
-from jumplab.staged import StagedOrder
-from jumplab.transcription import Assembled
-from jumplab.whole_body import Mesh, WholeBodyPlanner
+from jumplab.stages.srmp import SrmpPlanner
+from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 
 
 def symmetric(upper: ca.DM) -> np.ndarray:

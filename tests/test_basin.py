@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from fixtures_core import jump
 
-from jumplab import store
 from jumplab.errors import InputError
-from jumplab.experiments import BasinGrid, Trial, TrialSettings, basin, landing_basin, states_kept
+from jumplab.io import folder as store
+from jumplab.studies import basin
+from jumplab.studies.basin import BasinGrid, landing_basin, states_kept
+from jumplab.studies.trials import Trial, TrialSettings
 
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
 

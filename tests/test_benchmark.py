@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from jumplab import benchmark
-from jumplab.benchmark.report import line_error, report, text
 from jumplab.errors import InputError
+from jumplab.stages.whole_body import Mesh
+from jumplab.studies import bench as benchmark
+from jumplab.studies.bench import line_error, report, text
 from jumplab.task import JumpTask
-from jumplab.whole_body import Mesh
 
 TIMES = {"plan": [0.5, 0.6], "re-plan": [0.2, 0.2], "direct, at once": [1.0, 1.0], "direct, build": [0.5, 0.5],
          "direct, over a coarse mesh": [2.0, 0.9], "direct, Gauss-Newton first": [0.5, 0.5], "plan: 1 SRMP": [0.1, 0.1],

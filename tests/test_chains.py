@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from fixtures_chains import planner, rehearsal, waiting
 
-from jumplab.chains import Course, crouched, run_chain
-from jumplab.chains.foresight import Ahead, Foresight
-from jumplab.chains.posture import CROUCH, Gauge
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.pipeline import Planner
 from jumplab.robot import load_robot
 from jumplab.robot.stance import configuration, stance_angles
+from jumplab.stages.planner import Planner
+from jumplab.studies.chain import Course, crouched, run_chain
+from jumplab.studies.chain.course import CROUCH, Gauge
+from jumplab.studies.chain.foresight import Ahead, Foresight
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses
@@ -136,7 +136,7 @@ def test_crouch_is_a_stance_of_the_same_robot(bhr):
 
 
 def test_robot_that_cannot_crouch_keeps_its_stance(bhr, monkeypatch):
-    from jumplab.chains import posture
+    from jumplab.studies.chain import course as posture
 
     monkeypatch.setattr(posture, "CROUCH", {"knee_rad": 3.0, "trunk_pitch_rad": 0.2})
     assert crouched(bhr) is bhr

@@ -8,16 +8,16 @@ import pytest
 from fixtures_chains import chain, planner, rehearsal, waiting
 from matplotlib.text import Text
 
-from jumplab import __main__ as cli
-from jumplab import store
-from jumplab.chains import ChainReport, ChainTrial, Course, run_chain, write_chain
-from jumplab.chains.posture import Gauge
+from jumplab.cli import main as cli
 from jumplab.errors import SolverError
-from jumplab.plotting import chains as pictures
-from jumplab.plotting.style import MIN_FONT_PT, PAGE_IN
+from jumplab.io import folder as store
 from jumplab.robot import load_robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import SLIGHT, Perturbation
+from jumplab.show import chains as pictures
+from jumplab.show.style import MIN_FONT_PT, PAGE_IN
+from jumplab.sim import SLIGHT, Perturbation
+from jumplab.studies.chain import ChainReport, ChainTrial, Course, run_chain, write_chain
+from jumplab.studies.chain.course import Gauge
 
 # ------------------------------------------------------------------------------------------ in the simulation
 

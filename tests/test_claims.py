@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from paper import claims
+from paper.claims import Start, against_crouch, compare_starts, judge, readings, readings_markdown
 
-from jumplab import claims, notebooks
-from jumplab.claims import Start, against_crouch, compare_starts, judge, readings, readings_markdown
+from jumplab.cli import notebooks
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 

@@ -14,9 +14,9 @@ import pytest
 from test_store import Result, make_summary, make_tape, names
 
 import jumplab
-from jumplab import __main__ as cli
-from jumplab import store
+from jumplab.cli import main as cli
 from jumplab.errors import InfeasibleError, SolverError
+from jumplab.io import folder as store
 from jumplab.robot.description import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -170,13 +170,13 @@ def planner(bhr, monkeypatch):
             tape=make_tape(robot), robot=robot, task=task, summary=make_summary() | {"stages": STAGES}
         )
 
-    def write_passport(folder, into=None):
+    def write_audit(folder, into=None):
         ((into or folder) / "passport.json").write_text("{}")
         return types.SimpleNamespace(checks=said.checks, table=lambda: "the table")
 
     for name, module in {
         "pipeline": types.SimpleNamespace(plan_jump=plan_jump),
-        "passport": types.SimpleNamespace(write_passport=write_passport),
+        "passport": types.SimpleNamespace(write_audit=write_audit),
     }.items():
         monkeypatch.setitem(sys.modules, f"jumplab.{name}", module)
         monkeypatch.setattr(jumplab, name, module, raising=False)
@@ -255,7 +255,7 @@ def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
         def to_json(self):
             return metrics
 
-    simulation = importlib.import_module("jumplab.simulation")
+    simulation = importlib.import_module("jumplab.sim")
     asked = {}
     monkeypatch.setattr(simulation, "simulate_jump", lambda tape, robot, **kw: asked.update(kw) or Simulated())
     target = {"distance_m": 1.0, "height_m": 0.5, "platform_m": 0.3}
@@ -270,7 +270,7 @@ def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
 def test_help_is_quick_and_complete():
     """Asked of a new process: help must not import the numerical libraries."""
     code = (
-        "import sys; from jumplab.__main__ import main\n"
+        "import sys; from jumplab.cli.main import main\n"
         "try: main(['--help'])\n"
         "except SystemExit as e: assert not e.code\n"
         "print(sorted({'numpy', 'casadi', 'pinocchio', 'pybullet', 'papermill'} & set(sys.modules)))"

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from jumplab import __main__ as command_line
-from jumplab import notebooks
-from jumplab.commands import COMMANDS
+from jumplab.cli import COMMANDS, notebooks
+from jumplab.cli import main as command_line
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))

@@ -6,15 +6,15 @@ import math
 import pytest
 from fixtures_robots import child, write
 
-from jumplab import envelope
-from jumplab.__main__ import main
-from jumplab.envelope import BEYOND, OPEN, VERDICT, Cell, Envelope, measure, usage
+from jumplab.cli.main import main
 from jumplab.errors import InputError
-from jumplab.plotting.envelope import envelope_map
 from jumplab.robot import load_robot
+from jumplab.show.envelope import envelope_map
+from jumplab.stages.whole_body import WholeBodyPlanner
+from jumplab.stages.whole_body.settings import Limits
+from jumplab.studies import envelope
+from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Cell, Envelope, measure, usage
 from jumplab.task import JumpTask
-from jumplab.whole_body import WholeBodyPlanner
-from jumplab.whole_body.settings import Limits
 
 
 def test_cells_are_plans_within_the_limits(bhr, tmp_path):

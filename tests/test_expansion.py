@@ -5,11 +5,11 @@ import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, replay
 
-from jumplab.expansion import expand, planar_motion, planar_quantities
 from jumplab.models.planar import evaluator
-from jumplab.pipeline import to_link_angles
+from jumplab.ocp.nlp import PhaseSolution
 from jumplab.robot.stance import stance_angles
-from jumplab.solver import PhaseSolution
+from jumplab.stages.planner import to_link_angles
+from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
 
 TARGET = (1.0, 0.5, 0.0, "direct")
 

@@ -14,9 +14,10 @@ from test_cli import one_sentence, run
 from test_robot import with_free_base
 from test_store import names
 
-from jumplab import export, store
 from jumplab.errors import InputError
-from jumplab.motion import Motion
+from jumplab.io import export
+from jumplab.io import folder as store
+from jumplab.io.motion import Motion
 
 
 @pytest.fixture(scope="module")

@@ -5,20 +5,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from paper.drawings import trunk_angle
 
-from jumplab import passport
+from jumplab import auditing as passport
 from jumplab.errors import InputError, SolverError
-from jumplab.expansion import planar_quantities
-from jumplab.experiments.trial import TrialKey
-from jumplab.pipeline import Planner
-from jumplab.plotting.flips import trunk_angle
 from jumplab.robot import load_robot
-from jumplab.simulation import Perturbation, simulate_jump
-from jumplab.simulation.tuck import Tuck, is_flip
+from jumplab.sim import Perturbation, simulate_jump
+from jumplab.sim.reaim import Tuck, is_flip
+from jumplab.stages.planner import Planner
+from jumplab.stages.reconstruction import planar_quantities
+from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, Weights
+from jumplab.stages.whole_body.flips import CLIMB_M, EASY_M, climb
+from jumplab.stages.whole_body.terms import RESERVE_SHARE, WholeBodyTerms
+from jumplab.studies.trials import TrialKey
 from jumplab.task import JumpTask
-from jumplab.whole_body import FlipPlanner, Limits, Mesh, Weights
-from jumplab.whole_body.flips import CLIMB_M, EASY_M, climb
-from jumplab.whole_body.terms import RESERVE_SHARE, WholeBodyTerms
 
 TURN = 2 * np.pi
 

@@ -19,15 +19,16 @@ from papermill.iorw import load_notebook_node
 from papermill.parameterize import parameterize_notebook
 from test_store import make_summary, make_tape
 
-from jumplab import notebooks, store
+from jumplab.auditing import audit, write_audit
+from jumplab.cli import notebooks
 from jumplab.errors import InputError, JumplabError
-from jumplab.joint_map import map_to_joints
-from jumplab.passport import audit, write_passport
-from jumplab.pipeline import METHODS, Planner, plan_jump
+from jumplab.io import folder as store
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot, load_robot
-from jumplab.simulation import Scene, simulate_jump
+from jumplab.sim import Scene, simulate_jump
+from jumplab.stages.joint_qp import map_to_joints
+from jumplab.stages.planner import METHODS, Planner, plan_jump
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
@@ -140,7 +141,7 @@ def result_folder(rng, folder):
     here = folder / "new"
     calls = [
         lambda: store.read_plan(place),
-        lambda: write_passport(place),
+        lambda: write_audit(place),
         lambda: store.write_simulation(place, None, make_summary() | {"manifest": {}}),
         lambda: store.write_simulation(here, None, bad),
         lambda: store.write_plan(here, bad, ROBOT, {}),

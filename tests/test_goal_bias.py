@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 from fixtures_core import planner
+from paper.goal_bias import reach_goal
 
 from jumplab.errors import InfeasibleError, InputError
-from jumplab.experiments import reach_goal
-from jumplab.simulation import Perturbation, Scene
+from jumplab.sim import Perturbation, Scene
 from jumplab.task import JumpTask
 
 GOAL = JumpTask(1.0, 0.5)

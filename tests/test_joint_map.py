@@ -10,10 +10,10 @@ import pytest
 from fixtures_core import jump, pendulum
 
 from jumplab.errors import SolverError
-from jumplab.joint_map import PRINTED, CvxpySolver, DirectSolver, JointMapper, Limits, Options, map_to_joints
-from jumplab.joint_map.solve import CLARABEL
 from jumplab.models.full import FullBody, force_target
 from jumplab.robot import load_robot
+from jumplab.stages.joint_qp import PRINTED, CvxpySolver, DirectSolver, JointMapper, Limits, Options, map_to_joints
+from jumplab.stages.joint_qp.solve import CLARABEL
 
 SAMPLE_S = 0.005
 AGREE = {"force": 0.02, "acceleration": 2e-3}  # N or N m, rad/s^2: a hundred thousandth of what occurs

@@ -8,11 +8,11 @@ import pytest
 from test_joint_map import followable, mapped
 
 from jumplab.errors import InputError, SolverError
-from jumplab.joint_map import CvxpySolver, DirectSolver, Form, Limits, Options, map_to_joints
-from jumplab.joint_map.explain import conflict
-from jumplab.joint_map.problem import Layout, StepQp
-from jumplab.joint_map.reference import Track, hermite
 from jumplab.robot import load_robot
+from jumplab.stages.joint_qp import CvxpySolver, DirectSolver, Form, Limits, Options, map_to_joints
+from jumplab.stages.joint_qp.diagnosis import conflict
+from jumplab.stages.joint_qp.problem import Layout, StepQp
+from jumplab.stages.joint_qp.reference import Track, hermite
 
 
 def broken(phase, **changes):
@@ -110,7 +110,7 @@ def test_the_conflict_is_told_from_the_bystanders():
 
 
 def test_a_wrong_answer_is_refused_whatever_the_status():
-    from jumplab.joint_map.solve import checked_answer
+    from jumplab.stages.joint_qp.solve import checked_answer
 
     with pytest.raises(
         SolverError, match=r"did not settle \(optimal\): one exists, but the answer misses 'sum x \+ y' by 0\.5"

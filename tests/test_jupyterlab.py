@@ -20,8 +20,8 @@ import nbformat
 import numpy as np
 import pytest
 
-from jumplab import notebooks
-from jumplab.plotting.style import PHASE_COLORS
+from jumplab.cli import notebooks
+from jumplab.show.style import PHASE_COLORS
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

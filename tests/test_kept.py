@@ -5,9 +5,9 @@ import pytest
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
-from jumplab import kept
-from jumplab.solver import Nlp
-from jumplab.transcription import Assembled
+from jumplab.ocp import cache as kept
+from jumplab.ocp.assembly import Assembled
+from jumplab.ocp.nlp import Nlp
 
 
 @pytest.fixture

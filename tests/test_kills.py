@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from fixtures_core import jump
 
-from jumplab import passport, store
+from jumplab import auditing as passport
+from jumplab.io import folder as store
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("JUMPLAB_KILLS", "4"))
@@ -36,7 +37,7 @@ def names(folder):
 def folder(tmp_path):
     """A finished plan of the old target, with its passport and a simulation."""
     plan = jump(1.0, OLD)
-    store.write_plan(tmp_path, plan.tape, plan.robot, plan.summary, passport.write_passport)
+    store.write_plan(tmp_path, plan.tape, plan.robot, plan.summary, passport.write_audit)
     command(["simulate", str(tmp_path)], tmp_path).communicate(timeout=120)
     assert names(tmp_path) == PLAN | SIMULATION
     return tmp_path

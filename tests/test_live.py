@@ -6,10 +6,11 @@ import sys
 import types
 
 import pytest
+from paper import explore
 
-from jumplab import live
 from jumplab.errors import JumplabError
-from jumplab.plotting.style import Picture
+from jumplab.show import widgets as live
+from jumplab.show.style import Picture
 from jumplab.task import JumpTask
 
 
@@ -66,23 +67,23 @@ def test_a_terminal_has_a_plain_bar(unwatched, monkeypatch, capsys):
 
 
 def test_explore_without_reader_is_a_picture(unwatched, planner, capsys):
-    assert isinstance(live.explore_stage1(planner, JumpTask(0.5, 0.5)), Picture)
+    assert isinstance(explore.explore_stage1(planner, JumpTask(0.5, 0.5)), Picture)
     with pytest.raises(JumplabError) as refusal:
         planner.plan(JumpTask(0.5, 1.4))
     capsys.readouterr()
-    assert live.explore_stage1(planner, JumpTask(0.5, 1.4)) is None
+    assert explore.explore_stage1(planner, JumpTask(0.5, 1.4)) is None
     assert capsys.readouterr().out == f"{refusal.value}\n"
 
 
 def test_explore_with_reader_solves_what_the_sliders_ask(watched, planner, monkeypatch):
     asked = []
     monkeypatch.setattr(live, "_picture_or_refusal", lambda planner, task: asked.append(task))
-    box = live.explore_stage1(planner, JumpTask(0.5, 0.4))
+    box = explore.explore_stage1(planner, JumpTask(0.5, 0.4))
     (distance, height, turn), picture = box.children[0].children, box.children[1]
     assert type(picture).__name__ == "Output"
     assert [(t.distance_m, t.height_m, t.rotation_rad) for t in asked] == [(0.5, 0.4, 0.0)]
     distance.value, height.value = 0.8, 0.3
     turn.value = "backflip"
-    assert asked[-1] == JumpTask(0.8, 0.3, rotation_rad=live.TURNS["backflip"])
-    far = live.explore_stage1(planner, JumpTask(2.5, 1.0)).children[0].children  # beyond what the sliders usually offer
+    assert asked[-1] == JumpTask(0.8, 0.3, rotation_rad=explore.TURNS["backflip"])
+    far = explore.explore_stage1(planner, JumpTask(2.5, 1.0)).children[0].children  # beyond the usual
     assert (far[0].max, far[1].max) == (2.5, 1.0)

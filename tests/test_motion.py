@@ -7,7 +7,7 @@ from fixtures_core import jump
 from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
-from jumplab.motion import Motion
+from jumplab.io.motion import Motion
 
 
 def spinning(times, rate=(0.3, -7.0, 1.1), joints=2):

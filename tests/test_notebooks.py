@@ -15,8 +15,9 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from jumplab import notebooks, store
+from jumplab.cli import notebooks
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
+from jumplab.io import folder as store
 from jumplab.robot.description import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,7 +31,7 @@ robot: str = "bhr"
 out: str = "x"
 figures: str = "y"
 n: int = 1"""
-CHECK = "from jumplab.notebooks import check_parameters\ncheck_parameters(globals(), n=int)"
+CHECK = "from jumplab.cli.notebooks import check_parameters\ncheck_parameters(globals(), n=int)"
 RECORD = """
 import json, pathlib, sys, os
 pathlib.Path(out, "seen_%s.json").write_text(json.dumps({
@@ -214,7 +215,7 @@ def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
     code = (
         f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab import notebooks;"
-        f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.__main__ import main;"
+        f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.cli.main import main;"
         f"sys.exit(main(['run', '-p', 'n=2']))"
     )
     env = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -246,7 +247,7 @@ def wait_for(condition, seconds=60.0):
 
 def test_what_a_notebook_asks_is_known_before_it_runs(tmp_path):
     """Types and ranges of the further parameters stand in the notebook; what cannot be read there is left to it."""
-    from jumplab.parameters import declared_kinds
+    from jumplab.cli.parameters import declared_kinds
 
     asked = {p.name[:2]: declared_kinds(p) for p in SOURCES}
     assert {"samples": range(1, 10_001)}.items() <= asked["01"].items() and asked["05"]["fast"] is bool

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from test_notebooks import RECORD, make_notebook, names, wait_for
 
-from jumplab import notebooks
+from jumplab.cli import notebooks
 
 ROOT = Path(__file__).resolve().parent.parent
 CAP_DAC_OVERRIDE, PR_CAPBSET_DROP = 1, 24  # of Linux: what lets root write where nobody may
@@ -27,7 +27,7 @@ def run_there(checkout, *arguments, code="", **options):
     """``jumplab run`` from a copy of the package that lies in ``checkout``."""
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "JUPYTER_PATH")}
     env |= {"PYTHONPATH": str(checkout), "HOME": "/nonexistent"}
-    program = f"import sys; {code}\nfrom jumplab.__main__ import main; sys.exit(main(['run', *sys.argv[1:]]))"
+    program = f"import sys; {code}\nfrom jumplab.cli.main import main; sys.exit(main(['run', *sys.argv[1:]]))"
     return subprocess.Popen([sys.executable, "-c", program, *map(str, arguments)], env=env, text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=obey_permissions,
                             **options)  # fmt: skip
@@ -57,7 +57,7 @@ def everything(folder):
 
 
 # our two notebooks make no plan: what `run` prints of one is left out
-NO_PLAN = "from jumplab.commands import run; run.print_summary = run.print_simulation = lambda x: None;" \
+NO_PLAN = "from jumplab.cli import run; run.print_summary = run.print_simulation = lambda x: None;" \
           "from jumplab import store; store.read_plan = lambda x: (0, 0, 0); store.read_json = lambda x: 0"  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jumplab import notebooks
+from jumplab.cli import notebooks
 from jumplab.errors import InputError
 
 

@@ -33,10 +33,10 @@ from fixtures_passport import (
     strong_at_speed,
 )
 
+from jumplab.auditing import AuditReport, audit
 from jumplab.errors import InputError
-from jumplab.passport import Passport, audit
+from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ ALONE = {"finite numbers", "order of phases", "time step", "unit quaternion", "r
          "sole as in the URDF", "links have mass"}  # fmt: skip
 
 
-def audited(broken) -> Passport:
+def audited(broken) -> AuditReport:
     return audit(*broken) if isinstance(broken, tuple) else audit(broken, ROBOT, TASK)
 
 
@@ -239,7 +239,7 @@ def test_another_robots_tape_is_refused(good):
 
 def test_audit_shares_no_code_with_the_planner():
     code = """
-import sys, jumplab.passport
+import sys, jumplab.auditing
 ours = {"errors", "task", "trajectory", "robot", "passport"}
 names = [m.split(".") for m in sys.modules]
 print([n for n in names if n[0] == "casadi" or n[0] == "jumplab" and len(n) > 1 and n[1] not in ours])

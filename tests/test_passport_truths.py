@@ -11,16 +11,16 @@ import pinocchio as pin
 import pytest
 from fixtures_passport import KNEE, LEFT, ROBOT, edit, good_tape, robot_with, with_forces
 
+from jumplab.auditing import AuditReport, Check, audit, contact, folder, write_audit
+from jumplab.auditing.joints import available_torque
+from jumplab.auditing.kinematics import mirror
+from jumplab.auditing.replay import open_tape, replay
+from jumplab.auditing.report import worst
+from jumplab.auditing.target import foot_turn
 from jumplab.errors import InputError, RobotError
-from jumplab.passport import Check, Passport, audit, contact, folder, write_passport
-from jumplab.passport.joints import available_torque
-from jumplab.passport.kinematics import mirror
-from jumplab.passport.replay import open_tape, replay
-from jumplab.passport.report import worst
-from jumplab.passport.target import foot_turn
+from jumplab.io.tape import Tape
 from jumplab.robot.stance import com_from_toe, stance_angles, stance_configuration
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 
 @pytest.fixture(scope="module")
@@ -149,13 +149,13 @@ def test_report_is_strict_and_readable():
     low = worst("tape", "low", [3.0, -1.0], [0.1, 0.2], 0.0, "m", "what", at_least=True)
     assert (low.value, low.time, low.passed) == (-1.0, 0.2, False)
     assert worst("tape", "none", [], [], 2.0, "m", "what").passed
-    passport = Passport((rows, low, Check("joints", "fine", 1, 2, "m", None, "ok")), {"size": np.float64(np.inf)})
+    passport = AuditReport((rows, low, Check("joints", "fine", 1, 2, "m", None, "ok")), {"size": np.float64(np.inf)})
     data = json.loads(passport.to_json(), parse_constant=pytest.fail)
     assert data["passed"] is False and data["failed"] == ["x", "low"] and data["manifest"]["size"] is None
     assert data["checks"][0]["value"] is None and data["checks"][2]["passed"] is True
     table = passport.table()
     assert "FAIL low" in table and "1 of 3 checks passed" in table and "FAIL x: what; worst: b" in table
-    assert not Passport(()).passed
+    assert not AuditReport(()).passed
     with pytest.raises(KeyError):
         passport["absent"]
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -171,20 +171,20 @@ def write_folder(path, tape: Tape, **summary):
 
 def test_folder_gets_its_passport(good, tmp_path):
     write_folder(tmp_path, good, target={"distance_m": 1.0, "height_m": 0.5, "other": 1}, stages=[{"iterations": 31}])
-    passport = write_passport(tmp_path)
+    passport = write_audit(tmp_path)
     data = json.loads((tmp_path / "passport.json").read_text())
     assert passport.passed and data["passed"] and len(data["checks"]) == len(passport.checks)
     assert data["manifest"]["target"]["distance_m"] == 1.0 and data["manifest"]["robot_hash"] == ROBOT.hash
     assert data["manifest"]["planner"]["stages"] == [{"iterations": 31}] and len(data["manifest"]["plan_sha256"]) == 64
     assert {"name", "value", "limit", "unit", "time", "passed", "note"} <= set(data["checks"][0])
-    assert not write_passport(tmp_path, JumpTask(0.9, 0.5)).passed  # the caller's target wins
+    assert not write_audit(tmp_path, JumpTask(0.9, 0.5)).passed  # the caller's target wins
     assert not (set(p.name for p in tmp_path.iterdir()) - {"plan.npz", "robot.urdf", "robot.toml", "summary.json",
                                                            "passport.json"})  # fmt: skip
 
 
 def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
     write_folder(tmp_path, good)
-    write_passport(tmp_path)
+    write_audit(tmp_path)
     files = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
 
     def interrupt(*_):
@@ -192,7 +192,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
 
     monkeypatch.setattr(folder.os, "replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        write_passport(tmp_path, JumpTask(0.9, 0.5))
+        write_audit(tmp_path, JumpTask(0.9, 0.5))
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
 
 
@@ -215,5 +215,5 @@ def test_damaged_folder_is_refused_in_one_sentence(good, tmp_path, name, content
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises((InputError, RobotError), match=message) as error:
-        write_passport(tmp_path)
+        write_audit(tmp_path)
     assert "\n" not in str(error.value) and not (tmp_path / "passport.json").exists()

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from fixtures_core import LIMBS, Replay, jump, planner
 
-from jumplab import pipeline
 from jumplab.errors import InputError, SolverError
-from jumplab.pipeline import METHODS, Planner, guess_from_joints, plan_jump
+from jumplab.io.tape import Tape
 from jumplab.robot import load_robot
+from jumplab.stages import planner as pipeline
+from jumplab.stages.planner import METHODS, Planner, guess_from_joints, plan_jump
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 
 @pytest.fixture(scope="module")

@@ -19,17 +19,17 @@ from fixtures_core import jump
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.text import Text
+from paper import drawings
 
-from jumplab import plotting
+from jumplab import show as plotting
 from jumplab.errors import InputError
 from jumplab.models.srmp import SrmpState
-from jumplab.plotting import style
+from jumplab.ocp.nlp import Nlp
 from jumplab.robot.reach import postures, reach
 from jumplab.robot.stance import configuration, stance_configuration
-from jumplab.simulation import simulate_jump
-from jumplab.solver import Nlp
-from jumplab.srmp.landing import LandingPlanner
-from jumplab.srmp.touchdown import touchdown_of_plan
+from jumplab.show import style
+from jumplab.sim import simulate_jump
+from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_plan
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,17 +49,17 @@ def material(bhr):
 
 
 FIGURES = {
-    "framework": lambda m, r: plotting.framework(),
-    "link_models": lambda m, r: plotting.link_models(r),
-    "pendulum_diagram": lambda m, r: plotting.pendulum_diagram(),
-    "inverted_pendulum": lambda m, r: plotting.inverted_pendulum(m["plan"].srmp),
-    "inverted_pendulum, platform": lambda m, r: plotting.inverted_pendulum(m["high"].srmp),
-    "launch_strobe": lambda m, r: plotting.launch_strobe(m["plan"].srmp),
-    "flight_shaping": lambda m, r: plotting.flight_shaping(m["plan"].srmp),
-    "flight_comparison": lambda m, r: plotting.flight_comparison({"flat": m["plan"].srmp, "high": m["high"].srmp}),
-    "reach_envelope": lambda m, r: plotting.reach_envelope(reach(r, 2**12), m["plan"].srmp, samples=postures(r, 2**10)),
-    "reach_envelope, empty": lambda m, r: plotting.reach_envelope(reach(r, 2**12)),
-    "landing_reference": lambda m, r: plotting.landing_reference(m["landing"], m["plan"].srmp.reach),
+    "framework": lambda m, r: drawings.framework(),
+    "link_models": lambda m, r: drawings.link_models(r),
+    "pendulum_diagram": lambda m, r: drawings.pendulum_diagram(),
+    "inverted_pendulum": lambda m, r: drawings.inverted_pendulum(m["plan"].srmp),
+    "inverted_pendulum, platform": lambda m, r: drawings.inverted_pendulum(m["high"].srmp),
+    "launch_strobe": lambda m, r: drawings.launch_strobe(m["plan"].srmp),
+    "flight_shaping": lambda m, r: drawings.flight_shaping(m["plan"].srmp),
+    "flight_comparison": lambda m, r: drawings.flight_comparison({"flat": m["plan"].srmp, "high": m["high"].srmp}),
+    "reach_envelope": lambda m, r: drawings.reach_envelope(reach(r, 2**12), m["plan"].srmp, samples=postures(r, 2**10)),
+    "reach_envelope, empty": lambda m, r: drawings.reach_envelope(reach(r, 2**12)),
+    "landing_reference": lambda m, r: drawings.landing_reference(m["landing"], m["plan"].srmp.reach),
     "joint_trajectories": lambda m, r: plotting.joint_trajectories(m["tape"], r),
     "joint_trajectories, guess": lambda m, r: plotting.joint_trajectories(m["tape"], r, guess=m["guess"]),
     "inertia_and_momentum": lambda m, r: plotting.inertia_and_momentum(m["tape"]),
@@ -148,7 +148,7 @@ def test_colours_are_okabe_and_ito():
 def test_style_is_package_data_and_is_used_whatever_the_caller_has():
     assert style.STYLE_FILE.is_file()
     with matplotlib.rc_context({"font.size": 20, "figure.figsize": (9, 9)}):
-        fig = plotting.pendulum_diagram()
+        fig = drawings.pendulum_diagram()
         assert {t.get_fontsize() for t in texts(fig)} <= {7.0, 8.0, 9.0}
         assert matplotlib.rcParams["font.size"] == 20
         plotting.use_style()
@@ -181,7 +181,7 @@ def test_sources_neither_show_nor_print(path):
 # files ------------------------------------------------------------------------------------------------------------
 def test_saving_writes_three_files_without_dates(tmp_path, bhr):
     task = JumpTask(-0.2, 0.5, platform_m=0.3, rotation_rad=-2 * np.pi)
-    fig = plotting.pendulum_diagram()
+    fig = drawings.pendulum_diagram()
     assert plotting.save_figure(fig, "x", tmp_path / "new" / "folder", "What is seen.", task=task, robot=bhr) is fig
     folder = tmp_path / "new" / "folder"
     assert sorted(p.name for p in folder.iterdir()) == ["x.pdf", "x.png", "x.txt"]
@@ -210,7 +210,7 @@ def test_drawn_twice_means_the_same_bytes(name, material, bhr, tmp_path):
 
 def test_saved_twice_means_the_same_bytes(tmp_path):
     """The layout is that of the first time."""
-    fig = plotting.pendulum_diagram()
+    fig = drawings.pendulum_diagram()
     for name in "ab":
         plotting.save_figure(fig, name, tmp_path)
     for kind in ("png", "pdf"):
@@ -223,7 +223,7 @@ def test_files_are_the_same_in_every_process(tmp_path):
         "import sys, matplotlib; matplotlib.rcParams['font.size'] = float(sys.argv[2]);"
         "from jumplab import plotting; from jumplab.robot import load_robot;"
         "[plotting.save_figure(f, n, sys.argv[1]) for n, f in"
-        " (('a', plotting.framework()), ('b', plotting.link_models(load_robot())))]"
+        " (('a', drawings.framework()), ('b', drawings.link_models(load_robot())))]"
     )
     made = []
     for seed, size in (("1", "8"), ("2", "15")):

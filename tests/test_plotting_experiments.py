@@ -7,12 +7,14 @@ import pytest
 from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from paper.measurement import measure
 
-from jumplab.experiments import BasinGrid, BasinReport, Trial, TrialKey, TrialSettings, measure, wilson
-from jumplab.plotting import experiments as pictures
-from jumplab.plotting import render
-from jumplab.plotting.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
-from jumplab.simulation import Scene, SensorNoise, simulate_jump
+from jumplab.show import experiments as pictures
+from jumplab.show import render
+from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
+from jumplab.sim import Scene, SensorNoise, simulate_jump
+from jumplab.studies.basin import BasinGrid, BasinReport
+from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
 
 DITCH = Scene.ditch(0.3, 0.75)
 SHORT_S = 0.3  # of standing: enough for a picture

@@ -6,10 +6,11 @@ import pytest
 from fixtures_core import pendulum
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
+from paper import drawings
 
-from jumplab import plotting
-from jumplab.joint_map import JointMapper, map_to_joints
-from jumplab.plotting.style import MIN_FONT_PT
+from jumplab import show as plotting
+from jumplab.show.style import MIN_FONT_PT
+from jumplab.stages.joint_qp import JointMapper, map_to_joints
 
 ROWS = [
     {"target": target, "start": start, "iterations": n, "cost": cost}
@@ -27,10 +28,10 @@ def mapped(bhr):
 
 
 FIGURES = {
-    "snapshots": lambda plan, robot: plotting.mapped_snapshots(plan, robot),
-    "snapshots, platform": lambda plan, robot: plotting.mapped_snapshots(plan, robot, 0.2),
-    "tracking": lambda plan, robot: plotting.mapped_tracking(plan),
-    "starts": lambda plan, robot: plotting.guess_comparison(ROWS, PANELS),
+    "snapshots": lambda plan, robot: drawings.mapped_snapshots(plan, robot),
+    "snapshots, platform": lambda plan, robot: drawings.mapped_snapshots(plan, robot, 0.2),
+    "tracking": lambda plan, robot: drawings.mapped_tracking(plan),
+    "starts": lambda plan, robot: drawings.guess_comparison(ROWS, PANELS),
 }
 
 
@@ -53,7 +54,7 @@ def test_legible_and_within_the_page(figure):
 
 
 def test_snapshots_end_at_touchdown_at_their_true_heights(mapped, bhr):
-    (ax,) = plotting.mapped_snapshots(mapped, bhr).axes
+    (ax,) = drawings.mapped_snapshots(mapped, bhr).axes
     said = [t.get_text() for t in ax.texts]
     assert said[0] == "0.00 s" and f"{mapped.t[-1]:.2f} s" in said and {"launch", "flight"} <= set(said)
     body = plotting.Silhouette(bhr)
@@ -65,14 +66,14 @@ def test_snapshots_end_at_touchdown_at_their_true_heights(mapped, bhr):
 
 
 def test_tracking_shows_reference_dashed_and_the_difference_below(mapped):
-    axes = np.reshape(plotting.mapped_tracking(mapped).axes, (2, 4))
+    axes = np.reshape(drawings.mapped_tracking(mapped).axes, (2, 4))
     assert all(any(line.is_dashed() for line in ax.lines) for ax in axes[0])
     difference = np.concatenate([line.get_ydata() for line in axes[1, 1].lines if len(line.get_ydata()) > 2])
     np.testing.assert_allclose(difference, mapped.actual["L"] - mapped.reference["L"])
 
 
 def test_starts_without_a_solution_leave_a_gap():
-    one, two = plotting.guess_comparison(ROWS, PANELS).axes
+    one, two = drawings.guess_comparison(ROWS, PANELS).axes
     dots = [line.get_ydata() for line in one.lines if line.get_marker() == "o"]
     np.testing.assert_array_equal(dots, [[30, 50], [20, np.nan]])
     assert one.get_ylim()[0] == 0 and 0.8 < two.get_ylim()[0] < 1  # values that hardly differ are not drawn from zero

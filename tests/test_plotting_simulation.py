@@ -9,13 +9,13 @@ from matplotlib.path import Path
 from matplotlib.text import Text
 from scipy.ndimage import binary_dilation
 
-from jumplab import plotting
+from jumplab import show as plotting
 from jumplab.errors import RobotError
-from jumplab.plotting import render
-from jumplab.plotting import simulation as pictures
-from jumplab.plotting.style import MIN_FONT_PT, PHASE_COLORS
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import Scene, simulate_jump
+from jumplab.show import render
+from jumplab.show import simulation as pictures
+from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
+from jumplab.sim import Scene, simulate_jump
 from jumplab.task import JumpTask
 
 TASK = JumpTask(1.0, 0.5)

@@ -2,15 +2,15 @@
 
 import pytest
 
+from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, RobotError
-from jumplab.passport.audit import audit
-from jumplab.pipeline import Planner
 from jumplab.robot import load_robot
 from jumplab.robot.accuracy import reduction_error
 from jumplab.robot.checkup import check, draft
 from jumplab.robot.description import SHIPPED
-from jumplab.robot.urdf_file import PACKAGE, have_published, locate
-from jumplab.simulation import Scene, simulate_jump
+from jumplab.robot_import.urdf import PACKAGE, have_published, locate
+from jumplab.sim import Scene, simulate_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 PUBLISHED = [name for name in SHIPPED if name != "bhr"]
@@ -46,7 +46,7 @@ def test_nothing_of_the_mass_is_lost(name, kg):
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_what_is_found_is_what_the_configuration_says(name):
     robot = load_robot(name)
-    from jumplab.robot.config import read_toml
+    from jumplab.robot_import.config import read_toml
 
     config = read_toml(SHIPPED[name].read_text(), name)
     found = draft(locate(config["urdf"], SHIPPED[name].parent), ("inertia",)).roles

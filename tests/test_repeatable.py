@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fixtures_core import planner
 
-from jumplab.joint_map import solve
-from jumplab.pipeline import plan_jump
 from jumplab.robot import load_robot
+from jumplab.stages.joint_qp import solve
+from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,7 +46,7 @@ for i, target in enumerate(TARGETS):
 @pytest.mark.slow
 def test_a_plan_made_three_times_is_the_same(tmp_path):
     """Five targets, by planners that planned others before, in two processes and two orders; and from scratch."""
-    from jumplab.trajectory import Tape
+    from jumplab.io.tape import Tape
 
     code = ELSEWHERE.format(root=str(ROOT), tests=str(ROOT / "tests"), folder=str(tmp_path))
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
@@ -61,7 +61,7 @@ def test_joint_map_is_the_same_to_the_last_bit():
     """Stage 3 multiplies what differs here by a thousand; memory is laid out anew each time."""
     from fixtures_core import pendulum
 
-    from jumplab.joint_map import map_to_joints
+    from jumplab.stages.joint_qp import map_to_joints
 
     rng, seen, litter = np.random.default_rng(3), set(), []
     for _ in range(6):

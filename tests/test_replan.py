@@ -9,15 +9,15 @@ from fixtures_core import jump, planner
 from test_solver import flat_guess, move
 from test_transcription import toy
 
-from jumplab import pipeline, whole_body
+from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
-from jumplab.packing import group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
-from jumplab.passport.audit import audit
+from jumplab.ocp.assembly import Assembled, group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess
+from jumplab.ocp.problem import Term
 from jumplab.robot import load_robot
-from jumplab.solver import WARM, Nlp, PhaseGuess
+from jumplab.stages import planner as pipeline
+from jumplab.stages import whole_body
 from jumplab.task import JumpTask
-from jumplab.terms import Term
-from jumplab.transcription import Assembled
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,16 @@ from fixtures_robots import (
     write,
 )
 
+from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
-from jumplab.passport.audit import audit
-from jumplab.pipeline import plan_jump
 from jumplab.robot import Robot, load_robot
 from jumplab.robot.accuracy import reduction_error
-from jumplab.robot.config import read_toml
 from jumplab.robot.description import Robot as Described
-from jumplab.robot.jumper import make_jumper
 from jumplab.robot.stance import stance_angles
-from jumplab.simulation import Scene, World, simulate_jump
+from jumplab.robot_import.config import read_toml
+from jumplab.robot_import.jumper import make_jumper
+from jumplab.sim import Scene, World, simulate_jump
+from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
 FREE = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="{0}"/></joint>'

@@ -3,39 +3,39 @@
 import pytest
 from fixtures_robots import GOOD, config, mirrored, write
 
-from jumplab.__main__ import main
-from jumplab.plotting.robots import robot_sheet
+from jumplab.cli.main import main
 from jumplab.robot import load_robot
+from jumplab.show.robots import robot_sheet
 
 
-def said(capsys, *argv) -> tuple[int, str, str]:
+def quoted(capsys, *argv) -> tuple[int, str, str]:
     code = main(["robot", *map(str, argv)])
     out, err = capsys.readouterr()
     return code, out, err
 
 
 def test_list_names_every_shipped_robot(capsys):
-    code, out, _ = said(capsys, "list")
+    code, out, _ = quoted(capsys, "list")
     names = [line.split()[0] for line in out.splitlines()[2:]]
     assert code == 0 and names[0] == "bhr" and {"g1", "talos"} <= set(names)
 
 
 def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path):
     (tmp_path / "my.urdf").write_text(mirrored()[0])
-    code, out, err = said(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
+    code, out, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
     assert (code, err) == (0, "")
     assert "42.000 kg (42.000 kg in the XML), 14 of 14 joints move" in out
     assert "left_knee" in out and "+y -y" in out and "sole: from its box" in out
     assert (tmp_path / "out" / "bhr.png").stat().st_size > 10_000
     robot = load_robot(str(tmp_path / "out" / "bhr.toml"))
     assert robot.joints["knee"] == ("left_knee", "right_knee")
-    code, _, err = said(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
+    code, _, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
     assert code == 2 and "is there already" in err
 
 
 def test_check_takes_a_persons_word(capsys, tmp_path):
     path = write(tmp_path, mirrored)
-    code, out, _ = said(capsys, "check", path.replace(".toml", ".urdf"), "--config", path)
+    code, out, _ = quoted(capsys, "check", path.replace(".toml", ".urdf"), "--config", path)
     assert code == 0 and "robot mirrored" in out
 
 
@@ -49,20 +49,20 @@ def test_check_takes_a_persons_word(capsys, tmp_path):
      "jumplab: --config /no/such.toml: cannot be read as text (FileNotFoundError)"),
 ])  # fmt: skip
 def test_bad_input_in_one_sentence(capsys, argv, sentence):
-    code, _, err = said(capsys, *argv)
+    code, _, err = quoted(capsys, *argv)
     assert (code, err.strip()) == (2, sentence)
 
 
 def test_all_faults_are_shown(capsys, tmp_path):
     (tmp_path / "my.urdf").write_text(GOOD.replace('mass value="5"', 'mass value="-5"'))
-    code, out, err = said(capsys, "check", tmp_path / "my.urdf")
+    code, out, err = quoted(capsys, "check", tmp_path / "my.urdf")
     assert code == 2 and "left_thigh" in err and "(1 further faults are printed above)" in err and "right_thigh" in out
 
 
 def test_a_configuration_without_source_is_refused(capsys, tmp_path):
     (tmp_path / "my.urdf").write_text(GOOD)
     (tmp_path / "my.toml").write_text(config("my").replace("[source]", "[other]"))
-    code, _, err = said(capsys, "check", tmp_path / "my.urdf", "--config", tmp_path / "my.toml")
+    code, _, err = quoted(capsys, "check", tmp_path / "my.urdf", "--config", tmp_path / "my.toml")
     assert code == 2 and "the table [source] is missing" in err
 
 

@@ -9,10 +9,10 @@ from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 
 from jumplab.errors import RobotError
 from jumplab.robot.checkup import check, draft
-from jumplab.robot.roles import find_roles
-from jumplab.robot.soles import find_sole
-from jumplab.robot.starter import starter
-from jumplab.robot.tree import Tree, repaired
+from jumplab.robot_import.roles import find_roles
+from jumplab.robot_import.soles import find_sole
+from jumplab.robot_import.starter import starter
+from jumplab.robot_import.tree import Tree, repaired
 
 LEGS = {
     "hip_pitch": ("left_hip_pitch", "right_hip_pitch"),

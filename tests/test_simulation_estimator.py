@@ -4,11 +4,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from jumplab.pipeline import plan_jump
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import Perturbation, SensorNoise, simulate_jump
-from jumplab.simulation.estimator import Estimator, Perception, estimation_error
-from jumplab.simulation.sensors import Sensors
+from jumplab.sim import Perturbation, SensorNoise, simulate_jump
+from jumplab.sim.estimator import Estimator, Perception, Sensors, estimation_error
+from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
 STILL = np.zeros((2, 6))

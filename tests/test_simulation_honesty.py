@@ -7,11 +7,12 @@ import numpy as np
 import pybullet as bullet
 import pytest
 
-from jumplab.commands.common import print_simulation
-from jumplab.pipeline import plan_jump
-from jumplab.simulation import Disturbance, Perturbation, World, jump, simulate_jump, simulate_landing
-from jumplab.simulation.honesty import STAND_S
-from jumplab.simulation.playback import Motors
+from jumplab.cli.common import print_simulation
+from jumplab.sim import Disturbance, Perturbation, World, simulate_jump, simulate_landing
+from jumplab.sim import loop as jump
+from jumplab.sim.checks import STAND_S
+from jumplab.sim.playback import Motors
+from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
 SHORT_S = 0.3

@@ -10,18 +10,17 @@ import pinocchio as pin
 import pytest
 
 from jumplab.errors import InputError, SolverError
-from jumplab.pipeline import plan_jump
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.simulation import Disturbance, LandingReference, Perturbation, Scene, SensorNoise, simulate_landing
-from jumplab.simulation import simulate_jump as simulate
-from jumplab.simulation.actuation import Actuators
-from jumplab.simulation.recorder import Recorder, _events
-from jumplab.simulation.reference import Forecast
-from jumplab.simulation.world import STEP_S, Contacts
-from jumplab.srmp.landing import LandingPlanner
-from jumplab.srmp.touchdown import touchdown_of_state
+from jumplab.sim import Disturbance, LandingReference, Perturbation, Scene, SensorNoise, simulate_landing
+from jumplab.sim import simulate_jump as simulate
+from jumplab.sim.actuation import Actuators
+from jumplab.sim.recorder import Recorder, _events
+from jumplab.sim.reference import Forecast
+from jumplab.sim.world import STEP_S, Contacts
+from jumplab.stages.planner import plan_jump
+from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
 from jumplab.task import JumpTask
-from jumplab.trajectory import Tape
 
 DISTANCE, HEIGHT = 0.6, 0.3
 SHORT_S = 0.3  # enough to compare launches and flights

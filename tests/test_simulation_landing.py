@@ -6,10 +6,9 @@ import pytest
 from scipy.optimize import brentq
 
 from jumplab.robot.stance import com_from_toe, configuration, stance_configuration
-from jumplab.simulation import LandingController, LandingReference, World
-from jumplab.simulation.actuation import Actuators
-from jumplab.simulation.body_terms import BodyTerms
-from jumplab.simulation.landing import PERIOD_STEPS
+from jumplab.sim import LandingController, LandingReference, World
+from jumplab.sim.actuation import Actuators
+from jumplab.sim.landing import PERIOD_STEPS, BodyTerms
 
 
 class Catch:

@@ -6,10 +6,9 @@ import pytest
 from jumplab.errors import SolverError
 from jumplab.robot import load_robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.simulation import replan
-from jumplab.simulation.reference import LandingReference, landing_planner
-from jumplab.simulation.replan import EVERY_S, FIRST_S, LATENCY_S, UNTIL_S, Replan, Rest
-from jumplab.srmp.touchdown import touchdown_of_state
+from jumplab.sim import reference as replan
+from jumplab.sim.reference import EVERY_S, FIRST_S, LATENCY_S, UNTIL_S, LandingReference, Replan, Rest, landing_planner
+from jumplab.stages.srmp.landing import touchdown_of_state
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from jumplab.errors import InputError, JumplabError, SolverError
-from jumplab.solver import GOOD_STATUSES, Nlp, PhaseGuess
-from jumplab.terms import Bound, Phase, Problem, Term
+from jumplab.ocp.nlp import GOOD_STATUSES, Nlp, PhaseGuess
+from jumplab.ocp.problem import Bound, Phase, Problem, Term
 
 N = 30
 

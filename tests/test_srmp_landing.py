@@ -11,9 +11,14 @@ from fixtures_core import pendulum, turned
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import load_robot
 from jumplab.robot.stance import configuration, stance_angles
-from jumplab.simulation import LandingController
-from jumplab.srmp.landing import LandingPlanner, LandingSettings
-from jumplab.srmp.touchdown import Touchdown, touchdown_of_plan, touchdown_of_state
+from jumplab.sim import LandingController
+from jumplab.stages.srmp.landing import (
+    LandingPlanner,
+    LandingSettings,
+    Touchdown,
+    touchdown_of_plan,
+    touchdown_of_state,
+)
 
 FALL = Touchdown(np.array([-0.16, 0.65]), np.array([0.9, -2.4]), -6.0, 4.0)
 

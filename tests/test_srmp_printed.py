@@ -5,12 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from fixtures_core import pendulum
-
-from jumplab.errors import InputError
-from jumplab.models.srmp import SrmpState
-from jumplab.robot import load_robot
-from jumplab.srmp import SrmpSettings
-from jumplab.srmp.printed import (
+from paper.srmp_printed import (
     WINDOW_MARGIN,
     PrintedSequence,
     build_printed_flight,
@@ -18,6 +13,11 @@ from jumplab.srmp.printed import (
     count_successes,
     plan_as_printed,
 )
+
+from jumplab.errors import InputError
+from jumplab.models.srmp import SrmpState
+from jumplab.robot import load_robot
+from jumplab.stages.srmp import SrmpSettings
 from jumplab.task import JumpTask
 
 TARGETS = [JumpTask(x, h) for x in (0.0, 0.6, 1.2) for h in (0.1, 0.35, 0.6)]

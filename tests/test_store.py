@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jumplab import store
 from jumplab.errors import InputError
-from jumplab.trajectory import Tape
+from jumplab.io import folder as store
+from jumplab.io.tape import Tape
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -133,7 +133,7 @@ WRITER = """
     import sys, itertools, time
     sys.path[:0] = [{root!r}, {tests!r}]
     from test_store import make_summary, make_tape
-    from jumplab import store
+    from jumplab.io import folder as store
     from jumplab.robot import load_robot
     robot = load_robot()
     for k in itertools.count({start}, 2):

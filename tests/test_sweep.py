@@ -13,10 +13,10 @@ import pytest
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab import sweep
-from jumplab.commands.sweep import values_of, weights_of
+from jumplab.cli.sweep import values_of, weights_of
 from jumplab.errors import InputError
 from jumplab.robot.description import SHIPPED
+from jumplab.studies import sweep
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jumplab.errors import InputError
-from jumplab.trajectory import SCHEMA, Tape
+from jumplab.io.tape import SCHEMA, Tape
 
 N = 6
 

@@ -8,10 +8,10 @@ import pytest
 from fixtures_core import srmp_planner
 from scipy.sparse import csc_matrix
 
-from jumplab.elements import chain
 from jumplab.errors import InputError
-from jumplab.terms import Bound, Phase, Problem, Term
-from jumplab.transcription import Assembled
+from jumplab.ocp.assembly import Assembled
+from jumplab.ocp.derivatives import chain
+from jumplab.ocp.problem import Bound, Phase, Problem, Term
 
 
 # the chain ------------------------------------------------------------------------------------------------------

@@ -15,12 +15,13 @@ import pytest
 from fixtures_core import jump
 from test_store import make_tape, names
 
-from jumplab import experiments, store
 from jumplab.errors import InputError, SolverError
-from jumplab.experiments import Trial, TrialKey, TrialSettings, monte_carlo, run_trials, wilson
-from jumplab.experiments import trial as single
-from jumplab.experiments.log import open_log
-from jumplab.simulation import Finding, Perturbation, Scene, SensorNoise
+from jumplab.io import folder as store
+from jumplab.sim import Finding, Perturbation, Scene, SensorNoise
+from jumplab.studies import trials as experiments
+from jumplab.studies import trials as monte_carlo
+from jumplab.studies import trials as single
+from jumplab.studies.trials import Trial, TrialKey, TrialSettings, open_log, run_trials, wilson
 
 ROOT = Path(__file__).resolve().parent.parent
 

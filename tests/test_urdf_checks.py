@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 from jumplab.errors import RobotError
-from jumplab.robot import urdf_checks
 from jumplab.robot.bhr import table
-from jumplab.robot.urdf_file import decode, locate, parse, read_urdf
+from jumplab.robot_import import checks as urdf_checks
+from jumplab.robot_import.urdf import decode, locate, parse, read_urdf
 
 GOOD = table.URDF_PATH.read_text()
 FILE = "my.urdf"

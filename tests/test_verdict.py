@@ -11,10 +11,10 @@ from fixtures_core import srmp_planner
 from scipy.integrate import solve_ivp
 
 from jumplab.errors import InfeasibleError, SolverError
+from jumplab.ocp.nlp import Nlp
 from jumplab.robot import load_robot
-from jumplab.solver import Nlp
-from jumplab.srmp import SYMMETRY_OFF, SrmpSettings, build_problem, naive_guess, parameters
-from jumplab.srmp.verdict import (
+from jumplab.stages.srmp import SYMMETRY_OFF, SrmpSettings, build_problem, naive_guess, parameters
+from jumplab.stages.srmp.reachable import (
     SWING_GAIN,
     capability,
     check_reachable,

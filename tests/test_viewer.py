@@ -20,12 +20,13 @@ from fixtures_core import jump
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab import store, viewer
 from jumplab.errors import InputError
-from jumplab.motion import Motion
-from jumplab.plotting.style import PHASE_COLORS
+from jumplab.io import folder as store
+from jumplab.io.motion import Motion
 from jumplab.robot import Robot
-from jumplab.simulation import Scene, simulate_jump
+from jumplab.show import page as viewer
+from jumplab.show.style import PHASE_COLORS
+from jumplab.sim import Scene, simulate_jump
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (

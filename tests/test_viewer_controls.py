@@ -8,9 +8,9 @@ import pytest
 from fixtures_core import jump
 from test_viewer import CHROMIUM, FLAGS, browser, count
 
-from jumplab import viewer
-from jumplab.simulation import simulate_jump
-from jumplab.viewer.page import FPS
+from jumplab.show import page as viewer
+from jumplab.show.page import FPS
+from jumplab.sim import simulate_jump
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
 pytestmark = [pytest.mark.slow, browser]

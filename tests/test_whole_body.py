@@ -8,11 +8,11 @@ import pytest
 from fixtures_core import LIMBS, jump, pendulum, planner, replay
 
 from jumplab.errors import InputError, SolverError
+from jumplab.ocp.nlp import GOOD_STATUSES
 from jumplab.robot import Robot
-from jumplab.solver import GOOD_STATUSES
+from jumplab.stages.whole_body import Limits, Mesh, WholeBodyPlanner, build_problem
+from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
-from jumplab.whole_body import Limits, Mesh, WholeBodyPlanner, build_problem
-from jumplab.whole_body.planner import platform_edge_m
 
 LIMITS, MG = Limits(), 42.0 * 9.8
 JUMPS = [

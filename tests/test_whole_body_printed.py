@@ -8,13 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, turned
-
-from jumplab.errors import InputError
-from jumplab.expansion import expand
-from jumplab.models.planar import lagrangian
-from jumplab.robot.stance import stance_configuration
-from jumplab.terms import Point
-from jumplab.whole_body.printed import (
+from paper.violations import violations
+from paper.whole_body_printed import (
     LINK_OF_THETA,
     MOTION,
     PaperCoordinates,
@@ -23,8 +18,13 @@ from jumplab.whole_body.printed import (
     PrintedWholeBody,
     planar_numbers,
 )
-from jumplab.whole_body.settings import Weights
-from jumplab.whole_body.violations import violations
+
+from jumplab.errors import InputError
+from jumplab.models.planar import lagrangian
+from jumplab.ocp.problem import Point
+from jumplab.robot.stance import stance_configuration
+from jumplab.stages.reconstruction import expand
+from jumplab.stages.whole_body.settings import Weights
 
 G, MASS = 9.8, 42.0
 BROKEN = {

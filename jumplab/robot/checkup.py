@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot import urdf_checks
 from jumplab.robot.accuracy import ReductionError, check_reduction
-from jumplab.robot.config import entry, read_toml
 from jumplab.robot.description import SHIPPED, Robot
-from jumplab.robot.jumper import Jumper, make_jumper
-from jumplab.robot.roles import Roles
-from jumplab.robot.soles import Sole
 from jumplab.robot.stance import check_stance, com_from_toe
-from jumplab.robot.starter import safe_name, starter
-from jumplab.robot.tree import Tree, moving_count
-from jumplab.robot.urdf_file import locate, parse, read_urdf
+from jumplab.robot_import import checks as urdf_checks
+from jumplab.robot_import.config import entry, read_toml
+from jumplab.robot_import.jumper import Jumper, make_jumper
+from jumplab.robot_import.roles import Roles
+from jumplab.robot_import.soles import Sole
+from jumplab.robot_import.starter import safe_name, starter
+from jumplab.robot_import.tree import Tree, moving_count
+from jumplab.robot_import.urdf import locate, parse, read_urdf
 
 ROLE_WORDS = {
     "hip_pitch": "hip pitch",

@@ -12,11 +12,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError, said
-from jumplab.robot.config import ROLES, entry, read_toml, roles_table
-from jumplab.robot.jumper import make_jumper
+from jumplab.errors import RobotError, quoted
 from jumplab.robot.sagittal import SagittalModel, reduce
-from jumplab.robot.urdf_file import locate, read_urdf
+from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
+from jumplab.robot_import.jumper import make_jumper
+from jumplab.robot_import.urdf import locate, read_urdf
 
 GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
 HERE = Path(__file__).parent
@@ -71,7 +71,7 @@ class Robot:
     def load(cls, name_or_config: str | Path = "bhr") -> Robot:
         """Load a shipped robot by name, or any robot by the path of its TOML file."""
         if not isinstance(name_or_config, str | os.PathLike):
-            raise RobotError(f"a robot must be a name or the path of a TOML file, got {said(name_or_config)}")
+            raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_config)}")
         path = SHIPPED.get(str(name_or_config)) or Path(name_or_config)
         known = ", ".join(SHIPPED)
         try:
@@ -172,7 +172,7 @@ class Robot:
                     float(text)
                 except ValueError:
                     where = f"robot {self.name}: joint {joint.get('name')!r}"
-                    raise RobotError(f"{where}: the limit {key!r} must be a number, got {said(text)}") from None
+                    raise RobotError(f"{where}: the limit {key!r} must be a number, got {quoted(text)}") from None
 
     @cached_property
     def model(self) -> pin.Model:

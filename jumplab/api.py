@@ -1,0 +1,120 @@
+"""The front door's functions: each takes what the one before returned. ``import jumplab as jl`` has them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jumplab.errors import require_type
+from jumplab.io import folder as folders
+from jumplab.robot import Robot
+from jumplab.stages.plan import JumpPlan
+from jumplab.stages.planner import Planner
+from jumplab.task import JumpTask
+
+if TYPE_CHECKING:  # what only some of the functions need is imported by them
+    from jumplab.auditing import AuditReport
+    from jumplab.show.page import Page
+    from jumplab.sim import SimulationResult
+
+
+class Saved(NamedTuple):
+    """What a result folder holds.
+
+    Attributes
+    ----------
+    plan : the plan; results of its stages are not on file.  run : its simulation, or None.
+    """
+
+    plan: JumpPlan
+    run: SimulationResult | None
+
+
+def plan(
+    task: JumpTask,
+    robot: Robot | str | Path = "bhr",
+    *,
+    method: str = "three-step",
+    weights: Mapping[str, float] | None = None,
+) -> JumpPlan:
+    """Plan one jump: three optimisations, then the 1 kHz tape (Sec. III to V of the paper).
+
+    Parameters
+    ----------
+    task : what to reach.
+    robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
+    method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, from a crouch).
+    weights : of stage 3's cost terms, instead of their own; "term" or "phase/term" -> weight.
+
+    Raises
+    ------
+    InputError, InfeasibleError, SolverError
+        If a stage refuses the target or finds no motion; the sentence says which, and what to ask for instead.
+    """
+    robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    return Planner(robot, keep=True).plan(task, method, weights=weights)
+
+
+def audit(plan: JumpPlan) -> AuditReport:
+    """Check a plan by a second code path that sees its tape, its robot and its target, and nothing of the planner."""
+    from jumplab.auditing import audit as check
+
+    require_type(plan, JumpPlan, "the plan to audit")
+    return check(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+
+
+def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
+    """Play a plan on a simulated robot, catch it, and watch it stand.
+
+    Parameters
+    ----------
+    options : as of :func:`jumplab.sim.simulate_jump`: ``mode``, ``perturbation``, ``scene`` (by default the ground that
+        the plan was made for), ``reaim``, ``landing``, ``stand_s``.
+
+    Returns
+    -------
+    SimulationResult
+        Also of a jump that fails: see its ``landed`` and ``reason``.
+    """
+    from jumplab.sim import Scene, simulate_jump
+
+    require_type(plan, JumpPlan, "the plan to simulate")
+    options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
+    return simulate_jump(plan.tape, plan.robot, **options)
+
+
+def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None) -> AuditReport:
+    """Write a plan, its audit and its simulation into a result folder, whole or not at all; returns the audit."""
+    from jumplab.auditing import write_audit
+
+    require_type(plan, JumpPlan, "the plan to save")
+    report = folders.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
+    if run is not None:
+        folders.write_simulation(folder, run, folders.read_plan(folder)[2])
+    return report
+
+
+def load(folder: str | Path) -> Saved:
+    """Read a result folder: ``plan, run = jl.load("out")``.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished plan, or a file is damaged or not the one that the summary speaks of.
+    """
+    from jumplab.sim import SimulationResult
+
+    tape, robot, summary = folders.read_plan(folder)
+    plan = JumpPlan.on_file(tape, robot, summary)
+    return Saved(plan, SimulationResult.load(folder, robot))
+
+
+def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
+    """The jump in 3-D, plan and simulation: a notebook shows the page, ``view(...).save("jump.html")`` writes it."""
+    from jumplab.show.page import page
+    from jumplab.sim import Scene
+
+    require_type(plan, JumpPlan, "the plan to view")
+    scene = Scene.of_plan(plan.summary, plan.robot)
+    return page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)

@@ -1,0 +1,275 @@
+"""Everything the audit needs, recomputed from URDF and tape with Pinocchio, sample by sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import InputError, RobotError
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.task import GRAVITY, JumpTask
+
+SOLE_POINTS = 7  # along each edge of the sole, so that the edge of a platform cannot pass between two of them
+EDGE_ROOM_M = 0.05  # between a sole and the edge of what it stands on: a playback that falls short still lands
+SAME_LEVEL_M = 1e-3  # corners this close to the lowest one belong to the sole
+
+
+@dataclass(frozen=True)
+class Sole:
+    """Sole rectangle in the frame of a foot link [m]."""
+
+    heel: float
+    toe: float
+    right: float
+    left: float
+    z: float
+
+    def points(self, n: int = SOLE_POINTS) -> np.ndarray:
+        """(2 n, 3) points on right and left edge: index 0 is the heel, n - 1 the toe, then the left edge likewise."""
+        x = np.linspace(self.heel, self.toe, n)
+        return np.array([[xi, y, self.z] for y in (self.right, self.left) for xi in x])
+
+
+def build_geometry(model: pin.Model, robot: Robot) -> pin.GeometryModel:
+    """Collision shapes of the URDF, without pairs."""
+    try:
+        return pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError) as e:
+        raise RobotError(f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}") from e
+
+
+def sole_of(geometry: pin.GeometryModel, model: pin.Model, frame_name: str) -> Sole | None:
+    """Lowest face of the boxes of a foot link, in the link's frame; None if it has no box."""
+    frame_id = model.getFrameId(frame_name)
+    frame = model.frames[frame_id]
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = []
+    for shape in geometry.geometryObjects:
+        half = getattr(shape.geometry, "halfSide", None)
+        if half is not None and shape.parentFrame == frame_id:
+            place = frame.placement.actInv(shape.placement)
+            corners += [place.act(s * half) for s in signs]
+    if not corners:
+        return None
+    corners = np.array(corners)
+    low = corners[corners[:, 2] < corners[:, 2].min() + SAME_LEVEL_M]
+    return Sole(low[:, 0].min(), low[:, 0].max(), low[:, 1].min(), low[:, 1].max(), low[:, 2].min())
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A tape, a robot's URDF and what follows from them; all vectors in world axes.
+
+    Attributes
+    ----------
+    tape, robot, task, edge_m : as given to the audit.
+    model, geometry : Pinocchio's, built from the URDF alone.
+    soles : one per contact frame.
+    com, com_velocity, com_acceleration : (N, 3) [m, m/s, m/s^2].
+    momentum, momentum_rate : (N, 3) angular momentum about the CoM and its derivative [kg m^2/s, N m].
+    energy : (N,) kinetic plus potential [J].
+    base : (N, 3) origin of the base link [m].
+    base_rotation : (N, 3, 3).
+    foot : (N, K, 3) origin of each contact frame [m].
+    foot_rotation : (N, K, 3, 3).
+    base_residual : (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides.
+    tau : (N, nv - 6) joint torques that the motion and the contact wrenches need [N m].
+    """
+
+    tape: Tape
+    robot: Robot
+    task: JumpTask | None
+    edge_m: float | None
+    model: pin.Model
+    geometry: pin.GeometryModel
+    soles: tuple[Sole, ...]
+    com: np.ndarray
+    com_velocity: np.ndarray
+    com_acceleration: np.ndarray
+    momentum: np.ndarray
+    momentum_rate: np.ndarray
+    energy: np.ndarray
+    base: np.ndarray
+    base_rotation: np.ndarray
+    foot: np.ndarray
+    foot_rotation: np.ndarray
+    base_residual: np.ndarray
+    tau: np.ndarray
+
+    @property
+    def gravity(self) -> float:
+        """Gravity of the replayed model, positive [m/s^2]."""
+        return float(-self.model.gravity.linear[2])
+
+    @cached_property
+    def mass(self) -> float:
+        """Mass of the URDF [kg]."""
+        return float(sum(body.mass for body in self.model.inertias))
+
+    @property
+    def weight(self) -> float:
+        """m g [N]."""
+        return self.mass * self.gravity
+
+    @cached_property
+    def launch(self) -> slice:
+        """Rows of the launch."""
+        return slice(0, self.tape.takeoff_index)
+
+    @cached_property
+    def flight(self) -> slice:
+        """Rows of the flight."""
+        return slice(self.tape.takeoff_index, len(self.tape.t))
+
+    @cached_property
+    def step(self) -> np.ndarray:
+        """(N - 1,) time steps [s]; zero across take-off."""
+        return np.diff(self.tape.t)
+
+    @cached_property
+    def sole_points(self) -> np.ndarray:
+        """(N, K, 2 SOLE_POINTS, 3) points of the soles in the world [m]."""
+        local = np.array([s.points() for s in self.soles])  # (K, P, 3)
+        return self.foot[:, :, None] + np.einsum("nkij,kpj->nkpi", self.foot_rotation, local)
+
+    @property
+    def toe_corners(self) -> np.ndarray:
+        """(N, K, 2, 3) ends of the toe edges [m]."""
+        return self.sole_points[:, :, [SOLE_POINTS - 1, 2 * SOLE_POINTS - 1]]
+
+    @property
+    def heel_corners(self) -> np.ndarray:
+        """(N, K, 2, 3) ends of the heel edges [m]."""
+        return self.sole_points[:, :, [0, SOLE_POINTS]]
+
+    @cached_property
+    def platform(self) -> float:
+        """Height of the landing surface [m]: the task's, or without one that of the soles in the last sample."""
+        return self.task.platform_m if self.task else float(self.sole_points[-1, :, :, 2].min())
+
+    @cached_property
+    def heading(self) -> float:
+        """+1 for a jump along +x, -1 along -x."""
+        return 1.0 if self.toe_corners[-1, ..., 0].mean() >= self.toe_corners[0, ..., 0].mean() else -1.0
+
+    @cached_property
+    def edge(self) -> float:
+        """x of the step between the two surfaces [m], as given; or else where the world is most natural.
+
+        A higher surface begins a little behind the sole that lands on it, not under the launching one if that can be;
+        the launching surface ends a little ahead of the launching sole if the landing one is lower.
+        """
+        if self.edge_m is not None:
+            return float(self.toe_corners[0, ..., 0].mean()) + self.edge_m
+        ahead = self.heading * self.sole_points[[0, -1], ..., 0]
+        launched, landed = float(ahead[0].max()), float(ahead[1].min())
+        up = min(max(landed - EDGE_ROOM_M, launched), landed)
+        return self.heading * (up if self.platform > 0 else launched + EDGE_ROOM_M)
+
+    def surface(self, x: np.ndarray) -> np.ndarray:
+        """Height of the surface under ``x`` [m]."""
+        ahead = self.heading * (np.asarray(x) - self.edge)
+        beyond = ahead > -1e-9 if self.platform > 0 else ahead > 1e-9
+        return np.where(beyond, self.platform, 0.0)
+
+    def integral(self, values: np.ndarray) -> np.ndarray:
+        """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
+        values = np.asarray(values, float)
+        step = self.step.reshape((-1,) + (1,) * (values.ndim - 1))
+        total = np.cumsum((values[1:] + values[:-1]) / 2 * step, axis=0)
+        return np.concatenate([np.zeros_like(values[:1]), total])
+
+
+def _check_names(tape: Tape, model: pin.Model, robot: Robot) -> list[int]:
+    names = tuple(model.names[2:])
+    if tuple(str(n) for n in tape.joint_names) != names:
+        raise InputError(f"tape: its joints are not those of the robot {robot.name!r} in the same order; plan the jump "
+                         f"again with this robot")  # fmt: skip
+    n, k = len(tape.t), len(tape.contact_frames)
+    shapes = {"q": (n, model.nq), "v": (n, model.nv), "a": (n, model.nv), "tau": (n, model.nv - 6), "f": (n, k, 6)}
+    for name, shape in shapes.items():
+        if getattr(tape, name).shape != shape:
+            found = getattr(tape, name).shape
+            raise InputError(f"tape: {name} has shape {found}, the robot {robot.name!r} needs {shape}")
+    frames = []
+    for name in tape.contact_frames:
+        if not model.existFrame(str(name)):
+            raise InputError(f"tape: the contact frame {str(name)!r} is not a link of the robot {robot.name!r}")
+        frames.append(model.getFrameId(str(name)))
+    if k == 0:
+        raise InputError("tape: it names no contact frame; a jump needs at least one foot")
+    return frames
+
+
+def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
+    """Pinocchio model from the URDF, and indices of the contact frames; raises InputError if the tape does not fit."""
+    try:
+        model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
+    except ValueError as e:
+        raise RobotError(f"robot {robot.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}") from e
+    model.gravity.linear = np.array([0.0, 0.0, -(task.gravity if task else GRAVITY)])
+    return model, _check_names(tape, model, robot)
+
+
+def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None = None) -> Replay:
+    """Recompute motion and forces of a whole tape (finite numbers only; see :func:`open_tape`)."""
+    model, frames = open_tape(tape, robot, task)
+    geometry = build_geometry(model, robot)
+    soles = []
+    for name in tape.contact_frames:
+        sole = sole_of(geometry, model, str(name))
+        if sole is None:  # a foot without boxes: what the robot's configuration says
+            f = robot.foot
+            sole = Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
+        soles.append(sole)
+    motion = _motion(tape, model, frames)
+    residual, tau = _inverse_dynamics(tape, model, frames, motion)
+    return Replay(tape, robot, task, edge_m, model, geometry, tuple(soles), base_residual=residual, tau=tau, **motion)
+
+
+def _motion(tape, model, frames) -> dict:
+    n, k, data = len(tape.t), len(frames), model.createData()
+    shapes = {"com": (3,), "com_velocity": (3,), "com_acceleration": (3,), "momentum": (3,), "momentum_rate": (3,),
+              "energy": (), "base": (3,), "base_rotation": (3, 3), "foot": (k, 3),
+              "foot_rotation": (k, 3, 3)}  # fmt: skip
+    out = {name: np.empty((n, *shape)) for name, shape in shapes.items()}
+    mass = sum(body.mass for body in model.inertias)
+    for i in range(n):
+        q, v, a = tape.q[i], tape.v[i], tape.a[i]
+        pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
+        pin.updateFramePlacements(model, data)
+        out["energy"][i] = pin.computeMechanicalEnergy(model, data, q, v)
+        out["com"][i] = data.com[0]
+        out["com_velocity"][i], out["momentum"][i] = data.hg.linear / mass, data.hg.angular
+        out["com_acceleration"][i], out["momentum_rate"][i] = data.dhg.linear / mass, data.dhg.angular
+        out["base"][i], out["base_rotation"][i] = data.oMi[1].translation, data.oMi[1].rotation
+        for j, frame in enumerate(frames):
+            out["foot"][i, j], out["foot_rotation"][i, j] = data.oMf[frame].translation, data.oMf[frame].rotation
+    return out
+
+
+def _inverse_dynamics(tape, model, frames, motion):
+    """Base residual (force, moment about the CoM; world axes) and joint torques."""
+    data, n = model.createData(), len(tape.t)
+    local = np.empty_like(tape.f)  # wrench at the contact frame's origin, in its axes
+    local[..., :3] = np.einsum("nkji,nkj->nki", motion["foot_rotation"], tape.f[..., :3])
+    local[..., 3:] = np.einsum("nkji,nkj->nki", motion["foot_rotation"], tape.f[..., 3:])
+    external = pin.StdVec_Force()
+    external.extend([pin.Force.Zero() for _ in range(model.njoints)])
+    joints = [model.frames[i].parentJoint for i in frames]
+    places = [model.frames[i].placement for i in frames]
+    need = np.empty((n, model.nv))
+    for i in range(n):
+        for j in set(joints):
+            external[j] = pin.Force.Zero()
+        for k, j in enumerate(joints):
+            external[j] = external[j] + places[k].act(pin.Force(local[i, k]))
+        need[i] = pin.rnea(model, data, tape.q[i], tape.v[i], tape.a[i], external)
+    force = np.einsum("nij,nj->ni", motion["base_rotation"], need[:, :3])
+    moment = np.einsum("nij,nj->ni", motion["base_rotation"], need[:, 3:6])
+    moment -= np.cross(motion["com"] - motion["base"], force)
+    return np.concatenate([force, moment], axis=1), need[:, 6:]

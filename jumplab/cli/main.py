@@ -1,0 +1,127 @@
+"""The command line, ``jumplab COMMAND`` (the same as ``python -m jumplab COMMAND``).
+
+Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad input, 3 infeasible or not within the
+limits, 4 internal failure, 130 and 143 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NoReturn
+
+from jumplab.cli import COMMANDS
+from jumplab.cli.common import common_options
+from jumplab.errors import InputError, JumplabError
+
+INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser that raises instead of printing its usage, and takes -1e-1 or -inf for numbers, not for options."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, allow_abbrev=False, **kwargs)
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)", re.IGNORECASE)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; '{self.prog} --help' shows what is possible")
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    try:
+        return metadata.version("jumplab")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.", parents=[common_options()]
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    for command in COMMANDS:
+        command.add(commands)
+    return parser
+
+
+def _names() -> str:
+    *first, last = (command.__name__.rpartition(".")[2] for command in COMMANDS)
+    return f"{', '.join(first)} or {last}"
+
+
+def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
+    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
+    seen.append(signum)
+    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
+
+
+def _heed(seen: list[int]) -> dict:
+    """Handle the signals that end a command; returns the handlers before. An ignored Ctrl-C stays ignored."""
+    usual = {signal.SIGTERM: True, signal.SIGINT: signal.getsignal(signal.SIGINT) is signal.default_int_handler}
+    return {number: signal.signal(number, partial(_stop, seen)) for number, ours in usual.items() if ours}
+
+
+def _complain(text: str, debug: bool) -> None:
+    if debug:
+        traceback.print_exc()
+    print(f"jumplab: {' '.join(text.split())}", file=sys.stderr)
+
+
+def _interrupted(said: str, debug: bool) -> int:
+    _complain(said or "interrupted; what was there before is unchanged", debug)
+    return INTERRUPTED
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    debug = "--debug" in argv
+    seen: list[int] = []
+    before = _heed(seen)
+    sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
+    try:
+        parser = _parser()
+        for text in argv:  # argparse would make an empty list of it
+            if re.fullmatch(r"-[^=]*=--", text):
+                parser.error(f"{text}: '--' is not a value")
+        args = parser.parse_args(argv)
+        if args.version:
+            print(f"jumplab {_version()}")
+        elif args.command is None:
+            parser.error(f"choose a command: {_names()}")
+        else:
+            args.work(args)
+        sys.stdout.flush()
+    except KeyboardInterrupt as e:
+        return _interrupted(str(e), debug)
+    except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return INTERNAL
+    except Exception as e:
+        if seen:
+            return TERMINATED if seen[-1] == signal.SIGTERM else _interrupted("", debug)
+        if isinstance(e, JumplabError):
+            _complain(str(e), debug)
+            return e.exit_code
+        first = (str(e).strip().splitlines() or ["no message"])[0]
+        hint = "" if debug else "; run it again with --debug for the traceback"
+        _complain(f"internal failure, {type(e).__name__}: {first}{hint}", debug)
+        return INTERNAL
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

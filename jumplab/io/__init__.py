@@ -1,0 +1,1 @@
+"""Tapes, result folders and exports: everything that is read from or written to disk."""

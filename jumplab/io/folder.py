@@ -1,0 +1,196 @@
+"""Result folders: written whole or not at all, checked when read.
+
+A plan's folder holds ``plan.npz`` (the tape), ``robot.urdf`` and ``robot.toml`` (the robot it was planned for) and
+``summary.json``, which comes last and whose ``manifest`` carries the SHA-256 of the others. What is said about that
+plan later (passport, simulation) lies beside it.
+
+How a folder changes all at once is told in :mod:`jumplab.transactions`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from jumplab.errors import InputError, as_path, require_type
+from jumplab.io.files import (
+    CONFIG,
+    HASHED,
+    PLAN,
+    SUMMARY,
+    URDF,
+    locked,
+    recover,
+    transaction,
+)
+from jumplab.io.files import ensure_writable as ensure_writable  # what commands and notebooks use with a result
+from jumplab.io.files import write_file as write_file
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+
+T = TypeVar("T")
+SCHEMA = "jumplab-result-1"
+PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
+
+
+def versions() -> dict[str, str]:
+    """Version of Python and of every package that shapes a result."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def to_json(data: Any) -> str:
+    """JSON text of nested mappings, sequences, NumPy values and paths; numbers that are not finite become null."""
+    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _plain(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, np.ndarray | np.generic):
+        return _plain(x.tolist())
+    if isinstance(x, list | tuple):
+        return [_plain(v) for v in x]
+    if isinstance(x, float):
+        return x if math.isfinite(x) else None
+    return str(x) if isinstance(x, Path) else x
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def write_plan(
+    folder: str | Path,
+    tape: Tape,
+    robot: Robot,
+    summary: Mapping[str, Any],
+    complete: Callable[[Path], T] | None = None,
+) -> T | None:
+    """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
+
+    Parameters
+    ----------
+    summary : becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the files.
+    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``).
+
+    Returns
+    -------
+    What ``complete`` returned.
+    """
+    require_type(tape, Tape, "the tape to write")
+    require_type(robot, Robot, "its robot")
+    require_type(summary, Mapping, "the summary")
+    with transaction(folder) as staging:
+        tape.save(staging / PLAN)
+        (staging / URDF).write_bytes(robot.urdf.encode())
+        (staging / CONFIG).write_bytes(robot.config_text.encode())
+        manifest = {
+            **summary.get("manifest", {}),
+            "schema": SCHEMA,
+            "versions": versions(),
+            "robot": {"name": robot.name, "hash": robot.hash},
+            "files": {name: sha256(staging / name) for name in HASHED},
+        }
+        (staging / SUMMARY).write_text(to_json({**summary, "manifest": manifest}), encoding="utf-8")
+        return complete(staging) if complete else None
+
+
+class Simulation(Protocol):
+    """What :func:`write_simulation` needs of a simulation's result."""
+
+    def save(self, folder: Path, extra: dict | None = None) -> None:
+        """Write both files, with further entries for the second one."""
+
+
+def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[str, Any]) -> None:
+    """Write ``simulation.npz`` and ``simulation.json`` beside the plan that ``summary`` was read with.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or has come to hold another plan.
+    """
+    require_type(summary, Mapping, "the summary")
+    if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
+        raise InputError("the summary is not one that a plan was read with; take it from store.read_plan")
+    folder = as_path(folder, "a result folder")
+    planned = {name: summary[name] for name in ("planned_distance_m", "planned_rise_m")}
+    with transaction(folder) as staging:
+        _same_plan(folder, summary)
+        result.save(staging, extra=planned)
+
+
+def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any], name: str) -> None:
+    """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
+    with transaction(folder) as staging:
+        _same_plan(Path(folder), summary)
+        (staging / name).write_text(to_json(report), encoding="utf-8")
+
+
+def _same_plan(folder: Path, summary: Mapping[str, Any]) -> None:
+    if read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
+        raise InputError(f"{str(folder)!r} has been planned again in the meantime; simulate the new plan")
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Read and check ``summary.json``; the lock is the caller's affair."""
+    path = folder / SUMMARY
+    if not path.is_file():
+        raise InputError(f"{str(folder)!r} holds no finished plan ({SUMMARY} is missing); make one with 'jumplab plan'")
+    summary = read_json(path)
+    manifest = summary.get("manifest")
+    files = manifest.get("files") if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA else None
+    if not isinstance(files, dict) or not all(isinstance(files.get(name), str) for name in HASHED):
+        raise InputError(f"{path}: not a summary of schema {SCHEMA!r}; plan the jump again")
+    return summary
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; raises :class:`InputError` in one sentence if it is missing or damaged."""
+    try:
+        data = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as e:
+        raise InputError(f"{path}: not a readable JSON file ({type(e).__name__})") from e
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: not a JSON object")
+    return data
+
+
+def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
+    """Read a plan's folder: the tape, the robot it was planned for, and the summary.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished plan, or if a file is damaged or not the one that the summary speaks of.
+    """
+    folder = as_path(folder, "a result folder")
+    try:
+        if not folder.is_dir():
+            raise InputError(f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first")
+        recover(folder)
+        with locked(folder, shared=True):
+            summary = read_summary(folder)
+            for name in HASHED:
+                if sha256(folder / name) != summary["manifest"]["files"][name]:
+                    raise InputError(f"{folder / name}: changed or damaged since it was written; plan the jump again")
+            urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
+            return Tape.load(folder / PLAN), Robot.from_text(urdf, config), summary
+    except (OSError, ValueError) as e:
+        reason = (e.strerror if isinstance(e, OSError) else str(e)) or type(e).__name__
+        raise InputError(f"the plan in {str(folder)!r} cannot be read ({reason})") from e

@@ -1,0 +1,128 @@
+"""A finished motion, planned or simulated, as pictures and exports want it: at any instants, without double samples."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jumplab.errors import InputError
+from jumplab.robot import Robot
+
+SIMULATION_NAME, SIMULATION_SCHEMA = "simulation.npz", "jumplab-simulation-1"
+MAX_RATE_HZ = 10_000.0  # our choice: ten times the rate of the logs; more than that is a typing error
+END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample in spite of rounding
+# what reading a cut, altered or foreign file may raise
+_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+
+
+class Record(Protocol):
+    """What a motion is made from: a ``Tape`` or a ``SimulationResult``."""
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    phase: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """States and torques of a robot over time.
+
+    Attributes
+    ----------
+    t : (N,) [s], never falling; an instant may stand twice, where one phase ends and the next begins.
+    q : (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
+    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
+    tau : (N, nv - 6) joint torques [N m].
+    phase : (N,) "launch", "flight" or "landing".
+    source : "plan" or "simulation".
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    phase: np.ndarray
+    source: str
+
+    @classmethod
+    def of(cls, record: Record) -> Motion:
+        """The motion of a ``Tape`` (it alone carries accelerations) or of a ``SimulationResult``."""
+        source = "plan" if hasattr(record, "a") else "simulation"
+        return cls(record.t, record.q, record.v, record.tau, record.phase, source)
+
+    @classmethod
+    def of_simulation_file(cls, folder: str | Path, robot: Robot) -> Motion:
+        """Read ``simulation.npz`` from a result folder; raises :class:`InputError` if it is missing or damaged."""
+        path = Path(folder) / SIMULATION_NAME
+        if not path.is_file():
+            raise InputError(f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first")
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                data = {k: file[k] for k in ("schema", "t", "q", "v", "tau", "phase", "joint_names")}
+        except _DAMAGE as e:
+            raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
+        schema, names = str(data.pop("schema")), tuple(str(n) for n in data.pop("joint_names"))
+        n, nq, nv = len(data["t"]), robot.model.nq, robot.model.nv
+        shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,))
+        fits = all(data[k].shape == shape for k, shape in shapes.items())
+        if schema != SIMULATION_SCHEMA or names != robot.joint_names or not fits:
+            raise InputError(f"{path}: not a simulation of this folder's robot; simulate the plan again")
+        return cls(**data, source="simulation")
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def at(self, times: np.ndarray) -> Motion:
+        """The motion at ``times`` (M,) [s]: everything linear between samples, the base's attitude along the arc.
+
+        An instant that stands twice gives its later sample, so that take-off belongs to the flight.
+
+        Raises
+        ------
+        InputError
+            If a time lies outside the motion.
+        """
+        times = np.asarray(times, float)
+        if len(times) and not (self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE):
+            raise InputError(
+                f"times {times.min():g} ... {times.max():g} s leave the motion, {self.t[0]:g} ... {self.t[-1]:g} s"
+            )
+        row = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
+        gap = self.t[row + 1] - self.t[row]
+        share = np.clip((times - self.t[row]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+        share[gap <= 0] = 1.0  # the last instant stands twice
+
+        def between(x: np.ndarray) -> np.ndarray:
+            return x[row] + share[:, None] * (x[row + 1] - x[row])
+
+        q = between(self.q)
+        q[:, 3:7] = _between_attitudes(self.q[row, 3:7], self.q[row + 1, 3:7], share)
+        phase = np.where(share < 1.0, self.phase[row], self.phase[row + 1])
+        return Motion(times, q, between(self.v), between(self.tau), phase, self.source)
+
+    def every(self, rate_hz: float) -> Motion:
+        """The motion on a grid of ``rate_hz`` samples a second, from its start to the last grid point within it."""
+        if not 0 < rate_hz <= MAX_RATE_HZ:
+            raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
+        count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
+        return self.at(np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1]))
+
+
+def _between_attitudes(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Quaternions xyzw (M, 4) at ``share`` (M,) of the arcs from ``first`` to ``second``, free of jumps in sign."""
+    start = Rotation.from_quat(first)
+    arc = (start.inv() * Rotation.from_quat(second)).as_rotvec()
+    quat = (start * Rotation.from_rotvec(share[:, None] * arc)).as_quat()
+    turned = np.sum(quat[1:] * quat[:-1], axis=1) < 0
+    flip = np.concatenate([[False], np.cumsum(turned) % 2 == 1])
+    return np.where(flip[:, None], -quat, quat)

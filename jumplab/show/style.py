@@ -1,0 +1,203 @@
+"""Colours, sizes and saving: everything that makes two jumplab figures look alike.
+
+>>> from jumplab import plotting
+>>> plotting.use_style()                                   # once per notebook, for plots of your own
+>>> fig = plotting.new_figure(plotting.COLUMN_IN, 2.0)     # or any of the package's figure functions
+>>> plotting.save_figure(fig, "my_figure", "figures", "What the reader sees.", task=task, robot=robot)
+
+Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one when it is the last expression of a cell
+(:func:`save_figure` returns it), nothing is shown twice, and nothing has to be closed.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from importlib import resources
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import matplotlib.colors as mcolors
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jumplab.errors import InputError
+from jumplab.io.folder import versions
+from jumplab.robot import Robot
+from jumplab.task import JumpTask
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Okabe and Ito's palette, which stays apart for every kind of colour vision
+LAUNCH, FLIGHT, LANDING = "#0072B2", "#E69F00", "#009E73"
+PURPLE, SKY, VERMILION = "#CC79A7", "#56B4E9", "#D55E00"
+PHASE_COLORS = {"launch": LAUNCH, "flight": FLIGHT, "landing": LANDING}
+REFERENCE = "#222222"  # dashed, thin: what was asked for
+LIMIT = "#999999"  # thin: a bound
+ELLIPSE = "#B8E6B0"  # the paper draws the inertia ellipse in light green
+INK = "#222222"  # text and outlines
+GROUND = "#8C8C8C"
+
+COLUMN_IN = 3.5  # width of one column of an IEEE page [in]
+PAGE_IN = 7.16  # width of both columns [in]
+DPI = 200  # of the PNG
+PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
+PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
+MIN_FONT_PT = 6.5  # smallest text in any figure; tests look for smaller
+REFERENCE_STYLE = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.9}
+LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}
+
+STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
+
+
+def use_style() -> None:
+    """Make the package's style matplotlib's default for this process (a notebook's second cell)."""
+    plt.style.use(STYLE_FILE)
+
+
+def style_context() -> AbstractContextManager:
+    """The style for a ``with`` block only."""
+    return plt.style.context(STYLE_FILE)
+
+
+def styled(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: the figure function draws in the package's style whatever the caller's settings are."""
+
+    @functools.wraps(function)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> R:
+        with style_context():
+            return function(*args, **kwargs)
+
+    return inner
+
+
+class Picture(Figure):
+    """A figure that shows itself in a notebook, whatever backend is chosen there."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with style_context():
+            self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+        return buffer.getvalue()
+
+
+def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
+    """An empty figure of the style, width and height in inches."""
+    with style_context():
+        return Picture(figsize=(width, height))
+
+
+def tint(color: str, share: float) -> tuple[float, float, float]:
+    """``color`` mixed with white: share 1 is the colour itself, 0 is white."""
+    rgb = np.array(mcolors.to_rgb(color))
+    return tuple(float(x) for x in 1 - share * (1 - rgb))
+
+
+def shade(color: str, share: float) -> tuple[float, float, float]:
+    """``color`` mixed with black: share 1 is the colour itself, 0 is black."""
+    return tuple(float(x) for x in share * np.array(mcolors.to_rgb(color)))
+
+
+# curves of a jump -----------------------------------------------------------------------------------------------
+def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs) -> list[Line2D]:
+    """Plot ``y`` (N,) over ``t`` (N,), each run of one ``phase`` (N,) in that phase's colour.
+
+    ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
+    """
+    phase = np.asarray(phase)
+    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
+    lines = []
+    for part in np.split(np.arange(len(phase)), cuts):
+        lines += ax.plot(t[part], y[part], **({"color": PHASE_COLORS[str(phase[part[0]])]} | kwargs))
+    return lines
+
+
+def mark_time(ax: Axes, times: Iterable[float]) -> None:
+    """Thin dotted vertical lines at the instants where phases change."""
+    for t in times:
+        ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
+
+
+def phase_handles(*phases: str, reference: str | None = None, limit: str | None = None) -> list[Line2D]:
+    """Legend entries: phases by name, then texts for the dashed reference and the thin limits."""
+    handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
+    if reference:
+        handles.append(Line2D([], [], **REFERENCE_STYLE, label=reference))
+    if limit:
+        handles.append(Line2D([], [], **LIMIT_STYLE, label=limit))
+    return handles
+
+
+def legend_above(fig: Figure, handles: list, columns: int | None = None) -> None:
+    """One legend over all panels, outside of them."""
+    fig.legend(handles=handles, loc="outside upper center", ncols=columns or len(handles), columnspacing=1.4)
+
+
+def panel_letters(axes: Iterable[Axes]) -> None:
+    """(a), (b), ... before the panels' titles."""
+    for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
+        ax.set_title(f"({letter}) {ax.get_title(loc='left')}".rstrip())
+
+
+def bare(ax: Axes) -> None:
+    """No frame, ticks or grid: for pictures rather than plots."""
+    ax.set(xticks=[], yticks=[])  # hidden ticks would still be laid out, which takes longer than the picture
+    ax.set_axis_off()
+    ax.grid(False)
+
+
+# saving ---------------------------------------------------------------------------------------------------------
+def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *,
+                task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> Figure:  # fmt: skip
+    """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
+
+    The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
+    It is laid out once, for the PNG; the PDF and what a notebook shows keep that layout. Returns the figure.
+
+    Raises
+    ------
+    InputError
+        If ``name`` is not a plain file name, or the folder cannot be written.
+    """
+    if not name or Path(name).name != name or name.startswith("."):
+        raise InputError(f"figure name {name!r}: must be a plain file name without ending, such as 'f08_joints'")
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with style_context():
+            fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
+            fig.set_layout_engine("none")
+            fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
+        (folder / f"{name}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
+    except OSError as e:
+        raise InputError(f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}") from e
+    return fig
+
+
+def caption_text(caption: str, task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> str:
+    """What NAME.txt says: the caption, then target or targets, robot and versions, one line each."""
+    lines = [caption.strip() or "No caption."]
+    tasks = [task] if isinstance(task, JumpTask) else list(task or ())
+    if tasks:
+        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {'; '.join(map(describe_task, tasks))}.")
+    if robot is not None:
+        lines.append(f"Robot: {robot.name}, {robot.total_mass:.1f} kg, description {robot.hash}.")
+    known = [f"{name} {version}" for name, version in versions().items() if version != "not installed"]
+    return "\n".join([*lines, f"Made with {', '.join(known)}.", ""])
+
+
+def describe_task(task: JumpTask) -> str:
+    """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
+    way = "forward" if task.distance_m >= 0 else "backward"
+    parts = [f"{abs(task.distance_m):.2f} m {way}", f"CoM rise {task.height_m:.2f} m"]
+    if task.platform_m:
+        parts.append(f"landing {abs(task.platform_m):.2f} m {'higher' if task.platform_m > 0 else 'lower'}")
+    if task.rotation_rad:
+        parts.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
+    return ", ".join(parts)

@@ -1,0 +1,331 @@
+"""Landing controller: a whole-body QP in torque mode, entered at touchdown.
+
+The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not repeat it; this one is
+ours. Every 2 ms it chooses joint accelerations and two foot wrenches that obey the base dynamics, friction, the soles'
+edges and the torques that the motors have, and that come closest to a list of wishes: CoM, angular momentum, trunk,
+feet flat and still, posture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from proxsuite import proxqp
+
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+from jumplab.sim.actuation import Actuators
+from jumplab.sim.reference import Reference
+
+
+# body_terms ------------------------------------------------------------------------------------------
+class BodyTerms:
+    """Quantities at one state (``update``); unknowns are x = (accelerations, wrench left, wrench right).
+
+    Wrenches act at the middle of each sole, world axes, force then moment, in units of ``wrench_scale``.
+
+    Attributes
+    ----------
+    mass : [kg];  standing_height : CoM above the soles in the stance [m];  pitch_rest : trunk pitch there [rad].
+    posture_rest : (nv - 6,) joint angles of the stance.
+    com, com_velocity : (3,) [m, m/s];  momentum : (3,) angular momentum about the CoM [kg m^2/s].
+    trunk : (3, 3) attitude of the base;  soles : (2, 3) their middles;  attitudes : (2, 3, 3);  twists : (2, 6).
+    sole_rows, sole_drift : (2, 6, nx) and (2, 6), acceleration of the sole = rows @ x + drift.
+    base_rows, base_offset : (6, nx) and (6,), the unactuated dynamics: rows @ x + offset = 0.
+    torque_rows, torque_offset : (nv - 6, nx) and (nv - 6,), torque = rows @ x + offset.
+    force_rows : (3, nx), CoM acceleration = rows @ x + gravity;  momentum_rows : (3, nx), rate of ``momentum``.
+    """
+
+    def __init__(self, robot: Robot, wrench_scale: float):
+        self._model, self._data, self._scale = robot.model, robot.model.createData(), wrench_scale
+        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        self._center = robot.foot.center
+        self.nv = self._model.nv
+        self.nx = self.nv + 12
+        self.mass = robot.total_mass
+        self.gravity = self._model.gravity.linear.copy()
+        rest = stance_configuration(robot)
+        self.posture_rest = rest[7:].copy()
+        self.pitch_rest = float(robot.stance["trunk_pitch_rad"])
+        pin.centerOfMass(self._model, self._data, rest)
+        self.standing_height = float(self._data.com[0][2])
+        nv, nx = self.nv, self.nx
+        self.soles, self.attitudes, self.twists = np.zeros((2, 3)), np.zeros((2, 3, 3)), np.zeros((2, 6))
+        self.sole_rows, self.sole_drift = np.zeros((2, 6, nx)), np.zeros((2, 6))
+        self.force_rows, self.momentum_rows = np.zeros((3, nx)), np.zeros((3, nx))
+        self._dynamics, self._zero = np.zeros((nv, nx)), np.zeros(nv)
+
+    def update(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Evaluate everything at (q, v), before :meth:`set_contact`."""
+        model, data = self._model, self._data
+        pin.computeAllTerms(model, data, q, v)
+        pin.forwardKinematics(model, data, q, v, self._zero)
+        self.com, self.com_velocity = data.com[0].copy(), data.vcom[0].copy()
+        self.momentum = data.hg.angular.copy()
+        self.trunk = data.oMi[1].rotation.copy()
+        self._dynamics[:, : self.nv] = data.M
+        self.base_rows, self.torque_rows = self._dynamics[:6], self._dynamics[6:]
+        self.base_offset, self.torque_offset = data.nle[:6], data.nle[6:]
+        for side, frame in enumerate(self._frames):
+            self._sole(side, frame)
+
+    def set_contact(self, contact: np.ndarray) -> None:
+        """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
+        for side in (0, 1):
+            at = slice(self.nv + 6 * side, self.nv + 6 * side + 6)
+            on = self._scale * float(contact[side])
+            self._dynamics[:, at] = -on * self.sole_rows[side, :, : self.nv].T
+            self.force_rows[:, at][:, :3] = on / self.mass * np.eye(3)
+            self.momentum_rows[:, at] = on * np.hstack([pin.skew(self.soles[side] - self.com), np.eye(3)])
+
+    def _sole(self, side: int, frame: int) -> None:
+        """Kinematics of one sole's middle, world axes."""
+        model, data, axes = self._model, self._data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        place = pin.updateFramePlacement(model, data, frame)
+        arm = place.rotation @ self._center
+        jacobian = pin.getFrameJacobian(model, data, frame, axes)
+        jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
+        velocity = pin.getFrameVelocity(model, data, frame, axes)
+        drift = pin.getFrameClassicalAcceleration(model, data, frame, axes)
+        w, spin = velocity.angular, pin.skew(velocity.angular)
+        self.soles[side], self.attitudes[side] = place.translation + arm, place.rotation
+        self.twists[side] = np.concatenate([velocity.linear + spin @ arm, w])
+        self.sole_rows[side, :, : self.nv] = jacobian
+        linear = drift.linear + pin.skew(drift.angular) @ arm + spin @ (spin @ arm)
+        self.sole_drift[side] = np.concatenate([linear, drift.angular])
+
+    def torque(self, x: np.ndarray) -> np.ndarray:
+        """Joint torques (nv - 6,) that go with the unknowns ``x`` [N m]."""
+        return self.torque_rows @ x + self.torque_offset
+
+    def gravity_torque(self, contact: np.ndarray) -> np.ndarray:
+        """Joint torques (nv - 6,) that hold the weight on the standing feet if nothing moves [N m]."""
+        x = np.zeros(self.nx)
+        share = self.mass * -self.gravity[2] / self._scale / max(1, int(np.sum(contact)))
+        for side in np.flatnonzero(contact):
+            x[self.nv + 6 * side + 2] = share
+        return self.torque(x)
+
+
+# landing ------------------------------------------------------------------------------------------
+PERIOD_STEPS = 2  # our choice: 500 Hz
+WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
+CONTACT_FORCE_N = 10.0  # our choice: a foot stands if it carries more than 2.5 % of the weight ...
+CONTACT_HOLD_S = 0.008  # ... and for so long after it last did; flicker of the flag makes robots fall
+NEAR_GROUND_M = 0.02  # our choice: a foot that bounced less than this is pressed down again, not swung
+# our choice: share of the sole's length and width for the wished CoP. All of the length, for the disturbed landings;
+# half of the width: two feet far apart need no more, and 0.95 lets perturbed robots roll onto an edge (7 % fell)
+SOLE_SHARE = 0.95, 0.5
+PLANNED_FRICTION = 0.45  # our choice: below the lowest floor friction of the perturbed trials, 0.5
+NOMINAL_INERTIA = 5.0  # [kg m^2] our choice: pitch inertia of the landed robot, turns a momentum rate into rad/s^2
+STOP_MARGIN_RAD = 0.05  # our choice: a stop is respected this far before it
+STOP_HORIZON_S = 0.05  # our choice: a joint that would reach it within this time is turned back
+SPIN_FRICTION = 0.04  # [m] our choice: friction coefficient times the mean lever of the sole, about 0.07 m
+MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] our choice: an impact must not make wishes that drown all others
+UNBOUNDED = 1e20  # ProxQP's infinity
+TOLERANCE = 1e-6  # our choice: of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
+MAX_ITERATIONS = 300  # our choice: ten times what the hardest recorded QP took
+# our choice: 0.1 mN m, no motor resolves it. ProxQP's last digits depend on where its memory lies; without rounding the
+# same landing would differ from run to run
+TORQUE_DIGITS = 4
+FALLBACK_DAMPING = 3.0  # [N m s/rad] our choice: stable at 500 Hz on the lightest joint
+UNEVEN = np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(6))  # (12, 12), squared difference of the two wrenches
+
+
+@dataclass(frozen=True)
+class LandingGains:
+    """Natural frequencies [rad/s] of critically damped wishes, and their weights.
+
+    All values are our choice, found by landing from states around the plan's touchdown. Weights are
+    [1 / (m/s^2)^2] or [1 / (rad/s^2)^2].
+    """
+
+    com_rate_xy: float = 4.0  # the pendulum's own sqrt(g/z) = 4: faster would ask for a longer sole
+    com_rate_z: float = 6.0  # stops 2 m/s within 0.12 m
+    momentum_rate: float = 8.0
+    trunk_rate: float = 7.0
+    foot_rate: float = 25.0
+    posture_rate: float = 8.0
+    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)  # z: a late push meets the end of the knee's stroke
+    momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
+    trunk_weight: float = 0.5
+    foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning
+    swing_weight: tuple[float, float] = (1.0, 0.05)
+    arm_posture_weight: float = 0.02
+    leg_posture_weight: float = 0.002  # pitch joints; feet, CoM and trunk decide them already
+    lateral_posture_weight: float = 0.2  # yaw and roll joints
+    stop_weight: float = 1.0
+    uneven_weight: float = 0.02  # [1 / (100 N)^2] of the difference between both wrenches
+    wrench_weight: float = 1e-3  # [1 / (100 N)^2]
+    acceleration_weight: float = 1e-4
+
+
+class LandingController:
+    """Torques that catch and hold the robot; see the module's docstring.
+
+    Parameters
+    ----------
+    robot : the robot as it was planned; the controller knows nothing of perturbations.
+    reference : followed if given; otherwise spring-dampers lead to the middle of the feet at standing height.
+
+    Attributes
+    ----------
+    solves, failures : counts of QPs posed, and of those without a solution.
+    """
+
+    def __init__(self, robot: Robot, *, reference: Reference | None = None, gains: LandingGains | None = None):
+        self.reference, self.gains = reference, gains or LandingGains()
+        self.solves = self.failures = 0
+        self._terms = BodyTerms(robot, WRENCH_SCALE)
+        self._actuators = Actuators(robot)
+        self._posture_weight = self._posture_weights(robot)
+        self._corners = _corner_rows(robot)
+        self._last_contact = np.full(2, -np.inf)
+        self._solver = _new_solver(self._terms.nx, len(self._actuators.effort) + len(self._corners))
+
+    def _posture_weights(self, robot: Robot) -> np.ndarray:
+        g, weights = self.gains, {}
+        for role, pair in robot.joints.items():
+            weight = g.arm_posture_weight if role == "shoulder_pitch" else g.leg_posture_weight
+            weights.update(dict.fromkeys(pair, weight))
+        return np.array([weights.get(name, g.lateral_posture_weight) for name in robot.joint_names])
+
+    def torque(self, time: float, q: np.ndarray, v: np.ndarray, foot_force: np.ndarray) -> np.ndarray:
+        """Joint torques (nv - 6,) [N m], ``time`` after touchdown, from measured state and vertical foot forces."""
+        body = self._terms
+        body.update(q, v)
+        contact = self._contact(time, np.asarray(foot_force))
+        body.set_contact(contact)
+        x = self._solve(*self._wishes(time, q, v, contact), v)
+        tau = -FALLBACK_DAMPING * v[6:] + body.gravity_torque(contact) if x is None else body.torque(x)
+        return np.clip(np.round(tau, TORQUE_DIGITS), *self._actuators.range(v[6:]))
+
+    def _contact(self, time: float, foot_force: np.ndarray) -> np.ndarray:
+        """Which feet (2,) may carry weight: those that did a moment ago, and any that hovers just beside one."""
+        self._last_contact[foot_force > CONTACT_FORCE_N] = time
+        loaded = time - self._last_contact <= CONTACT_HOLD_S
+        if not loaded.any():
+            return loaded
+        height = self._terms.soles[:, 2]
+        return loaded | (height - height[loaded].min() < NEAR_GROUND_M)
+
+    # wishes ----------------------------------------------------------------------------------------------------
+
+    def _wishes(self, time, q, v, contact):
+        """Least-squares rows (k, nx), targets (k,), weights (k,); wishes on joint accelerations and their weights."""
+        g, body = self.gains, self._terms
+        ground = body.soles[contact] if contact.any() else body.soles
+        com_wish, momentum_wish = self._balance(time, ground.mean(axis=0))
+        trunk_rows = np.zeros((3, body.nx))
+        trunk_rows[:, 3:6] = np.eye(3)
+        rows = [body.force_rows, body.momentum_rows / NOMINAL_INERTIA, trunk_rows]
+        targets = [com_wish - body.gravity, momentum_wish / NOMINAL_INERTIA, self._trunk_wish(v)]
+        weights = [np.array(g.com_weight), np.full(3, g.momentum_weight), np.full(3, g.trunk_weight)]
+        if not contact.any():  # in the air neither CoM nor momentum can be asked for
+            weights[0], weights[1] = np.zeros(3), np.zeros(3)
+        for side in (0, 1):
+            rows.append(body.sole_rows[side])
+            targets.append(self._foot_wish(side, contact[side], ground[:, 2].min()) - body.sole_drift[side])
+            weights.append(np.repeat(g.foot_weight if contact[side] else g.swing_weight, 3))
+        return np.vstack(rows), np.concatenate(targets), np.concatenate(weights), *self._posture(q, v)
+
+    def _balance(self, time, foot_middle):
+        """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
+        g, body = self.gains, self._terms
+        rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
+        goal, speed, momentum = foot_middle + np.array([0.0, 0.0, body.standing_height]), np.zeros(3), np.zeros(3)
+        push, twist = np.zeros(3), np.zeros(3)
+        if self.reference is not None:
+            com, com_rate, momentum[1] = self.reference.at(time)
+            goal[[0, 2]], speed[[0, 2]] = foot_middle[[0, 2]] + com, com_rate
+            push[[0, 2]], twist[1] = self.reference.feed_forward(time)
+        wish = push + rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
+        return wish, twist + g.momentum_rate * (momentum - body.momentum)
+
+    def _trunk_wish(self, v):
+        """Angular acceleration (3,) of the trunk in its own axes: upright in roll and pitch, yaw only damped."""
+        g, trunk = self.gains, self._terms.trunk
+        heading = np.arctan2(trunk[1, 0], trunk[0, 0])
+        goal = pin.rpy.rpyToMatrix(0.0, self._terms.pitch_rest, heading)
+        return g.trunk_rate**2 * pin.log3(trunk.T @ goal) - 2 * g.trunk_rate * v[3:6]
+
+    def _foot_wish(self, side, standing, ground_height):
+        """Acceleration (6,) of a sole: flat and still; a foot in the air is also led down to the ground."""
+        g, body = self.gains, self._terms
+        attitude, twist = body.attitudes[side], body.twists[side]
+        goal = pin.rpy.rpyToMatrix(0.0, 0.0, np.arctan2(attitude[1, 0], attitude[0, 0]))
+        turn = g.foot_rate**2 * pin.log3(goal @ attitude.T) - 2 * g.foot_rate * twist[3:]
+        shift = -2 * g.foot_rate * twist[:3]
+        if not standing:
+            shift[:2] = -2 * g.foot_rate * (twist[:2] - body.com_velocity[:2])
+            shift[2] += g.foot_rate**2 * (ground_height - body.soles[side, 2])
+        return np.concatenate([np.clip(shift, -MAX_SHIFT, MAX_SHIFT), np.clip(turn, -MAX_TURN, MAX_TURN)])
+
+    def _posture(self, q, v):
+        """Wished joint accelerations (nv - 6,) and their weights; near a stop the wish is to turn back in time."""
+        g, motors = self.gains, self._actuators
+        wish = g.posture_rate**2 * (self._terms.posture_rest - q[7:]) - 2 * g.posture_rate * v[6:]
+        weight = self._posture_weight.copy()
+        ahead = q[7:] + v[6:] * STOP_HORIZON_S
+        for stop, side in ((motors.lower + STOP_MARGIN_RAD, 1.0), (motors.upper - STOP_MARGIN_RAD, -1.0)):
+            needed = 2 * (stop - ahead) / STOP_HORIZON_S**2
+            near = side * needed > 0
+            wish[near], weight[near] = np.clip(needed[near], -MAX_TURN, MAX_TURN), g.stop_weight
+        return wish, weight
+
+    # the QP ----------------------------------------------------------------------------------------------------
+
+    def _solve(self, rows, targets, weights, joint_wish, joint_weight, v):
+        """Unknowns x (nx,) of the QP, or None if the solver does not report success."""
+        g, body, nv = self.gains, self._terms, self._terms.nv
+        weighted = rows * weights[:, None]  # (k, nx)
+        hessian = weighted.T @ rows
+        linear = -weighted.T @ targets
+        diagonal = np.concatenate([np.full(nv, g.acceleration_weight), np.full(12, g.wrench_weight)])
+        diagonal[6:nv] += joint_weight
+        linear[6:nv] -= joint_weight * joint_wish
+        hessian[np.diag_indices(body.nx)] += diagonal
+        hessian[nv:, nv:] += g.uneven_weight * UNEVEN
+        low, high = self._actuators.range(v[6:])
+        matrix = np.vstack([body.torque_rows, self._corners])
+        rest = np.zeros(len(self._corners))
+        lower = np.concatenate([low - body.torque_offset, rest])
+        upper = np.concatenate([high - body.torque_offset, rest + UNBOUNDED])
+        equations = (body.base_rows, -body.base_offset)
+        self.solves += 1
+        if self.solves == 1:
+            self._solver.init(hessian, linear, *equations, matrix, lower, upper)
+        else:
+            self._solver.update(hessian, linear, *equations, matrix, lower, upper)
+        self._solver.solve()
+        if self._solver.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            self.failures += 1
+            return None
+        return self._solver.results.x
+
+
+def _new_solver(unknowns: int, inequalities: int):
+    """ProxQP: on 2,600 recorded landing QPs it solved all, in 26 us in the middle (quadprog 35 us, PIQP 93 us)."""
+    solver = proxqp.dense.QP(unknowns, 6, inequalities)
+    solver.settings.eps_abs = TOLERANCE
+    solver.settings.max_iter = MAX_ITERATIONS
+    return solver
+
+
+def _corner_rows(robot: Robot) -> np.ndarray:
+    """(20, nx) rows r with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
+    foot, mu, spin = robot.foot, PLANNED_FRICTION / np.sqrt(2), SPIN_FRICTION
+    half_length, half_width = SOLE_SHARE[0] * (foot.toe - foot.heel) / 2, SOLE_SHARE[1] * foot.half_width
+    one = []
+    for column, reach in ((0, mu), (1, mu), (3, half_width), (4, half_length), (5, spin)):
+        for sign in (1.0, -1.0):
+            row = np.zeros(6)
+            row[2], row[column] = reach, sign
+            one.append(row)
+    nv = robot.model.nv
+    rows = np.zeros((20, nv + 12))
+    rows[:10, nv : nv + 6] = one
+    rows[10:, nv + 6 :] = one
+    return rows

@@ -1,0 +1,269 @@
+"""A landing planned anew while it goes on: the impact of a flip leaves the robot elsewhere than its plan expected.
+
+The soles of a backflip tilt up, the ankles meet their stop, and for a tenth of a second the ground pushes at the toes
+only. What stage 1 planned for flat soles is then off by 5 cm and more, and a controller that still follows it pushes
+CoM and trunk towards places that this robot cannot hold. From the measured state the rest is planned as the landing
+was: it takes its time too, so the robot follows the older plan until the newer one is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import thread_time
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import JumplabError
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.sim.scene import Scene
+from jumplab.sim.world import STEP_S
+from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
+from jumplab.task import GRAVITY
+
+# reference ------------------------------------------------------------------------------------------
+LEAD_S = 0.15  # our choice: three times what the solve takes on one core of a laptop
+KEPT_PLANNERS = 4  # our choice: robots of one session; a planner holds a few megabytes
+
+
+class Reference(Protocol):
+    """A planned landing: anything that knows its CoM and momentum at a time, as :class:`LandingReference` does."""
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,) from the middle of the soles, its velocity (2,), and L about the pitch axis."""
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) [m/s^2] and rate of L [N m]."""
+
+
+@dataclass(frozen=True)
+class LandingReference:
+    """A landing to follow, sampled: CoM from the middle between the soles.
+
+    Attributes
+    ----------
+    t : (N,) time since touchdown [s]; the last sample holds for ever.
+    com, com_velocity : (N, 2) x and z [m, m/s].
+    L : (N,) angular momentum about the pitch axis [kg m^2/s].
+    com_acceleration, L_rate : (N, 2), (N,) what is fed forward [m/s^2, N m]; nothing is if None.
+    """
+
+    t: np.ndarray
+    com: np.ndarray
+    com_velocity: np.ndarray
+    L: np.ndarray
+    com_acceleration: np.ndarray | None = None
+    L_rate: np.ndarray | None = None
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,), its velocity (2,) and momentum at ``time`` since touchdown."""
+        x, z, dx, dz, momentum = (
+            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
+        )
+        return np.array([x, z]), np.array([dx, dz]), float(momentum)
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) and rate of L at ``time`` since touchdown, zero after the last sample."""
+        push, twist = np.zeros(2), 0.0
+        if time < self.t[-1] and self.com_acceleration is not None:
+            push = np.array([np.interp(time, self.t, column) for column in self.com_acceleration.T])
+        if time < self.t[-1] and self.L_rate is not None:
+            twist = float(np.interp(time, self.t, self.L_rate))
+        return push, twist
+
+
+LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
+
+_planners: dict[str, LandingPlanner] = {}
+
+
+def landing_planner(robot: Robot) -> LandingPlanner:
+    """The landing planner of ``robot``, built once (0.3 s)."""
+    if robot.hash not in _planners:
+        while len(_planners) >= KEPT_PLANNERS:
+            del _planners[next(iter(_planners))]
+        _planners[robot.hash] = LandingPlanner(robot)
+    return _planners[robot.hash]
+
+
+class Forecast:
+    """The touchdown that a measured flight leads to.
+
+    Parameters
+    ----------
+    robot, tape : as planned; the tape's last row is the posture to land in.
+    scene : ground.
+    """
+
+    def __init__(self, robot: Robot, tape: Tape, scene: Scene):
+        self._robot, self._model, self._data, self._scene = robot, robot.model, robot.model.createData(), scene
+        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        self._q, self._v = tape.q[-1].copy(), tape.v[-1].copy()
+        com, soles = self._com_and_soles(self._q)
+        self._above, self._ahead = float(com[2] - soles[2]), float(soles[0] - com[0])
+
+    def _com_and_soles(self, q) -> tuple[np.ndarray, np.ndarray]:
+        com = pin.centerOfMass(self._model, self._data, q, False).copy()
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return com, np.mean([self._data.oMf[f].act(self._robot.foot.center) for f in self._frames], axis=0)
+
+    def time_left(self, q: np.ndarray, v: np.ndarray) -> float:
+        """Time until the soles meet the ground [s], from a measured state in flight; inf if they never do."""
+        pin.centerOfMass(self._model, self._data, q, v)
+        (x, _, z), (vx, _, vz) = self._data.com[0], self._data.vcom[0]
+        left = 0.0
+        for _ in range(2):  # the ground's height depends on where, and so on when
+            drop = z - self._above - self._scene.top_at(x + vx * left + self._ahead)
+            root = vz**2 + 2 * GRAVITY * drop
+            if root < 0:
+                return np.inf
+            left = (vz + np.sqrt(root)) / GRAVITY
+        return float(left)
+
+    def state(
+        self, q: np.ndarray, v: np.ndarray, pitch_error: float, correction: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured state in flight.
+
+        Parameters
+        ----------
+        pitch_error : of the trunk, now [rad]; it stays.
+        correction : (nv - 6,) angles that will have been added to the tape by then.
+        """
+        model, data = self._model, self._data
+        pin.ccrba(model, data, q, v)
+        speed, momentum = data.vcom[0].copy(), data.hg.angular[1]
+        speed[2] -= GRAVITY * self.time_left(q, v)
+        end, rates = self._q.copy(), self._v.copy()
+        turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch_error, 0.0))
+        end[3:7] = (turn * pin.Quaternion(end[6], end[3], end[4], end[5])).coeffs()
+        if correction is not None:
+            end[7:] += correction
+        # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM flies on
+        attitude = pin.Quaternion(end[6], end[3], end[4], end[5]).toRotationMatrix()
+        pin.ccrba(model, data, end, rates)
+        spin = np.array([0.0, (momentum - data.hg.angular[1]) / data.Ig.inertia[1, 1], 0.0])
+        rates[3:6] += attitude.T @ spin
+        pin.centerOfMass(model, data, end, rates)
+        rates[:3] += attitude.T @ (speed - data.vcom[0])
+        return end, rates
+
+
+@dataclass
+class LandingAhead:
+    """Where the landing controller's reference comes from, and what became of it.
+
+    Attributes
+    ----------
+    source : "planned" in flight by stage 1, "spring" (spring-dampers to the stance) or "given" by the caller.
+    followed : what was really followed, once decided; "spring" also if the planner found no landing.
+    """
+
+    source: str
+    followed: str | None = None
+    planned_s: float | None = None
+    time_left_s: float | None = None
+    solve_s: float | None = None
+    reason: str | None = None
+
+    def plan(self, robot: Robot, q: np.ndarray, v: np.ndarray, time: float, time_left: float) -> LandingPlan | None:
+        """Stage 1's landing from the forecast touchdown (q, v), None if there is none."""
+        planner = landing_planner(robot)
+        self.planned_s, self.time_left_s, began = time, time_left, thread_time()
+        try:
+            plan = planner.plan(touchdown_of_state(robot, q, v))
+        except JumplabError as e:
+            self.followed, self.reason, plan = "spring", str(e), None
+        else:
+            self.followed = "planned"
+        self.solve_s = thread_time() - began
+        return plan
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        in_time = None if self.solve_s is None else self.solve_s <= max(0.0, self.time_left_s)
+        return {
+            "asked": self.source, "followed": self.followed or self.source, "planned_at_s": self.planned_s,
+            "time_left_s": self.time_left_s, "solve_s": self.solve_s, "in_time": in_time, "reason": self.reason,
+        }  # fmt: skip
+
+
+# replan ------------------------------------------------------------------------------------------
+FIRST_S = 0.15  # our choice: after touchdown; before, the soles of flips are still tilted, and a plan knows flat ones
+EVERY_S = 0.10  # our choice: twice what a solve takes
+UNTIL_S = 1.2  # our choice: the longest landing that is planned; afterwards the controller leads to the stance
+LATENCY_S = 0.05  # our choice: before a new plan is followed, about what its solve takes
+OFF_M = 0.03  # our choice: of the capture point; less is what the controller's own feedback mends
+LEAST_HEIGHT_M = 0.3  # our choice: of the CoM, where the capture point of a squatting robot is still told
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The rest of a landing.
+
+    Attributes
+    ----------
+    plan : its time begins with zero.
+    began : its time zero, since touchdown [s].
+    """
+
+    plan: Reference
+    began: float
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
+        return self.plan.at(max(time - self.began, 0.0))
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) and rate of L at ``time`` since touchdown."""
+        return self.plan.feed_forward(max(time - self.began, 0.0))
+
+
+class Replan:
+    """Hands out the landing to follow: the one from before the touchdown, or the latest one planned after it.
+
+    Attributes
+    ----------
+    made, refused : counts of plans, and of states from which stage 1 found none.
+    slowest_s : the longest solve [s] of processor time.
+    """
+
+    def __init__(self, robot: Robot):
+        self._robot = robot
+        self._next: Rest | None = None
+        self._due = FIRST_S
+        self.made = self.refused = 0
+        self.slowest_s = 0.0
+
+    def follow(self, time: float, q: np.ndarray, v: np.ndarray, reference: Reference) -> Reference:
+        """What to follow at ``time`` since touchdown [s] from the measured state; ``reference`` is followed so far."""
+        if self._next is not None and time >= self._next.began + LATENCY_S - STEP_S / 2:
+            reference, self._next = self._next, None
+        if self._due - STEP_S / 2 <= time <= UNTIL_S:
+            self._due += EVERY_S
+            now = touchdown_of_state(self._robot, q, v, impact=False)
+            if abs(_off(now, *reference.at(time)[:2])) > OFF_M:
+                self._plan(now, time)
+        return reference
+
+    def _plan(self, now: Touchdown, time: float) -> None:
+        began = thread_time()
+        try:
+            self._next = Rest(landing_planner(self._robot).plan(now), time)
+            self.made += 1
+        except JumplabError:  # from here stage 1 knows no landing; the older one is the best there is
+            self.refused += 1
+        self.slowest_s = max(self.slowest_s, thread_time() - began)
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        return {"made": self.made, "refused": self.refused, "slowest_s": self.slowest_s}
+
+
+def _off(now: Touchdown, com: np.ndarray, velocity: np.ndarray) -> float:
+    """Distance between the capture points x + v_x / sqrt(g / z) of a state and of a plan [m]."""
+    rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))
+    return float(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate)

@@ -1,0 +1,218 @@
+"""The launch QP (JL-*, Sec. IV-A): unknowns X = [F_ext^js (12); theta'' (nv)]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
+from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
+from jumplab.stages.joint_qp.reference import LaunchReference
+from jumplab.stages.joint_qp.settings import Options
+
+WRENCH = 12
+FOOT_ROWS = ("F_z >= 0", "friction +x", "friction -x", "friction +y", "friction -y", "CoP left of right edge",
+             "CoP right of left edge", "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LaunchTarget:
+    """What one launch step asks for.
+
+    Attributes
+    ----------
+    com_acceleration : c''_ref, feed-forward + PD (3,) [m/s^2].
+    momentum_rate : rate of the centroidal angular momentum, L'_ref + feedback in the middle (3,) [N m].
+    inertia_accel : rho''_ref [kg m^2/s^2].
+    toe_acceleration : p''_foot of the tiptoes, zero but for the drift control (2, 6), linear then angular.
+    heel_floor : least vertical acceleration of the heels (2,) [m/s^2]; -inf where the row is off.
+    joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
+    symmetry : right side of the symmetry rows, zero but for the drift control (k,).
+    on_toes : heel up, CoP at the toe.
+    inertia_weight : of the inertia's term at this step, see :class:`~jumplab.stages.joint_qp.settings.LaunchWeights`.
+    step : its length [s].
+    """
+
+    com_acceleration: np.ndarray
+    momentum_rate: np.ndarray
+    inertia_accel: float
+    toe_acceleration: np.ndarray
+    heel_floor: np.ndarray
+    joints: np.ndarray
+    trunk: np.ndarray
+    symmetry: np.ndarray
+    on_toes: bool
+    inertia_weight: float
+    step: float
+
+
+class LaunchQp:
+    """Targets and matrices of the launch, step by step. Pure: nothing here solves or remembers a state.
+
+    Parameters
+    ----------
+    body : nine-link quantities.  q0 : (nq,) configuration at the start, soles flat.
+    reference : stage 1's launch.  options : gains, weights, limits, form.
+    toe_s : length of the toe phase [s]; None starts it where the reference's CoP stays at the toe.
+
+    Attributes
+    ----------
+    roots : square roots of the weights of the CoM's rows (3,) and of the momentum's (6,), feet flat and on the toes.
+    inertia_weights : (n,) weight of the inertia's term by step.  steps : (n,) their lengths [s].
+    """
+
+    name = "launch"
+
+    def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
+        self.body, self.reference, self.options = body, reference, options
+        self.nominal = swung_arms(body, q0, options.arm_rad)
+        self.t = reference.t
+        self.steps = np.diff(self.t)
+        start = body.terms(q0, np.zeros(body.nv))
+        self.toe0, self.pivot = start.toe, start.sole.mean(0)
+        self.joints = JointRows(body, q0, options.limits)
+        foot, form = body.robot.foot, options.form
+        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s) & (form.contact == "consistent")
+        # on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
+        pairs = ("hip",) if form.pairs == "hips" else ("hip", "shoulder")
+        self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
+        w = options.launch
+        com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
+        force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
+        self.roots = tuple(zip(com, force, strict=True))
+        self.inertia_weights = self._inertia_weights()
+        self.layout = self._layout(pairs)
+        self._fixed = self._fixed_rows()
+
+    def _layout(self, pairs) -> Layout:
+        nv, form = self.body.nv, self.options.form
+        names = self.body.robot.joint_names
+        axes = ("x", "y", "z", "rx", "ry", "rz")
+        wrench = [f"{s} {a}" for s in SIDES for a in ("fx", "fy", "fz", "mx", "my", "mz")]
+        cost = [("com", "xyz"), ("force", "xyz"), ("moment", "xyz"), ("inertia", ["rho"]), ("joints", names),
+                ("trunk turn", "xyz"), ("wrench", wrench), ("acceleration", [str(i) for i in range(nv)])]  # fmt: skip
+        contact = [f"{s} {a}" for s in SIDES for a in ("x", "y", "z", "rx", "rz")]
+        mirror = self.body.pair_names(pairs)
+        rows = [("base dynamics", axes[: form.base_rows]), ("tiptoe", contact)]
+        rows += [("foot pitch or toe moment", SIDES)] if form.contact == "consistent" else []
+        rows += [("symmetry", mirror)]
+        ground = [("ground", [f"{s} {r}" for s in SIDES for r in FOOT_ROWS]), ("heel", SIDES)]
+        steady = ("joints", "trunk turn", "wrench", "acceleration")
+        return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
+
+    def _inertia_weights(self) -> np.ndarray:
+        """(n,) by step: the flat feet's, fading geometrically to the toes' before the heel rises."""
+        w, start = self.options.launch, self.t[:-1]
+        heel_off = start[self.on_toes][0] if self.on_toes.any() else self.t[-1]
+        left = np.clip((heel_off - start) / w.inertia_fade_s, 0.0, 1.0)
+        return np.where(self.on_toes, w.inertia_toe, w.inertia_toe * (w.inertia / w.inertia_toe) ** left)
+
+    def _fixed_rows(self):
+        """Matrices with all rows that never change filled in, and the weights' roots."""
+        lay, w, nv = self.layout, self.options.launch, self.body.nv
+        n = WRENCH + nv
+        A, E, G, R = (np.zeros((lay.size(k), n)) for k in "AEGR")
+        A[lay.at("joints"), WRENCH + 6 :] = np.sqrt(w.posture) * np.eye(nv - 6)
+        A[lay.at("trunk turn"), WRENCH + 3 : WRENCH + 6] = np.sqrt(w.trunk) * np.eye(3)
+        A[lay.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
+        A[lay.at("acceleration"), WRENCH:] = np.sqrt(w.acceleration) * np.eye(nv)
+        E[lay.at("symmetry"), WRENCH:] = self.S
+        R[nv - 6 :, WRENCH + 6 :] = np.eye(nv - 6)
+        rows = self._ground_rows(False), self._ground_rows(True)
+        return A, E, G, R, rows
+
+    def _ground_rows(self, on_toes: bool) -> np.ndarray:
+        """(22, 12) unilateral, friction and CoP rows on F; rows that are off stay zero, 0 <= 0."""
+        lim, foot = self.options.limits, self.body.robot.foot
+        one = np.zeros((len(FOOT_ROWS), 6))  # columns fx fy fz mx my mz, moments about the tiptoe
+        if lim.unilateral:
+            one[0, 2] = -1.0
+        if lim.friction is not None:
+            for i, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1))):
+                one[1 + i, axis], one[1 + i, 2] = sign, -lim.friction
+            for i, sign in ((7, 1), (8, -1)):
+                one[i, 5], one[i, 2] = sign, -lim.friction * foot.half_width
+        if lim.cop_margin_m is not None:
+            one[5, 3], one[5, 2] = -1.0, -(foot.half_width - lim.cop_margin_m)
+            one[6, 3], one[6, 2] = 1.0, -(foot.half_width - lim.cop_margin_m)
+            if not on_toes:  # CoP = toe - my / fz
+                one[9, 4], one[9, 2] = -1.0, lim.cop_margin_m
+                one[10, 4], one[10, 2] = 1.0, -(foot.toe - foot.heel - lim.cop_margin_m)
+        return np.kron(np.eye(2), one)
+
+    def target(self, k: int, terms: FullMotion) -> LaunchTarget:
+        """Feed-forward + PD of step ``k`` from the quantities at its start."""
+        ref, gain, form = self.reference, self.options.gains, self.options.form
+        com = ref.com.command(k, terms.com - self.pivot, terms.com_velocity, gain.com)
+        turn = -gain.momentum.damping * terms.momentum[3:]
+        turn[1] = ref.momentum.command(k, 0.0, terms.momentum[4], gain.momentum)
+        rho = ref.inertia.command(k, terms.rho, terms.rho_rate, gain.inertia)
+        error = np.zeros((2, 6))  # of the tiptoes
+        error[:, :3] = terms.toe - self.toe0
+        side = terms.foot_rotation[:, :, 1]  # the feet's lateral axes
+        error[:, 3], error[:, 4], error[:, 5] = side[:, 2], terms.foot_pitch, -side[:, 0]
+        speed = np.concatenate([terms.toe_velocity, terms.foot_spin], 1)
+        contact = -gain.contact.stiffness * error - gain.contact.damping * speed
+        joints, trunk = accelerations(terms, self.nominal, gain.posture, gain.trunk)
+        asymmetry = self.S[:, 6:] @ terms.q[7:], self.S @ terms.v
+        mirror = -gain.contact.stiffness * asymmetry[0] - gain.contact.damping * asymmetry[1]
+        if form.hip_rule == "sum":
+            mirror = np.zeros(len(self.S))
+        on_toes = bool(self.on_toes[k])
+        floor = self._heel_floor(terms, on_toes)
+        weight, step = float(self.inertia_weights[k]), float(self.steps[k])
+        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight, step)
+
+    def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
+        gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
+        if form.contact == "consistent" and not on_toes:
+            return np.full(2, -np.inf)  # the flat foot's own row holds the heel
+        if form.heel == "always":
+            return np.zeros(2)
+        height = terms.heel[:, 2] - self.toe0[:, 2]
+        floor = -gain.stiffness * height - gain.damping * terms.heel_velocity[:, 2]
+        return np.where(height < limits.near_ground_m, floor, -np.inf)
+
+    def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
+        """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
+        lay, w, form, body = self.layout, self.options.launch, self.options.form, self.body
+        A0, E0, G0, R0, ground = self._fixed
+        A, E, G, R = A0.copy(), E0.copy(), G0.copy(), R0.copy()
+        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
+        lower, upper = np.empty(len(R)), np.empty(len(R))
+        half = 1.0 if form.half else 0.5  # without the 1/2 the optimum of X^T W X + f X is half of b
+        com, force = self.roots[target.on_toes]
+        A[:3, WRENCH:] = com[:, None] * terms.A_c
+        b[:3] = half * com * (target.com_acceleration - terms.B_c)
+        A[3:9, :WRENCH] = force[:, None] * terms.A_f
+        b[3:9] = half * force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
+        root = np.sqrt(target.inertia_weight)
+        A[9, WRENCH:] = root * terms.J_rho
+        b[9] = root * (target.inertia_accel - terms.drift_rho)
+        b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
+        b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
+        n = form.base_rows
+        E[:n, :WRENCH], E[:n, WRENCH:], e[:n] = -terms.J[:, :n].T, terms.M[:n], -terms.H[:n]  # base dynamics
+        self._contact(E, e, n, terms, target)
+        e[lay.at("symmetry")] = target.symmetry
+        G[: 2 * len(FOOT_ROWS), :WRENCH] = ground[target.on_toes]
+        for side in np.flatnonzero(np.isfinite(target.heel_floor)):
+            G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
+            h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
+        self.joints.fill(R, lower, upper, terms, start, target.step, WRENCH)
+        return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
+
+    def _contact(self, E, e, first, terms, target):
+        """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""
+        rows = [0, 1, 2, 3, 5]
+        E[first : first + 10, WRENCH:] = terms.J_toe[:, rows].reshape(10, -1)
+        e[first : first + 10] = (target.toe_acceleration - terms.drift_toe)[:, rows].ravel()
+        if self.options.form.contact == "free":
+            return
+        last = slice(first + 10, first + 12)
+        if target.on_toes:
+            E[[first + 10, first + 11], [4, 10]] = 1.0
+        else:
+            E[last, WRENCH:] = terms.J_toe[:, 4]
+            e[last] = (target.toe_acceleration - terms.drift_toe)[:, 4]

@@ -1,0 +1,187 @@
+"""The one QP shape of stage 2, its named rows, and the rows that both phases share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
+from jumplab.robot import SAGITTAL_JOINTS
+from jumplab.stages.joint_qp.settings import Gain, Limits
+
+OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # our choice: [N m], [rad/s] bounds of a row that is switched off, beyond all motion
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and one label per row.
+
+    ``steady`` names the cost blocks whose rows of A, being weights alone, never change.
+    """
+
+    blocks: dict
+    labels: dict
+    steady: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, steady: tuple[str, ...] = (), **matrices) -> Layout:
+        """From matrix -> list of (block name, row labels)."""
+        blocks, labels = {}, {}
+        for matrix, rows in matrices.items():
+            labels[matrix] = []
+            for name, own in rows:
+                at = len(labels[matrix])
+                blocks[name] = (matrix, slice(at, at + len(own)))
+                labels[matrix] += [f"{name} {label}".strip() for label in own]
+        return cls(blocks, {k: tuple(v) for k, v in labels.items()}, steady)
+
+    def size(self, matrix: str) -> int:
+        """Number of rows of a matrix."""
+        return len(self.labels[matrix])
+
+    def steady_rows(self) -> np.ndarray:
+        """(rows of A,) True where they never change."""
+        out = np.zeros(self.size("A"), bool)
+        for name in self.steady:
+            out[self.at(name)] = True
+        return out
+
+    def at(self, name: str) -> slice:
+        """Rows of a block."""
+        return self.blocks[name][1]
+
+
+@dataclass(frozen=True, slots=True)
+class StepQp:
+    """min 1/2 |A x - b|^2  subject to  E x = e,  G x <= h,  lower <= R x <= upper.
+
+    x is X = [F_ext^js (12); theta'' (nv)] in launch and theta'' (nv) in flight; A and b carry the square roots of the
+    weights. ``layout`` names every row.
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    E: np.ndarray
+    e: np.ndarray
+    G: np.ndarray
+    h: np.ndarray
+    R: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    layout: Layout = field(repr=False)
+
+    def block(self, name: str) -> tuple[np.ndarray, ...]:
+        """Matrix and right side (or lower and upper side) of the rows of one named block."""
+        matrix, rows = self.layout.blocks[name]
+        sides = {"A": ("A", "b"), "E": ("E", "e"), "G": ("G", "h"), "R": ("R", "lower", "upper")}
+        return tuple(getattr(self, x)[rows] for x in sides[matrix])
+
+    def objective(self, x: np.ndarray) -> float:
+        """Value of the cost at ``x``."""
+        r = self.A @ x - self.b
+        return float(r @ r) / 2
+
+    def violations(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """How far ``x`` breaks each row of E, G and R, in the row's own unit (0 where it does not)."""
+        box = self.R @ x
+        return {
+            "E": np.abs(self.E @ x - self.e),
+            "G": np.maximum(self.G @ x - self.h, 0.0),
+            "R": np.maximum(np.maximum(box - self.upper, self.lower - box), 0.0),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Configuration (nq,), rates (nv,) at the start of a step, and accelerations (nv,): the last known, or a guess."""
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+
+
+class JointRows:
+    """Rows on the joints that both phases share: torque, and speed and range as bounds on the acceleration."""
+
+    def __init__(self, body: FullBody, nominal: np.ndarray, limits: Limits):
+        self.limits = limits
+        actuators = [body.robot.actuators[name] for name in body.robot.joint_names]
+        column = {k: np.array([a[k] for a in actuators]) for k in ("lower", "upper", "speed", "effort", "corner_speed")}
+        margin = limits.range_margin_rad or 0.0
+        inertia = np.diag(body.terms(nominal, np.zeros(body.nv)).M)[6:]
+        self.brake = limits.stop_share * column["effort"] / inertia  # [rad/s^2]
+        self.lower, self.upper = column["lower"] + margin, column["upper"] - margin
+        off = np.full(len(actuators), OFF_SPEED)
+        self.speed = off if limits.speed_share is None else column["speed"] * limits.speed_share
+        self.effort = column["effort"] * (limits.torque_share or 1.0)
+        self.full_speed, self.corner = column["speed"], column["corner_speed"]
+
+    def torque(self, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest torque (n,) available at joint rates: full to the corner speed, then a line to zero."""
+        if self.limits.torque_share is None:
+            return np.full(len(rates), -OFF_TORQUE), np.full(len(rates), OFF_TORQUE)
+        left = (self.full_speed - np.abs(rates)) / (self.full_speed - self.corner)
+        driving = self.effort * np.minimum(np.maximum(left, 0.0), 1.0)
+        return np.where(rates < 0, -driving, -self.effort), np.where(rates > 0, driving, self.effort)
+
+    def acceleration(self, angles: np.ndarray, rates: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest joint acceleration (n,) that keeps speed and range after one step.
+
+        A joint may approach its stop at most at ``stop_rate`` times the angle left, and only as fast as it can brake.
+        """
+        low, high = -self.speed, self.speed
+        if self.limits.range_margin_rad is not None:
+            ahead = angles + rates * step
+            low = np.maximum(low, -self._approach(ahead - self.lower))
+            high = np.minimum(high, self._approach(self.upper - ahead))
+        return (low - rates) / step, (high - rates) / step
+
+    def _approach(self, left: np.ndarray) -> np.ndarray:
+        """Highest speed (n,) towards a stop at distances ``left``."""
+        left = np.maximum(left, 0.0)
+        return np.minimum(self.limits.stop_rate * left, np.sqrt(2 * self.brake * left))
+
+    def fill(
+        self,
+        R: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        terms: FullTerms,
+        start: State,
+        step: float,
+        first: int,
+    ) -> None:
+        """Write 2 n rows: torque M theta'' + H - J^T F, then acceleration; theta'' begins at column ``first`` of x."""
+        n = len(self.speed)
+        R[:n, first:] = terms.M[6:]
+        if first:
+            R[:n, :first] = -terms.J[:, 6:].T
+        low, high = self.torque(terms.v[6:])
+        lower[:n], upper[:n] = low - terms.H[6:], high - terms.H[6:]
+        lower[n:], upper[n:] = self.acceleration(start.q[7:], start.v[6:], step)
+
+    @staticmethod
+    def labels(body: FullBody) -> list[tuple[str, list[str]]]:
+        """Blocks of the rows that :meth:`fill` writes."""
+        names = list(body.robot.joint_names)
+        return [("torque", names), ("speed and range", names)]
+
+
+def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
+    """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
+    robot, q = body.robot, q0.copy()
+    for name, row, sign in robot.role_signs():
+        if SAGITTAL_JOINTS[row] == "shoulder":
+            q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
+    return q
+
+
+def accelerations(terms: FullMotion, nominal: np.ndarray, posture: Gain, trunk: Gain) -> tuple[np.ndarray, np.ndarray]:
+    """PD accelerations of the joints (nv - 6,) towards ``nominal`` (nq,), and of the trunk (3,), in base axes."""
+    joints = posture.stiffness * (nominal[7:] - terms.q[7:]) - posture.damping * terms.v[6:]
+    vector, scalar, wish, wish_scalar = terms.q[3:6], terms.q[6], nominal[3:6], nominal[6]
+    turn = wish_scalar * vector - scalar * wish - skew(wish) @ vector  # of the quaternion from nominal to q
+    near = 1.0 if wish_scalar * scalar + wish @ vector >= 0 else -1.0  # q and -q are the same orientation
+    return joints, -trunk.stiffness * 2 * near * turn - trunk.damping * terms.v[3:6]

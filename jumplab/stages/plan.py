@@ -1,0 +1,137 @@
+"""A finished plan: what it holds, and what ``summary.json`` says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from jumplab.io.tape import Tape
+from jumplab.ocp.nlp import Solution, Statistics
+from jumplab.robot import Robot
+from jumplab.stages.joint_qp import JointPlan
+from jumplab.stages.srmp import SrmpPlan
+from jumplab.stages.whole_body import WholeBodyPlan
+from jumplab.stages.whole_body.planner import platform_edge_m
+from jumplab.task import JumpTask
+
+NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """One line of the table of stages: what it cost. Times in seconds, wall clock."""
+
+    stage: str
+    iterations: int
+    build_s: float
+    solve_s: float
+
+
+@dataclass(frozen=True)
+class JumpPlan:
+    """A finished plan.
+
+    Attributes
+    ----------
+    task, robot, method : what was asked, of whom, and how it was planned.
+    tape : the 1 kHz tape of the full robot.
+    srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
+    whole_body : result of stage 3 or of the direct planner; None if the plan was read from a result folder.
+    statistics : one row per stage.
+    skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
+    stored : the summary that the plan was read with; None if it has just been made.
+    """
+
+    task: JumpTask
+    robot: Robot
+    method: str
+    tape: Tape
+    srmp: SrmpPlan | None
+    joints: JointPlan | None
+    whole_body: WholeBodyPlan | None
+    statistics: tuple[StageRow, ...]
+    skipped: str | None = None
+    stored: Mapping[str, Any] | None = None
+
+    @classmethod
+    def on_file(cls, tape: Tape, robot: Robot, summary: Mapping[str, Any]) -> JumpPlan:
+        """The plan of a result folder: its tape and its summary; the stages' own results are not on file."""
+        task = JumpTask(**{f.name: summary["target"][f.name] for f in fields(JumpTask)})
+        rows = tuple(StageRow(**row) for row in summary["stages"])
+        return cls(task, robot, summary["method"], tape, None, None, None, rows, summary.get("skipped"), summary)
+
+    @property
+    def planned_distance_m(self) -> float:
+        """Travel of the toe over the whole tape [m]."""
+        toe = self.tape.extra["planar_toe"]
+        return float(toe[-1, 0] - toe[0, 0])
+
+    @property
+    def planned_rise_m(self) -> float:
+        """CoM apex minus CoM at take-off [m], on the tape."""
+        com = self.tape.extra["planar_com"][self.tape.takeoff_index :, 1]
+        return float(com.max() - com[0])
+
+    @property
+    def weights(self) -> dict[str, dict[str, float]]:
+        """Cost weights of the stages, as solved: stage -> "phase/term" -> weight."""
+        if self.stored is not None:
+            return self.stored["manifest"]["weights"]
+        found = {"whole body": _weights(self.whole_body.solution)}
+        if self.joints is not None:
+            o = self.joints.options
+            qps = {f"{phase}/{k}": w for phase in ("launch", "flight") for k, w in vars(getattr(o, phase)).items()}
+            found = {"joint map": qps, **found}
+        if self.srmp is not None:
+            found = {"SRMP": _weights(self.srmp.solution), **found}
+        return found
+
+    @property
+    def solvers(self) -> dict[str, dict]:
+        """What the solvers said: stage -> status, iterations, size, cost, worst re-evaluated residual (scaled)."""
+        if self.stored is not None:
+            return self.stored["manifest"]["solvers"]
+        found = {} if self.srmp is None else {"SRMP": _solver(self.srmp.solution.statistics)}
+        if self.joints is not None:
+            s = self.joints.statistics
+            found["joint map"] = {"solver": s.method, "problems": s.steps, "iterations": s.iterations,
+                                  "residual": s.worst_residual}  # fmt: skip
+        return {**found, "whole body": _solver(self.whole_body.solution.statistics)}
+
+    @property
+    def summary(self) -> dict:
+        """What ``summary.json`` says: target, method, results, cost of the stages; plain types."""
+        if self.stored is not None:
+            return dict(self.stored)
+        task = {f: getattr(self.task, f) for f in ("distance_m", "height_m", "platform_m", "rotation_rad", "gravity")}
+        return {
+            "target": task,
+            "method": self.method,
+            "robot": {"name": self.robot.name, "hash": self.robot.hash, "mass_kg": self.robot.total_mass},
+            "planned_distance_m": self.planned_distance_m,
+            "planned_rise_m": self.planned_rise_m,
+            "launch_s": self.whole_body.launch_s,
+            "flight_s": self.whole_body.flight_s,
+            "platform_edge_m": platform_edge_m(self.task, self.robot),
+            "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
+            "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
+            "stages": [vars(row) for row in self.statistics],
+            **({"skipped": self.skipped} if self.skipped else {}),
+            "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
+        }
+
+
+def _solver(s: Statistics) -> dict:
+    times = ("build_s", "solve_s")  # these stand in the table of stages
+    return {"solver": "ipopt", **{k: v for k, v in vars(s).items() if k not in times}}
+
+
+def _weights(solution: Solution) -> dict[str, float]:
+    return {f"{row['phase']}/{row['name']}": row["weight"] for row in solution.cost_shares}
+
+
+def _peaks(names, values) -> dict[str, float]:
+    return {str(n): float(x) for n, x in zip(names, np.abs(values).max(axis=0), strict=True)}

@@ -1,0 +1,232 @@
+"""The named costs and constraints of stage 1 (Sec. III of the paper); pure, nothing here solves."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from jumplab.models.srmp import SrmpState
+from jumplab.ocp.derivatives import chain
+from jumplab.ocp.problem import Point, Term
+from jumplab.robot.reach import Reach
+from jumplab.stages.srmp.settings import SrmpSettings
+from jumplab.task import GRAVITY
+
+CROUCH_SMOOTHING_M = 0.02  # our choice: the positive part of a depth, rounded over this much
+QUARTERS = (0.25, 0.5, 0.75)
+GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
+
+
+def srmp_state(p: Point, mass: float) -> SrmpState:
+    """The pendulum at one instant; evaluated once for all terms that look there."""
+    if "srmp" not in p.memo:
+        p.memo["srmp"] = SrmpState(mass, p.q, p.v, p.a, p.p.gravity)
+    return p.memo["srmp"]
+
+
+def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
+    """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
+
+    def at(p):
+        return srmp_state(p, mass)
+
+    def inertia_box(p):
+        low, high = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.inertia_low_fit, reach.inertia_high_fit))
+        margin = s.inertia_margin * (high - low)
+        return ca.vertcat(at(p).inertia - low - margin, high - margin - at(p).inertia)
+
+    def cone(p):
+        f = at(p).ground_force
+        return ca.vertcat(s.friction * f[1] - f[0], s.friction * f[1] + f[0])
+
+    def strength(p):
+        """Leg force-velocity line: full force up to a share of the extension speed, none at the speed itself."""
+        force, speed = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.force_fit, reach.speed_fit))
+        fade = (speed - p.v[1]) / ((1 - s.corner_speed) * speed)
+        return ca.vertcat(force - at(p).ground_force[1], force * fade - at(p).ground_force[1])
+
+    def extension(p):
+        return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
+
+    mg, inf = mass * GRAVITY, np.inf
+    return [
+        Term("jerk", "SL-J1", "weighted", "mid", lambda p: ca.DM(np.sqrt(s.w_jerk)) * p.j, weight=1.0),
+        Term("CoM velocity", "SL-J2", "m/s", "node", lambda p: at(p).com_velocity, weight=s.w_velocity),
+        Term("L rate", "SL-J3", "N m", "node", lambda p: at(p).angular_momentum_rate, weight=s.w_momentum_rate),
+        Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], weight=s.w_turn),
+        Term("trunk range", "SL-P1, as path", "rad", "node", lambda p: p.q[0] + p.q[2], lower=reach.posture[0],
+             upper=reach.posture[1]),
+        Term("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_box, lower=0.0, upper=inf),
+        Term("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, lower=s.momentum[0],
+             upper=s.momentum[1], scale=10.0),
+        Term("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], lower=0.0, upper=inf, scale=mg,
+             skip=(0, 1)),
+        Term("friction", "ours", "N", "node", cone, lower=0.0, upper=inf, scale=mg, skip=(0, 1)),
+        Term("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, lower=0.0, upper=inf,
+             scale=mg),
+        Term("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, lower=0.0, upper=inf),
+    ]  # fmt: skip
+
+
+def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
+    """What keeps the pendulum among the robot's postures: usual inertia, and with flat feet a CoM not too low."""
+    fit = ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
+    slope, offset = reach.low_com_fit
+
+    def unusual(p):
+        return srmp_state(p, mass).inertia - ca.polyval(fit, p.q[1])
+
+    def height(p):
+        com = srmp_state(p, mass).com
+        return com[1] - slope * com[0] - offset
+
+    def deep(p):
+        com = srmp_state(p, mass).com
+        below = ca.polyval(ca.DM(reach.easy_com_fit), com[0]) - com[1]
+        return (below + ca.sqrt(below**2 + CROUCH_SMOOTHING_M**2)) / 2
+
+    def between(left, right, step):
+        # the CoM only touches this limit, at the bottom of the crouch: with nodes alone it would pass between two
+        inside = [chain(left.q, left.v, left.a, left.j, share * step)[0] for share in QUARTERS]
+        return ca.vertcat(*(q[1] * (ca.cos(q[0]) - slope * ca.sin(q[0])) - offset for q in inside))
+
+    rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
+    if not heel_up:
+        rows.append(Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch))
+        for name, at, room in (("CoM not too low", "node", height), ("CoM not too low (between)", "interval", between)):
+            rows.append(Term(name, "ours: flat feet", "m", at, room, lower=0.0, upper=np.inf, scale=0.1))
+    return rows
+
+
+def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[Term]:
+    """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0.
+
+    ``slack`` [N m] is allowed on either side; it matters only where F_z vanishes.
+    """
+
+    def room(p):
+        f, torque = srmp_state(p, mass).ground_force, srmp_state(p, mass).pivot_torque
+        return ca.vertcat(slack - torque - low * f[1], slack + high * f[1] + torque)
+
+    scale = 0.1 * mass * GRAVITY
+    return [
+        Term("CoP", "SL-P2, times F_z", "N m", "node", room, lower=0.0, upper=np.inf, scale=scale, skip=(0, 1)),
+        Term("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, lower=0.0, upper=np.inf, scale=scale),
+    ]
+
+
+def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
+    """Costs and constraints at the end of the launch, SL-J2, J3 and SL-E* (Sec. III-A)."""
+
+    def at(p):
+        return srmp_state(p, mass)
+
+    mg, posture = mass * GRAVITY, s.posture_end
+    return [
+        Term("posture at take-off", "SL-J2", "rad", "end", lambda p: p.q[0] + p.q[2], weight=s.w_posture_end),
+        Term("L at take-off", "SL-J3", "kg m^2/s", "end", lambda p: at(p).angular_momentum, weight=s.w_momentum_end),
+        Term("take-off speed", "SL-E2", "m/s", "end", lambda p: at(p).com_velocity[1] - p.p.takeoff_speed),
+        Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
+        Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
+        Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
+        Term(
+            "take-off length",
+            "SL-B1 at the end; ours",
+            "m",
+            "end",
+            lambda p: p.q[1],
+            lower=reach.length[0],
+            upper=s.takeoff_length * reach.start[1],
+        ),
+        Term("posture range", "SL-P1", "rad", "end", lambda p: p.q[0] + p.q[2], lower=posture[0], upper=posture[1]),
+    ]
+
+
+def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
+    """Costs and constraints of the flight, SF-* (Sec. III-B); coordinate rho = rho_R + rho_I, state theta.
+
+    With ``reach``, also the inertia at touchdown is one that the robot usually has at that leg length.
+    """
+
+    def rotation(left, right, step):
+        total = 0
+        for share, weight in GAUSS:
+            total += weight * left.c.L / chain(left.q, left.v, left.a, left.j, share * step)[0]
+        return right.z - left.z - step * total
+
+    def usual(p):
+        return p.q - ca.polyval(ca.DM(reach.usual_toe_fit), p.c.leg)
+
+    low, high = s.touchdown_inertia
+    landing = [] if reach is None else [
+        Term("inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", usual, lower=low, upper=high)
+    ]  # fmt: skip
+    return [
+        *landing,
+        Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", lambda p: p.a, weight=s.w_inertia_accel),
+        Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", lambda p: p.j, weight=s.w_inertia_jerk),
+        Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),
+        Term("inertia rate at touchdown", "ours", "kg m^2/s", "end", lambda p: p.v, lower=-s.touchdown_inertia_rate,
+             upper=s.touchdown_inertia_rate, scale=10.0),
+        Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", _touchdown_height),
+        Term("falling at touchdown", "ours: not on the way up", "m/s", "end",
+             lambda p: p.c.vel_z - p.p.gravity * p.duration, lower=-np.inf, upper=0.0),
+        Term("lean at touchdown", "ours: foot below the CoM", "rad", "end", lambda p: p.z[0] - p.p.rotation,
+             lower=-s.touchdown_lean, upper=s.touchdown_lean),
+    ]  # fmt: skip
+
+
+def _foot_ahead(p: Point):
+    """Sole centre ahead of the CoM at touchdown [m], by the angle theta of the foot-CoM line."""
+    return -p.c.leg * ca.sin(p.z[0] - p.p.rotation)
+
+
+def _touchdown_height(p: Point):
+    t = p.duration
+    com = p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2
+    return com - p.p.platform - p.c.leg * ca.cos(p.z[0] - p.p.rotation)
+
+
+def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
+    """Links at take-off (SF-L1..4), jump length and landing condition over both phases."""
+
+    def continuity(e):
+        a, b = e["flat"].end, e["toe"].start
+        return ca.vertcat(
+            *((x - y) / ca.DM(scale) for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0)))
+        )
+
+    def inertia_link(e):
+        a, b = srmp_state(e["toe"].end, mass), e["flight"].start
+        return ca.vertcat(a.inertia - b.q[0], (a.inertia_rate - b.v[0]) / 20, (a.inertia_accel - b.a[0]) / 200)
+
+    def ballistic(e):
+        a, c = srmp_state(e["toe"].end, mass), e["flight"].start.c
+        position, velocity = a.com, a.com_velocity
+        return ca.vertcat(position - ca.vertcat(c.com_x, c.com_z), velocity - ca.vertcat(c.vel_x, c.vel_z))
+
+    def length(e):
+        c, end = e["flight"].start.c, e["flight"].end
+        return c.com_x + c.vel_x * end.duration + _foot_ahead(end) - end.p.distance
+
+    def capture(e):
+        end = e["flight"].end
+        return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
+
+    return [
+        Term("launch time", "SL-J5", "s", "problem", lambda e: e["flat"].end.duration + e["toe"].end.duration,
+             weight=s.w_time),
+        Term("flat to toe", "ours: heel up", "scaled", "problem", continuity, identity=True),
+        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["toe"].end.q[0] - e["flight"].start.z[0],
+             identity=True),
+        Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link, identity=True),
+        Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem",
+             lambda e: srmp_state(e["toe"].end, mass).angular_momentum - e["flight"].start.c.L, scale=10.0,
+             identity=True),
+        Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic, identity=True),
+        Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
+        Term("capture window", "ours; replaces SF-E1", "m", "problem", capture, lower=s.capture_window_m[0],
+             upper=s.capture_window_m[1], scale=0.1),
+        Term("symmetric landing", "SF-E1 (about the pivot)", "rad", "problem",
+             lambda e: e["flight"].end.z[0] + e["toe"].end.q[0] - e["flight"].end.p.rotation),
+    ]  # fmt: skip

@@ -1,0 +1,150 @@
+"""Jumps that turn over: the same problem with other limits, and a guess whose angles turn (theta_tar of the paper)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from jumplab.errors import SolverError
+from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution, Statistics
+from jumplab.robot import Robot
+from jumplab.robot.stance import com_from_toe
+from jumplab.stages.srmp import SrmpPlan
+from jumplab.stages.whole_body.planner import COARSE, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body.problem import build_problem
+from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
+from jumplab.stages.whole_body.terms import WholeBodyTerms
+from jumplab.task import JumpTask
+
+# our choice: a solve that needs more is lost; plans took 94 iterations at most on the coarse mesh, 112 on the fine one
+EFFORT = {"max_iter": 150, "max_wall_time": 15.0}
+# our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
+MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
+# Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
+# of 0.6 m on the spot; six of the flat foot, three of the toe phase, six of the flight, the last of one turn. Back: the
+# arms swing up and forward, the trunk follows. Front: the trunk leans back first, then whips forward over braked feet.
+POSTURES = {
+    -1: ([0.0, 0.15, -0.25, 0.32, 0.52], [0.0, -0.06, -0.24, 1.04, 1.77], [0.0, -0.02, -0.38, 1.49, 2.65],
+         [0.0, 0.50, -0.88, 1.12, 1.84], [0.0, 0.81, -1.20, 0.81, 0.74], [0.0, 0.77, -1.28, 0.66, -0.47],
+         [0.02, 0.72, -1.16, 0.55, -0.95], [0.16, 0.65, -1.0, 0.38, -1.46], [0.47, 0.56, -0.84, 0.15, -2.05],
+         [1.45, 0.64, -1.25, -0.48, -3.03], [0.38, -0.49, -2.84, -1.11, -2.28], [-1.04, -1.90, -4.25, -2.25, -2.77],
+         [-2.53, -3.22, -5.59, -3.57, -3.55], [-4.62, -4.39, -6.65, -4.86, -4.68], [-6.28, -5.41, -6.81, -5.98, -6.11]),
+    1: ([0.0, 0.23, -0.22, -0.08, -0.12], [0.0, 0.25, -0.15, -0.39, -0.53], [0.0, 0.31, -0.09, -0.65, -0.90],
+        [0.0, 0.47, -0.12, -0.79, -1.09], [0.0, 0.64, -0.19, -0.86, -1.16], [0.0, 0.87, -0.25, -0.92, -1.25],
+        [0.41, 1.31, -0.47, -0.97, -1.34], [0.53, 1.39, -0.38, -1.0, -2.24], [0.40, 0.72, -0.15, -0.47, -2.07],
+        [1.07, 0.24, -0.36, 0.86, -0.75], [2.56, 1.69, -0.21, 1.81, 0.92], [4.23, 3.36, 1.02, 3.01, 2.61],
+        [5.54, 4.80, 2.45, 4.42, 4.15], [6.26, 6.08, 3.97, 5.64, 5.13], [6.28, 6.53, 5.13, 6.58, 5.51]),
+}  # fmt: skip
+FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # our choice: how long the phases of the launch last in those solutions
+FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # our choice: of the flat foot, when its postures are
+EASY_M = 0.5  # our choice: searches from postures end well up to here; of those at 0.7 m two in three did not
+CLIMB_M = 0.04  # our choice: from flip to flip on the way up; with steps of 0.07 m two in six of 0.7 m got lost
+LOW_M = 0.03  # our choice: the CoM touches down this much above its take-off height
+
+
+class FlipPlanner(WholeBodyPlanner):
+    """Stage 3 (or, without ``tracking``, the direct planner) for jumps with rotation: built once, solved for any.
+
+    A jump without rotation is another planner's and stays the same problem whatever flips need.
+    """
+
+    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
+                 tracking: bool = True, options: Mapping | None = None):  # fmt: skip
+        options, weights = {**EFFORT, **(options or {})}, weights.of_flip()
+        super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights, tracking=tracking, options=options,
+                         refine=False)  # fmt: skip
+        # the first idea of the motion may be rough: its jerks jump as they like
+        self.rough = self.mesh.coarse()
+        rough = build_problem(robot, self.rough, replace(self.limits, jerk_step=None), weights, tracking=tracking)
+        first = Nlp(rough, {**COARSE, **options})
+        self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
+
+    def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
+             weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
+             stage1: Callable[[JumpTask], SrmpPlan] | None = None) -> WholeBodyPlan:  # fmt: skip
+        """Solve for a target: searches on the coarse mesh, then the fine one; a high flip by way of lower ones.
+
+        Parameters
+        ----------
+        srmp, guess, weights, off : as in the base class.
+        stage1 : with tracking, plans stage 1 for the lower flips on the way; without it none are tried.
+
+        Raises
+        ------
+        SolverError
+            After some seconds, if a search ends without a plan; it says at which height.
+        """
+        how = dict(weights=weights, off=off, explain=False)
+        way = [task] if guess is not None or (self.tracking and stage1 is None) else climb(task)
+        plans = [srmp if t is task or not self.tracking else stage1(t) for t in way]
+        try:
+            searches = self._searches if guess is None else self._searches[:1]
+            start = guess or self.naive_guess(way[0])
+            solution, first = self._search(way[0], plans[0], start, searches, how)
+            for easier, one in zip(way[1:], plans[1:], strict=True):
+                solution = self.nlp.solve(self.parameters(easier, one), solution.guess(),
+                                          references=self.references(one, self.mesh), **how)  # fmt: skip
+        except SolverError as e:
+            where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
+            raise SolverError(
+                f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its "
+                f"limits, ask for another height or distance",
+                stage=e.stage, status=e.status,
+            ) from e  # fmt: skip
+        return WholeBodyPlan(task, solution, first)
+
+    def _search(self, task: JumpTask, srmp, guess, searches, how) -> tuple[Solution, Statistics]:
+        """The fine solution from a guess, and what the coarse one before it cost."""
+        parameters, failure = self.parameters(task, srmp), None
+        start = {name: guess[name].resampled(n) for name, n in self.rough.intervals().items()}
+        for search in searches:
+            try:
+                first = search.solve(parameters, start, references=self.references(srmp, self.rough), **how)
+                fine = self.nlp.solve(parameters, self._refined(first), references=self.references(srmp, self.mesh),
+                                      **how)  # fmt: skip
+            except SolverError as e:
+                failure = failure or e
+            else:
+                return fine, first.statistics
+        raise failure
+
+    def _refined(self, first: Solution) -> dict[str, PhaseGuess]:
+        """A coarse solution as the fine problem's start, the jerks that its intervals carry on included."""
+        out = {}
+        for name, guess in first.guess(self.mesh.intervals()).items():
+            jerk = np.diff(guess.a, axis=0) * (len(guess.a) - 1) / guess.duration
+            before = np.vstack([np.zeros(jerk.shape[1]), jerk])
+            out[name] = replace(guess, z=np.array([WholeBodyTerms.relative(x).full().ravel() for x in before]))
+        return out
+
+    def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
+        """Start values that know only the target: a smooth curve through postures of a flip, its rates included."""
+        from scipy.interpolate import PchipInterpolator  # a third of a second that other jumps need not wait for
+
+        way = 1 if task.rotation_rad > 0 else -1
+        knots = np.array([self.stance, *POSTURES[way]])
+        shares = np.arange(1, 7) / 6
+        knots[-6:] += (shares * (task.rotation_rad - way * 2 * np.pi))[:, None]
+        takeoff, land_s = FLAT_S + TOE_S[way], task.flight_time(min(task.platform_m, 0.9 * task.height_m) - LOW_M)
+        times = [0.0, *(FLAT_S * np.array(FLAT_SHARES)), *(FLAT_S + TOE_S[way] * np.arange(1, 4) / 3),
+                 *(takeoff + land_s * shares)]  # fmt: skip
+        curve, n = PchipInterpolator(times, knots), self.mesh
+        com, down = com_from_toe(self.robot, knots[-7]), com_from_toe(self.robot, knots[-1])
+        speed = (task.distance_m - com[0] + down[0]) / land_s
+        constants = dict(com_x=com[0], com_z=com[1], vel_x=speed, vel_z=task.takeoff_speed)
+        out = {}
+        for name, first, last, count in (("flat", 0.0, FLAT_S, n.flat), ("toe", FLAT_S, takeoff, n.toe),
+                                         ("flight", takeoff, takeoff + land_s, n.flight)):  # fmt: skip
+            t = np.linspace(first, last, count + 1)
+            q, v = (curve(t, order)[:, 1 if name == "flat" else 0 :] for order in (0, 1))
+            out[name] = PhaseGuess(last - first, q, v, 0 * q, None, constants if name == "flight" else {})
+        return out
+
+
+def climb(task: JumpTask) -> list[JumpTask]:
+    """The target, preceded by lower ones if it is high: the first is as high as a guess is good for."""
+    steps = max(0, math.ceil((task.height_m - EASY_M) / CLIMB_M - 1e-9))
+    return [replace(task, height_m=EASY_M + (task.height_m - EASY_M) * k / steps) for k in range(steps)] + [task]

@@ -1,0 +1,1 @@
+"""Many plans or many simulations: trials, chains, sweeps, envelopes, benchmark."""

@@ -1,0 +1,221 @@
+"""What a chain of jumps shall achieve: how far each time, how high, onto what; and the ground that belongs to it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import InfeasibleError, InputError, RobotError, quoted
+from jumplab.robot import Robot
+from jumplab.robot.reach import Reach
+from jumplab.robot.stance import check_stance
+from jumplab.sim.scene import REACH_M, Block, Scene
+from jumplab.stages.planner import to_link_angles
+from jumplab.stages.srmp.reachable import check_reachable
+from jumplab.stages.whole_body.planner import platform_edge_m
+from jumplab.stages.whole_body.settings import Limits
+from jumplab.task import GRAVITY, JumpTask
+
+# posture ------------------------------------------------------------------------------------------
+# our choice: half-way between the stance and the bottom of a landing; a jump from there needs 0.70 s instead of 0.86 s,
+# and the robot is in it sooner after touchdown
+CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}
+
+
+def crouched(robot: Robot) -> Robot:
+    """The robot whose standing posture is a crouch; itself if its joints do not allow that one.
+
+    Planners begin there, landings end there, and the standing controller holds it: all of them ask the robot.
+    """
+    text = robot.config_text
+    for key, value in CROUCH.items():
+        text, found = re.subn(rf"(?m)^(\s*{key}\s*=\s*)[-+.\deE]+", rf"\g<1>{value}", text, count=1)
+        if not found:
+            return robot
+    other = Robot.from_text(robot.urdf, text)
+    try:
+        check_stance(other)
+    except RobotError:
+        return robot
+    return other
+
+
+class Gauge:
+    """Reads from a state of the full robot what a plan needs: where the toes are, and the sagittal posture."""
+
+    def __init__(self, robot: Robot):
+        self.robot, self._data = robot, robot.model.createData()
+        self._frames = [robot.model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        self._toe = np.array([robot.foot.toe, 0.0, robot.foot.sole_z])
+
+    def toe(self, q: np.ndarray) -> np.ndarray:
+        """Middle between the toes (3,) [m]."""
+        pin.framesForwardKinematics(self.robot.model, self._data, q)
+        return np.mean([self._data.oMf[f].act(self._toe) for f in self._frames], axis=0)
+
+    def heading(self, q: np.ndarray) -> float:
+        """Yaw of the feet, mean of both [rad]."""
+        pin.framesForwardKinematics(self.robot.model, self._data, q)
+        return float(np.mean([np.arctan2(*self._data.oMf[f].rotation[[1, 0], 0]) for f in self._frames]))
+
+    def posture(self, q: np.ndarray) -> np.ndarray:
+        """Absolute link angles (5,) with the feet taken as flat, mean of left and right [rad]."""
+        zero = np.zeros((1, self.robot.model.nv))
+        angles = to_link_angles(self.robot, q[None], zero, zero)[0][0]
+        angles[0] = 0.0
+        return angles
+
+    def com(self, q: np.ndarray) -> np.ndarray:
+        """CoM (3,) [m]."""
+        return pin.centerOfMass(self.robot.model, self._data, q, False).copy()
+
+    def com_velocity(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Velocity of the CoM (3,) [m/s]."""
+        pin.centerOfMass(self.robot.model, self._data, q, v, False)
+        return self._data.vcom[0].copy()
+
+    def com_ahead(self, q: np.ndarray, v: np.ndarray, left_s: float) -> np.ndarray:
+        """CoM (3,) in ``left_s`` of free flight [m]."""
+        speed = self.com_velocity(q, v)
+        return self.com(q) + speed * left_s - np.array([0.0, 0.0, GRAVITY * left_s**2 / 2])
+
+
+# course ------------------------------------------------------------------------------------------
+MOST_JUMPS = 50  # our choice: two minutes of simulated time; more is surely a typo
+
+
+@dataclass(frozen=True)
+class Course:
+    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers.
+
+    Attributes
+    ----------
+    distances_m : travel of the feet in each jump, toe to toe [m].
+    heights_m : rise of the CoM in each flight [m].
+    platforms_m : height of each landing surface above the ground that the chain begins on [m].
+    """
+
+    distances_m: tuple[float, ...]
+    heights_m: tuple[float, ...]
+    platforms_m: tuple[float, ...]
+
+    @classmethod
+    def of(cls, distances_m: Iterable[Any], height_m: Any, platforms_m: Iterable[Any] | None = None) -> Course:
+        """A course from what somebody typed.
+
+        Parameters
+        ----------
+        height_m : one number for all jumps, or one per jump.
+        platforms_m : one per jump; level ground if None.
+
+        Raises
+        ------
+        InputError
+            If there is no jump, if the lists differ in length, or if a number cannot be meant.
+        """
+        distances = _numbers("distances", distances_m)
+        count = len(distances)
+        if not 1 <= count <= MOST_JUMPS:
+            raise InputError(f"a chain has 1 ... {MOST_JUMPS} jumps, this one has {count}; give one distance per jump")
+        heights = _numbers("heights", [height_m] if np.ndim(height_m) == 0 else height_m)
+        heights = heights * count if len(heights) == 1 else heights
+        platforms = (0.0,) * count if platforms_m is None else _numbers("platforms", platforms_m)
+        for name, values in (("heights", heights), ("platforms", platforms)):
+            if len(values) != count:
+                raise InputError(f"{len(values)} {name} for {count} distances: give one per jump")
+        course = cls(distances, heights, platforms)
+        for k in range(count):
+            try:
+                course.task(k)
+            except InputError as e:
+                raise InputError(f"jump {k + 1} of {count}: {e}") from e
+        return course
+
+    @property
+    def count(self) -> int:
+        """Number of jumps."""
+        return len(self.distances_m)
+
+    @cached_property
+    def goals_m(self) -> tuple[float, ...]:
+        """Where the toes should be after each jump, from where they stand at first [m]."""
+        return tuple(float(x) for x in np.cumsum(self.distances_m))
+
+    def level(self, k: int) -> float:
+        """Height of the surface that jump ``k`` (counted from 0) starts from [m]."""
+        return self.platforms_m[k - 1] if k else 0.0
+
+    def task(self, k: int, distance_m: float | None = None) -> JumpTask:
+        """Target of jump ``k`` (counted from 0), with another distance if given."""
+        distance = self.distances_m[k] if distance_m is None else distance_m
+        return JumpTask(distance, self.heights_m[k], round(self.platforms_m[k] - self.level(k), 9))
+
+    def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
+        """(x, height) where the ground changes its height, x from the toes' first place [m]."""
+        found = []
+        for k in range(self.count):
+            task, before = self.task(k), (0.0, *self.goals_m)[k]
+            if task.platform_m:
+                found.append((before + platform_edge_m(task, robot), self.platforms_m[k]))
+        return tuple(found)
+
+    def check(self, robot: Robot, reach: Reach) -> None:
+        """Refuse what no solve could mend, before any: platforms under a sole, jumps beyond the robot's reach.
+
+        Raises
+        ------
+        InputError
+            If platforms overlap with a place where the robot stands.
+        InfeasibleError
+            If a jump is beyond the robot's reach, by closed forms.
+        """
+        self._check_platforms(robot)
+        for k in range(self.count):
+            try:
+                check_reachable(self.task(k), reach, robot)
+            except InfeasibleError as e:
+                raise InfeasibleError(f"jump {k + 1} of {self.count}: {e}") from e
+
+    def _check_platforms(self, robot: Robot) -> None:
+        """Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`."""
+        if any(self.platforms_m) and min(self.distances_m) < 0:
+            k = int(np.argmin(self.distances_m))
+            raise InputError(f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
+                             f"chains with platforms go forward, backward jumps stay on the level")  # fmt: skip
+        least = 2 * Limits().edge_before_heel_m - robot.sagittal.heel[0]
+        for k in range(self.count):
+            rise, distance = self.task(k).platform_m, self.distances_m[k]
+            if rise and distance < least:
+                what = f"{self.platforms_m[k]:g} m high" if rise > 0 else f"down at {self.platforms_m[k]:g} m"
+                raise InputError(
+                    f"jump {k + 1} of {self.count}: the surface {what} would begin under the sole that stands "
+                    f"{distance:g} m before it; place them {least:.2f} m apart or more, toe to toe"
+                )
+
+    def scene(self, robot: Robot) -> Scene:
+        """The ground: level, or blocks that meet at the edges."""
+        edges = self.edges(robot)
+        if not edges:
+            return Scene.flat()
+        zero = robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
+        ends = [(-REACH_M, 0.0), *((zero + x, top) for x, top in edges), (REACH_M, 0.0)]
+        return Scene("platforms", tuple(Block(a, b, top) for (a, top), (b, _) in pairwise(ends)))
+
+
+def _numbers(name: str, values: Any) -> tuple[float, ...]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InputError(f"the {name} of a chain must be a list of numbers, got {quoted(values)}")
+    out = []
+    for k, value in enumerate(values, 1):
+        try:
+            out.append(float("" if isinstance(value, bool) else value))
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"the {name} of a chain must be numbers in m; number {k} is {quoted(value)}") from None
+    return tuple(out)

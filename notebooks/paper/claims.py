@@ -1,0 +1,245 @@
+"""The paper's claims, judged: the four verdicts, measurements that need more than a line, and the table of readings."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import coal  # noqa: F401  (its shapes are what Pinocchio's geometry objects hold)
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
+from jumplab.models.full import FullBody
+from jumplab.robot import Robot
+from jumplab.stages.joint_qp import map_to_joints
+from jumplab.stages.planner import guess_from_joints
+from jumplab.stages.reconstruction import expand, planar_quantities
+from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
+from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.task import GRAVITY, JumpTask
+
+HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
+STARTS = ("crouch", "stage 2", "looser stage 3")
+LOOSE_MESH = Mesh(13, 10, 15)  # our choice: half of stage 3's mesh ...
+LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
+READINGS = ("the paper says", "we do", "because", "effect")
+HEADING = "## Differences from the paper"
+
+
+# ---------------------------------------------------------------------------------------------- verdicts
+
+
+def judge(claim: str, ok: bool | None, measured: str, where: str, change: str = "") -> dict[str, str]:
+    """One line of the table of claims.
+
+    Parameters
+    ----------
+    claim : what is said, in one sentence.
+    ok : whether the measurement agrees; None if nothing here can tell.
+    measured : the numbers, with units.
+    where : notebook that shows it at length.
+    change : what was read, done or found differently, where that is part of the verdict.
+
+    Raises
+    ------
+    InputError
+        If a text is empty, or ``ok`` is neither a truth value nor None.
+    """
+    for name, text in (("claim", claim), ("measured", measured), ("where", where)):
+        if not (isinstance(text, str) and text.strip()):
+            raise InputError(f"{name} of a claim must be a text, got {quoted(text)}; say what was measured and where")
+    if ok is not None and not isinstance(ok, bool | np.bool_):
+        raise InputError(
+            f"verdict of a claim must be True, False or None, got {quoted(ok)}; compare the number with a limit"
+        )
+    verdict = OPEN if ok is None else FAILS if not ok else CHANGED if change else HOLDS
+    return {"claim": claim, "verdict": verdict, "measured": measured, "change": change, "where": where}
+
+
+# ---------------------------------------------------------------------------------------------- measurements
+
+
+def standing_height_m(robot: Robot) -> float:
+    """Height of the robot's collision shapes with all joints at zero, legs straight [m] (Sec. VI-A)."""
+    require_type(robot, Robot, "the robot")
+    shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+    data, places = robot.model.createData(), shapes.createData()
+    pin.updateGeometryPlacements(robot.model, data, shapes, places, pin.neutral(robot.model))
+    low, high = np.inf, -np.inf
+    for shape, place in zip(shapes.geometryObjects, places.oMg, strict=True):
+        shape.geometry.computeLocalAABB()
+        box = shape.geometry.aabb_local
+        corners = np.array(list(itertools.product(*zip(box.min_, box.max_, strict=True))))  # (8, 3)
+        z = corners @ place.rotation[2] + place.translation[2]
+        low, high = min(low, z.min()), max(high, z.max())
+    return float(high - low)
+
+
+def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[str, float]:
+    """Largest differences of the five-link from the nine-link model over random symmetric motions (Sec. II-C).
+
+    Returns
+    -------
+    mass [kg], CoM [m], L [kg m^2/s], rho [kg m^2] -> largest difference.
+    """
+    require_type(robot, Robot, "the robot")
+    random = np.random.default_rng(seed)
+    angles = random.uniform([0.0, -0.2, -1.2, -0.2, -2.0], [0.6, 1.2, 0.6, 0.9, 1.0], (samples, 5))
+    rates, accels = random.normal(0, 4, (samples, 5)), random.normal(0, 40, (samples, 5))
+    rest = np.zeros((samples, 2))
+    motion = dict(t=np.arange(samples) / 1000, angles=angles, rates=rates, accels=accels, toe=rest, toe_velocity=rest,
+                  toe_acceleration=rest, flying=np.zeros(samples, bool))  # fmt: skip
+    tape = expand(motion, robot, GRAVITY)
+    five = planar_quantities(robot, angles, rates, accels, rest, GRAVITY)
+    body = FullBody(robot)
+    nine = [body.terms(q, v) for q, v in zip(tape.q, tape.v, strict=True)]
+    com = five["com"] - robot.sagittal.sole_center  # the tape's world starts at the middle of the sole
+    return {
+        "mass [kg]": abs(robot.sagittal.total_mass - body.mass),
+        "CoM [m]": float(np.abs(com - [n.com[[0, 2]] for n in nine]).max()),
+        "L [kg m^2/s]": float(np.abs(five["L"] - [n.momentum[4] for n in nine]).max()),
+        "rho [kg m^2]": float(np.abs(five["rho"] - [n.rho for n in nine]).max()),
+    }
+
+
+@dataclass(frozen=True)
+class Start:
+    """Stage 3 from one initial guess, at one target.
+
+    Attributes
+    ----------
+    task, start : the target, and one of :data:`STARTS`.
+    iterations : of stage 3, coarse and fine mesh together; None if it failed.
+    alone_s, total_s : processor time of stage 3, and with that of making the guess [s]; None if it failed.
+    cost : of the jump it ends in [1]; None if it failed.
+    """
+
+    task: JumpTask
+    start: str
+    iterations: int | None = None
+    alone_s: float | None = None
+    total_s: float | None = None
+    cost: float | None = None
+
+
+def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
+    """Stage 3 from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
+
+    Returns
+    -------
+    Three rows per target, in the order of :data:`STARTS`. Stages 1 to 3 are built once, and not counted.
+
+    Raises
+    ------
+    InputError, InfeasibleError, SolverError
+        If stage 1 refuses a target; what fails later is a row without numbers.
+    """
+    # by ipopt alone, so that iterations are of one kind and as the paper counts them
+    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot, approach=False)
+    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE, approach=False)
+    rows = []
+    for task in tasks:
+        first = stage1.plan(task)
+        for name in STARTS:
+            try:
+                rows.append(_from_start(name, task, first, whole, loose))
+            except JumplabError:
+                rows.append(Start(task, name))
+    return rows
+
+
+def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner) -> Start:
+    began = time.process_time()
+    guess = None  # the planner's own: four postures joined by straight lines
+    if name == "stage 2":
+        motion = map_to_joints(first, whole.robot.under_gravity(task.gravity), method="direct")
+        guess = guess_from_joints(motion, whole, task, first.toe_s)
+    elif name == "looser stage 3":
+        guess = loose.plan(task, first).solution.guess(asdict(whole.mesh))
+    ready = time.process_time()
+    plan = whole.plan(task, first, guess=guess)
+    end = time.process_time()
+    fine, coarse = plan.solution.statistics, plan.coarse
+    iterations = fine.iterations + (coarse.iterations if coarse else 0)
+    return Start(task, name, iterations, end - ready, end - began, fine.objective)
+
+
+def against_crouch(rows: Sequence[Start]) -> list[dict]:
+    """One row per start: solved targets, and medians of iterations and time as shares of the crouch's.
+
+    Only targets count that the crouch has solved too; shares are None where there is none.
+    """
+    crouch = {r.task: r for r in rows if r.start == STARTS[0] and r.iterations is not None}
+    out = []
+    for name in dict.fromkeys(r.start for r in rows):
+        here = [r for r in rows if r.start == name]
+        both = [(r, crouch[r.task]) for r in here if r.iterations is not None and r.task in crouch]
+        shares = {
+            "iterations, share": [r.iterations / c.iterations for r, c in both],
+            "stage 3 alone, share": [r.alone_s / c.alone_s for r, c in both],
+            "with the guess, share": [r.total_s / c.total_s for r, c in both],
+        }
+        out.append({"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
+                   | {key: float(np.median(x)) if x else None for key, x in shares.items()})  # fmt: skip
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- readings
+
+
+def readings(notebooks: Iterable[str | Path]) -> list[dict[str, str]]:
+    """What the notebooks do differently from the paper, gathered from the tables at their ends.
+
+    Returns
+    -------
+    Rows with ``notebook`` and the four columns :data:`READINGS`, in Markdown, in the order of the notebooks. A notebook
+    without such a table adds none.
+
+    Raises
+    ------
+    InputError
+        If a notebook cannot be read, or its table has other columns or a broken row.
+    """
+    rows = []
+    for path in (as_path(p, "a notebook") for p in notebooks):
+        for line in _lines(path):
+            cells = [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+            if len(cells) != len(READINGS):
+                raise InputError(f"{path.name}: the row {line!r} of its differences from the paper has {len(cells)} "
+                                 f"columns, not {len(READINGS)}; write \\| for a bar inside a column")  # fmt: skip
+            rows.append({"notebook": path.stem, **dict(zip(READINGS, cells, strict=True))})
+    return rows
+
+
+def _lines(path: Path) -> list[str]:
+    """Rows of the table under :data:`HEADING`, without its head."""
+    try:
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        sources = ["".join(c["source"]) for c in cells if c["cell_type"] == "markdown"]
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{path}: not a readable notebook ({type(e).__name__}); restore it") from e
+    for source in sources:
+        before, found, after = source.partition(HEADING)
+        if found and (not before or before.endswith("\n")):
+            lines = [line.strip() for line in after.split("\n## ")[0].splitlines() if line.strip().startswith("|")]
+            head = [c.strip() for c in lines[0].strip("|").split("|")] if lines else []
+            if lines and tuple(head) != READINGS:
+                raise InputError(f"{path.name}: its differences from the paper have the columns {', '.join(head)}; "
+                                 f"they must be {', '.join(READINGS)}")  # fmt: skip
+            return lines[2:]
+    return []
+
+
+def readings_markdown(rows: Iterable[dict[str, str]]) -> str:
+    """The rows of :func:`readings` as one Markdown table, whose first column leads to the notebooks beside it."""
+    lines = [f"| {' | '.join(('notebook', *READINGS))} |", "|---" * (1 + len(READINGS)) + "|"]
+    for row in rows:
+        name = row["notebook"]
+        lines.append(f"| [{name}]({name}.ipynb) | {' | '.join(row[c] for c in READINGS)} |")
+    return "\n".join(lines)
