@@ -12,11 +12,11 @@ import pinocchio as pin
 import pybullet
 import pytest
 from fixtures_core import LIMBS
+from paper import bhr_table as table
 from scipy.stats import qmc
 
 import jumplab
 from jumplab.robot import Robot, load_robot
-from jumplab.robot.bhr import table
 from jumplab.robot.description import GRAVITY
 from jumplab.robot.reach import sobol
 from jumplab.task import GRAVITY as TASK_GRAVITY

@@ -5,12 +5,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics
+from paper import bhr_table as table
 
 from jumplab.errors import RobotError
 from jumplab.models.full import FullBody
 from jumplab.models.planar import evaluator
 from jumplab.robot import SAGITTAL_LINKS, Robot
-from jumplab.robot.bhr import table
 from jumplab.robot.stance import com_from_toe, configuration, stance_angles, stance_configuration
 
 

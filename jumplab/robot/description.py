@@ -11,14 +11,15 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+import tomlkit
 
 from jumplab.errors import RobotError, quoted
 from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.urdf import locate, read_urdf
+from jumplab.task import GRAVITY
 
-GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
 HERE = Path(__file__).parent
 SHIPPED = {path.stem: path for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))}
 
@@ -68,19 +69,28 @@ class Robot:
     config_text: str = field(repr=False, default="")
 
     @classmethod
-    def load(cls, name_or_config: str | Path = "bhr") -> Robot:
-        """Load a shipped robot by name, or any robot by the path of its TOML file."""
-        if not isinstance(name_or_config, str | os.PathLike):
-            raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_config)}")
-        path = SHIPPED.get(str(name_or_config)) or Path(name_or_config)
-        known = ", ".join(SHIPPED)
+    def load(cls, name_or_path: str | Path = "bhr") -> Robot:
+        """Load a robot.
+
+        Parameters
+        ----------
+        name_or_path : name of a shipped robot (:data:`SHIPPED`), or path of a TOML or URDF file; for a URDF see
+            :meth:`from_urdf`.
+
+        Raises :class:`RobotError` if there is no such robot, or its files do not describe one.
+        """
+        if not isinstance(name_or_path, str | os.PathLike):
+            raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_path)}")
+        name = str(name_or_path)
+        path = SHIPPED.get(name) or Path(name)
+        if path.suffix == ".urdf":
+            return cls.from_urdf(path)
         try:
             text = path.read_text()
         except UnicodeDecodeError as e:
             raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
         except (OSError, ValueError) as e:
-            name = str(name_or_config)
-            short = name if len(name) < 80 else name[:77] + "..."
+            known, short = ", ".join(SHIPPED), name if len(name) < 80 else name[:77] + "..."
             raise RobotError(f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file") from e
         config = read_toml(text, str(path))
         urdf = config.get("urdf")
@@ -89,14 +99,9 @@ class Robot:
         file = locate(urdf, path.parent)
         if "source" not in config:
             return cls.from_text(read_urdf(file), text)
-        from jumplab.robot.accuracy import check_reduction  # both build on this class
-        from jumplab.robot.stance import check_stance
+        from jumplab.robot.checkup import check  # builds on this class
 
-        jumper = make_jumper(read_urdf(file), config, file.name, file)
-        robot = cls.from_text(jumper.urdf, jumper.config_text)
-        check_reduction(robot)
-        check_stance(robot)
-        return robot
+        return check(file, text).robot
 
     @classmethod
     def from_urdf(cls, path: str | Path, *, repair: tuple[str, ...] = ()) -> Robot:
@@ -194,6 +199,23 @@ class Robot:
         model.gravity.linear = np.array([0.0, 0.0, -gravity])
         other.__dict__["model"] = model  # fills the cached property
         return other
+
+    def with_stance(self, **stance: float) -> Robot:
+        """The same robot, standing otherwise: a new description, hence a new hash.
+
+        Parameters
+        ----------
+        stance : ``knee_rad``, ``trunk_pitch_rad``, ``shoulder_rad`` [rad]; those not given stay.
+
+        Raises :class:`RobotError` for other names and for numbers that are none. Whether the robot can stand so,
+        :func:`jumplab.robot.stance.check_stance` says.
+        """
+        config = tomlkit.parse(self.config_text)
+        unknown = stance.keys() - self.stance.keys()
+        if unknown:
+            raise RobotError(f"a stance has {', '.join(self.stance)}, not {', '.join(sorted(unknown))}")
+        config["stance"].update(stance)
+        return self.from_text(self.urdf, tomlkit.dumps(config))
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
