@@ -5,8 +5,7 @@ import pytest
 from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, RobotError
 from jumplab.robot import load_robot
-from jumplab.robot.accuracy import reduction_error
-from jumplab.robot.checkup import check, draft
+from jumplab.robot.checkup import check, draft, reduction_error
 from jumplab.robot.description import SHIPPED
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import Scene, simulate_jump

@@ -16,7 +16,6 @@ import tomlkit
 from jumplab.errors import RobotError, quoted
 from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
-from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.urdf import locate, read_urdf
 from jumplab.task import GRAVITY
 

@@ -14,22 +14,19 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 
-PITCH_AXIS = 0.999  # our choice: axes canted by less than 2.6 deg count as pitch
+PITCH_AXIS = 0.999  # [1] axes canted by less than 2.6 deg count as pitch
 SAGITTAL_LINKS = ("foot", "shank", "thigh", "trunk", "arm")
 SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 # hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)
-JOINT_OF_ANGLES = np.array(
-    [
-        [0.0, 0.0, 1.0, -1.0, 0.0],
-        [0.0, 1.0, -1.0, 0.0, 0.0],
-        [1.0, -1.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, -1.0, 1.0],
-    ]
-)
-
-LEG_ROLES = ("ankle_pitch", "knee", "hip_pitch")
-# limits of the massless arm of a robot whose arms are held; our choice: it hardly moves and never binds
+JOINT_OF_ANGLES = np.array([[0.0, 0, 1, -1, 0], [0, 1, -1, 0, 0], [1, -1, 0, 0, 0], [0, 0, 0, -1, 1]])  # (joint, angle)
+# limits of the massless arm of a robot whose arms are held: it hardly moves and never binds
 HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "effort": 10.0}
+
+
+def rotated(angle: float | np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """``vector`` (2,), x and z, turned by ``angle`` (...) about +y: (..., 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
 
 
 @dataclass(frozen=True)
@@ -92,6 +89,12 @@ class SagittalModel:
         arms[: min(link, 4)] = self.span[: min(link, 4)]
         arms[link] = point
         return arms  # (angle, xz)
+
+    def link_coms(self, angles: np.ndarray) -> np.ndarray:
+        """(..., 5, 2) CoM of every link from the toe [m] at absolute link angles (..., 5)."""
+        arms = self.com_arms()
+        links = [sum(rotated(angles[..., j], arms[i, j]) for j in range(i + 1)) for i in range(5)]
+        return np.stack(links, -2)
 
     def joint_angles(self, angles: np.ndarray) -> np.ndarray:
         """Joint angles (..., 4) hip, knee, ankle, shoulder from absolute link angles (..., 5); also for their rates."""
@@ -194,7 +197,7 @@ def reduce(model: pin.Model, joints: dict, foot: Any, actuators: dict, urdf: str
     def place(role):
         return np.mean([data.oMi[model.getJointId(n)].translation[[0, 2]] for n in joints[role]], axis=0)
 
-    ankle, knee, hip = (place(r) for r in LEG_ROLES)
+    ankle, knee, hip = (place(r) for r in ("ankle_pitch", "knee", "hip_pitch"))
     held = not joints["shoulder_pitch"]
     shoulder = hip + 2 * (com[3] - hip) if held else place("shoulder_pitch")  # held arms: a point to draw the trunk to
     frame = data.oMf[model.getFrameId(foot.frames[0])]
@@ -209,10 +212,17 @@ def reduce(model: pin.Model, joints: dict, foot: Any, actuators: dict, urdf: str
     for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
         signs.append(_axis_signs(model, data, role, joints[role]) or [1.0, 1.0])
         rows.append(_limits(actuators, joints[role], signs[-1]) if joints[role] else HELD_ARM)
-    limits = {key: [row[key] for row in rows] for key in HELD_ARM}
-    base = data.oMi[1].translation[[0, 2]] - hip
-    points = {"toe": (0, np.zeros(2)), "heel": (0, heel - toe), "knee": (2, np.zeros(2)), "hip": (3, np.zeros(2)),
-              "shoulder": (4, np.zeros(2)), "hand": (4, hand), "mid-arm": (4, hand / 2)}  # fmt: skip
+    points = {name: (link, np.zeros(2)) for name, link in (("toe", 0), ("knee", 2), ("hip", 3), ("shoulder", 4))}
+    points |= {"heel": (0, heel - toe), "hand": (4, hand), "mid-arm": (4, hand / 2)}
     return SagittalModel(
-        mass, inertia, com - lower_joint, span, heel - toe, (heel - toe) / 2, base, np.array(signs),
-        **{k: np.array(x) for k, x in limits.items()}, points=points)  # fmt: skip
+        mass=mass,
+        inertia=inertia,
+        com=com - lower_joint,
+        span=span,
+        heel=heel - toe,
+        sole_center=(heel - toe) / 2,
+        base=data.oMi[1].translation[[0, 2]] - hip,
+        signs=np.array(signs),
+        points=points,
+        **{key: np.array([row[key] for row in rows]) for key in HELD_ARM},
+    )
