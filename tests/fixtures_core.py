@@ -69,8 +69,8 @@ def full_state(
     for i, role in enumerate(LIMBS):
         for name in robot.joints[role]:
             column = model.idx_vs[model.getJointId(name)]
-            v[column] = s.sign[i] * s.joint_angles(rates)[i]
-            a[column] = s.sign[i] * s.joint_angles(accels)[i]
+            v[column] = s.signs[i, 0] * s.joint_angles(rates)[i]
+            a[column] = s.signs[i, 0] * s.joint_angles(accels)[i]
     return configuration(robot, np.asarray(angles), toe), v, a
 
 

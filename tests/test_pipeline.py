@@ -174,7 +174,7 @@ def test_guess_is_stage_twos_motion(plan):
     assert np.all(guess["toe"].q[:, 0] >= 0.0)
     robot = plan.robot
     last = plan.joints.q[-1]
-    joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.sign
+    joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.signs[:, 0]
     for angle, role in zip(joints[:3], LIMBS[:3], strict=True):
         own = np.mean([last[robot.model.idx_qs[robot.model.getJointId(n)]] for n in robot.joints[role]])
         assert angle == pytest.approx(own, abs=1e-9)

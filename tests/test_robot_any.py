@@ -145,7 +145,7 @@ def test_a_result_folder_reads_back_the_same_robot(tmp_path):
 
 def test_from_urdf_alone(tmp_path, bhr):
     (tmp_path / "my.urdf").write_text(bhr.urdf)
-    robot = Robot.from_urdf(tmp_path / "my.urdf")
+    robot = Robot.load(tmp_path / "my.urdf")
     assert robot.joints == bhr.joints and robot.name == "bhr"
     np.testing.assert_allclose(robot.sagittal.mass, bhr.sagittal.mass, atol=1e-12)
     assert (robot.foot.heel, robot.foot.toe, robot.foot.sole_z) == pytest.approx((-0.1, 0.14, -0.075))

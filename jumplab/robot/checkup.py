@@ -9,17 +9,17 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.description import SHIPPED, Robot
+from jumplab.robot.description import Robot, files_of
 from jumplab.robot.sagittal import SagittalModel
 from jumplab.robot.stance import check_stance, com_from_toe, configuration
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.config import entry, read_toml
+from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper, make_jumper
 from jumplab.robot_import.roles import Roles
 from jumplab.robot_import.soles import Sole
 from jumplab.robot_import.starter import safe_name, starter
 from jumplab.robot_import.tree import Tree, moving_count
-from jumplab.robot_import.urdf import locate, parse, read_urdf
+from jumplab.robot_import.urdf import parse, read_urdf
 
 SAMPLES = 24  # fixed random postures over the whole joint range
 RATE_RAD_S = 3.0  # of every link, for the momentum
@@ -30,13 +30,7 @@ SHARE_LIMIT = 0.01  # [1] of pitch inertia, and of momentum
 # five links against the full robot ------------------------------------------------------------------
 @dataclass(frozen=True)
 class ReductionError:
-    """Largest difference between the sagittal and the full model.
-
-    Attributes
-    ----------
-    mass_kg, com_m, inertia_kgm2, momentum_kgm2_s : absolute.
-    inertia_share, momentum_share : of the largest value seen.
-    """
+    """Largest difference between the sagittal and the full model; the shares are of the largest value seen."""
 
     mass_kg: float
     com_m: float
@@ -107,20 +101,12 @@ class Draft:
 
 @dataclass(frozen=True)
 class Checkup:
-    """A robot that can be planned with, and how it came about.
-
-    Attributes
-    ----------
-    robot : the robot.
-    jumper : its lumped bodies and the URDF as it was.
-    error : sagittal model against full robot.
-    stance : absolute link angles (5,) of the standing posture.
-    """
+    """A robot that can be planned with, and how it came about."""
 
     robot: Robot
-    jumper: Jumper
-    error: ReductionError
-    stance: np.ndarray
+    jumper: Jumper  # its lumped bodies and the URDF as it was
+    error: ReductionError  # sagittal model against full robot
+    stance: np.ndarray  # (5,) absolute link angles of the standing posture [rad]
 
     def rows(self) -> list[dict]:
         """One row per role: joints, direction of their axes, range, torque and speed."""
@@ -180,20 +166,7 @@ def check(path: str | Path, config_text: str) -> Checkup:
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
-    """The checkup of a shipped robot, of a TOML file, or of a URDF whose roles are found; raises :class:`RobotError`.
-
-    Parameters
-    ----------
-    robot : name of a shipped robot, or path of a TOML or URDF file.
-    repair : what may be repaired where roles are found, see :meth:`jumplab.robot.Robot.from_urdf`.
-    """
-    path = SHIPPED.get(str(robot)) or Path(robot)
-    if path.suffix != ".toml":
-        return check(path, draft(path, repair).text)
-    try:
-        text = path.read_text()
-    except (OSError, ValueError) as e:
-        raise RobotError(f"{path}: cannot be read as text ({type(e).__name__})") from e
-    config = read_toml(text, str(path))
-    urdf = locate(entry(config, "urdf", kind=str), path.parent)
-    return check(urdf, text if "source" in config else draft(urdf, repair).text)
+    """The checkup of what :meth:`Robot.load` takes; roles are found where no table [source] tells them."""
+    path, config = files_of(robot)
+    told = config is not None and "source" in read_toml(config, "robot configuration")
+    return check(path, config if told else draft(path, repair).text)

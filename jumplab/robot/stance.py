@@ -33,12 +33,9 @@ def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits:
     def angles(shank):
         return np.array([0.0, shank, shank - knee, pitch, pitch + shoulder])
 
-    found = angles(_level(robot, knee, pitch, pitch + shoulder))
-    if not within_limits:
-        return found
-    joints = robot.sagittal.joint_angles(found)
-    for name, angle, low, high in zip(SAGITTAL_JOINTS, joints, robot.sagittal.lower, robot.sagittal.upper, strict=True):
-        if not low <= angle <= high:
+    found, m = angles(_level(robot, knee, pitch, pitch + shoulder)), robot.sagittal
+    for name, angle, low, high in zip(SAGITTAL_JOINTS, m.joint_angles(found), m.lower, m.upper, strict=True):
+        if within_limits and not low <= angle <= high:
             raise RobotError(
                 f"robot {robot.name}: standing with the knee at {knee:g} rad needs {name} at {angle:.3f} rad, outside "
                 f"its range {low:g} ... {high:g}; change [stance] in its configuration"
