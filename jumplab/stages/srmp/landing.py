@@ -155,7 +155,9 @@ class LandingSettings:
     duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     press_share: float = 0.7  # of the weight, least vertical force: soles that are hardly loaded slip and tip
-    force_gain: float = 1.0 / SETTINGS.force_share  # a landing may use the whole peak torque, it lasts a tenth of a second
+    force_gain: float = (
+        1.0 / SETTINGS.force_share
+    )  # a landing may use the whole peak torque, it lasts a tenth of a second
     w_jerk: float = 0.03  # [1], of the launch's weighted jerk: the catch has to be quick
     w_momentum_rate: float = 5e-4  # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
     w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low

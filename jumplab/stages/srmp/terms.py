@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
@@ -12,9 +15,13 @@ from jumplab.robot.reach import Reach
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import GRAVITY
 
-CROUCH_SMOOTHING_M = 0.02  # our choice: the positive part of a depth, rounded over this much
 QUARTERS = (0.25, 0.5, 0.75)
 GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
+
+
+def limit(name: str, equation: str, unit: str, at: str, of: Any, low: Any, high: Any = np.inf, **more: Any) -> Term:
+    """A constraint low <= of <= high."""
+    return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
 
 
 def srmp_state(p: Point, mass: float) -> SrmpState:
@@ -24,13 +31,17 @@ def srmp_state(p: Point, mass: float) -> SrmpState:
     return p.memo["srmp"]
 
 
+def trunk(p: Point) -> ca.SX:
+    """Pitch of the trunk, theta_l + theta_pl [rad]."""
+    return p.q[0] + p.q[2]
+
+
+# launch ------------------------------------------------------------------------------------------
 def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
+    at, mg = partial(srmp_state, mass=mass), mass * GRAVITY
 
-    def at(p):
-        return srmp_state(p, mass)
-
-    def inertia_box(p):
+    def inertia_room(p):
         low, high = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.inertia_low_fit, reach.inertia_high_fit))
         margin = s.inertia_margin * (high - low)
         return ca.vertcat(at(p).inertia - low - margin, high - margin - at(p).inertia)
@@ -48,54 +59,50 @@ def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     def extension(p):
         return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
 
-    mg, inf = mass * GRAVITY, np.inf
     return [
         Term("jerk", "SL-J1", "weighted", "mid", lambda p: ca.DM(np.sqrt(s.w_jerk)) * p.j, weight=1.0),
         Term("CoM velocity", "SL-J2", "m/s", "node", lambda p: at(p).com_velocity, weight=s.w_velocity),
         Term("L rate", "SL-J3", "N m", "node", lambda p: at(p).angular_momentum_rate, weight=s.w_momentum_rate),
         Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], weight=s.w_turn),
-        Term("trunk range", "SL-P1, as path", "rad", "node", lambda p: p.q[0] + p.q[2], lower=reach.posture[0],
-             upper=reach.posture[1]),
-        Term("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_box, lower=0.0, upper=inf),
-        Term("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, lower=s.momentum[0],
-             upper=s.momentum[1], scale=10.0),
-        Term("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], lower=0.0, upper=inf, scale=mg,
-             skip=(0, 1)),
-        Term("friction", "ours", "N", "node", cone, lower=0.0, upper=inf, scale=mg, skip=(0, 1)),
-        Term("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, lower=0.0, upper=inf,
-             scale=mg),
-        Term("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, lower=0.0, upper=inf),
-    ]  # fmt: skip
+        limit("trunk range", "SL-P1, as path", "rad", "node", trunk, *reach.posture),
+        limit("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_room, 0.0),
+        limit("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, *s.momentum, scale=10.0),
+        limit("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], 0.0, scale=mg, skip=(0, 1)),
+        limit("friction", "ours", "N", "node", cone, 0.0, scale=mg, skip=(0, 1)),
+        limit("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, 0.0, scale=mg),
+        limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, 0.0),
+    ]
 
 
 def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
     """What keeps the pendulum among the robot's postures: usual inertia, and with flat feet a CoM not too low."""
-    fit = ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
+    at, fit = partial(srmp_state, mass=mass), ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
     slope, offset = reach.low_com_fit
 
     def unusual(p):
-        return srmp_state(p, mass).inertia - ca.polyval(fit, p.q[1])
+        return at(p).inertia - ca.polyval(fit, p.q[1])
 
     def height(p):
-        com = srmp_state(p, mass).com
+        com = at(p).com
         return com[1] - slope * com[0] - offset
 
     def deep(p):
-        com = srmp_state(p, mass).com
+        com = at(p).com
         below = ca.polyval(ca.DM(reach.easy_com_fit), com[0]) - com[1]
-        return (below + ca.sqrt(below**2 + CROUCH_SMOOTHING_M**2)) / 2
+        return (below + ca.sqrt(below**2 + s.crouch_smoothing_m**2)) / 2
 
     def between(left, right, step):
         # the CoM only touches this limit, at the bottom of the crouch: with nodes alone it would pass between two
         inside = [chain(left.q, left.v, left.a, left.j, share * step)[0] for share in QUARTERS]
         return ca.vertcat(*(q[1] * (ca.cos(q[0]) - slope * ca.sin(q[0])) - offset for q in inside))
 
-    rows = [Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)]
-    if not heel_up:
-        rows.append(Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch))
-        for name, at, room in (("CoM not too low", "node", height), ("CoM not too low (between)", "interval", between)):
-            rows.append(Term(name, "ours: flat feet", "m", at, room, lower=0.0, upper=np.inf, scale=0.1))
-    return rows
+    usual = Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)
+    flat = [
+        Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch),
+        limit("CoM not too low", "ours: flat feet", "m", "node", height, 0.0, scale=0.1),
+        limit("CoM not too low (between)", "ours: flat feet", "m", "interval", between, 0.0, scale=0.1),
+    ]
+    return [usual] if heel_up else [usual, *flat]
 
 
 def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[Term]:
@@ -110,38 +117,28 @@ def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[
 
     scale = 0.1 * mass * GRAVITY
     return [
-        Term("CoP", "SL-P2, times F_z", "N m", "node", room, lower=0.0, upper=np.inf, scale=scale, skip=(0, 1)),
-        Term("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, lower=0.0, upper=np.inf, scale=scale),
+        limit("CoP", "SL-P2, times F_z", "N m", "node", room, 0.0, scale=scale, skip=(0, 1)),
+        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, 0.0, scale=scale),
     ]
 
 
 def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
     """Costs and constraints at the end of the launch, SL-J2, J3 and SL-E* (Sec. III-A)."""
-
-    def at(p):
-        return srmp_state(p, mass)
-
-    mg, posture = mass * GRAVITY, s.posture_end
+    at, mg = partial(srmp_state, mass=mass), mass * GRAVITY
+    length = reach.length[0], s.takeoff_length * reach.start[1]
     return [
-        Term("posture at take-off", "SL-J2", "rad", "end", lambda p: p.q[0] + p.q[2], weight=s.w_posture_end),
+        Term("posture at take-off", "SL-J2", "rad", "end", trunk, weight=s.w_posture_end),
         Term("L at take-off", "SL-J3", "kg m^2/s", "end", lambda p: at(p).angular_momentum, weight=s.w_momentum_end),
         Term("take-off speed", "SL-E2", "m/s", "end", lambda p: at(p).com_velocity[1] - p.p.takeoff_speed),
         Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
         Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
         Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
-        Term(
-            "take-off length",
-            "SL-B1 at the end; ours",
-            "m",
-            "end",
-            lambda p: p.q[1],
-            lower=reach.length[0],
-            upper=s.takeoff_length * reach.start[1],
-        ),
-        Term("posture range", "SL-P1", "rad", "end", lambda p: p.q[0] + p.q[2], lower=posture[0], upper=posture[1]),
+        limit("take-off length", "SL-B1 at the end; ours", "m", "end", lambda p: p.q[1], *length),
+        limit("posture range", "SL-P1", "rad", "end", trunk, *s.posture_end),
     ]
 
 
+# flight ------------------------------------------------------------------------------------------
 def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
     """Costs and constraints of the flight, SF-* (Sec. III-B); coordinate rho = rho_R + rho_I, state theta.
 
@@ -154,41 +151,50 @@ def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
             total += weight * left.c.L / chain(left.q, left.v, left.a, left.j, share * step)[0]
         return right.z - left.z - step * total
 
-    def usual(p):
+    def unusual(p):
         return p.q - ca.polyval(ca.DM(reach.usual_toe_fit), p.c.leg)
 
-    low, high = s.touchdown_inertia
-    landing = [] if reach is None else [
-        Term("inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", usual, lower=low, upper=high)
-    ]  # fmt: skip
+    def height(p):
+        t = p.duration
+        com = p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2
+        return com - p.p.platform - p.c.leg * ca.cos(_foot_angle(p))
+
+    def climb(p):
+        return p.c.vel_z - p.p.gravity * p.duration
+
+    rate, lean = s.touchdown_inertia_rate, s.touchdown_lean
+    usual = limit("inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", unusual, *s.touchdown_inertia)
     return [
-        *landing,
+        *([] if reach is None else [usual]),
         Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", lambda p: p.a, weight=s.w_inertia_accel),
         Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", lambda p: p.j, weight=s.w_inertia_jerk),
         Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),
-        Term("inertia rate at touchdown", "ours", "kg m^2/s", "end", lambda p: p.v, lower=-s.touchdown_inertia_rate,
-             upper=s.touchdown_inertia_rate, scale=10.0),
-        Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", _touchdown_height),
-        Term("falling at touchdown", "ours: not on the way up", "m/s", "end",
-             lambda p: p.c.vel_z - p.p.gravity * p.duration, lower=-np.inf, upper=0.0),
-        Term("lean at touchdown", "ours: foot below the CoM", "rad", "end", lambda p: p.z[0] - p.p.rotation,
-             lower=-s.touchdown_lean, upper=s.touchdown_lean),
-    ]  # fmt: skip
+        limit("inertia rate at touchdown", "ours", "kg m^2/s", "end", lambda p: p.v, -rate, rate, scale=10.0),
+        Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", height),
+        limit("falling at touchdown", "ours: not on the way up", "m/s", "end", climb, -np.inf, 0.0),
+        limit("lean at touchdown", "ours: foot below the CoM", "rad", "end", _foot_angle, -lean, lean),
+    ]
 
 
-def _foot_ahead(p: Point):
-    """Sole centre ahead of the CoM at touchdown [m], by the angle theta of the foot-CoM line."""
-    return -p.c.leg * ca.sin(p.z[0] - p.p.rotation)
+def _foot_angle(p: Point) -> ca.SX:
+    """Angle theta of the line from foot to CoM at touchdown [rad], whole turns taken off."""
+    return p.z[0] - p.p.rotation
 
 
-def _touchdown_height(p: Point):
-    t = p.duration
-    com = p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2
-    return com - p.p.platform - p.c.leg * ca.cos(p.z[0] - p.p.rotation)
+def _foot_ahead(p: Point) -> ca.SX:
+    """Sole centre ahead of the CoM at touchdown [m]."""
+    return -p.c.leg * ca.sin(_foot_angle(p))
 
 
+# both ------------------------------------------------------------------------------------------
 def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
-    """Links at take-off (SF-L1..4), jump length and landing condition over both phases."""
+    """Links at take-off (SF-L1..4), jump length and landing condition; ``e`` has the ends of every phase."""
+
+    def takeoff(e):
+        return srmp_state(e["toe"].end, mass)
+
+    def launch_time(e):
+        return e["flat"].end.duration + e["toe"].end.duration
 
     def continuity(e):
         a, b = e["flat"].end, e["toe"].start
@@ -196,14 +202,19 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
             *((x - y) / ca.DM(scale) for x, y, scale in ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0)))
         )
 
+    def lean_link(e):
+        return e["toe"].end.q[0] - e["flight"].start.z[0]
+
     def inertia_link(e):
-        a, b = srmp_state(e["toe"].end, mass), e["flight"].start
+        a, b = takeoff(e), e["flight"].start
         return ca.vertcat(a.inertia - b.q[0], (a.inertia_rate - b.v[0]) / 20, (a.inertia_accel - b.a[0]) / 200)
 
+    def momentum_link(e):
+        return takeoff(e).angular_momentum - e["flight"].start.c.L
+
     def ballistic(e):
-        a, c = srmp_state(e["toe"].end, mass), e["flight"].start.c
-        position, velocity = a.com, a.com_velocity
-        return ca.vertcat(position - ca.vertcat(c.com_x, c.com_z), velocity - ca.vertcat(c.vel_x, c.vel_z))
+        a, c = takeoff(e), e["flight"].start.c
+        return ca.vertcat(a.com - ca.vertcat(c.com_x, c.com_z), a.com_velocity - ca.vertcat(c.vel_x, c.vel_z))
 
     def length(e):
         c, end = e["flight"].start.c, e["flight"].end
@@ -213,20 +224,18 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
         end = e["flight"].end
         return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
 
+    def symmetry(e):
+        return e["flight"].end.z[0] + e["toe"].end.q[0] - e["flight"].end.p.rotation
+
+    link, window = {"identity": True}, s.capture_window_m
     return [
-        Term("launch time", "SL-J5", "s", "problem", lambda e: e["flat"].end.duration + e["toe"].end.duration,
-             weight=s.w_time),
-        Term("flat to toe", "ours: heel up", "scaled", "problem", continuity, identity=True),
-        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["toe"].end.q[0] - e["flight"].start.z[0],
-             identity=True),
-        Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link, identity=True),
-        Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem",
-             lambda e: srmp_state(e["toe"].end, mass).angular_momentum - e["flight"].start.c.L, scale=10.0,
-             identity=True),
-        Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic, identity=True),
+        Term("launch time", "SL-J5", "s", "problem", launch_time, weight=s.w_time),
+        Term("flat to toe", "ours: heel up", "scaled", "problem", continuity, **link),
+        Term("lean link", "SF-L1", "rad", "problem", lean_link, **link),
+        Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link, **link),
+        Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem", momentum_link, scale=10.0, **link),
+        Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic, **link),
         Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
-        Term("capture window", "ours; replaces SF-E1", "m", "problem", capture, lower=s.capture_window_m[0],
-             upper=s.capture_window_m[1], scale=0.1),
-        Term("symmetric landing", "SF-E1 (about the pivot)", "rad", "problem",
-             lambda e: e["flight"].end.z[0] + e["toe"].end.q[0] - e["flight"].end.p.rotation),
-    ]  # fmt: skip
+        limit("capture window", "ours; replaces SF-E1", "m", "problem", capture, *window, scale=0.1),
+        Term("symmetric landing", "SF-E1 (about the pivot)", "rad", "problem", symmetry),
+    ]
