@@ -192,12 +192,10 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
     flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
     launch_s = flat.duration + toe.duration
     t = np.linspace(0, launch_s, int(np.ceil(launch_s / step_s)) + 1)
-    quantities = launch_function(mass, task.gravity).map(len(t))
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
     q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
-    out = [x.full().T.squeeze() for x in quantities(q.T, v.T, a.T)]
-    com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = out
+    com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = pendulum(mass, task.gravity, q, v, a)
     up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
     cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
     cop[~up] = cop[up][-1]
@@ -208,13 +206,17 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
 
 
 @cache
-def launch_function(mass: float, gravity: float) -> ca.Function:
-    """The pendulum's CoM, momentum, inertia (each with rates), ground force and pivot torque from (q, v, a), 4 each."""
+def _pendulum_function(mass: float, gravity: float) -> ca.Function:
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
     s = SrmpState(mass, q, v, a, gravity)
-    return ca.Function("srmp", [q, v, a], [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum,
-                                           s.angular_momentum_rate, s.inertia, s.inertia_rate, s.inertia_accel,
-                                           s.ground_force, s.pivot_torque])  # fmt: skip
+    out = [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum, s.angular_momentum_rate]
+    out += [s.inertia, s.inertia_rate, s.inertia_accel, s.ground_force, s.pivot_torque]
+    return ca.Function("srmp", [q, v, a], out)
+
+
+def pendulum(mass: float, gravity: float, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> list[np.ndarray]:
+    """CoM, momentum, inertia (each with rates), ground force, pivot torque (n, ...) along a motion (n, 4) each."""
+    return [x.full().T.squeeze() for x in _pendulum_function(mass, gravity).map(len(q))(q.T, v.T, a.T)]
 
 
 def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
