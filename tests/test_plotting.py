@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.text import Text
 from paper import drawings
+from paper.srmp_touchdown import touchdown_of_plan
 
 from jumplab import show as plotting
 from jumplab.errors import InputError
@@ -29,7 +30,7 @@ from jumplab.robot.reach import postures, reach
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.show import style
 from jumplab.sim import simulate_jump
-from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_plan
+from jumplab.stages.srmp.landing import LandingPlanner
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import pendulum, turned
+from paper.srmp_touchdown import touchdown_of_plan
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.robot import load_robot
@@ -16,7 +17,6 @@ from jumplab.stages.srmp.landing import (
     LandingPlanner,
     LandingSettings,
     Touchdown,
-    touchdown_of_plan,
     touchdown_of_state,
 )
 

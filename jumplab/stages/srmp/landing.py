@@ -13,25 +13,20 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import root
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import SolverError
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp.nlp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import SETTINGS, Reach, reach
-from jumplab.robot.stance import com_from_toe, configuration
-from jumplab.stages.srmp.planner import SrmpPlan, pendulum
+from jumplab.stages.srmp.planner import pendulum
 from jumplab.stages.srmp.problem import SCALES
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.srmp.terms import cop_terms, launch_terms, limit, srmp_state
 from jumplab.task import GRAVITY
 
 # touchdown ------------------------------------------------------------------------------------------
-TRUNK_RAD = 0.15  # middle of what stage 3 allows at touchdown
-KNEE_GUESS_RAD = 1.0  # start of the search, likewise
-POSTURE_TOLERANCE_M = 1e-6  # far below anything that matters for an impact
 
 
 @dataclass(frozen=True)
@@ -42,22 +37,7 @@ class Touchdown:
     com_velocity: np.ndarray  # (2,) [m/s]
     L: float  # angular momentum about the CoM, about +y [kg m^2/s]
     rho: float  # pitch inertia about the CoM [kg m^2]
-    trunk_pitch: float = TRUNK_RAD  # [rad]
-
-
-def touchdown_of_plan(plan: SrmpPlan, robot: Robot, *, impact: bool = True) -> Touchdown:
-    """Touchdown of a stage-1 plan; ``impact`` False keeps the velocities of the flight.
-
-    Stage 1 has no posture, so for the impact the legs are bent until the CoM is where the plan has it, feet flat, trunk
-    and arms as usual at touchdown; the whole body moves as one with the plan's velocity and angular momentum. Raises
-    :class:`InfeasibleError` if the legs cannot put the CoM there.
-    """
-    flight = plan.flight
-    com, velocity, momentum, rho = -flight.foot_com[-1], flight.com_velocity[-1], flight.L[-1], float(flight.rho[-1])
-    if impact:
-        q = configuration(robot, _posture(robot, com), toe=-robot.sagittal.sole_center)
-        velocity, momentum = _after_impact(robot, q, _rigid_motion(robot, q, velocity, momentum))
-    return Touchdown(com, velocity, float(momentum), rho)
+    trunk_pitch: float = 0.15  # [rad]; the middle of what stage 3 allows at touchdown
 
 
 def touchdown_of_state(robot: Robot, q: np.ndarray, v: np.ndarray, *, impact: bool = True) -> Touchdown:
@@ -75,43 +55,12 @@ def touchdown_of_state(robot: Robot, q: np.ndarray, v: np.ndarray, *, impact: bo
     com, inertia, trunk = data.com[0].copy(), float(data.Ig.inertia[1, 1]), data.oMi[1].rotation
     velocity, momentum = data.hg.linear[[0, 2]] / robot.total_mass, float(data.hg.angular[1])
     if impact:
-        velocity, momentum = _after_impact(robot, q, v)
+        velocity, momentum = after_impact(robot, q, v)
     pitch = float(np.arctan2(trunk[0, 2], trunk[2, 2]))
     return Touchdown((com - sole)[[0, 2]], velocity, momentum, inertia, pitch)
 
 
-def _posture(robot: Robot, com: np.ndarray) -> np.ndarray:
-    """Link angles (5,) with flat feet that put the CoM at ``com`` (2,) from the middle of the sole."""
-    model, shoulder = robot.sagittal, robot.stance["shoulder_rad"]
-
-    def angles(legs):
-        return np.array([0.0, *legs, TRUNK_RAD, TRUNK_RAD + shoulder])
-
-    def miss(legs):
-        return com_from_toe(robot, angles(legs)) - model.sole_center - com
-
-    found = root(miss, [KNEE_GUESS_RAD / 2, -KNEE_GUESS_RAD / 2])
-    if not np.max(np.abs(found.fun)) < POSTURE_TOLERANCE_M:
-        raise InfeasibleError(
-            f"touchdown with the CoM {com[0]:+.3f} m ahead of and {com[1]:.3f} m above the soles: the legs of "
-            f"{robot.name} do not reach that; plan with a shorter leg at touchdown"
-        )
-    return angles(found.x)
-
-
-def _rigid_motion(robot: Robot, q: np.ndarray, velocity: np.ndarray, momentum: float) -> np.ndarray:
-    """Velocity (nv,) of the robot moving as one body with CoM velocity (2,) and angular momentum."""
-    model, data = robot.model, robot.model.createData()
-    v = np.zeros(model.nv)
-    pin.ccrba(model, data, q, v)
-    base = pin.XYZQUATToSE3(q[:7])
-    spin = np.array([0.0, momentum / data.Ig.inertia[1, 1], 0.0])
-    linear = np.array([velocity[0], 0.0, velocity[1]]) + np.cross(spin, base.translation - data.com[0])
-    v[:3], v[3:6] = base.rotation.T @ linear, base.rotation.T @ spin
-    return v
-
-
-def _after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
+def after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     """CoM velocity (2,) and angular momentum once both feet stand, v+ = v - M^-1 J^T (J M^-1 J^T)^-1 J v."""
     model, data = robot.model, robot.model.createData()
     pin.computeAllTerms(model, data, q, v)

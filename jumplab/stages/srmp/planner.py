@@ -96,53 +96,64 @@ class SrmpPlan:
 
 
 # planner ------------------------------------------------------------------------------------------
-# ipopt adds to an indefinite Hessian only if the step itself meets negative curvature; over 143 targets this took 18
-# iterations instead of 22 in the middle
-CURVATURE = {"neg_curv_test_tol": 1e-12}
-# our choice: tolerances as in stage 3 (that of the rows stays), a barrier that stays above a hundredth of them, and
-# first multipliers of limits that fit it: 14 iterations in the middle of 143 targets, 41 at most
-SEARCH = {"bound_mult_init_method": "mu-based", "mu_init": 0.01, "tol": 1e-4, "compl_inf_tol": 1e-5, "mu_min": 1e-6}
+OPTIONS = {  # of ipopt
+    "neg_curv_test_tol": 1e-12,  # adds to an indefinite Hessian only if the step itself meets negative curvature
+    "bound_mult_init_method": "mu-based",  # first multipliers of limits that fit the barrier
+    "mu_init": 0.01,
+    "mu_min": 1e-6,  # a hundredth of the tolerances
+    "tol": 1e-4,  # as in stage 3; the rows' own tolerance stays
+    "compl_inf_tol": 1e-5,
+}
 
 
 def parameters(task: JumpTask, envelope: Reach, start: np.ndarray | None = None) -> dict:
     """Parameter values of the stage-1 problem for a target; ``start`` (4,) instead of the stance."""
-    return dict(start=envelope.start if start is None else start, distance=task.distance_m, platform=task.platform_m,
-                takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)  # fmt: skip
+    return dict(
+        start=envelope.start if start is None else start,
+        distance=task.distance_m,
+        platform=task.platform_m,
+        takeoff_speed=task.takeoff_speed,
+        rotation=task.rotation_rad,
+        gravity=task.gravity,
+    )
 
 
 def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict[str, PhaseGuess]:
     """Start values that know only the target: crouch and rise on a straight line, constant inertia, steady turning."""
     n_flat, n_toe, n = settings.intervals
     phi0, t_f = envelope.start[1], task.flight_time(min(task.platform_m, 0.9 * task.height_m))
-    # our choice: of sixteen combinations of four numbers, the one with the fewest iterations at the hardest targets
+    # durations [s], time of the crouch and lean [rad] with the fewest iterations at the hardest targets
     flat_s, toe_s, bottom, reach_rad = 0.5, 0.12, 0.75, 0.45
     share = flat_s / (flat_s + toe_s)
     s = np.concatenate([np.linspace(0, share, n_flat + 1), np.linspace(share, 1, n_toe + 1)])
-    crouch = 0.62 * phi0  # our choice: a knee bend of about a right angle
+    crouch = 0.62 * phi0  # a knee bend of about a right angle
     length = np.interp(s, [0, bottom, 1], [phi0, crouch, 0.9 * phi0])
     vel_x = 0.8 * task.distance_m / t_f
     lean = reach_rad * np.tanh(vel_x) * s**2
     radius = np.sqrt(np.clip(envelope.start[3] ** 2 * length / phi0, 0.01, None))
     q = np.stack([lean, length, 0.4 * s, radius], -1)
+    flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
     rho = envelope.mass * radius[-1] ** 2
     spin = (task.rotation_rad - 2 * lean[-1]) / t_f
-    flight = PhaseGuess(t_f, np.full((n + 1, 1), rho), np.zeros((n + 1, 1)), np.zeros((n + 1, 1)),
-                        (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None],
-                        dict(L=rho * spin, com_x=length[-1] * np.sin(lean[-1]), com_z=length[-1] * np.cos(lean[-1]),
-                             vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.94 * phi0))  # fmt: skip
-    flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
-    return {"flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0), "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
-            "flight": flight}  # fmt: skip
+    com_x, com_z = length[-1] * np.sin(lean[-1]), length[-1] * np.cos(lean[-1])
+    constants = dict(L=rho * spin, com_x=com_x, com_z=com_z, vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.94 * phi0)
+    theta = (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None]
+    return {
+        "flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0),
+        "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
+        "flight": PhaseGuess(t_f, np.full_like(theta, rho), theta * 0, theta * 0, theta, constants),
+    }
 
 
 class SrmpPlanner:
     """Stage 1 for one robot: built once, solved for any target; ``keep`` keeps what was built for later processes."""
 
-    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None, *,
-                 keep: bool = False):  # fmt: skip
+    def __init__(
+        self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None, *, keep: bool = False
+    ):
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
-        options = {**CURVATURE, **SEARCH, **(options or {})}
+        options = OPTIONS | (options or {})
         self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
         self._warm = self.nlp.with_options({**WARM, **options})
 
@@ -181,9 +192,8 @@ class SrmpPlanner:
 
     def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
-        nlp = self.nlp if multipliers is None else self._warm
-        solution = nlp.solve(parameters(task, self.reach, start), guess, weights=weights, off=off, explain=explain,
-                             multipliers=multipliers)  # fmt: skip
+        nlp, data = self.nlp if multipliers is None else self._warm, parameters(task, self.reach, start)
+        solution = nlp.solve(data, guess, weights=weights, off=off, explain=explain, multipliers=multipliers)
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
 
 
@@ -199,10 +209,11 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
     up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
     cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
     cop[~up] = cop[up][-1]
-    launched = SrmpLaunch(t, com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force[:, 0], force[:, 1], cop,
-                          q[:, 0], q[:, 0] + q[:, 2], q)  # fmt: skip
-    return SrmpPlan(task, launched, _sample_flight(task, flight, toe.q[-1, 1], step_s), solution, envelope,
-                    flight.constants["leg"])  # fmt: skip
+    launched = SrmpLaunch(
+        t, com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, *force.T, cop, q[:, 0], q[:, 0] + q[:, 2], q
+    )
+    flown = _sample_flight(task, flight, toe.q[-1, 1], step_s)
+    return SrmpPlan(task, launched, flown, solution, envelope, flight.constants["leg"])
 
 
 @cache
@@ -223,16 +234,15 @@ def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
     t = np.linspace(0, flight.duration, int(np.ceil(flight.duration / step_s)) + 1)
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
     c, ones = flight.constants, np.ones_like(t)
-    nodes = flight.t
     # theta between nodes: the cubic through the node values with the exact rates L / rho
-    theta = _cubic(nodes, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
+    theta = _cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
     rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
     # leg length from take-off to touchdown: smooth, only the ends matter (the rod has no mass)
     s = t / flight.duration
-    blend, blend1, blend2 = (10 * s**3 - 15 * s**4 + 6 * s**5, (30 * s**2 - 60 * s**3 + 30 * s**4) / flight.duration,
-                             (60 * s - 180 * s**2 + 120 * s**3) / flight.duration**2)  # fmt: skip
     d = c["leg"] - takeoff_length
-    leg, leg1, leg2 = takeoff_length + d * blend, d * blend1, d * blend2
+    leg = takeoff_length + d * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    leg1 = d * ((30 * s**2 - 60 * s**3 + 30 * s**4) / flight.duration)
+    leg2 = d * ((60 * s - 180 * s**2 + 120 * s**3) / flight.duration**2)
     along = -np.stack([np.sin(theta), np.cos(theta)], -1)
     across = np.stack([along[:, 1], -along[:, 0]], -1)
     foot = leg[:, None] * along
