@@ -199,14 +199,9 @@ class Robot:
         for name in self.joint_names:
             j = m.getJointId(name)
             iq, iv = m.idx_qs[j], m.idx_vs[j]
-            speed = float(m.upperVelocityLimit[iv])
-            out[name] = {
-                "lower": float(m.lowerPositionLimit[iq]),
-                "upper": float(m.upperPositionLimit[iq]),
-                "speed": speed,
-                "effort": float(m.upperEffortLimit[iv]),
-                "corner_speed": self.corner_speed_ratio * speed,
-            }
+            told = m.lowerPositionLimit[iq], m.upperPositionLimit[iq], m.upperVelocityLimit[iv], m.upperEffortLimit[iv]
+            out[name] = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
+            out[name]["corner_speed"] = self.corner_speed_ratio * out[name]["speed"]
         return out
 
     @cached_property

@@ -21,9 +21,8 @@ from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import SETTINGS, Reach, reach
 from jumplab.stages.srmp.planner import pendulum
-from jumplab.stages.srmp.problem import SCALES
+from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, srmp_state
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.srmp.terms import cop_terms, launch_terms, limit, srmp_state
 from jumplab.task import GRAVITY
 
 # touchdown ------------------------------------------------------------------------------------------

@@ -22,50 +22,39 @@ from jumplab.task import JumpTask
 
 # plan ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class SrmpLaunch:
-    """Stage 1's launch on a fixed grid; positions from the pivot, the middle of the sole at its initial place.
+class SrmpMotion:
+    """Launch or flight on a fixed grid; positions from the pivot, the middle of the sole at its initial place."""
 
-    t (n,) [s]; com, com_velocity, com_acceleration (n, 2) [m ...]; L [kg m^2/s]; L_rate [N m]; rho [kg m^2] with rate
-    and accel; F_x, F_z [N]; cop_x [m]; lean, posture (theta_l + theta_pl) [rad]; coordinates (n, 4).
-    """
-
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    com_acceleration: np.ndarray
-    L: np.ndarray
-    L_rate: np.ndarray
-    rho: np.ndarray
-    rho_rate: np.ndarray
-    rho_accel: np.ndarray
-    F_x: np.ndarray
-    F_z: np.ndarray
-    cop_x: np.ndarray
-    lean: np.ndarray
-    posture: np.ndarray
-    coordinates: np.ndarray
+    t: np.ndarray  # (n,) since the launch began, or since take-off [s]
+    com: np.ndarray  # (n, 2) x and z [m]
+    com_velocity: np.ndarray  # (n, 2) [m/s]
+    com_acceleration: np.ndarray  # (n, 2) [m/s^2]
+    L: np.ndarray  # (n,) [kg m^2/s]
+    rho: np.ndarray  # (n,) [kg m^2]
+    rho_rate: np.ndarray  # (n,) [kg m^2/s]
+    rho_accel: np.ndarray  # (n,) [kg m^2/s^2]
+    lean: np.ndarray  # (n,) angle of the line from pivot or foot to CoM against the vertical, theta_l [rad]
 
 
 @dataclass(frozen=True)
-class SrmpFlight:
-    """Stage 1's flight on a fixed grid, t from take-off: as :class:`SrmpLaunch`, L constant.
+class SrmpLaunch(SrmpMotion):
+    """Stage 1's launch."""
 
-    lean : angle of the line from foot to CoM against the vertical [rad] (theta_l of the flight);
-    foot_com : middle of the sole relative to the CoM (n, 2) [m], with rate and acceleration.
-    """
+    L_rate: np.ndarray  # (n,) [N m]
+    F_x: np.ndarray  # (n,) [N]
+    F_z: np.ndarray  # (n,) [N]
+    cop_x: np.ndarray  # (n,) [m]
+    posture: np.ndarray  # (n,) theta_l + theta_pl [rad]
+    coordinates: np.ndarray  # (n, 4)
 
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    com_acceleration: np.ndarray
-    L: np.ndarray
-    rho: np.ndarray
-    rho_rate: np.ndarray
-    rho_accel: np.ndarray
-    lean: np.ndarray
-    foot_com: np.ndarray
-    foot_com_rate: np.ndarray
-    foot_com_accel: np.ndarray
+
+@dataclass(frozen=True)
+class SrmpFlight(SrmpMotion):
+    """Stage 1's flight, L constant."""
+
+    foot_com: np.ndarray  # (n, 2) middle of the sole relative to the CoM [m]
+    foot_com_rate: np.ndarray  # (n, 2) [m/s]
+    foot_com_accel: np.ndarray  # (n, 2) [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -77,7 +66,6 @@ class SrmpPlan:
     flight: SrmpFlight
     solution: Solution
     reach: Reach
-    touchdown_length_m: float
 
     @property
     def launch_s(self) -> float:
@@ -210,10 +198,9 @@ def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float
     cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
     cop[~up] = cop[up][-1]
     launched = SrmpLaunch(
-        t, com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, *force.T, cop, q[:, 0], q[:, 0] + q[:, 2], q
+        t, com, com_v, com_a, momentum, rho, rho_v, rho_a, q[:, 0], rate, *force.T, cop, q[:, 0] + q[:, 2], q
     )
-    flown = _sample_flight(task, flight, toe.q[-1, 1], step_s)
-    return SrmpPlan(task, launched, flown, solution, envelope, flight.constants["leg"])
+    return SrmpPlan(task, launched, _sample_flight(task, flight, toe.q[-1, 1], step_s), solution, envelope)
 
 
 @cache
