@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
 from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
@@ -18,7 +18,7 @@ LIMBS = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 @cache
 def planner() -> Planner:
     """The stages, built once."""
-    return Planner(load_robot())
+    return Planner(Robot.load())
 
 
 @cache
@@ -30,7 +30,7 @@ def jump(distance_m: float, height_m: float, platform_m: float = 0.0, method: st
 @cache
 def srmp_planner() -> SrmpPlanner:
     """Stage 1, built once."""
-    return SrmpPlanner(load_robot())
+    return SrmpPlanner(Robot.load())
 
 
 @cache

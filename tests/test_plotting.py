@@ -222,9 +222,9 @@ def test_files_are_the_same_in_every_process(tmp_path):
     """Same bytes whatever the hash seed, the caller's settings and the folder's name."""
     code = (
         "import sys, matplotlib; matplotlib.rcParams['font.size'] = float(sys.argv[2]);"
-        "from jumplab import plotting; from jumplab.robot import load_robot;"
+        "from jumplab import plotting; from jumplab.robot import Robot;"
         "[plotting.save_figure(f, n, sys.argv[1]) for n, f in"
-        " (('a', drawings.framework()), ('b', drawings.link_models(load_robot())))]"
+        " (('a', drawings.framework()), ('b', drawings.link_models(Robot.load())))]"
     )
     made = []
     for seed, size in (("1", "8"), ("2", "15")):

@@ -16,7 +16,7 @@ from paper import bhr_table as table
 
 import jumplab
 from jumplab.errors import RobotError
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.robot.description import GRAVITY
 from jumplab.robot.stance import check_stance, stance_angles
 from jumplab.task import GRAVITY as TASK_GRAVITY
@@ -122,7 +122,7 @@ def test_gravity_is_the_papers_everywhere(bhr):
 def test_robot_is_immutable_and_its_hash_is_its_text(bhr):
     with pytest.raises(FrozenInstanceError):
         bhr.name = "other"
-    assert bhr.hash == load_robot().hash and len(bhr.hash) == 12
+    assert bhr.hash == Robot.load().hash and len(bhr.hash) == 12
     assert Robot.from_text(bhr.urdf + " ", bhr.config_text).hash != bhr.hash
     assert Robot.from_text(bhr.urdf, bhr.config_text + "\n# a remark").hash != bhr.hash
 

@@ -7,6 +7,4 @@ Begin with :mod:`description`; stage 1's view of what the robot can do is in :mo
 from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, SAGITTAL_LINKS, SagittalModel
 
-load_robot = Robot.load
-
-__all__ = ["SAGITTAL_JOINTS", "SAGITTAL_LINKS", "Robot", "SagittalModel", "load_robot"]
+__all__ = ["SAGITTAL_JOINTS", "SAGITTAL_LINKS", "Robot", "SagittalModel"]
