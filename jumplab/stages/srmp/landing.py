@@ -20,7 +20,7 @@ from jumplab.ocp.nlp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import SETTINGS, Reach, reach
-from jumplab.stages.srmp.planner import pendulum
+from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
 from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, srmp_state
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import GRAVITY
@@ -74,7 +74,6 @@ def after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray
 
 
 # landing ------------------------------------------------------------------------------------------
-SAMPLE_S = 0.005  # a hundred samples and more over the landing
 GUESS_S = 0.8  # duration that the solver begins with
 
 
@@ -97,27 +96,12 @@ class LandingSettings:
 
 
 @dataclass(frozen=True)
-class LandingPlan:
-    """A planned landing, sampled; positions from the middle between the soles."""
+class LandingPlan(SrmpStance):
+    """A planned landing, sampled."""
 
-    t: np.ndarray  # (N,) since touchdown [s]
-    com: np.ndarray  # (N, 2) x and z [m]
-    com_velocity: np.ndarray  # (N, 2) [m/s]
-    com_acceleration: np.ndarray  # (N, 2) [m/s^2]
-    L: np.ndarray  # (N,) [kg m^2/s]
-    L_rate: np.ndarray  # (N,) [N m]
-    rho: np.ndarray  # (N,) [kg m^2]
-    F_x: np.ndarray  # (N,) [N]
-    F_z: np.ndarray  # (N,) [N]
-    cop_x: np.ndarray  # (N,) [m]
     touchdown: Touchdown  # the state it began in
     statistics: Statistics  # what the solve cost
     solution: PhaseSolution  # its nodes
-
-    @property
-    def duration_s(self) -> float:
-        """From touchdown to standing [s]."""
-        return float(self.t[-1])
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for ever."""
@@ -207,10 +191,10 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
 class LandingPlanner:
     """Landings of one robot: built once, solved from any touchdown."""
 
-    def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings(), options: dict | None = None):
+    def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings()):
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         self._mass, self._margin = robot.sagittal.total_mass, SrmpSettings().inertia_margin
-        self.nlp = Nlp(build_landing(robot, settings, self.reach), options)
+        self.nlp = Nlp(build_landing(robot, settings, self.reach))
 
     def plan(self, touchdown: Touchdown, *, gravity: float = GRAVITY, guess: PhaseGuess | None = None) -> LandingPlan:
         """Plan from ``touchdown`` to standing.
@@ -227,7 +211,10 @@ class LandingPlanner:
         """
         data = self._parameters(touchdown)
         solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": guess or self._guess(data)})
-        return _sample(solution.phases["landing"], touchdown, solution.statistics, self._mass, gravity)
+        phase = solution.phases["landing"]
+        t = grid(phase.duration)
+        columns = on_ground(self._mass, gravity, t, *phase.sample(t))
+        return LandingPlan(*columns, touchdown, solution.statistics, phase)
 
     def catch(self, q: np.ndarray, v: np.ndarray) -> LandingPlan | None:
         """Landing from a state of the full robot at the first touch, None if there is none; see :meth:`plan`."""
@@ -255,10 +242,3 @@ class LandingPlanner:
         q[:, :2] += GUESS_S * data["rates"] * s * (1 - s) ** 4
         q[:, 1] = np.clip(q[:, 1], *self.reach.length)
         return PhaseGuess(GUESS_S, q)
-
-
-def _sample(phase: PhaseSolution, touchdown: Touchdown, statistics, mass: float, gravity: float) -> LandingPlan:
-    t = np.linspace(0, phase.duration, int(np.ceil(phase.duration / SAMPLE_S)) + 1)
-    com, com_v, com_a, momentum, rate, rho, _, _, force, torque = pendulum(mass, gravity, *phase.sample(t))
-    F_x, F_z = force.T
-    return LandingPlan(t, com, com_v, com_a, momentum, rate, rho, F_x, F_z, -torque / F_z, touchdown, statistics, phase)

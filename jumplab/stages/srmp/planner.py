@@ -11,7 +11,7 @@ import numpy as np
 
 from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
-from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess, Solution
+from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
@@ -23,9 +23,9 @@ from jumplab.task import JumpTask
 # plan ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class SrmpMotion:
-    """Launch or flight on a fixed grid; positions from the pivot, the middle of the sole at its initial place."""
+    """Columns that all parts of a jump have; positions from the middle of the sole where it stands or took off."""
 
-    t: np.ndarray  # (n,) since the launch began, or since take-off [s]
+    t: np.ndarray  # (n,) since this part began [s]
     com: np.ndarray  # (n, 2) x and z [m]
     com_velocity: np.ndarray  # (n, 2) [m/s]
     com_acceleration: np.ndarray  # (n, 2) [m/s^2]
@@ -33,12 +33,17 @@ class SrmpMotion:
     rho: np.ndarray  # (n,) [kg m^2]
     rho_rate: np.ndarray  # (n,) [kg m^2/s]
     rho_accel: np.ndarray  # (n,) [kg m^2/s^2]
-    lean: np.ndarray  # (n,) angle of the line from pivot or foot to CoM against the vertical, theta_l [rad]
+    lean: np.ndarray  # (n,) angle of the line from the sole to the CoM against the vertical, theta_l [rad]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last sample [s]."""
+        return float(self.t[-1])
 
 
 @dataclass(frozen=True)
-class SrmpLaunch(SrmpMotion):
-    """Stage 1's launch."""
+class SrmpStance(SrmpMotion):
+    """Launch or landing, on the ground."""
 
     L_rate: np.ndarray  # (n,) [N m]
     F_x: np.ndarray  # (n,) [N]
@@ -62,7 +67,7 @@ class SrmpPlan:
     """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept in, the target."""
 
     task: JumpTask
-    launch: SrmpLaunch
+    launch: SrmpStance
     flight: SrmpFlight
     solution: Solution
     reach: Reach
@@ -70,7 +75,7 @@ class SrmpPlan:
     @property
     def launch_s(self) -> float:
         """Duration of the launch [s]."""
-        return float(self.launch.t[-1])
+        return self.launch.duration_s
 
     @property
     def toe_s(self) -> float:
@@ -80,10 +85,11 @@ class SrmpPlan:
     @property
     def flight_s(self) -> float:
         """Duration of the flight [s]."""
-        return float(self.flight.t[-1])
+        return self.flight.duration_s
 
 
 # planner ------------------------------------------------------------------------------------------
+SAMPLE_S = 0.005  # a hundred samples and more over each part
 OPTIONS = {  # of ipopt
     "neg_curv_test_tol": 1e-12,  # adds to an indefinite Hessian only if the step itself meets negative curvature
     "bound_mult_init_method": "mu-based",  # first multipliers of limits that fit the barrier
@@ -136,14 +142,11 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
 class SrmpPlanner:
     """Stage 1 for one robot: built once, solved for any target; ``keep`` keeps what was built for later processes."""
 
-    def __init__(
-        self, robot: Robot, settings: SrmpSettings = SrmpSettings(), options: dict | None = None, *, keep: bool = False
-    ):
+    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), *, keep: bool = False):
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
-        options = OPTIONS | (options or {})
-        self.nlp = Nlp(build_problem(robot, settings, self.reach), options, key)
-        self._warm = self.nlp.with_options({**WARM, **options})
+        self.nlp = Nlp(build_problem(robot, settings, self.reach), OPTIONS, key)
+        self._warm = self.nlp.with_options(WARM | OPTIONS)
 
     def plan(
         self,
@@ -185,26 +188,25 @@ class SrmpPlanner:
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
 
 
-def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float, step_s: float = 0.005) -> SrmpPlan:
-    """Sample a stage-1 solution on grids of about ``step_s`` that include both ends of both phases."""
+# samples ------------------------------------------------------------------------------------------
+def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float) -> SrmpPlan:
+    """Sample a stage-1 solution on grids that include both ends of both parts."""
     flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
-    launch_s = flat.duration + toe.duration
-    t = np.linspace(0, launch_s, int(np.ceil(launch_s / step_s)) + 1)
+    t = grid(flat.duration + toe.duration)
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
     q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
-    com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = pendulum(mass, task.gravity, q, v, a)
-    up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
-    cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
-    cop[~up] = cop[up][-1]
-    launched = SrmpLaunch(
-        t, com, com_v, com_a, momentum, rho, rho_v, rho_a, q[:, 0], rate, *force.T, cop, q[:, 0] + q[:, 2], q
-    )
-    return SrmpPlan(task, launched, _sample_flight(task, flight, toe.q[-1, 1], step_s), solution, envelope)
+    launch = SrmpStance(*on_ground(mass, task.gravity, t, q, v, a))
+    return SrmpPlan(task, launch, _sample_flight(flight, toe.q[-1, 1], task.gravity), solution, envelope)
+
+
+def grid(duration: float) -> np.ndarray:
+    """Times [s] at most :data:`SAMPLE_S` apart, both ends included."""
+    return np.linspace(0, duration, int(np.ceil(duration / SAMPLE_S)) + 1)
 
 
 @cache
-def _pendulum_function(mass: float, gravity: float) -> ca.Function:
+def _pendulum(mass: float, gravity: float) -> ca.Function:
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
     s = SrmpState(mass, q, v, a, gravity)
     out = [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum, s.angular_momentum_rate]
@@ -212,13 +214,19 @@ def _pendulum_function(mass: float, gravity: float) -> ca.Function:
     return ca.Function("srmp", [q, v, a], out)
 
 
-def pendulum(mass: float, gravity: float, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> list[np.ndarray]:
-    """CoM, momentum, inertia (each with rates), ground force, pivot torque (n, ...) along a motion (n, 4) each."""
-    return [x.full().T.squeeze() for x in _pendulum_function(mass, gravity).map(len(q))(q.T, v.T, a.T)]
+def on_ground(mass: float, gravity: float, t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple:
+    """Columns of a :class:`SrmpStance` from times (n,) and coordinates with their rates (n, 4)."""
+    out = [x.full().T.squeeze() for x in _pendulum(mass, gravity).map(len(t))(q.T, v.T, a.T)]
+    com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = out
+    up = force[:, 1] > 1.0  # N; at take-off the CoP is 0/0
+    cop = np.where(up, -torque / np.where(up, force[:, 1], 1.0), np.nan)
+    cop[~up] = cop[up][-1]
+    motion = t, com, com_v, com_a, momentum, rho, rho_v, rho_a, q[:, 0]
+    return *motion, rate, *force.T, cop, q[:, 0] + q[:, 2], q
 
 
-def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
-    t = np.linspace(0, flight.duration, int(np.ceil(flight.duration / step_s)) + 1)
+def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float) -> SrmpFlight:
+    t = grid(flight.duration)
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
     c, ones = flight.constants, np.ones_like(t)
     # theta between nodes: the cubic through the node values with the exact rates L / rho
@@ -235,9 +243,9 @@ def _sample_flight(task, flight, takeoff_length, step_s) -> SrmpFlight:
     foot = leg[:, None] * along
     foot_v = leg1[:, None] * along + (leg * rate)[:, None] * across
     foot_a = (leg2 - leg * rate**2)[:, None] * along + (leg * accel + 2 * leg1 * rate)[:, None] * across
-    com = np.stack([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - task.gravity * t**2 / 2], -1)
-    com_v = np.stack([c["vel_x"] * ones, c["vel_z"] - task.gravity * t], -1)
-    com_a = np.stack([0 * ones, -task.gravity * ones], -1)
+    com = np.stack([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - gravity * t**2 / 2], -1)
+    com_v = np.stack([c["vel_x"] * ones, c["vel_z"] - gravity * t], -1)
+    com_a = np.stack([0 * ones, -gravity * ones], -1)
     return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)
 
 

@@ -207,9 +207,6 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
         pairs = ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0))
         return ca.vertcat(*((x - y) / ca.DM(scale) for x, y, scale in pairs))
 
-    def lean_link(e):
-        return e["toe"].end.q[0] - e["flight"].start.z[0]
-
     def inertia_link(e):
         a, b = takeoff(e), e["flight"].start
         return ca.vertcat(a.inertia - b.q[0], (a.inertia_rate - b.v[0]) / 20, (a.inertia_accel - b.a[0]) / 200)
@@ -236,7 +233,7 @@ def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
     return [
         Term("launch time", "SL-J5", "s", "problem", launch_time, weight=s.w_time),
         Term("flat to toe", "ours: heel up", "scaled", "problem", continuity, **link),
-        Term("lean link", "SF-L1", "rad", "problem", lean_link, **link),
+        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["toe"].end.q[0] - e["flight"].start.z[0], **link),
         Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link, **link),
         Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem", momentum_link, scale=10.0, **link),
         Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic, **link),
