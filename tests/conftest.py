@@ -12,9 +12,9 @@ import pytest
 @pytest.fixture(scope="session")
 def bhr():
     """The default robot."""
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
 
-    return load_robot()
+    return Robot.load()
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.sim import SLIGHT, Perturbation
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import ChainResult, Course, Rehearsal, crouched, run_chain
@@ -11,7 +11,7 @@ from jumplab.studies.chain import ChainResult, Course, Rehearsal, crouched, run_
 @cache
 def waiting() -> Robot:
     """The default robot in its crouch."""
-    return crouched(load_robot())
+    return crouched(Robot.load())
 
 
 @cache
@@ -27,6 +27,6 @@ def rehearsal() -> Rehearsal:
 @cache
 def chain(solve_s: float = 0.2, seed: int | None = None) -> ChainResult:
     """Two jumps of 0.6 m, planning charged with a given time."""
-    drawn = None if seed is None else Perturbation.draw(load_robot(), seed, SLIGHT)
-    return run_chain(Course.of([0.6, 0.6], 0.3), load_robot(), planner=planner(), rehearsal=rehearsal(),
+    drawn = None if seed is None else Perturbation.draw(Robot.load(), seed, SLIGHT)
+    return run_chain(Course.of([0.6, 0.6], 0.3), Robot.load(), planner=planner(), rehearsal=rehearsal(),
                      solve_s=solve_s, perturbation=drawn)  # fmt: skip

@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
 from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
@@ -18,7 +18,7 @@ LIMBS = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 @cache
 def planner() -> Planner:
     """The stages, built once."""
-    return Planner(load_robot())
+    return Planner(Robot.load())
 
 
 @cache
@@ -30,7 +30,7 @@ def jump(distance_m: float, height_m: float, platform_m: float = 0.0, method: st
 @cache
 def srmp_planner() -> SrmpPlanner:
     """Stage 1, built once."""
-    return SrmpPlanner(load_robot())
+    return SrmpPlanner(Robot.load())
 
 
 @cache
@@ -69,8 +69,8 @@ def full_state(
     for i, role in enumerate(LIMBS):
         for name in robot.joints[role]:
             column = model.idx_vs[model.getJointId(name)]
-            v[column] = s.sign[i] * s.joint_angles(rates)[i]
-            a[column] = s.sign[i] * s.joint_angles(accels)[i]
+            v[column] = s.signs[i, 0] * s.joint_angles(rates)[i]
+            a[column] = s.signs[i, 0] * s.joint_angles(accels)[i]
     return configuration(robot, np.asarray(angles), toe), v, a
 
 

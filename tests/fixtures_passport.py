@@ -10,11 +10,11 @@ import pinocchio as pin
 from fixtures_core import jump
 
 from jumplab.io.tape import Tape
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.task import JumpTask
 
 TASK = JumpTask(1.0, 0.5)
-ROBOT = load_robot()
+ROBOT = Robot.load()
 LEFT, RIGHT = 0, 1
 STANDING = 100  # row early in the launch, the foot flat
 FLYING, LAST, PUSHING = "flight", -1, -30  # rows from take-off: 100 later, the last of the launch, heel up

@@ -2,7 +2,7 @@
 
 from xml.etree import ElementTree as ET
 
-from jumplab.robot.bhr import table
+from paper import bhr_table as table
 
 GOOD = table.URDF_PATH.read_text()
 CONFIG = """

@@ -10,7 +10,7 @@ from jumplab.errors import SolverError
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
 from jumplab.ocp.sqp import Approach, StagedOrder
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 
@@ -25,8 +25,8 @@ def assembled(request):
     if request.param == "move":
         return Assembled(move())
     if request.param == "SRMP":
-        return SrmpPlanner(load_robot()).nlp.assembled
-    return WholeBodyPlanner(load_robot(), Mesh(3, 2, 4), refine=False).nlp.assembled
+        return SrmpPlanner(Robot.load()).nlp.assembled
+    return WholeBodyPlanner(Robot.load(), Mesh(3, 2, 4), refine=False).nlp.assembled
 
 
 def staged(a: Assembled, order: StagedOrder, x, p):
@@ -67,7 +67,7 @@ def test_a_variable_that_follows_from_nothing_is_refused():
 
 
 def test_what_joins_far_nodes_is_left_out():
-    order = StagedOrder(SrmpPlanner(load_robot()).nlp.assembled)
+    order = StagedOrder(SrmpPlanner(Robot.load()).nlp.assembled)
     assert [order.a.rows[i].term.name for i in np.flatnonzero(~order.kept)] == ["symmetric landing"]
 
 

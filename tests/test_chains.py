@@ -5,7 +5,7 @@ import pytest
 from fixtures_chains import planner, rehearsal, waiting
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_angles
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
@@ -77,7 +77,7 @@ def test_impossible_chains_are_refused_before_any_solve(monkeypatch, arguments, 
     """Neither a planner's stage but the reach nor the simulation is asked."""
     monkeypatch.setattr(Planner, "plan", lambda *a, **k: pytest.fail("a jump was planned"))
     with pytest.raises(kind) as e:
-        run_chain(Course.of(*arguments), load_robot(), planner=planner())
+        run_chain(Course.of(*arguments), Robot.load(), planner=planner())
     assert str(e.value).startswith(sentence) and "\n" not in str(e.value)
 
 
@@ -87,7 +87,7 @@ def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
 
     monkeypatch.setattr(planner(), "plan", fail)
     with pytest.raises(InfeasibleError, match=r"^jump 1 of 1: stage 1: no plan$"):
-        run_chain(Course.of([0.55], 0.3), load_robot(), planner=planner())
+        run_chain(Course.of([0.55], 0.3), Robot.load(), planner=planner())
 
 
 @pytest.mark.parametrize(
@@ -104,13 +104,13 @@ def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
 )
 def test_settings_that_make_no_sense(arguments, sentence):
     with pytest.raises(InputError) as e:
-        run_chain(Course.of([0.6], 0.3), load_robot(), planner=planner(), **arguments)
+        run_chain(Course.of([0.6], 0.3), Robot.load(), planner=planner(), **arguments)
     assert str(e.value) == sentence
 
 
 def test_planner_of_another_posture_is_refused():
     with pytest.raises(InputError, match=r"make it for crouched\(robot\)$"):
-        run_chain(Course.of([0.6], 0.3), load_robot(), planner=Planner(load_robot()))
+        run_chain(Course.of([0.6], 0.3), Robot.load(), planner=Planner(Robot.load()))
 
 
 def test_scene_of_platforms(bhr):

@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from jumplab.cli import main as cli
 from jumplab.errors import SolverError
 from jumplab.io import folder as store
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.show import chains as pictures
 from jumplab.show.style import MIN_FONT_PT, PAGE_IN
@@ -72,8 +72,8 @@ def test_a_late_plan_is_waited_for_in_the_crouch():
 @pytest.mark.slow
 def test_a_chain_made_twice_is_the_same(tmp_path):
     a = chain(0.2, 3)
-    b = run_chain(a.course, load_robot(), planner=planner(), rehearsal=rehearsal(), solve_s=0.2,
-                  perturbation=Perturbation.draw(load_robot(), 3, SLIGHT))  # fmt: skip
+    b = run_chain(a.course, Robot.load(), planner=planner(), rehearsal=rehearsal(), solve_s=0.2,
+                  perturbation=Perturbation.draw(Robot.load(), 3, SLIGHT))  # fmt: skip
     assert np.array_equal(a.q, b.q) and np.array_equal(a.tau, b.tau)
     assert a.stood and np.abs(a.errors_m).max() < 0.03
 
@@ -84,7 +84,7 @@ def test_a_plan_that_does_not_come_ends_the_chain(monkeypatch):
         raise SolverError("no plan today")
 
     monkeypatch.setattr(planner(), "replan", fail)
-    result = run_chain(Course.of([0.6], 0.3), load_robot(), planner=planner(), rehearsal=rehearsal(), solve_s=0.0)
+    result = run_chain(Course.of([0.6], 0.3), Robot.load(), planner=planner(), rehearsal=rehearsal(), solve_s=0.0)
     assert not result.stood and result.reason == "no plan for jump 1: no plan today"
 
 

@@ -8,7 +8,7 @@ from fixtures_robots import child, write
 
 from jumplab.cli.main import main
 from jumplab.errors import InputError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.show.envelope import envelope_map
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.stages.whole_body.settings import Limits
@@ -94,7 +94,7 @@ def test_the_command_draws_and_names_the_largest_jump(capsys, tmp_path):
     assert "limited by" in capsys.readouterr().out
     assert (tmp_path / "map" / "envelope.png").stat().st_size > 5000
     assert len(json.loads((tmp_path / "map" / "envelope.json").read_text())["cells"]) == 2
-    assert load_robot(robot).name == "child"
+    assert Robot.load(robot).name == "child"
 
 
 def test_the_picture_has_every_reason():

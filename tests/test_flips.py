@@ -9,7 +9,7 @@ from paper.drawings import trunk_angle
 
 from jumplab import auditing as passport
 from jumplab.errors import InputError, SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.sim import Perturbation, simulate_jump
 from jumplab.sim.reaim import Tuck, is_flip
 from jumplab.stages.planner import Planner
@@ -25,7 +25,7 @@ TURN = 2 * np.pi
 
 @lru_cache
 def planner():
-    return Planner(load_robot())
+    return Planner(Robot.load())
 
 
 @lru_cache
@@ -168,6 +168,6 @@ def test_three_steps_say_what_they_skipped():
 @pytest.mark.slow
 def test_a_flip_beyond_the_robot_is_refused_in_words():
     """Little effort stands for a hard target: no plan, and no minute of searching."""
-    flips = FlipPlanner(load_robot(), tracking=False, options={"max_iter": 3})
+    flips = FlipPlanner(Robot.load(), tracking=False, options={"max_iter": 3})
     with pytest.raises(SolverError, match="every search from a flip's postures ended so"):
         flips.plan(JumpTask(0.0, 0.5, rotation_rad=TURN))

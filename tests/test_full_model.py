@@ -7,7 +7,7 @@ import pytest
 from jumplab.errors import RobotError
 from jumplab.models.full import FullBody, force_target
 from jumplab.models.planar import evaluator
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_configuration
 
 STEP = 1e-5  # central differences: truncation and round-off meet near 1e-9 for quantities of size 1 to 100
@@ -16,7 +16,7 @@ TOLERANCE = 2e-7
 
 @pytest.fixture(scope="module")
 def body():
-    return FullBody(load_robot())
+    return FullBody(Robot.load())
 
 
 def random_states(body, n=4, seed=3):
@@ -124,7 +124,7 @@ def test_wrench_map(body):
 
 
 def test_gravity_can_be_another():
-    robot = load_robot()
+    robot = Robot.load()
     moon, rest = FullBody(robot, gravity=1.62), np.zeros(robot.model.nv)
     weight = moon.terms(stance_configuration(robot), rest).H[[0, 2]]
     assert np.hypot(*weight) == pytest.approx(42 * 1.62) and moon.gravity == pytest.approx(1.62)
@@ -146,18 +146,18 @@ def with_axis(robot, joint, old, new):
 
 
 def test_mirrored_axes_turn_sums_into_differences():
-    rolled = with_axis(load_robot(), "right_hip_roll", "1 0 0", "-1 0 0")
+    rolled = with_axis(Robot.load(), "right_hip_roll", "1 0 0", "-1 0 0")
     row = FullBody(rolled).symmetry_rows(("hip",))[1]
     assert sorted(row[row != 0]) == [-1, 1]  # a difference now
 
 
 def test_crooked_robots_are_named():
     with pytest.raises(RobotError, match=r"left_hip_pitch.*right_hip_pitch.*not mirror images"):
-        FullBody(with_axis(load_robot(), "right_hip_pitch", "0 1 0", "0.6 0.8 0"))
+        FullBody(with_axis(Robot.load(), "right_hip_pitch", "0 1 0", "0.6 0.8 0"))
     straight = '<origin xyz="0 0 -0.35" rpy="0 0 0" />'  # of knees and ankles
-    turned = load_robot().urdf.replace(straight, straight.replace("0 0 0", "0 0 0.1"))
+    turned = Robot.load().urdf.replace(straight, straight.replace("0 0 0", "0 0 0.1"))
     with pytest.raises(RobotError, match=r"axes of 'left_foot' are not parallel"):
-        FullBody(Robot.from_text(turned, load_robot().config_text))
+        FullBody(Robot.from_text(turned, Robot.load().config_text))
 
 
 def test_motion_is_terms_without_jacobians(body):

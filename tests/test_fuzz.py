@@ -24,7 +24,7 @@ from jumplab.cli import notebooks
 from jumplab.errors import InputError, JumplabError
 from jumplab.io import folder as store
 from jumplab.io.tape import Tape
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.sim import Scene, simulate_jump
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import METHODS, Planner, plan_jump
@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 SLOWEST_S = 10.0
 FEW, ALL = 60, 500  # cases per door: in the everyday run, and in the slow one (API and notebooks make a thousand)
-ROBOT = load_robot()
+ROBOT = Robot.load()
 SILLY = [None, True, "far", "", "\0", b"x", float("nan"), math.inf, -math.inf, 1e9, 10**400, 1j, [], {}, [1.0, 2.0],
          np.array([1.0, 2.0]), object(), print, "x" * 5000, "1,0", "½", "--", ("a",), {"a": 1}]  # fmt: skip
 
@@ -62,7 +62,7 @@ def target(rng, folder):
 def robot_name(rng, folder):
     bad = rng.choice([None, 3, True, b"bhr", [], {}, 1.5, "", ".", "/", "/dev/null", "a\0b", junk(rng) + "?", "x" * 999,
                       str(folder), Path("nowhere.toml"), "BHR", "bhr "])  # fmt: skip
-    return lambda: load_robot(bad)
+    return lambda: Robot.load(bad)
 
 
 def robot_text(rng, folder):

@@ -11,7 +11,7 @@ from fixtures_core import jump, pendulum
 
 from jumplab.errors import SolverError
 from jumplab.models.full import FullBody, force_target
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.joint_qp import PRINTED, CvxpySolver, DirectSolver, JointMapper, Limits, Options, map_to_joints
 from jumplab.stages.joint_qp.solve import CLARABEL
 
@@ -22,7 +22,7 @@ AGREE = {"force": 0.02, "acceleration": 2e-3}  # N or N m, rad/s^2: a hundred th
 @cache
 def followable() -> SimpleNamespace:
     """A reference that the robot can follow, in stage 1's shape: the quantities of a finished whole-body plan."""
-    tape, body = jump(1.0, 0.5, method="direct").tape, FullBody(load_robot())
+    tape, body = jump(1.0, 0.5, method="direct").tape, FullBody(Robot.load())
     foot, phases = body.robot.foot, {}
     pivot = body.terms(tape.q[0], tape.v[0]).sole.mean(0)
     for phase in ("launch", "flight"):
@@ -54,7 +54,7 @@ def followable() -> SimpleNamespace:
 def mapped(method="direct", **form):
     """The roll-out of :func:`followable`."""
     options, q0 = Options().with_form(**form), jump(1.0, 0.5, method="direct").tape.q[0]
-    return map_to_joints(followable(), load_robot(), method=method, options=options, q0=q0)
+    return map_to_joints(followable(), Robot.load(), method=method, options=options, q0=q0)
 
 
 def check_physics(plan):
@@ -82,7 +82,7 @@ def test_heel_rises_only_with_the_pressure_at_the_toe():
     plan = mapped()
     toe = np.flatnonzero(plan.contact == "toe")
     assert 0.04 < plan.t[toe[-1]] - plan.t[toe[0]] < 0.2
-    body = FullBody(load_robot())
+    body = FullBody(Robot.load())
     pitch = np.array([body.terms(q, v).foot_pitch for q, v in zip(plan.q, plan.v, strict=True)])
     assert np.abs(pitch[plan.contact == "flat"]).max() < 1e-3
     assert pitch[toe[-1]].min() > 0.1
@@ -90,7 +90,7 @@ def test_heel_rises_only_with_the_pressure_at_the_toe():
 
 @pytest.mark.parametrize("target", [(1.0, 0.5), (0.5, 0.3)])
 def test_follows_stage_one(target):
-    plan = map_to_joints(pendulum(*target), load_robot(), method="direct")
+    plan = map_to_joints(pendulum(*target), Robot.load(), method="direct")
     e = plan.tracking
     check_physics(plan)
     assert e["takeoff_velocity"] < 0.02 and e["launch_momentum"] < 0.05
@@ -102,7 +102,7 @@ def test_targets_within_reach_are_followed():
     """All of 24 targets run through within every limit; what stage 1 asks is now and then beyond the robot."""
     seen = []
     for target in product((0.0, 0.2, 0.4, 0.6, 0.8, 1.0), (0.2, 0.3, 0.4, 0.5)):
-        plan = map_to_joints(pendulum(*target), load_robot(), method="direct")
+        plan = map_to_joints(pendulum(*target), Robot.load(), method="direct")
         check_physics(plan)
         seen.append([plan.tracking[k] for k in ("takeoff_velocity", "launch_momentum", "launch_inertia_rms",
                                                 "flight_inertia_rms")])  # fmt: skip
@@ -121,7 +121,7 @@ def test_both_paths_roll_out_the_same_motion():
 def steps():
     """(phase QP, published accelerations, quantities, target, matrices) at some steps of the roll-out."""
     plan, reference = mapped(), followable()
-    mapper = JointMapper(reference, load_robot(), q0=plan.q[0])
+    mapper = JointMapper(reference, Robot.load(), q0=plan.q[0])
     launch, flight = plan.rows("launch"), plan.rows("flight")
     flying = mapper.flight_from(plan.state(flight.start))
     out = []
@@ -214,7 +214,7 @@ def test_missing_half_halves_the_targets():
 def test_three_base_rows_do_not_conserve_angular_momentum():
     loose = Options(limits=Limits(torque_share=None)).with_form(base_rows=3)
     try:
-        plan = map_to_joints(followable(), load_robot(), method="direct", options=loose, q0=mapped().q[0])
+        plan = map_to_joints(followable(), Robot.load(), method="direct", options=loose, q0=mapped().q[0])
     except SolverError as e:
         assert e.status
     else:
@@ -223,7 +223,7 @@ def test_three_base_rows_do_not_conserve_angular_momentum():
 
 def pressure_behind_toe(plan):
     """Largest distance [m] of the CoP behind the toe while the heel is up, from the published wrenches."""
-    body, launch, worst = FullBody(load_robot()), plan.rows("launch"), 0.0
+    body, launch, worst = FullBody(Robot.load()), plan.rows("launch"), 0.0
     toe_point = np.array([body.robot.foot.toe, 0.0, body.robot.foot.sole_z])
     for k in range(launch.start, launch.stop - 1):
         x, f = body.terms(plan.q[k], plan.v[k]), plan.f[k, 0]
@@ -242,7 +242,7 @@ def test_free_heel_leaves_the_pressure_behind():
 
 def test_printed_form_is_not_enough():
     with pytest.raises(SolverError, match=r"stage 2: at t = \d\.\d+ s of the (launch|flight) no joint motion") as error:
-        map_to_joints(followable(), load_robot(), method="direct", options=Options(form=PRINTED), q0=mapped().q[0])
+        map_to_joints(followable(), Robot.load(), method="direct", options=Options(form=PRINTED), q0=mapped().q[0])
     assert error.value.stage == "joint_map" and error.value.violations
 
 
@@ -250,6 +250,6 @@ def test_results_are_immutable_and_repeatable():
     plan = mapped()
     with pytest.raises(ValueError, match="read-only"):
         plan.q[0, 0] = 1
-    again = map_to_joints(followable(), load_robot(), method="direct", q0=plan.q[0])
+    again = map_to_joints(followable(), Robot.load(), method="direct", q0=plan.q[0])
     np.testing.assert_allclose(plan.q, again.q, atol=1e-10)  # the order of sums may depend on where arrays lie
     assert plan.f.shape == (len(plan.t), 2, 6) and plan.tau.shape == (len(plan.t), 14)

@@ -8,7 +8,7 @@ import pytest
 from test_joint_map import followable, mapped
 
 from jumplab.errors import InputError, SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.joint_qp import CvxpySolver, DirectSolver, Form, Limits, Options, map_to_joints
 from jumplab.stages.joint_qp.diagnosis import conflict
 from jumplab.stages.joint_qp.problem import Layout, StepQp
@@ -43,32 +43,32 @@ def nan_at(k):
 )
 def test_bad_references(phase, changes, text):
     with pytest.raises(InputError, match=text):
-        map_to_joints(broken(phase, **changes), load_robot(), method="direct")
+        map_to_joints(broken(phase, **changes), Robot.load(), method="direct")
 
 
 def test_missing_parts():
     reference = copy.deepcopy(followable())
     del reference.launch.rho
     with pytest.raises(InputError, match="the array 'rho' is missing"):
-        map_to_joints(reference, load_robot())
+        map_to_joints(reference, Robot.load())
     del reference.launch
     with pytest.raises(InputError, match="no phase 'launch'"):
-        map_to_joints(reference, load_robot())
+        map_to_joints(reference, Robot.load())
 
 
 @pytest.mark.parametrize("step", [0.0, -0.01, 0.1, float("nan"), "fast", None])
 def test_bad_step(step):
     with pytest.raises(InputError, match=r"step_s = .* must be a number between"):
-        map_to_joints(followable(), load_robot(), step_s=step)
+        map_to_joints(followable(), Robot.load(), step_s=step)
 
 
 def test_unknown_words():
     with pytest.raises(InputError, match=r"method 'quick' is unknown; it must be one of cvxpy, direct"):
-        map_to_joints(followable(), load_robot(), method="quick")
+        map_to_joints(followable(), Robot.load(), method="quick")
     with pytest.raises(InputError, match=r"form: heel = 'never', must be one of"):
         Form(heel="never")
     with pytest.raises(InputError, match=r"q0 has shape \(3,\)"):
-        map_to_joints(followable(), load_robot(), q0=np.zeros(3))
+        map_to_joints(followable(), Robot.load(), q0=np.zeros(3))
 
 
 @pytest.mark.parametrize("method", ["direct", "cvxpy"])
@@ -79,7 +79,7 @@ def test_hopeless_limits_name_phase_time_and_rows(method):
         r"\d.* (N|m/s\^2|N m|rad/s\^2) \(.+\), held back by .+ \(.+_.+\); ask for another distance, "
     )
     with pytest.raises(SolverError, match=said) as error:
-        map_to_joints(followable(), load_robot(), method=method, options=weak)
+        map_to_joints(followable(), Robot.load(), method=method, options=weak)
     assert error.value.exit_code == 3 and error.value.violations and "\n" not in str(error.value)
     words = ("PROXQP", "QP", "infeasible", "solver", "row", "slack")  # of the solver, not of the jump
     assert error.value.status and not [w for w in words if w in str(error.value)]
@@ -142,5 +142,5 @@ def test_track_from_state_begins_there_and_joins():
 def test_switched_off_limits_never_bind():
     free = Limits(None, None, False, None, None, None)
     assert replace(free, friction=0.4).friction == 0.4
-    plan = map_to_joints(followable(), load_robot(), method="direct", options=Options(limits=free), q0=mapped().q[0])
+    plan = map_to_joints(followable(), Robot.load(), method="direct", options=Options(limits=free), q0=mapped().q[0])
     assert plan.residuals["torque"] > 0.5 and plan.tracking["takeoff_velocity"] < 0.02

@@ -10,7 +10,7 @@ from fixtures_core import LIMBS, Replay, jump, planner
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
 from jumplab.stages.planner import METHODS, Planner, guess_from_joints, plan_jump
 from jumplab.task import JumpTask
@@ -88,7 +88,7 @@ def test_result_is_immutable(plan):
 
 
 def test_the_robots_hash_ties_plan_and_robot(plan):
-    assert plan.summary["robot"]["hash"] == load_robot().hash
+    assert plan.summary["robot"]["hash"] == Robot.load().hash
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_inertia_is_shaped_in_flight(plan):  # N-16
 @pytest.mark.parametrize("method", ["", "two-step", "Direct", None])
 def test_unknown_method(method):
     with pytest.raises(InputError) as e:
-        Planner(load_robot()).plan(JumpTask(1.0, 0.5), method)
+        Planner(Robot.load()).plan(JumpTask(1.0, 0.5), method)
     assert str(e.value) == f"method {method!r}: choose one of three-step, direct"
 
 
@@ -135,7 +135,7 @@ class Broken:
 
 def test_a_failed_stage_feeds_nothing(monkeypatch):
     failure, reached = SolverError("SRMP: no", stage="SRMP", status="Infeasible"), AssertionError("a later stage ran")
-    one = Planner(load_robot())
+    one = Planner(Robot.load())
     one._stages = {"srmp": Broken(failure), "whole body": Broken(reached), "direct": Broken(failure)}
     monkeypatch.setattr(pipeline, "map_to_joints", lambda *a, **k: (_ for _ in ()).throw(reached))
     for method in METHODS:
@@ -146,7 +146,7 @@ def test_a_failed_stage_feeds_nothing(monkeypatch):
 
 def test_a_failed_map_feeds_nothing(monkeypatch):
     failure, reached = SolverError("stage 2: no", stage="stage 2"), AssertionError("stage 3 ran")
-    one = Planner(load_robot())
+    one = Planner(Robot.load())
     one._stages = {"srmp": planner().stage("srmp"), "whole body": Broken(reached)}
 
     def fail(*arguments, **options):
@@ -160,7 +160,7 @@ def test_a_failed_map_feeds_nothing(monkeypatch):
 
 def test_plan_jump_is_a_planner_for_one(monkeypatch):
     monkeypatch.setattr(Planner, "plan", lambda self, task, method: (self.robot.name, task.distance_m, method))
-    assert plan_jump(JumpTask(0.7, 0.3), load_robot(), method="direct") == ("bhr", 0.7, "direct")
+    assert plan_jump(JumpTask(0.7, 0.3), Robot.load(), method="direct") == ("bhr", 0.7, "direct")
 
 
 def test_guess_is_stage_twos_motion(plan):
@@ -174,7 +174,7 @@ def test_guess_is_stage_twos_motion(plan):
     assert np.all(guess["toe"].q[:, 0] >= 0.0)
     robot = plan.robot
     last = plan.joints.q[-1]
-    joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.sign
+    joints = robot.sagittal.joint_angles(guess["flight"].q[-1]) * robot.sagittal.signs[:, 0]
     for angle, role in zip(joints[:3], LIMBS[:3], strict=True):
         own = np.mean([last[robot.model.idx_qs[robot.model.getJointId(n)]] for n in robot.joints[role]])
         assert angle == pytest.approx(own, abs=1e-9)

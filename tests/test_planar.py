@@ -84,9 +84,9 @@ def test_turning_the_whole_robot_turns_its_forces(planar):
 
 
 def evaluator_without_gravity():
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
 
-    return evaluator(load_robot().sagittal, 0.0)
+    return evaluator(Robot.load().sagittal, 0.0)
 
 
 def energy(model, q, v, gravity=9.8):

@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.text import Text
 from paper import drawings
+from paper.srmp_touchdown import touchdown_of_plan
 
 from jumplab import show as plotting
 from jumplab.errors import InputError
@@ -29,7 +30,7 @@ from jumplab.robot.reach import postures, reach
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.show import style
 from jumplab.sim import simulate_jump
-from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_plan
+from jumplab.stages.srmp.landing import LandingPlanner
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -221,9 +222,9 @@ def test_files_are_the_same_in_every_process(tmp_path):
     """Same bytes whatever the hash seed, the caller's settings and the folder's name."""
     code = (
         "import sys, matplotlib; matplotlib.rcParams['font.size'] = float(sys.argv[2]);"
-        "from jumplab import plotting; from jumplab.robot import load_robot;"
+        "from jumplab import plotting; from jumplab.robot import Robot;"
         "[plotting.save_figure(f, n, sys.argv[1]) for n, f in"
-        " (('a', drawings.framework()), ('b', drawings.link_models(load_robot())))]"
+        " (('a', drawings.framework()), ('b', drawings.link_models(Robot.load())))]"
     )
     made = []
     for seed, size in (("1", "8"), ("2", "15")):

@@ -4,9 +4,8 @@ import pytest
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, RobotError
-from jumplab.robot import load_robot
-from jumplab.robot.accuracy import reduction_error
-from jumplab.robot.checkup import check, draft
+from jumplab.robot import Robot
+from jumplab.robot.checkup import check, draft, reduction_error
 from jumplab.robot.description import SHIPPED
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import Scene, simulate_jump
@@ -26,26 +25,26 @@ def urdf(name: str):
 @pytest.mark.skipif(have_published(), reason="the published robots are there")
 def test_without_the_package_the_way_to_it_is_told():
     with pytest.raises(RobotError, match=r"pip install 'jumplab\[robots\]'$"):
-        load_robot("g1")
+        Robot.load("g1")
 
 
 @here
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_sagittal_model_is_the_full_robot(name):
-    e = reduction_error(load_robot(name))
+    e = reduction_error(Robot.load(name))
     assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
 
 
 @here
 @pytest.mark.parametrize("name, kg", [("g1", 33.341), ("talos", 93.336), ("romeo", 40.529), ("alexander", 49.081)])
 def test_nothing_of_the_mass_is_lost(name, kg):
-    assert load_robot(name).total_mass == pytest.approx(kg, abs=1e-3)
+    assert Robot.load(name).total_mass == pytest.approx(kg, abs=1e-3)
 
 
 @here
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_what_is_found_is_what_the_configuration_says(name):
-    robot = load_robot(name)
+    robot = Robot.load(name)
     from jumplab.robot_import.config import read_toml
 
     config = read_toml(SHIPPED[name].read_text(), name)
@@ -58,7 +57,7 @@ def test_what_is_found_is_what_the_configuration_says(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05)), ("alexander", (0.2, 0.05))])
 def test_planned_clean_and_landed(name, target):
-    robot = load_robot(name)
+    robot = Robot.load(name)
     plan = Planner(robot).plan(JumpTask(*target))
     report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
@@ -76,7 +75,7 @@ def test_planned_clean_and_landed(name, target):
 ])  # fmt: skip
 def test_too_much_is_refused_with_the_joint_and_the_largest_jump(name, words):
     with pytest.raises(InfeasibleError, match=words):
-        Planner(load_robot(name)).plan(JumpTask(0.3, 1.2))
+        Planner(Robot.load(name)).plan(JumpTask(0.3, 1.2))
 
 
 REFUSED = [

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fixtures_core import planner
 
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.joint_qp import solve
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
@@ -54,7 +54,7 @@ def test_a_plan_made_three_times_is_the_same(tmp_path):
         here = planner().plan(JumpTask(*target)).tape.arrays()
         assert worst_difference(here, Tape.load(tmp_path / f"{i}.npz").arrays()) <= SAME, target
         if i < 2:
-            assert worst_difference(here, plan_jump(JumpTask(*target), load_robot()).tape.arrays()) <= SAME, target
+            assert worst_difference(here, plan_jump(JumpTask(*target), Robot.load()).tape.arrays()) <= SAME, target
 
 
 def test_joint_map_is_the_same_to_the_last_bit():
@@ -66,7 +66,7 @@ def test_joint_map_is_the_same_to_the_last_bit():
     rng, seen, litter = np.random.default_rng(3), set(), []
     for _ in range(6):
         litter.append([np.empty(n) for n in rng.integers(1, 500, 200)])
-        plan = map_to_joints(pendulum(0.3, 0.2), load_robot(), method="direct")
+        plan = map_to_joints(pendulum(0.3, 0.2), Robot.load(), method="direct")
         seen.add(digest({k: getattr(plan, k) for k in ("q", "v", "a", "f", "tau")}))
     assert len(seen) == 1
 

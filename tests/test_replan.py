@@ -14,7 +14,7 @@ from jumplab.errors import InputError
 from jumplab.ocp.assembly import Assembled, group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
 from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess
 from jumplab.ocp.problem import Term
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
 from jumplab.stages import whole_body
 from jumplab.task import JumpTask
@@ -119,7 +119,7 @@ def test_of_another_robot():
 def test_a_jerk_that_jumps_too_far_is_made_dearer(monkeypatch):
     """The default jump's jerk jumps by 16,000 rad/s^3; allowed less, it is solved again, and moves more evenly."""
     module, task = whole_body.planner, JumpTask(1.0, 0.5)
-    planner = whole_body.WholeBodyPlanner(load_robot(), tracking=False)
+    planner = whole_body.WholeBodyPlanner(Robot.load(), tracking=False)
     usual = planner.plan(task)
     monkeypatch.setattr(module, "FOLLOWED_JERK_STEP", 0.8 * usual.jerk_step)
     even = planner.plan(task)

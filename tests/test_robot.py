@@ -12,13 +12,13 @@ import pinocchio as pin
 import pybullet
 import pytest
 from fixtures_core import LIMBS
-from scipy.stats import qmc
+from paper import bhr_table as table
 
 import jumplab
-from jumplab.robot import Robot, load_robot
-from jumplab.robot.bhr import table
+from jumplab.errors import RobotError
+from jumplab.robot import Robot
 from jumplab.robot.description import GRAVITY
-from jumplab.robot.reach import sobol
+from jumplab.robot.stance import check_stance, stance_angles
 from jumplab.task import GRAVITY as TASK_GRAVITY
 
 MASSIVE = {"trunk", *(f"{side}_{part}" for side in ("left", "right") for part in ("thigh", "shank", "foot", "arm"))}
@@ -122,9 +122,27 @@ def test_gravity_is_the_papers_everywhere(bhr):
 def test_robot_is_immutable_and_its_hash_is_its_text(bhr):
     with pytest.raises(FrozenInstanceError):
         bhr.name = "other"
-    assert bhr.hash == load_robot().hash and len(bhr.hash) == 12
+    assert bhr.hash == Robot.load().hash and len(bhr.hash) == 12
     assert Robot.from_text(bhr.urdf + " ", bhr.config_text).hash != bhr.hash
     assert Robot.from_text(bhr.urdf, bhr.config_text + "\n# a remark").hash != bhr.hash
+
+
+def test_the_same_robot_in_another_stance(bhr):
+    other = bhr.with_stance(knee_rad=1.0, trunk_pitch_rad=np.float64(0.2))
+    assert other.stance == {"knee_rad": 1.0, "trunk_pitch_rad": 0.2, "shoulder_rad": 0.0}
+    assert other.urdf == bhr.urdf and other.hash != bhr.hash and bhr.with_stance(**bhr.stance).hash == bhr.hash
+    assert Robot.from_text(other.urdf, other.config_text).stance == other.stance  # as a result folder reads it
+    assert other.joints == bhr.joints and other.foot == bhr.foot
+    assert bhr.sagittal.joint_angles(stance_angles(other))[1] == pytest.approx(1.0)
+    check_stance(other)
+
+
+def test_a_stance_of_other_names_or_numbers(bhr):
+    with pytest.raises(RobotError) as e:
+        bhr.with_stance(knee=1.0)
+    assert str(e.value) == "a stance has knee_rad, trunk_pitch_rad, shoulder_rad, not knee"
+    with pytest.raises(RobotError, match=r"'stance\.knee_rad' = nan, must be a finite number"):
+        bhr.with_stance(knee_rad=np.nan)
 
 
 def test_actuators_are_those_of_the_table(bhr):
@@ -206,7 +224,3 @@ def test_sole_is_the_bottom_of_the_foots_box(bhr, shapes):
         np.testing.assert_allclose(place - half, want[0], atol=1e-12)
         np.testing.assert_allclose((place + half)[:2], want[1], atol=1e-12)
     assert foot.toe - foot.heel == pytest.approx(0.24) and 2 * foot.half_width == pytest.approx(0.10)
-
-
-def test_sobols_sequence_is_scipys():
-    np.testing.assert_array_equal(sobol(2**10), qmc.Sobol(5, scramble=False).random(2**10))

@@ -24,8 +24,8 @@ from fixtures_robots import (
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
-from jumplab.robot import Robot, load_robot
-from jumplab.robot.accuracy import reduction_error
+from jumplab.robot import Robot
+from jumplab.robot.checkup import reduction_error
 from jumplab.robot.description import Robot as Described
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
@@ -38,7 +38,7 @@ FREE = '<link name="world"/><joint name="root" type="floating"><parent link="wor
 
 
 def load(folder, variant, *args) -> Robot:
-    return load_robot(write(folder, variant, *args))
+    return Robot.load(write(folder, variant, *args))
 
 
 def broken(urdf: str, toml: str) -> str:
@@ -121,7 +121,7 @@ def test_hips_bend_no_further_than_the_boxes_allow(tmp_path):
     fat = config("fat") + "[shapes]\ntrunk_m = [[-0.15, 0.2, 0.14, 0.05, 0.75]]\n"
     (tmp_path / "fat.toml").write_text(fat)
     (tmp_path / "fat.urdf").write_text(text(root()))
-    robot = load_robot(str(tmp_path / "fat.toml"))
+    robot = Robot.load(str(tmp_path / "fat.toml"))
     assert -1.6 < robot.sagittal.lower[0] < -0.3
     assert robot.sagittal.lower[0] > load(tmp_path, plain).sagittal.lower[0]
 
@@ -130,7 +130,7 @@ def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
     (tmp_path / "s.urdf").write_text(text(root()))
     (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
     with pytest.raises(RobotError) as e:
-        load_robot(str(tmp_path / "s.toml"))
+        Robot.load(str(tmp_path / "s.toml"))
     assert str(e.value) == (
         "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
         "start there: change [stance] in its configuration"
@@ -145,7 +145,7 @@ def test_a_result_folder_reads_back_the_same_robot(tmp_path):
 
 def test_from_urdf_alone(tmp_path, bhr):
     (tmp_path / "my.urdf").write_text(bhr.urdf)
-    robot = Robot.from_urdf(tmp_path / "my.urdf")
+    robot = Robot.load(tmp_path / "my.urdf")
     assert robot.joints == bhr.joints and robot.name == "bhr"
     np.testing.assert_allclose(robot.sagittal.mass, bhr.sagittal.mass, atol=1e-12)
     assert (robot.foot.heel, robot.foot.toe, robot.foot.sole_z) == pytest.approx((-0.1, 0.14, -0.075))

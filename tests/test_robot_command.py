@@ -4,7 +4,7 @@ import pytest
 from fixtures_robots import GOOD, config, mirrored, write
 
 from jumplab.cli.main import main
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.show.robots import robot_sheet
 
 
@@ -27,7 +27,7 @@ def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path):
     assert "42.000 kg (42.000 kg in the XML), 14 of 14 joints move" in out
     assert "left_knee" in out and "+y -y" in out and "sole: from its box" in out
     assert (tmp_path / "out" / "bhr.png").stat().st_size > 10_000
-    robot = load_robot(str(tmp_path / "out" / "bhr.toml"))
+    robot = Robot.load(str(tmp_path / "out" / "bhr.toml"))
     assert robot.joints["knee"] == ("left_knee", "right_knee")
     code, _, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
     assert code == 2 and "is there already" in err
@@ -69,6 +69,6 @@ def test_a_configuration_without_source_is_refused(capsys, tmp_path):
 def test_sheet_of_a_robot_with_and_without_arms(bhr, tmp_path):
     from fixtures_robots import held_arms
 
-    for robot in (bhr, load_robot(write(tmp_path, held_arms))):
+    for robot in (bhr, Robot.load(write(tmp_path, held_arms))):
         texts = [t.get_text() for ax in robot_sheet(robot).axes for t in ax.texts]
         assert ("arms held" in texts) == (not robot.joints["shoulder_pitch"])

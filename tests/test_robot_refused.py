@@ -3,7 +3,7 @@
 import pytest
 
 from jumplab.errors import RobotError
-from jumplab.robot import Robot, load_robot
+from jumplab.robot import Robot
 from jumplab.robot.description import SHIPPED
 from jumplab.robot.stance import stance_angles
 
@@ -11,13 +11,13 @@ from jumplab.robot.stance import stance_angles
 # descriptions that are no robot ---------------------------------------------------------------------------------
 def test_unknown_robot(tmp_path):
     with pytest.raises(RobotError) as e:
-        load_robot("atlas")
+        Robot.load("atlas")
     known = ", ".join(SHIPPED)
     assert str(e.value) == f"robot 'atlas': neither a shipped robot ({known}) nor a readable TOML file"
     assert e.value.exit_code == 2
     for name in (str(tmp_path), "", "a\0b", "x" * 5000):
         with pytest.raises(RobotError, match=r"neither a shipped robot \(bhr, .*\) nor a readable TOML file$"):
-            load_robot(name)
+            Robot.load(name)
 
 
 def changed(robot, old, new=""):
@@ -60,16 +60,16 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
     config = tmp_path / "robot.toml"
     config.write_text("name = ")
     with pytest.raises(RobotError, match=r"robot\.toml: not a TOML file: "):
-        load_robot(str(config))
+        Robot.load(str(config))
     config.write_text(bhr.config_text)
     with pytest.raises(RobotError) as e:
-        load_robot(str(config))
+        Robot.load(str(config))
     assert str(e.value) == f"{tmp_path / 'bhr.urdf'}: there is no such file; give the path of a URDF"
     (tmp_path / "bhr.urdf").write_text("<robot")
     with pytest.raises(RobotError, match=r"^robot bhr: the URDF is no well-formed XML: "):
-        load_robot(str(config))
+        Robot.load(str(config))
     (tmp_path / "bhr.urdf").write_text(bhr.urdf)
-    assert load_robot(str(config)).hash == bhr.hash
+    assert Robot.load(str(config)).hash == bhr.hash
 
 
 def test_a_posture_that_cannot_stand(bhr):

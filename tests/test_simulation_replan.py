@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jumplab.errors import SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import reference as replan
 from jumplab.sim.reference import EVERY_S, FIRST_S, LATENCY_S, UNTIL_S, LandingReference, Replan, Rest, landing_planner
@@ -13,7 +13,7 @@ from jumplab.stages.srmp.landing import touchdown_of_state
 
 @pytest.fixture
 def robot():
-    return load_robot()
+    return Robot.load()
 
 
 def standing(ahead_m=0.0, speed=0.0):

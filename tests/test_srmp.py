@@ -11,7 +11,7 @@ from fixtures_core import pendulum, srmp_planner
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot.reach import reach
 from jumplab.stages.srmp import SYMMETRY_OFF, SrmpPlanner, SrmpSettings, build_problem
-from jumplab.stages.srmp.terms import GAUSS, flight_terms
+from jumplab.stages.srmp.problem import GAUSS, flight_terms
 from jumplab.task import JumpTask
 
 TARGETS = [(1.0, 0.5, 0.0), (0.5, 0.3, 0.0), (0.0, 0.4, 0.0), (0.6, 0.5, 0.3), (0.8, 0.3, -0.2)]

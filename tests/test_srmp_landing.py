@@ -7,16 +7,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import pendulum, turned
+from paper.srmp_touchdown import touchdown_of_plan
 
 from jumplab.errors import InfeasibleError, SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_angles
 from jumplab.sim import LandingController
 from jumplab.stages.srmp.landing import (
     LandingPlanner,
     LandingSettings,
     Touchdown,
-    touchdown_of_plan,
     touchdown_of_state,
 )
 
@@ -25,7 +25,7 @@ FALL = Touchdown(np.array([-0.16, 0.65]), np.array([0.9, -2.4]), -6.0, 4.0)
 
 @cache
 def planner() -> LandingPlanner:
-    return LandingPlanner(load_robot())
+    return LandingPlanner(Robot.load())
 
 
 @cache
@@ -35,7 +35,7 @@ def fall():
 
 def bent_state():
     """Full-robot state (q, v) and its planar counterpart: link angles and rates, toe velocity."""
-    robot = load_robot()
+    robot = Robot.load()
     angles = np.array([0.0, 0.5, -0.6, 0.2, -0.1])
     rates = np.array([-1.5, 0.8, -2.0, 0.3, 1.1])
     toe_velocity = np.array([1.2, -3.1])
@@ -47,7 +47,7 @@ def bent_state():
 
 def planar_maps(angles):
     """Planar mass matrix over (toe x, toe z, five angles), and the maps to CoM velocity and L."""
-    m = load_robot().sagittal
+    m = Robot.load().sagittal
     arms = m.com_arms()
     places = np.array([sum(turned(angles[j], arms[i, j]) for j in range(5)) for i in range(5)])
     columns = np.array([[turned(angles[j] + np.pi / 2, arms[i, j]) for j in range(5)] for i in range(5)])
@@ -65,7 +65,7 @@ def test_touchdown_of_a_state_without_impact_is_the_state():
     q, v, angles, rates, toe_velocity = bent_state()
     _, to_com, spin = planar_maps(angles)
     u = np.concatenate([toe_velocity, rates])
-    got = touchdown_of_state(load_robot(), q, v, impact=False)
+    got = touchdown_of_state(Robot.load(), q, v, impact=False)
     np.testing.assert_allclose(got.com_velocity, to_com @ u, atol=1e-6)
     assert got.L == pytest.approx(spin @ u, abs=1e-6)
     assert got.trunk_pitch == pytest.approx(0.2, abs=1e-9)
@@ -77,14 +77,14 @@ def test_impact_agrees_with_the_planar_projection():
     u = np.concatenate([toe_velocity, rates])
     after = np.zeros(7)  # toe and foot stand; the impulse acts on them alone, so the other rows of M du are zero
     after[3:] = np.linalg.solve(mass[3:, 3:], mass[3:] @ u)
-    got = touchdown_of_state(load_robot(), q, v)
+    got = touchdown_of_state(Robot.load(), q, v)
     np.testing.assert_allclose(got.com_velocity, to_com @ after, atol=1e-5)
     assert got.L == pytest.approx(spin @ after, abs=1e-5)
     assert abs(got.com_velocity[1]) < abs((to_com @ u)[1])
 
 
 def test_impact_of_a_standing_robot_changes_nothing():
-    robot = load_robot()
+    robot = Robot.load()
     q = configuration(robot, stance_angles(robot))
     got = touchdown_of_state(robot, q, np.zeros(robot.model.nv))
     np.testing.assert_allclose([*got.com_velocity, got.L], 0.0, atol=1e-12)
@@ -93,7 +93,7 @@ def test_impact_of_a_standing_robot_changes_nothing():
 
 
 def test_touchdown_of_a_plan_starts_from_its_last_instant():
-    plan, robot = pendulum(1.0, 0.5), load_robot()
+    plan, robot = pendulum(1.0, 0.5), Robot.load()
     before, after = (touchdown_of_plan(plan, robot, impact=x) for x in (False, True))
     np.testing.assert_allclose(before.com_velocity, plan.flight.com_velocity[-1])
     np.testing.assert_allclose(before.com, -plan.flight.foot_com[-1])
@@ -107,7 +107,7 @@ def test_touchdown_out_of_reach_is_refused_in_words():
     plan = pendulum(1.0, 0.5)
     flight = replace(plan.flight, foot_com=plan.flight.foot_com * 2)
     with pytest.raises(InfeasibleError, match=r"CoM -0\.\d+ m ahead of and 1\.\d+ m above the soles"):
-        touchdown_of_plan(replace(plan, flight=flight), load_robot())
+        touchdown_of_plan(replace(plan, flight=flight), Robot.load())
 
 
 def test_landing_begins_at_touchdown_and_ends_standing():
@@ -151,13 +151,13 @@ def test_landing_obeys_newton_and_euler():
 
 @pytest.mark.parametrize("target", [(0.0, 0.1), (0.0, 0.6), (0.6, 0.35), (1.2, 0.1), (1.2, 0.6), (0.7, 0.55, 0.5)])
 def test_every_jump_has_a_landing(target):
-    plan = planner().plan(touchdown_of_plan(pendulum(*target), load_robot()))
+    plan = planner().plan(touchdown_of_plan(pendulum(*target), Robot.load()))
     assert plan.statistics.iterations < 40
     assert plan.statistics.residual < 1e-5
 
 
 def test_finer_mesh_changes_little():
-    fine = LandingPlanner(load_robot(), LandingSettings(intervals=64)).plan(FALL)
+    fine = LandingPlanner(Robot.load(), LandingSettings(intervals=64)).plan(FALL)
     for t in np.linspace(0, 1.2, 49):
         np.testing.assert_allclose(fall().at(t)[0], fine.at(t)[0], atol=0.008)
 
@@ -187,7 +187,7 @@ def test_too_fast_a_fall_forward_names_what_gives():
 
 
 def test_catch_from_a_full_state_or_nothing():
-    robot = load_robot()
+    robot = Robot.load()
     q = configuration(robot, np.array([0.0, 0.45, -0.55, 0.15, 0.0]), toe=(0.3, 0.0))
     falling, away = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
     falling[2], away[0], away[2] = -2.5, 8.0, -2.5
@@ -198,7 +198,7 @@ def test_catch_from_a_full_state_or_nothing():
 
 
 def test_the_landing_controller_takes_the_plan_as_its_reference():
-    robot = load_robot()
+    robot = Robot.load()
     controller = LandingController(robot, reference=fall())
     q = configuration(robot, stance_angles(robot), toe=-robot.sagittal.sole_center)
     torque = controller.torque(2.0, q, np.zeros(robot.model.nv), np.full(2, 206.0))

@@ -16,7 +16,7 @@ from paper.srmp_printed import (
 
 from jumplab.errors import InputError
 from jumplab.models.srmp import SrmpState
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.task import JumpTask
 
@@ -25,7 +25,7 @@ TARGETS = [JumpTask(x, h) for x in (0.0, 0.6, 1.2) for h in (0.1, 0.35, 0.6)]
 
 @cache
 def sequence(window: bool) -> PrintedSequence:
-    return PrintedSequence(load_robot(), window=window)
+    return PrintedSequence(Robot.load(), window=window)
 
 
 @cache
@@ -121,7 +121,7 @@ def test_backflip_by_the_window():
 
 
 def test_problems_hold_the_printed_terms_and_no_others():
-    robot, reach = load_robot(), sequence(False).reach
+    robot, reach = Robot.load(), sequence(False).reach
     launch = build_printed_launch(robot, SrmpSettings(), reach)
     names = {t.name for _, t in launch.terms()}
     assert not names & {"friction", "unilateral", "leg force", "leg speed", "inertia envelope", "take-off length"}
@@ -140,7 +140,7 @@ def test_platform_is_refused_in_words():
 
 
 def test_one_call_does_the_same_as_the_kept_sequence():
-    once = plan_as_printed(load_robot(), JumpTask(0.6, 0.35))
+    once = plan_as_printed(Robot.load(), JumpTask(0.6, 0.35))
     kept = result(0.6, 0.35, False)
     assert once.launch.statistics.objective == pytest.approx(kept.launch.statistics.objective, rel=1e-9)
     assert once.flight is None

@@ -134,8 +134,8 @@ WRITER = """
     sys.path[:0] = [{root!r}, {tests!r}]
     from test_store import make_summary, make_tape
     from jumplab.io import folder as store
-    from jumplab.robot import load_robot
-    robot = load_robot()
+    from jumplab.robot import Robot
+    robot = Robot.load()
     for k in itertools.count({start}, 2):
         store.write_plan({folder!r}, make_tape(robot, float(k)), robot, make_summary(float(k)))
         print(k, flush=True)

@@ -5,9 +5,9 @@ from xml.etree import ElementTree as ET
 
 import pinocchio as pin
 import pytest
+from paper import bhr_table as table
 
 from jumplab.errors import RobotError
-from jumplab.robot.bhr import table
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.urdf import decode, locate, parse, read_urdf
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.ocp.nlp import Nlp
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.srmp import SYMMETRY_OFF, SrmpSettings, build_problem, naive_guess, parameters
 from jumplab.stages.srmp.reachable import (
     SWING_GAIN,
@@ -28,7 +28,7 @@ from jumplab.task import JumpTask
 
 
 def check(task, envelope=None):
-    check_reachable(task, envelope or srmp_planner().reach, load_robot())
+    check_reachable(task, envelope or srmp_planner().reach, Robot.load())
 
 
 def message(task, **options) -> str:
@@ -45,7 +45,7 @@ def can():
 @cache
 def small_effort() -> Nlp:
     """Stage 1 with few iterations: enough for every target of the grid."""
-    return Nlp(build_problem(load_robot(), SrmpSettings(), srmp_planner().reach), {"max_iter": 120})
+    return Nlp(build_problem(Robot.load(), SrmpSettings(), srmp_planner().reach), {"max_iter": 120})
 
 
 def test_the_whole_grid_passes():

@@ -111,7 +111,7 @@ def test_base_is_the_base_link_of_the_robot(bhr):
         assert 2 * np.arctan2(q[4], q[6]) == pytest.approx(theta[2])
         for i, role in enumerate(LIMBS):
             column = bhr.model.idx_qs[bhr.model.getJointId(bhr.joints[role][0])]
-            assert bhr.sagittal.sign[i] * q[column] == pytest.approx(theta[3 + i])
+            assert bhr.sagittal.signs[i, 0] * q[column] == pytest.approx(theta[3 + i])
 
 
 def test_start_is_the_stance(bhr, planner, printed):

@@ -60,11 +60,11 @@ def _chain(args: argparse.Namespace) -> None:
     seed = None if args.seed is None and runs == 1 else _whole("--seed", args.seed or "0", 0, 2**31 - 1)
 
     from jumplab.io import folder as store
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
     from jumplab.sim import Perturbation
     from jumplab.studies.chain import RANGES, Course, run_chain, run_chains, write_chain
 
-    course, robot = Course.of(distances, heights, platforms), load_robot(args.robot)
+    course, robot = Course.of(distances, heights, platforms), Robot.load(args.robot)
     store.ensure_writable(out)
     ranges = RANGES[args.ranges]
     drawn = None if seed is None else Perturbation.draw(robot, seed, ranges)

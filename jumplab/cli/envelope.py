@@ -40,9 +40,9 @@ def _envelope(args: argparse.Namespace) -> None:
         raise InputError(f"--workers must be a whole number from 1 to 256, got {args.workers!r}")
 
     from jumplab.io import folder as store
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
 
-    robot = load_robot(args.robot)
+    robot = Robot.load(args.robot)
     store.ensure_writable(out)
 
     from jumplab.show.envelope import envelope_map

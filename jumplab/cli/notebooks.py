@@ -25,7 +25,7 @@ from jumplab import errors
 from jumplab.cli.parameters import STANDARD, check_parameters, check_value, declared_kinds, declared_parameters, literal
 from jumplab.errors import InputError, JumplabError, as_path, require_type
 from jumplab.io import folder as store
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.task import JumpTask
 
 __all__ = ["STANDARD", "RunReport", "check_parameters", "declared_parameters", "find_notebooks", "run_notebooks"]
@@ -145,7 +145,7 @@ def _checked(values: dict[str, Any], known: set[str], kinds: Mapping[str, type |
             check_value(name, value, kinds[name])
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
     if "robot" in values:
-        load_robot(values["robot"])
+        Robot.load(values["robot"])
         if Path(values["robot"]).is_file():
             values["robot"] = str(Path(values["robot"]).resolve())
     return {**values, "out": "result", "figures": "figures"}

@@ -33,9 +33,9 @@ def _plan(args: argparse.Namespace) -> None:
     task, out = task_of(args), folder_of("--out", args.out)
 
     from jumplab.io import folder as store
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
 
-    robot = load_robot(args.robot)
+    robot = Robot.load(args.robot)
     store.ensure_writable(out)
 
     from jumplab import auditing as passport

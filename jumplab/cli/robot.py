@@ -33,14 +33,14 @@ def _neither(args: argparse.Namespace) -> None:
 
 
 def _list(args: argparse.Namespace) -> None:
-    from jumplab.robot import load_robot
+    from jumplab.robot import Robot
     from jumplab.robot.description import SHIPPED
     from jumplab.show.tables import table
 
     rows = []
     for name in SHIPPED:
         try:
-            robot = load_robot(name)
+            robot = Robot.load(name)
             arms = "swing" if robot.joints["shoulder_pitch"] else "held"
             rows.append(
                 {"name": name, "kg": robot.total_mass, "joints": len(robot.joint_names), "arms": arms, "note": ""}

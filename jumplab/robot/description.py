@@ -11,16 +11,37 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+import tomlkit
 
 from jumplab.errors import RobotError, quoted
 from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
-from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.urdf import locate, read_urdf
+from jumplab.task import GRAVITY
 
-GRAVITY = 9.8  # [m/s^2], stated by the paper (Sec. III); URDF tools default to 9.81
 HERE = Path(__file__).parent
 SHIPPED = {path.stem: path for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))}
+
+
+def files_of(name_or_path: str | Path) -> tuple[Path, str | None]:
+    """Path of a robot's URDF and text of its TOML file, None for a bare URDF; raises :class:`RobotError`."""
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_path)}")
+    name = str(name_or_path)
+    path = SHIPPED.get(name) or Path(name)
+    if path.suffix == ".urdf":
+        return path, None
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as e:
+        raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
+    except (OSError, ValueError) as e:
+        known, short = ", ".join(SHIPPED), name if len(name) < 80 else name[:77] + "..."
+        raise RobotError(f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file") from e
+    urdf = read_toml(text, str(path)).get("urdf")
+    if not isinstance(urdf, str):
+        raise RobotError(f"{path}: the entry 'urdf' must name the URDF file beside it, got {urdf!r}")
+    return locate(urdf, path.parent), text
 
 
 @dataclass(frozen=True)
@@ -47,72 +68,33 @@ class Foot:
 
 @dataclass(frozen=True)
 class Robot:
-    """A humanoid: URDF text, roles of its joints, soles, stance and actuators.
+    """A humanoid: URDF text, roles of its joints, soles, stance and actuators; made by :meth:`load`."""
 
-    Attributes
-    ----------
-    name : short name, used in file names and messages.
-    urdf : the XML text itself, so that a result folder can carry its robot.
-    joints : role -> (left, right) joint names; the shoulder's are () where the arms are held.
-    foot : sole rectangle.
-    stance : knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture.
-    corner_speed_ratio : share of the speed limit up to which full torque is available.
-    """
-
-    name: str
-    urdf: str
-    joints: dict
+    name: str  # short, for file names and messages
+    urdf: str  # the XML text itself, so that a result folder can carry its robot
+    joints: dict[str, tuple[str, ...]]  # role -> (left, right) joint names; the shoulder's are () where arms are held
     foot: Foot
-    stance: dict
-    corner_speed_ratio: float
+    stance: dict[str, float]  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
+    corner_speed_ratio: float  # [1] share of the speed limit up to which full torque is available
     config_text: str = field(repr=False, default="")
 
     @classmethod
-    def load(cls, name_or_config: str | Path = "bhr") -> Robot:
-        """Load a shipped robot by name, or any robot by the path of its TOML file."""
-        if not isinstance(name_or_config, str | os.PathLike):
-            raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_config)}")
-        path = SHIPPED.get(str(name_or_config)) or Path(name_or_config)
-        known = ", ".join(SHIPPED)
-        try:
-            text = path.read_text()
-        except UnicodeDecodeError as e:
-            raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
-        except (OSError, ValueError) as e:
-            name = str(name_or_config)
-            short = name if len(name) < 80 else name[:77] + "..."
-            raise RobotError(f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file") from e
-        config = read_toml(text, str(path))
-        urdf = config.get("urdf")
-        if not isinstance(urdf, str):
-            raise RobotError(f"{path}: the entry 'urdf' must name the URDF file beside it, got {urdf!r}")
-        file = locate(urdf, path.parent)
-        if "source" not in config:
-            return cls.from_text(read_urdf(file), text)
-        from jumplab.robot.accuracy import check_reduction  # both build on this class
-        from jumplab.robot.stance import check_stance
-
-        jumper = make_jumper(read_urdf(file), config, file.name, file)
-        robot = cls.from_text(jumper.urdf, jumper.config_text)
-        check_reduction(robot)
-        check_stance(robot)
-        return robot
-
-    @classmethod
-    def from_urdf(cls, path: str | Path, *, repair: tuple[str, ...] = ()) -> Robot:
-        """A robot from nothing but its URDF: roles, soles and standing posture are found.
+    def load(cls, name_or_path: str | Path = "bhr", *, repair: tuple[str, ...] = ()) -> Robot:
+        """Load a robot; raises :class:`RobotError` if there is none, or if it is not fit for jumping.
 
         Parameters
         ----------
-        path : the URDF file.
-        repair : what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that a solid can
-            have), "massless" (a gram for bodies without any).
-
-        Raises :class:`RobotError` where the file or the robot is not fit for jumping.
+        name_or_path : name of a shipped robot (:data:`SHIPPED`), or path of a TOML file or of a URDF. Of a bare URDF,
+            roles, soles and standing posture are found.
+        repair : of a bare URDF, what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that
+            a solid can have), "massless" (a gram for bodies without any).
         """
+        path, config = files_of(name_or_path)
+        if config is not None and "source" not in read_toml(config, str(path)):
+            return cls.from_text(read_urdf(path), config)
         from jumplab.robot.checkup import check, draft  # they build on this class
 
-        return check(path, draft(path, repair).text).robot
+        return check(path, draft(path, repair).text if config is None else config).robot
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:
@@ -123,9 +105,8 @@ class Robot:
         links = get("feet", "links", kind=str, count=2)
         foot = Foot(tuple(links), x[0], x[1], (y[1] - y[0]) / 2, get("feet", "sole_z_m"))
         if not (x[0] < x[1] and y[0] < y[1]):
-            raise RobotError(
-                f"robot configuration: the sole {x} x {y} m has no area; give [heel, toe] and [right, left]"
-            )
+            wrong = f"the sole {x} x {y} m has no area; give [heel, toe] and [right, left]"
+            raise RobotError(f"robot configuration: {wrong}")
         joints = roles_table(config)
         stance = {key: get("stance", key) for key in ("knee_rad", "trunk_pitch_rad", "shoulder_rad")}
         corner = get("actuators", "corner_speed_ratio")
@@ -151,9 +132,8 @@ class Robot:
             if joint and not (np.isfinite(inertia.mass) and inertia.mass >= 0 and np.all(np.isfinite(inertia.inertia))):
                 raise RobotError(f"robot {self.name}: the body moved by {name!r} has mass {inertia.mass:g} kg")
         for name, a in self.actuators.items():
-            if not (
-                a["lower"] < a["upper"] and a["effort"] > 0 and a["speed"] > 0 and np.all(np.isfinite([*a.values()]))
-            ):
+            in_order = a["lower"] < a["upper"] and a["effort"] > 0 and a["speed"] > 0
+            if not (in_order and np.all(np.isfinite([*a.values()]))):
                 raise RobotError(
                     f"robot {self.name}: joint {name!r} has range {a['lower']:g} ... {a['upper']:g} rad, effort "
                     f"{a['effort']:g} N m, speed {a['speed']:g} rad/s; all must be finite, positive and in order"
@@ -195,6 +175,18 @@ class Robot:
         other.__dict__["model"] = model  # fills the cached property
         return other
 
+    def with_stance(self, **stance: float) -> Robot:
+        """The same robot, standing otherwise: ``knee_rad``, ``trunk_pitch_rad``, ``shoulder_rad`` [rad]; a new hash.
+
+        Raises :class:`RobotError` for other names. Whether it can stand so, :func:`.stance.check_stance` says.
+        """
+        unknown = sorted(stance.keys() - self.stance.keys())
+        if unknown:
+            raise RobotError(f"a stance has {', '.join(self.stance)}, not {', '.join(unknown)}")
+        config = tomlkit.parse(self.config_text)
+        config["stance"].update({key: float(angle) for key, angle in stance.items()})
+        return self.from_text(self.urdf, tomlkit.dumps(config))
+
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints in Pinocchio's order (nv - 6 of them)."""
@@ -207,14 +199,9 @@ class Robot:
         for name in self.joint_names:
             j = m.getJointId(name)
             iq, iv = m.idx_qs[j], m.idx_vs[j]
-            speed = float(m.upperVelocityLimit[iv])
-            out[name] = {
-                "lower": float(m.lowerPositionLimit[iq]),
-                "upper": float(m.upperPositionLimit[iq]),
-                "speed": speed,
-                "effort": float(m.upperEffortLimit[iv]),
-                "corner_speed": self.corner_speed_ratio * speed,
-            }
+            told = m.lowerPositionLimit[iq], m.upperPositionLimit[iq], m.upperVelocityLimit[iv], m.upperEffortLimit[iv]
+            out[name] = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
+            out[name]["corner_speed"] = self.corner_speed_ratio * out[name]["speed"]
         return out
 
     @cached_property
@@ -224,8 +211,10 @@ class Robot:
 
     def role_signs(self) -> list[tuple[str, int, float]]:
         """(joint, row of its role, sign) for every joint with a role: joint angle = sign * sagittal angle."""
-        return [(name, row, float(sign)) for row, role in enumerate(ROLES)
-                for name, sign in zip(self.joints[role], self.sagittal.signs[row], strict=False)]  # fmt: skip
+        rows = enumerate(zip(ROLES, self.sagittal.signs, strict=True))
+        return [
+            (n, row, float(s)) for row, (role, signs) in rows for n, s in zip(self.joints[role], signs, strict=False)
+        ]
 
     @cached_property
     def total_mass(self) -> float:

@@ -13,85 +13,68 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot_import.config import ROLES
 
-PITCH_AXIS = 0.999  # our choice: axes canted by less than 2.6 deg count as pitch
+PITCH_AXIS = 0.999  # [1] axes canted by less than 2.6 deg count as pitch
 SAGITTAL_LINKS = ("foot", "shank", "thigh", "trunk", "arm")
 SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 # hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)
-JOINT_OF_ANGLES = np.array(
-    [
-        [0.0, 0.0, 1.0, -1.0, 0.0],
-        [0.0, 1.0, -1.0, 0.0, 0.0],
-        [1.0, -1.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, -1.0, 1.0],
-    ]
-)
-
-LEG_ROLES = ("ankle_pitch", "knee", "hip_pitch")
-# limits of the massless arm of a robot whose arms are held; our choice: it hardly moves and never binds
+JOINT_OF_ANGLES = np.array([[0.0, 0, 1, -1, 0], [0, 1, -1, 0, 0], [1, -1, 0, 0, 0], [0, 0, 0, -1, 1]])  # (joint, angle)
+# limits of the massless arm of a robot whose arms are held: it hardly moves and never binds
 HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "effort": 10.0}
+
+
+def rotated(angle: float | np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """``vector`` (2,), x and z, turned by ``angle`` (...) about +y: (..., 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
 
 
 @dataclass(frozen=True)
 class SagittalModel:
     """Five links in the x-z plane; angles are absolute, positive about +y, zero in the robot's neutral pose.
 
-    All vectors are (x, z) in metres, written in the neutral pose, so a link at angle a has its vectors turned by a.
-
-    Attributes
-    ----------
-    mass, inertia : (5,) kg and kg m^2 about each link's own CoM, both sides summed; order :data:`SAGITTAL_LINKS`.
-    com : (5, 2) CoM from the link's lower joint: toe, ankle, knee, hip; for the arm from the shoulder.
-    span : (5, 2) from that joint to the next: toe to ankle, to knee, to hip, to shoulder, to hand.
-    heel, sole_center : (2,) from the toe.
-    base : (2,) from the hip to the origin of the robot's base link, fixed in the trunk.
-    signs : (4, 2) +1 or -1 of the left and the right joint, robot joint angle = sign * sagittal joint angle; order
-        :data:`SAGITTAL_JOINTS`. Arms that are held have 1.
-    lower, upper, speed, effort, corner_speed : (4,) limits in sagittal signs, of the weaker side; effort of both sides.
-    points : named points on the links for clearance, name -> (link index, (x, z) from the link's lower joint).
+    Links are in the order of :data:`SAGITTAL_LINKS`, joints in that of :data:`SAGITTAL_JOINTS`. Vectors are (x, z) [m],
+    written in the neutral pose, so a link at angle a has its vectors turned by a. The lower joints of the links are
+    toe, ankle, knee and hip, and the shoulder for the arm.
     """
 
-    mass: np.ndarray
-    inertia: np.ndarray
-    com: np.ndarray
-    span: np.ndarray
-    heel: np.ndarray
-    sole_center: np.ndarray
-    base: np.ndarray
-    signs: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    speed: np.ndarray
-    effort: np.ndarray
-    corner_speed: np.ndarray
-    points: dict
-
-    @property
-    def sign(self) -> np.ndarray:
-        """(4,) signs of the left joints."""
-        return self.signs[:, 0]
+    mass: np.ndarray  # (5,) both sides summed [kg]
+    inertia: np.ndarray  # (5,) about each link's own CoM, both sides summed [kg m^2]
+    com: np.ndarray  # (5, 2) CoM from the link's lower joint
+    span: np.ndarray  # (5, 2) from the lower joint to the next: toe to ankle, to knee, to hip, to shoulder, to hand
+    heel: np.ndarray  # (2,) from the toe
+    sole_center: np.ndarray  # (2,) from the toe
+    base: np.ndarray  # (2,) from the hip to the origin of the robot's base link, fixed in the trunk
+    signs: np.ndarray  # (4, 2) of the left and right joint, its angle = sign * sagittal angle; 1 for arms that are held
+    lower: np.ndarray  # (4,) [rad] limits in sagittal signs, of the weaker side
+    upper: np.ndarray  # (4,) [rad]
+    speed: np.ndarray  # (4,) [rad/s]
+    effort: np.ndarray  # (4,) of both sides together [N m]
+    corner_speed: np.ndarray  # (4,) [rad/s]
+    points: dict  # on the links, for clearance: name -> (link index, (x, z) from the link's lower joint)
 
     @property
     def total_mass(self) -> float:
         """Mass of the whole robot [kg]."""
         return float(self.mass.sum())
 
-    def com_arms(self) -> np.ndarray:
-        """(5, 5, 2) array d: CoM of link i from the toe is sum over j of R(a_j) d[i, j]."""
-        arms = np.zeros((5, 5, 2))
-        for i in range(4):
-            arms[i, :i] = self.span[:i]
-            arms[i, i] = self.com[i]
-        arms[4, :4] = self.span[:4]
-        arms[4, 4] = self.com[4]
-        return arms  # (link, angle, xz)
-
     def point_arms(self, link: int, point: np.ndarray) -> np.ndarray:
         """(5, 2) array d: a point fixed in ``link`` sits at sum over j of R(a_j) d[j] from the toe."""
         arms = np.zeros((5, 2))
-        arms[: min(link, 4)] = self.span[: min(link, 4)]
+        arms[:link] = self.span[:link]
         arms[link] = point
         return arms  # (angle, xz)
+
+    def com_arms(self) -> np.ndarray:
+        """(5, 5, 2) array d: CoM of link i from the toe is sum over j of R(a_j) d[i, j]."""
+        return np.stack([self.point_arms(i, com) for i, com in enumerate(self.com)])  # (link, angle, xz)
+
+    def link_coms(self, angles: np.ndarray) -> np.ndarray:
+        """(..., 5, 2) CoM of every link from the toe [m] at absolute link angles (..., 5)."""
+        arms = self.com_arms()
+        links = [sum(rotated(angles[..., j], arms[i, j]) for j in range(i + 1)) for i in range(5)]
+        return np.stack(links, -2)
 
     def joint_angles(self, angles: np.ndarray) -> np.ndarray:
         """Joint angles (..., 4) hip, knee, ankle, shoulder from absolute link angles (..., 5); also for their rates."""
@@ -163,56 +146,56 @@ def reduce(model: pin.Model, joints: dict, foot: Any, actuators: dict, urdf: str
 
     Parameters
     ----------
-    model : Pinocchio model with a free-flyer base.
-    joints : role -> (left, right) joint names for hip_pitch, knee, ankle_pitch, shoulder_pitch; () for held arms.
-    foot : object with ``frames`` (left, right), ``heel``, ``toe``, ``sole_z`` in the foot frame [m].
-    actuators : name -> dict(lower, upper, speed, effort, corner_speed) for every joint.
-    urdf : the robot's XML, for its collision shapes.
+    model : Pinocchio model with a free-flyer base.  urdf : the robot's XML, for its collision shapes.
+    joints : role -> (left, right) joint names; () for held arms.  foot : :class:`.description.Foot`.
+    actuators : joint name -> lower, upper, speed, effort, corner_speed.
 
     Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or share no range. Left and right
     may turn opposite ways.
     """
-    data = model.createData()
-    q = pin.neutral(model)
+    data, q = model.createData(), pin.neutral(model)
     pin.computeJointJacobians(model, data, q)
     pin.framesForwardKinematics(model, data, q)
     parts = _members(model, joints)
     mass, com, inertia = np.zeros(5), np.zeros((5, 2)), np.zeros(5)
     for i, members in enumerate(parts):
-        total = pin.Inertia.Zero()
-        for j in members:
-            total += data.oMi[j].act(model.inertias[j])
-        if not members:  # arms that are held
-            continue
-        mass[i], com[i] = total.mass, total.lever[[0, 2]]
-        # products along y drop out of the pitch axis, so the two sides may simply be added
-        inertia[i] = sum(
-            world.inertia[1, 1] + world.mass * np.sum((world.lever[[0, 2]] - com[i]) ** 2)
-            for world in (data.oMi[j].act(model.inertias[j]) for j in members)
-        )
+        bodies = [data.oMi[j].act(model.inertias[j]) for j in members]
+        if bodies:  # none: arms that are held
+            total = pin.Inertia.Zero()
+            for body in bodies:
+                total += body
+            mass[i], com[i] = total.mass, total.lever[[0, 2]]
+            # products along y drop out of the pitch axis, so the two sides may simply be added
+            levers = [np.sum((b.lever[[0, 2]] - com[i]) ** 2) for b in bodies]
+            inertia[i] = sum(b.inertia[1, 1] + b.mass * lever for b, lever in zip(bodies, levers, strict=True))
 
     def place(role):
         return np.mean([data.oMi[model.getJointId(n)].translation[[0, 2]] for n in joints[role]], axis=0)
 
-    ankle, knee, hip = (place(r) for r in LEG_ROLES)
+    ankle, knee, hip = (place(r) for r in ("ankle_pitch", "knee", "hip_pitch"))
     held = not joints["shoulder_pitch"]
     shoulder = hip + 2 * (com[3] - hip) if held else place("shoulder_pitch")  # held arms: a point to draw the trunk to
     frame = data.oMf[model.getFrameId(foot.frames[0])]
-    toe = frame.act(np.array([foot.toe, 0.0, foot.sole_z]))[[0, 2]]
-    heel = frame.act(np.array([foot.heel, 0.0, foot.sole_z]))[[0, 2]]
+    toe, heel = (frame.act(np.array([x, 0.0, foot.sole_z]))[[0, 2]] for x in (foot.toe, foot.heel))
     hand = np.zeros(2) if held else _limb_tip(model, data, urdf, parts[4], shoulder, com[4])
     if held:
         com[4] = shoulder
     lower_joint = np.array([toe, ankle, knee, hip, shoulder])
     span = np.array([ankle - toe, knee - ankle, hip - knee, shoulder - hip, hand])
-    signs, rows = [], []
-    for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"):
-        signs.append(_axis_signs(model, data, role, joints[role]) or [1.0, 1.0])
-        rows.append(_limits(actuators, joints[role], signs[-1]) if joints[role] else HELD_ARM)
-    limits = {key: [row[key] for row in rows] for key in HELD_ARM}
-    base = data.oMi[1].translation[[0, 2]] - hip
-    points = {"toe": (0, np.zeros(2)), "heel": (0, heel - toe), "knee": (2, np.zeros(2)), "hip": (3, np.zeros(2)),
-              "shoulder": (4, np.zeros(2)), "hand": (4, hand), "mid-arm": (4, hand / 2)}  # fmt: skip
+    pairs = [joints[role] for role in ROLES]
+    signs = [_axis_signs(model, data, role, joints[role]) or [1.0, 1.0] for role in ROLES]
+    rows = [_limits(actuators, pair, sign) if pair else HELD_ARM for pair, sign in zip(pairs, signs, strict=True)]
+    points = {name: (link, np.zeros(2)) for name, link in (("toe", 0), ("knee", 2), ("hip", 3), ("shoulder", 4))}
+    points |= {"heel": (0, heel - toe), "hand": (4, hand), "mid-arm": (4, hand / 2)}
     return SagittalModel(
-        mass, inertia, com - lower_joint, span, heel - toe, (heel - toe) / 2, base, np.array(signs),
-        **{k: np.array(x) for k, x in limits.items()}, points=points)  # fmt: skip
+        mass=mass,
+        inertia=inertia,
+        com=com - lower_joint,
+        span=span,
+        heel=heel - toe,
+        sole_center=(heel - toe) / 2,
+        base=data.oMi[1].translation[[0, 2]] - hip,
+        signs=np.array(signs),
+        points=points,
+        **{key: np.array([row[key] for row in rows]) for key in HELD_ARM},
+    )

@@ -7,22 +7,17 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot.description import Robot
-from jumplab.robot.sagittal import SAGITTAL_JOINTS
+from jumplab.robot.sagittal import SAGITTAL_JOINTS, rotated
 
-STANCE_ROOM_RAD = 0.04  # our choice: plans keep 0.03 off every stop
-SHANK_LEAN_RAD = (-0.6, 1.4)  # our choice: generous lean of the shank, both ways
-
-
-def _rotate(angle, vector):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1]], -1)
+STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
+SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
     """CoM (x, z) from the toe [m] at absolute link angles (5,)."""
     model = robot.sagittal
     arms = np.einsum("i,ijk->jk", model.mass, model.com_arms()) / model.total_mass
-    return np.sum([_rotate(a, d) for a, d in zip(angles, arms, strict=True)], axis=0)
+    return np.sum([rotated(a, d) for a, d in zip(angles, arms, strict=True)], axis=0)
 
 
 def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits: bool = True) -> np.ndarray:
@@ -38,12 +33,9 @@ def stance_angles(robot: Robot, knee_rad: float | None = None, *, within_limits:
     def angles(shank):
         return np.array([0.0, shank, shank - knee, pitch, pitch + shoulder])
 
-    found = angles(_level(robot, knee, pitch, pitch + shoulder))
-    if not within_limits:
-        return found
-    joints = robot.sagittal.joint_angles(found)
-    for name, angle, low, high in zip(SAGITTAL_JOINTS, joints, robot.sagittal.lower, robot.sagittal.upper, strict=True):
-        if not low <= angle <= high:
+    found, m = angles(_level(robot, knee, pitch, pitch + shoulder)), robot.sagittal
+    for name, angle, low, high in zip(SAGITTAL_JOINTS, m.joint_angles(found), m.lower, m.upper, strict=True):
+        if within_limits and not low <= angle <= high:
             raise RobotError(
                 f"robot {robot.name}: standing with the knee at {knee:g} rad needs {name} at {angle:.3f} rad, outside "
                 f"its range {low:g} ... {high:g}; change [stance] in its configuration"
@@ -94,8 +86,8 @@ def configuration(robot: Robot, angles: np.ndarray, toe: tuple[float, float] | n
     One posture, (5,) and (2,) -> (nq,), or many, (n, 5) and (n, 2) -> (n, nq).
     """
     model, angles = robot.sagittal, np.asarray(angles)
-    base = np.asarray(toe) + sum(_rotate(angles[..., j], model.span[j]) for j in range(3))
-    base = base + _rotate(angles[..., 3], model.base)
+    base = np.asarray(toe) + sum(rotated(angles[..., j], model.span[j]) for j in range(3))
+    base = base + rotated(angles[..., 3], model.base)
     q = np.broadcast_to(pin.neutral(robot.model), (*angles.shape[:-1], robot.model.nq)).copy()
     q[..., 0], q[..., 2] = base[..., 0], base[..., 1]
     q[..., 3:7] = 0.0

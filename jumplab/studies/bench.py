@@ -24,7 +24,7 @@ import numpy as np
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError, JumplabError, SolverError
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, guess_from_joints, make_tape
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
@@ -205,9 +205,9 @@ import time
 began = time.perf_counter()
 import json, resource, sys
 from jumplab.stages.planner import Planner
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.task import JumpTask
-robot, task = load_robot(sys.argv[1]), JumpTask(float(sys.argv[2]), float(sys.argv[3]))
+robot, task = Robot.load(sys.argv[1]), JumpTask(float(sys.argv[2]), float(sys.argv[3]))
 imports_s = time.process_time()
 plan = Planner(robot, keep=sys.argv[4] == "keep").plan(task)
 cpu_s, wall_s = time.process_time(), time.perf_counter() - began
@@ -262,7 +262,7 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
     """
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
-    robot, watch = load_robot(robot_name), Stopwatch()
+    robot, watch = Robot.load(robot_name), Stopwatch()
     planner = Planner(robot, mesh)
     ways = {name: WholeBodyPlanner(robot, mesh, tracking=False, **how).plan for name, how in WAYS.items()}
     audits: dict[str, list[bool]] = {}

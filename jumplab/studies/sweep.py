@@ -26,7 +26,7 @@ from tqdm import tqdm
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError, JumplabError
 from jumplab.io.folder import ensure_writable, locked, write_file
-from jumplab.robot import load_robot
+from jumplab.robot import Robot
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.whole_body import build_problem
 from jumplab.stages.whole_body.planner import platform_edge_m
@@ -84,7 +84,7 @@ def grid(
 @cache
 def _planner(robot: str, method: str) -> Planner:
     """A planner with its stages built, once per process."""
-    planner = Planner(load_robot(robot), keep=True)
+    planner = Planner(Robot.load(robot), keep=True)
     for stage in ("reach", "direct") if method == "direct" else ("srmp", "whole body"):
         planner.stage(stage)
     return planner
@@ -140,7 +140,7 @@ def run(cases: list[Case], out: str | Path, *, jobs: int = -1, cluster: str | No
         If a robot cannot be read, the folder holds another sweep, or there is no such cluster.
     """
     _check_weights(cases)
-    hashes = {name: load_robot(name).hash for name in sorted({case.robot for case in cases})}
+    hashes = {name: Robot.load(name).hash for name in sorted({case.robot for case in cases})}
     folder = ensure_writable(out)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
@@ -167,7 +167,7 @@ def _check_weights(cases: list[Case]) -> None:
     """Refuse weights of terms that stage 3 does not have, or that are no number, before anything is planned."""
     for case in cases:
         if case.weights:
-            problem = build_problem(load_robot(case.robot), tracking=case.method == "three-step")
+            problem = build_problem(Robot.load(case.robot), tracking=case.method == "three-step")
             known = {t.name for _, t in problem.terms() if t.is_cost}
             for name, value in case.weights.items():
                 if name not in known:

@@ -1,8 +1,8 @@
 """Stage 1 exactly as the paper prints it: first the launch alone, then the flight from wherever the launch ended.
 
-Kept to be compared with the joint problem of :mod:`jumplab.srmp.problem`, never to plan with. Costs, weights and end
-constraints are the same terms; what differs is what Sec. III prints and what it does not: two problems in a row, boxes
-instead of the robot's envelope, the CoP as a quotient, no friction, no unilateral force, no leg force.
+Kept to be compared with the joint problem of :mod:`jumplab.stages.srmp.problem`, never to plan with. Costs, weights and
+end constraints are the same terms; what differs is what Sec. III prints and what it does not: two problems in a row,
+boxes instead of the robot's envelope, the CoP as a quotient, no friction, no unilateral force, no leg force.
 
 Nothing in the printed launch ties its final angular momentum to the rotation that the flight needs, so most flights
 have no solution. ``window=True`` adds what is missing at the launch's end and nothing else: the momentum is one that
@@ -23,9 +23,8 @@ from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.planner import naive_guess
-from jumplab.stages.srmp.problem import FLIGHT_SCALES, SCALES
+from jumplab.stages.srmp.problem import FLIGHT_SCALES, SCALES, flight_terms, launch_terms, srmp_state, takeoff_terms
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.srmp.terms import flight_terms, launch_terms, srmp_state, takeoff_terms
 from jumplab.task import GRAVITY, JumpTask
 
 PRINTED_COSTS = ("jerk", "CoM velocity", "L rate", "turn", "L range")  # of the launch, SL-J1..J4 and SL-P5

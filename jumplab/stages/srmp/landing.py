@@ -2,8 +2,8 @@
 
 The paper takes its landing trajectory from an earlier work and does not repeat it. This one is ours, on the same
 reaction mass pendulum and with the same terms as the launch: CoP inside the sole, friction, unilateral force, leg force
-and inertia envelope of the robot, smooth, of free duration. It begins right after the impact (see
-:mod:`jumplab.srmp.touchdown`) and ends at rest in the stance.
+and inertia envelope of the robot, smooth, of free duration. It begins right after the impact and ends at rest in the
+stance.
 """
 
 from __future__ import annotations
@@ -13,67 +13,30 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import root
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import SolverError
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp.nlp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
-from jumplab.robot.reach import FORCE_SHARE, Reach, reach
-from jumplab.robot.stance import com_from_toe, configuration
-from jumplab.stages.srmp.planner import SrmpPlan, launch_function
+from jumplab.robot.reach import SETTINGS, Reach, reach
+from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
+from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, srmp_state
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.srmp.terms import cop_terms, launch_terms, srmp_state
 from jumplab.task import GRAVITY
 
 # touchdown ------------------------------------------------------------------------------------------
-TRUNK_RAD = 0.15  # our choice: middle of what stage 3 allows at touchdown
-KNEE_GUESS_RAD = 1.0  # our choice: start of the search, likewise
-POSTURE_TOLERANCE_M = 1e-6  # our choice: far below anything that matters for an impact
 
 
 @dataclass(frozen=True)
 class Touchdown:
-    """Whole-body quantities at the start of a landing, sagittal plane.
+    """Whole-body quantities at the start of a landing, sagittal plane."""
 
-    Attributes
-    ----------
-    com, com_velocity : (2,) x and z from the middle between the soles [m, m/s].
-    L : angular momentum about the CoM, about +y [kg m^2/s].
-    rho : pitch inertia about the CoM [kg m^2].
-    trunk_pitch : [rad].
-    """
-
-    com: np.ndarray
-    com_velocity: np.ndarray
-    L: float
-    rho: float
-    trunk_pitch: float = TRUNK_RAD
-
-
-def touchdown_of_plan(plan: SrmpPlan, robot: Robot, *, impact: bool = True) -> Touchdown:
-    """Touchdown of a stage-1 plan.
-
-    Stage 1 has no posture, so for the impact the legs are bent until the CoM is where the plan has it, feet flat, trunk
-    and arms as usual at touchdown; the whole body moves as one with the plan's velocity and angular momentum.
-
-    Parameters
-    ----------
-    impact : False keeps the velocities of the flight.
-
-    Raises
-    ------
-    InfeasibleError
-        If the legs cannot put the CoM there.
-    """
-    flight = plan.flight
-    com, velocity, momentum, rho = -flight.foot_com[-1], flight.com_velocity[-1], flight.L[-1], float(flight.rho[-1])
-    if impact:
-        angles = _posture(robot, com)
-        q = configuration(robot, angles, toe=-robot.sagittal.sole_center)
-        velocity, momentum = _after_impact(robot, q, _rigid_motion(robot, q, velocity, momentum))
-    return Touchdown(com, velocity, float(momentum), rho)
+    com: np.ndarray  # (2,) x and z from the middle between the soles [m]
+    com_velocity: np.ndarray  # (2,) [m/s]
+    L: float  # angular momentum about the CoM, about +y [kg m^2/s]
+    rho: float  # pitch inertia about the CoM [kg m^2]
+    trunk_pitch: float = 0.15  # [rad]; the middle of what stage 3 allows at touchdown
 
 
 def touchdown_of_state(robot: Robot, q: np.ndarray, v: np.ndarray, *, impact: bool = True) -> Touchdown:
@@ -91,43 +54,12 @@ def touchdown_of_state(robot: Robot, q: np.ndarray, v: np.ndarray, *, impact: bo
     com, inertia, trunk = data.com[0].copy(), float(data.Ig.inertia[1, 1]), data.oMi[1].rotation
     velocity, momentum = data.hg.linear[[0, 2]] / robot.total_mass, float(data.hg.angular[1])
     if impact:
-        velocity, momentum = _after_impact(robot, q, v)
+        velocity, momentum = after_impact(robot, q, v)
     pitch = float(np.arctan2(trunk[0, 2], trunk[2, 2]))
-    return Touchdown((com - sole)[[0, 2]], velocity.copy(), float(momentum), inertia, pitch)
+    return Touchdown((com - sole)[[0, 2]], velocity, momentum, inertia, pitch)
 
 
-def _posture(robot: Robot, com: np.ndarray) -> np.ndarray:
-    """Link angles (5,) with flat feet that put the CoM at ``com`` (2,) from the middle of the sole."""
-    model, shoulder = robot.sagittal, robot.stance["shoulder_rad"]
-
-    def angles(legs):
-        return np.array([0.0, *legs, TRUNK_RAD, TRUNK_RAD + shoulder])
-
-    def miss(legs):
-        return com_from_toe(robot, angles(legs)) - model.sole_center - com
-
-    found = root(miss, [KNEE_GUESS_RAD / 2, -KNEE_GUESS_RAD / 2])
-    if not np.max(np.abs(found.fun)) < POSTURE_TOLERANCE_M:
-        raise InfeasibleError(
-            f"touchdown with the CoM {com[0]:+.3f} m ahead of and {com[1]:.3f} m above the soles: the legs of "
-            f"{robot.name} do not reach that; plan with a shorter leg at touchdown"
-        )
-    return angles(found.x)
-
-
-def _rigid_motion(robot: Robot, q: np.ndarray, velocity: np.ndarray, momentum: float) -> np.ndarray:
-    """Velocity (nv,) of the robot moving as one body with CoM velocity (2,) and angular momentum."""
-    model, data = robot.model, robot.model.createData()
-    v = np.zeros(model.nv)
-    pin.ccrba(model, data, q, v)
-    base = pin.XYZQUATToSE3(q[:7])
-    spin = np.array([0.0, momentum / data.Ig.inertia[1, 1], 0.0])
-    linear = np.array([velocity[0], 0.0, velocity[1]]) + np.cross(spin, base.translation - data.com[0])
-    v[:3], v[3:6] = base.rotation.T @ linear, base.rotation.T @ spin
-    return v
-
-
-def _after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
+def after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     """CoM velocity (2,) and angular momentum once both feet stand, v+ = v - M^-1 J^T (J M^-1 J^T)^-1 J v."""
     model, data = robot.model, robot.model.createData()
     pin.computeAllTerms(model, data, q, v)
@@ -142,20 +74,19 @@ def _after_impact(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarra
 
 
 # landing ------------------------------------------------------------------------------------------
-SHARED = ("jerk", "L rate", "trunk range", "unilateral", "friction", "leg force", "inertia envelope", "L range")
-SCALES = {"q": 1.0, "v": [5.0, 3.0, 5.0, 2.0], "a": [50.0, 30.0, 50.0, 20.0], "j": [1000.0, 500.0, 1000.0, 500.0]}
-SAMPLE_S = 0.005  # our choice: a hundred samples and more over the landing
+GUESS_S = 0.8  # duration that the solver begins with
 
 
 @dataclass(frozen=True)
 class LandingSettings:
-    """Weights and bounds of the landing; the paper prints none, all are our choice."""
+    """Weights and bounds of the landing; the paper prints none of these numbers."""
 
     intervals: int = 32  # steps of about 30 ms; twice as many move the CoM by less than 5 mm
     duration_s: tuple[float, float] = (0.5, 1.2)  # from a quick knee bend to a slow one
+    lean_rad: tuple[float, float] = (-0.8, 0.8)  # box on theta_l
     cop_margin_m: float = 0.018  # inside the sole's edges: what the landing controller itself keeps
     press_share: float = 0.7  # of the weight, least vertical force: soles that are hardly loaded slip and tip
-    force_gain: float = 1.0 / FORCE_SHARE  # a landing may use the whole peak torque, it lasts a tenth of a second
+    force_gain: float = 1.0 / SETTINGS.force_share  # the whole peak torque: a landing lasts a tenth of a second
     w_jerk: float = 0.03  # [1], of the launch's weighted jerk: the catch has to be quick
     w_momentum_rate: float = 5e-4  # [1 / (N m)^2 / s]; a quarter of the launch's, L must be gone soon
     w_acceleration: float = 2e-2  # [1 / (m/s^2)^2 / s] of the CoM: an even push, peak force low
@@ -165,41 +96,17 @@ class LandingSettings:
 
 
 @dataclass(frozen=True)
-class LandingPlan:
-    """A planned landing, sampled; positions from the middle between the soles.
+class LandingPlan(SrmpStance):
+    """A planned landing, sampled."""
 
-    Attributes
-    ----------
-    t : (N,) since touchdown [s].
-    com, com_velocity, com_acceleration : (N, 2) x and z [m, m/s, m/s^2].
-    L, L_rate : (N,) [kg m^2/s, N m];  rho : (N,) [kg m^2];  F_x, F_z : (N,) [N];  cop_x : (N,) [m].
-    touchdown : the state it began in;  statistics : what the solve cost;  solution : its nodes.
-    """
-
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    com_acceleration: np.ndarray
-    L: np.ndarray
-    L_rate: np.ndarray
-    rho: np.ndarray
-    F_x: np.ndarray
-    F_z: np.ndarray
-    cop_x: np.ndarray
-    touchdown: Touchdown
-    statistics: Statistics
-    solution: PhaseSolution
-
-    @property
-    def duration_s(self) -> float:
-        """From touchdown to standing [s]."""
-        return float(self.t[-1])
+    touchdown: Touchdown  # the state it began in
+    statistics: Statistics  # what the solve cost
+    solution: PhaseSolution  # its nodes
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown; the last sample holds for ever."""
-        x, z, dx, dz, momentum = (
-            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
-        )
+        columns = (*self.com.T, *self.com_velocity.T, self.L)
+        x, z, dx, dz, momentum = (np.interp(time, self.t, column) for column in columns)
         return np.array([x, z]), np.array([dx, dz]), float(momentum)
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
@@ -227,64 +134,67 @@ def _own_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:
     def acceleration(p: Point):
         return srmp_state(p, mass).com_acceleration
 
+    def momentum(p: Point):
+        return srmp_state(p, mass).angular_momentum
+
+    def jump(p: Point):
+        return momentum(p) - p.p.L
+
     return [
         Term("CoM acceleration", "ours: a soft catch", "m/s^2", "node", acceleration, weight=s.w_acceleration),
         Term("CoP from the middle", "ours, times F_z / m g", "m", "node", cop, weight=s.w_cop),
         Term("trunk upright", "ours", "rad", "node", lambda p: p.q[0] + p.q[2] - upright, weight=s.w_posture),
         Term("landing time", "ours", "s", "end", lambda p: p.duration, weight=s.w_time),
-        Term("leg speed", "ours: from the joint speeds", "m/s", "node", room, lower=0.0, upper=np.inf, skip=(1, 0)),
-        Term("L at touchdown", "after the impact", "kg m^2/s", "start",
-             lambda p: srmp_state(p, mass).angular_momentum - p.p.L, scale=10.0),
-        Term("L at rest", "standing", "kg m^2/s", "end", lambda p: srmp_state(p, mass).angular_momentum, scale=10.0),
-    ]  # fmt: skip
+        limit("leg speed", "ours: from the joint speeds", "m/s", "node", room, 0.0, skip=(1, 0)),
+        Term("L at touchdown", "after the impact", "kg m^2/s", "start", jump, scale=10.0),
+        Term("L at rest", "standing", "kg m^2/s", "end", momentum, scale=10.0),
+    ]
+
+
+def _shared_terms(mass: float, envelope: Reach, s: LandingSettings, base: SrmpSettings) -> list[Term]:
+    """Terms of the launch, some of them changed."""
+    # what is measured at touchdown is a fact: constraints that its fixed part alone decides begin one node later
+    changes = {name: {"skip": (1, 0)} for name in ("trunk range", "inertia envelope", "L range")}
+    changes |= {"jerk": {"weight": s.w_jerk}, "L rate": {"weight": s.w_momentum_rate}, "friction": {}, "leg force": {}}
+    changes["unilateral"] = {"lower": s.press_share * mass * GRAVITY}
+    strong = replace(envelope, force_fit=s.force_gain * envelope.force_fit)
+    return [replace(t, **changes[t.name]) for t in launch_terms(mass, strong, base) if t.name in changes]
 
 
 def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> Problem:
     """The landing as a problem of one phase; parameters: start (lean, length, turn, radius), their rates, L."""
-    mass = robot.sagittal.total_mass
-    strong = replace(envelope, force_fit=settings.force_gain * envelope.force_fit)
-    base = SrmpSettings()
-    shared = [t for t in launch_terms(mass, strong, base) if t.name in SHARED]
-    weights = {"jerk": settings.w_jerk, "L rate": settings.w_momentum_rate}
-    shared = [replace(t, weight=weights.get(t.name, t.weight)) if t.is_cost else t for t in shared]
-    # what is measured at touchdown is a fact: constraints that its fixed part alone decides begin one node later
-    shared = [
-        replace(t, skip=(1, 0)) if t.name in ("trunk range", "inertia envelope", "L range") else t for t in shared
-    ]
-    press = settings.press_share * mass * GRAVITY
-    shared = [replace(t, lower=press) if t.name == "unilateral" else t for t in shared]
+    mass, base, s, free = robot.sagittal.total_mass, SrmpSettings(), settings, np.inf
     heel, toe = envelope.cop
-    sole = cop_terms(mass, heel + settings.cop_margin_m, toe - settings.cop_margin_m)
-    low, high = envelope.length
-    unset = np.inf
+    sole = cop_terms(mass, heel + s.cop_margin_m, toe - s.cop_margin_m)
+    terms = (*_shared_terms(mass, envelope, s, base), *sole, *_own_terms(mass, envelope, s))
 
     def start(parameters):
         return parameters["start"]
 
     def rates(sign):
-        return lambda parameters: np.array([*parameters["rates"], sign * unset, sign * unset])
+        return lambda parameters: np.array([*parameters["rates"], sign * free, sign * free])
 
+    low, high = zip(s.lean_rad, envelope.length, base.turn_rad, base.radius_m, strict=True)
+    first, last = ([0.0, envelope.start[1], turn, envelope.start[3]] for turn in (-free, free))
     bounds = (
         Bound("touchdown", "flight's end", "rad, m", "q", start, start, "start"),
         Bound("touchdown rates", "after the impact", "1/s", "v", rates(-1), rates(1), "start"),
-        Bound("state box", "SL-B1", "rad, m", "q", [-0.8, low, -2.5, 0.1], [0.8, high, 2.5, 1.0], "inner"),
-        Bound("stance", "standing", "rad, m", "q", [0.0, envelope.start[1], -unset, envelope.start[3]],
-              [0.0, envelope.start[1], unset, envelope.start[3]], "end"),
-        Bound("at rest", "standing", "1/s", "v", [0.0, 0.0, -unset, 0.0], [0.0, 0.0, unset, 0.0], "end"),
+        Bound("state box", "SL-B1", "rad, m", "q", low, high, "inner"),
+        Bound("stance", "standing", "rad, m", "q", first, last, "end"),
+        Bound("at rest", "standing", "1/s", "v", [0.0, 0.0, -free, 0.0], [0.0, 0.0, free, 0.0], "end"),
         Bound("at rest (acceleration)", "standing", "1/s^2", "a", 0.0, 0.0, "end"),
-    )  # fmt: skip
-    phase = Phase("landing", COORDINATES, settings.intervals, settings.duration_s,
-                  (*shared, *sole, *_own_terms(mass, envelope, settings)), bounds, scales=SCALES)  # fmt: skip
-    return Problem("landing", (phase,), (), dict(start=4, rates=2, L=1, gravity=1))
+    )
+    phase = Phase("landing", COORDINATES, s.intervals, s.duration_s, terms, bounds, scales=SCALES)
+    return Problem("landing", (phase,), (), {"start": 4, "rates": 2, "L": 1, "gravity": 1})
 
 
 class LandingPlanner:
     """Landings of one robot: built once, solved from any touchdown."""
 
-    def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings(), options: dict | None = None):
+    def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings()):
         self.robot, self.settings, self.reach = robot, settings, reach(robot)
         self._mass, self._margin = robot.sagittal.total_mass, SrmpSettings().inertia_margin
-        self.nlp = Nlp(build_landing(robot, settings, self.reach), options)
+        self.nlp = Nlp(build_landing(robot, settings, self.reach))
 
     def plan(self, touchdown: Touchdown, *, gravity: float = GRAVITY, guess: PhaseGuess | None = None) -> LandingPlan:
         """Plan from ``touchdown`` to standing.
@@ -302,7 +212,9 @@ class LandingPlanner:
         data = self._parameters(touchdown)
         solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": guess or self._guess(data)})
         phase = solution.phases["landing"]
-        return _sample(phase, touchdown, solution.statistics, self._mass, gravity)
+        t = grid(phase.duration)
+        columns = on_ground(self._mass, gravity, t, *phase.sample(t))
+        return LandingPlan(*columns, touchdown, solution.statistics, phase)
 
     def catch(self, q: np.ndarray, v: np.ndarray) -> LandingPlan | None:
         """Landing from a state of the full robot at the first touch, None if there is none; see :meth:`plan`."""
@@ -317,28 +229,16 @@ class LandingPlanner:
         along, across = np.array([np.sin(lean), np.cos(lean)]), np.array([np.cos(lean), -np.sin(lean)])
         low, high = (np.polyval(f, length) for f in (self.reach.inertia_low_fit, self.reach.inertia_high_fit))
         inside = 2 * self._margin * (high - low)
-        rho = np.clip(
-            touchdown.rho, low + inside, high - inside
-        )  # the envelope is sampled, the robot may be just outside
+        # the envelope is sampled, the robot may be just outside
+        rho = np.clip(touchdown.rho, low + inside, high - inside)
         start = np.array([lean, length, touchdown.trunk_pitch - lean, np.sqrt(rho / self._mass)])
         return dict(start=start, rates=np.array([dx, dz]) @ np.array([across / length, along]).T, L=touchdown.L)
 
     def _guess(self, data: dict) -> PhaseGuess:
         """Sink and rise: leg length and lean with the given speeds, everything else straight to the stance."""
-        n, first, last = self.settings.intervals, data["start"], self.reach.start
-        duration = 0.8  # our choice
-        s = np.linspace(0, 1, n + 1)[:, None]
+        first, last = data["start"], self.reach.start
+        s = np.linspace(0, 1, self.settings.intervals + 1)[:, None]
         q = first + (last - first) * (3 * s**2 - 2 * s**3)
-        q[:, 1:2] += duration * data["rates"][1] * s * (1 - s) ** 4
-        q[:, 0:1] += duration * data["rates"][0] * s * (1 - s) ** 4
+        q[:, :2] += GUESS_S * data["rates"] * s * (1 - s) ** 4
         q[:, 1] = np.clip(q[:, 1], *self.reach.length)
-        return PhaseGuess(duration, q)
-
-
-def _sample(phase: PhaseSolution, touchdown: Touchdown, statistics, mass: float, gravity: float) -> LandingPlan:
-    t = np.linspace(0, phase.duration, int(np.ceil(phase.duration / SAMPLE_S)) + 1)
-    q, v, a = phase.sample(t)
-    out = [x.full().T.squeeze() for x in launch_function(mass, gravity).map(len(t))(q.T, v.T, a.T)]
-    com, com_v, com_a, momentum, rate, rho, _, _, force, torque = out
-    return LandingPlan(t, com, com_v, com_a, momentum, rate, rho, force[:, 0], force[:, 1], -torque / force[:, 1],
-                       touchdown, statistics, phase)  # fmt: skip
+        return PhaseGuess(GUESS_S, q)

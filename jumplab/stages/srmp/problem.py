@@ -1,62 +1,276 @@
-"""Stage 1 as a problem: flat foot, toe (heel up) and flight, joined at take-off (Sec. III of the paper)."""
+"""Stage 1 as a problem: named costs and constraints, and the phases flat foot, toe (heel up) and flight, joined at
+take-off (Sec. III of the paper); pure, nothing here solves.
+"""
 
 from __future__ import annotations
 
-from jumplab.models.srmp import COORDINATES
-from jumplab.ocp.problem import Bound, Phase, Problem
+from functools import partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from jumplab.models.srmp import COORDINATES, SrmpState
+from jumplab.ocp.derivatives import chain
+from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.srmp.terms import cop_terms, flight_terms, joining_terms, launch_terms, reach_terms, takeoff_terms
+from jumplab.task import GRAVITY
 
-COM_BOX_M = (-1.5, 2.5)  # our choice: the CoM at take-off, seen from the pivot
-SPEED_BOX_M_S = (-6.0, 6.0)  # our choice: a CoM rise of 1.8 m
-# our choice: the toe part's CoP lies within this distance of the toe edge, where the robot's is once its heel is up.
-# The costs push it to the inner end: at 5 mm the robot missed 1.3 % of the take-off speed; below 1 mm solves are longer
-TOE_BAND_M = 0.0015
-# our choice: at 1600 N the CoP's band is 1 mm wider, at 100 N 2 cm. As force and torque vanish together at take-off,
-# their quotient bends by more within the last interval; with a quarter of it that interval decided the plan and cost
-# 12 % more than on a fine mesh
-TOE_SLACK_N_M = 2.0
+QUARTERS = (0.25, 0.5, 0.75)
+GAUSS = ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(15) / 10, 5 / 18))  # three points on [0, 1]
 SCALES = {"q": 1.0, "v": [5.0, 3.0, 5.0, 2.0], "a": [50.0, 30.0, 50.0, 20.0], "j": [1000.0, 500.0, 1000.0, 500.0]}
 FLIGHT_SCALES = {"q": 1.0, "v": 20.0, "a": 200.0, "j": 5000.0}
 SYMMETRY_OFF = ("symmetric landing",)  # about the pivot it lands too far ahead (falls); the capture window replaces it
-PARAMETERS = dict(start=4, distance=1, platform=1, takeoff_speed=1, rotation=1, gravity=1)
 
 
+def limit(name: str, equation: str, unit: str, at: str, of: Any, low: Any, high: Any = np.inf, **more: Any) -> Term:
+    """A constraint low <= of <= high."""
+    return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
+
+
+def srmp_state(p: Point, mass: float) -> SrmpState:
+    """The pendulum at one instant; evaluated once for all terms that look there."""
+    if "srmp" not in p.memo:
+        p.memo["srmp"] = SrmpState(mass, p.q, p.v, p.a, p.p.gravity)
+    return p.memo["srmp"]
+
+
+def trunk(p: Point) -> ca.SX:
+    """Pitch of the trunk, theta_l + theta_pl [rad]."""
+    return p.q[0] + p.q[2]
+
+
+# launch ------------------------------------------------------------------------------------------
+def launch_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
+    """Costs and constraints all along the launch, SL-* (Sec. III-A)."""
+    at, mg = partial(srmp_state, mass=mass), mass * GRAVITY
+
+    def inertia_room(p):
+        low, high = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.inertia_low_fit, reach.inertia_high_fit))
+        margin = s.inertia_margin * (high - low)
+        return ca.vertcat(at(p).inertia - low - margin, high - margin - at(p).inertia)
+
+    def cone(p):
+        f = at(p).ground_force
+        return ca.vertcat(s.friction * f[1] - f[0], s.friction * f[1] + f[0])
+
+    def strength(p):
+        """Leg force-velocity line: full force up to a share of the extension speed, none at the speed itself."""
+        force, speed = (ca.polyval(ca.DM(fit), p.q[1]) for fit in (reach.force_fit, reach.speed_fit))
+        fade = (speed - p.v[1]) / ((1 - s.corner_speed) * speed)
+        return ca.vertcat(force - at(p).ground_force[1], force * fade - at(p).ground_force[1])
+
+    def extension(p):
+        return s.speed_share * ca.polyval(ca.DM(reach.speed_fit), p.q[1]) - p.v[1]
+
+    return [
+        Term("jerk", "SL-J1", "weighted", "mid", lambda p: ca.DM(np.sqrt(s.w_jerk)) * p.j, weight=1.0),
+        Term("CoM velocity", "SL-J2", "m/s", "node", lambda p: at(p).com_velocity, weight=s.w_velocity),
+        Term("L rate", "SL-J3", "N m", "node", lambda p: at(p).angular_momentum_rate, weight=s.w_momentum_rate),
+        Term("turn", "SL-J4", "rad", "node", lambda p: p.q[2], weight=s.w_turn),
+        limit("trunk range", "SL-P1, as path", "rad", "node", trunk, *reach.posture),
+        limit("inertia envelope", "SL-P4, SL-E5; ours: rho(phi)", "kg m^2", "node", inertia_room, 0.0),
+        limit("L range", "SL-P5", "kg m^2/s", "node", lambda p: at(p).angular_momentum, *s.momentum, scale=10.0),
+        limit("unilateral", "ours", "N", "node", lambda p: at(p).ground_force[1], 0.0, scale=mg, skip=(0, 1)),
+        limit("friction", "ours", "N", "node", cone, 0.0, scale=mg, skip=(0, 1)),
+        limit("leg force", "SL-B1 on F; ours: from the joint torques", "N", "node", strength, 0.0, scale=mg),
+        limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, 0.0),
+    ]
+
+
+def reach_terms(mass: float, reach: Reach, s: SrmpSettings, heel_up: bool) -> list[Term]:
+    """What keeps the pendulum among the robot's postures: usual inertia, and with flat feet a CoM not too low."""
+    at, fit = partial(srmp_state, mass=mass), ca.DM(reach.usual_toe_fit if heel_up else reach.usual_flat_fit)
+    slope, offset = reach.low_com_fit
+
+    def unusual(p):
+        return at(p).inertia - ca.polyval(fit, p.q[1])
+
+    def height(p):
+        com = at(p).com
+        return com[1] - slope * com[0] - offset
+
+    def deep(p):
+        com = at(p).com
+        below = ca.polyval(ca.DM(reach.easy_com_fit), com[0]) - com[1]
+        return (below + ca.sqrt(below**2 + s.crouch_smoothing_m**2)) / 2
+
+    def between(left, right, step):
+        # the CoM only touches this limit, at the bottom of the crouch: with nodes alone it would pass between two
+        inside = [chain(left.q, left.v, left.a, left.j, share * step)[0] for share in QUARTERS]
+        return ca.vertcat(*(q[1] * (ca.cos(q[0]) - slope * ca.sin(q[0])) - offset for q in inside))
+
+    usual = Term("usual inertia", "ours: rho(phi)", "kg m^2", "node", unusual, weight=s.w_usual_inertia)
+    flat = [
+        Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch),
+        limit("CoM not too low", "ours: flat feet", "m", "node", height, 0.0, scale=0.1),
+        limit("CoM not too low (between)", "ours: flat feet", "m", "interval", between, 0.0, scale=0.1),
+    ]
+    return [usual] if heel_up else [usual, *flat]
+
+
+def cop_terms(mass: float, low: float, high: float, slack: float = 0.0) -> list[Term]:
+    """SL-P2 multiplied by F_z, so that it holds at take-off too, where the printed quotient is 0/0.
+
+    ``slack`` [N m] is allowed on either side; it matters only where F_z vanishes.
+    """
+
+    def room(p):
+        f, torque = srmp_state(p, mass).ground_force, srmp_state(p, mass).pivot_torque
+        return ca.vertcat(slack - torque - low * f[1], slack + high * f[1] + torque)
+
+    scale = 0.1 * mass * GRAVITY
+    return [
+        limit("CoP", "SL-P2, times F_z", "N m", "node", room, 0.0, scale=scale, skip=(0, 1)),
+        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", room, 0.0, scale=scale),
+    ]
+
+
+def takeoff_terms(mass: float, reach: Reach, s: SrmpSettings) -> list[Term]:
+    """Costs and constraints at the end of the launch, SL-J2, J3 and SL-E* (Sec. III-A)."""
+    at, mg = partial(srmp_state, mass=mass), mass * GRAVITY
+    length = reach.length[0], s.takeoff_length * reach.start[1]
+    return [
+        Term("posture at take-off", "SL-J2", "rad", "end", trunk, weight=s.w_posture_end),
+        Term("L at take-off", "SL-J3", "kg m^2/s", "end", lambda p: at(p).angular_momentum, weight=s.w_momentum_end),
+        Term("take-off speed", "SL-E2", "m/s", "end", lambda p: at(p).com_velocity[1] - p.p.takeoff_speed),
+        Term("rod force zero", "SL-E3", "N", "end", lambda p: at(p).rod_force, scale=mg),
+        Term("pivot torque zero", "SL-E4", "N m", "end", lambda p: at(p).pivot_torque, scale=0.1 * mg),
+        Term("L rate zero", "SL-E6", "N m", "end", lambda p: at(p).angular_momentum_rate, scale=0.1 * mg),
+        limit("take-off length", "SL-B1 at the end; ours", "m", "end", lambda p: p.q[1], *length),
+        limit("posture range", "SL-P1", "rad", "end", trunk, *s.posture_end),
+    ]
+
+
+# flight ------------------------------------------------------------------------------------------
+def flight_terms(s: SrmpSettings, reach: Reach | None = None) -> list[Term]:
+    """Costs and constraints of the flight, SF-* (Sec. III-B); coordinate rho = rho_R + rho_I, state theta.
+
+    With ``reach``, also the inertia at touchdown is one that the robot usually has at that leg length.
+    """
+
+    def rotation(left, right, step):
+        total = 0
+        for share, weight in GAUSS:
+            total += weight * left.c.L / chain(left.q, left.v, left.a, left.j, share * step)[0]
+        return right.z - left.z - step * total
+
+    def unusual(p):
+        return p.q - ca.polyval(ca.DM(reach.usual_toe_fit), p.c.leg)
+
+    def height(p):
+        t = p.duration
+        com = p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2
+        return com - p.p.platform - p.c.leg * ca.cos(_foot_angle(p))
+
+    def climb(p):
+        return p.c.vel_z - p.p.gravity * p.duration
+
+    rate, lean = s.touchdown_inertia_rate, s.touchdown_lean
+    usual = limit("inertia at touchdown", "ours: rho(phi)", "kg m^2", "end", unusual, *s.touchdown_inertia)
+    return [
+        *([] if reach is None else [usual]),
+        Term("inertia acceleration", "SF-J1", "kg m^2/s^2", "node", lambda p: p.a, weight=s.w_inertia_accel),
+        Term("inertia jerk", "SF-J1", "kg m^2/s^3", "mid", lambda p: p.j, weight=s.w_inertia_jerk),
+        Term("rotation", "SF-D1", "rad", "interval", rotation, identity=True),
+        limit("inertia rate at touchdown", "ours", "kg m^2/s", "end", lambda p: p.v, -rate, rate, scale=10.0),
+        Term("touchdown height", "ours: t_f from both CoM heights", "m", "end", height),
+        limit("falling at touchdown", "ours: not on the way up", "m/s", "end", climb, -np.inf, 0.0),
+        limit("lean at touchdown", "ours: foot below the CoM", "rad", "end", _foot_angle, -lean, lean),
+    ]
+
+
+def _foot_angle(p: Point) -> ca.SX:
+    """Angle theta of the line from foot to CoM at touchdown [rad], whole turns taken off."""
+    return p.z[0] - p.p.rotation
+
+
+def _foot_ahead(p: Point) -> ca.SX:
+    """Sole centre ahead of the CoM at touchdown [m]."""
+    return -p.c.leg * ca.sin(_foot_angle(p))
+
+
+# both ------------------------------------------------------------------------------------------
+def joining_terms(mass: float, s: SrmpSettings) -> list[Term]:
+    """Links at take-off (SF-L1..4), jump length and landing condition; ``e`` has the ends of every phase."""
+
+    def takeoff(e):
+        return srmp_state(e["toe"].end, mass)
+
+    def launch_time(e):
+        return e["flat"].end.duration + e["toe"].end.duration
+
+    def continuity(e):
+        a, b = e["flat"].end, e["toe"].start
+        pairs = ((a.q, b.q, 1.0), (a.v, b.v, 5.0), (a.a, b.a, 50.0))
+        return ca.vertcat(*((x - y) / ca.DM(scale) for x, y, scale in pairs))
+
+    def inertia_link(e):
+        a, b = takeoff(e), e["flight"].start
+        return ca.vertcat(a.inertia - b.q[0], (a.inertia_rate - b.v[0]) / 20, (a.inertia_accel - b.a[0]) / 200)
+
+    def momentum_link(e):
+        return takeoff(e).angular_momentum - e["flight"].start.c.L
+
+    def ballistic(e):
+        a, c = takeoff(e), e["flight"].start.c
+        return ca.vertcat(a.com - ca.vertcat(c.com_x, c.com_z), a.com_velocity - ca.vertcat(c.vel_x, c.vel_z))
+
+    def length(e):
+        c, end = e["flight"].start.c, e["flight"].end
+        return c.com_x + c.vel_x * end.duration + _foot_ahead(end) - end.p.distance
+
+    def capture(e):
+        end = e["flight"].end
+        return _foot_ahead(end) - s.capture_offset_m - s.capture_slope_s * end.c.vel_x
+
+    def symmetry(e):
+        return e["flight"].end.z[0] + e["toe"].end.q[0] - e["flight"].end.p.rotation
+
+    link, window = {"identity": True}, s.capture_window_m
+    return [
+        Term("launch time", "SL-J5", "s", "problem", launch_time, weight=s.w_time),
+        Term("flat to toe", "ours: heel up", "scaled", "problem", continuity, **link),
+        Term("lean link", "SF-L1", "rad", "problem", lambda e: e["toe"].end.q[0] - e["flight"].start.z[0], **link),
+        Term("inertia link", "SF-L2..L4", "kg m^2 ...", "problem", inertia_link, **link),
+        Term("momentum link", "SF-D1: L constant", "kg m^2/s", "problem", momentum_link, scale=10.0, **link),
+        Term("ballistic CoM", "Sec. III", "m, m/s", "problem", ballistic, **link),
+        Term("jump length", "SL-E1, foot to foot", "m", "problem", length),
+        limit("capture window", "ours; replaces SF-E1", "m", "problem", capture, *window, scale=0.1),
+        Term("symmetric landing", "SF-E1 (about the pivot)", "rad", "problem", symmetry),
+    ]
+
+
+# phases ------------------------------------------------------------------------------------------
 def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, Phase]:
+    """Flat foot and toe: the same terms all along; the CoP inside the sole, then in a band at the toe edge."""
+
     def start(parameters):
         return parameters["start"]
 
-    low, high = reach.length
-    box = Bound("state box", "SL-B1", "rad, m", "q", [s.takeoff_lean[0], low, -2.5, 0.1],
-                [s.takeoff_lean[1], high, 2.5, 1.0], "inner")  # fmt: skip
+    low, high = zip(s.takeoff_lean, reach.length, s.turn_rad, s.radius_m, strict=True)
+    box = Bound("state box", "SL-B1", "rad, m", "q", low, high, "inner")
     bounds = (
         Bound("start posture", "SL-P3; ours: the stance", "rad, m", "q", start, start, "start"),
         Bound("at rest", "ours", "1/s", "v", 0.0, 0.0, "start"),
         Bound("at rest (acceleration)", "ours", "1/s^2", "a", 0.0, 0.0, "start"),
         box,
     )
-    heel, toe, margin = *reach.cop, s.cop_margin_m
+    heel, toe = reach.cop
     along = launch_terms(mass, reach, s)
-    inside, edge = cop_terms(mass, heel + margin, toe), cop_terms(mass, toe - TOE_BAND_M, toe, TOE_SLACK_N_M)
-    flat = Phase(
-        "flat",
-        COORDINATES,
-        s.intervals[0],
-        s.flat_s,
-        (*along, *reach_terms(mass, reach, s, False), *inside),
-        bounds,
-        scales=SCALES,
+    flat = (*along, *reach_terms(mass, reach, s, False), *cop_terms(mass, heel + s.cop_margin_m, toe))
+    edge = cop_terms(mass, toe - s.toe_band_m, toe, s.toe_slack_n_m)
+    tip = (*along, *reach_terms(mass, reach, s, True), *edge, *takeoff_terms(mass, reach, s))
+    return (
+        Phase("flat", COORDINATES, s.intervals[0], s.flat_s, flat, bounds, scales=SCALES),
+        Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip, (box,), scales=SCALES),
     )
-    tip_terms = (*along, *reach_terms(mass, reach, s, True), *edge, *takeoff_terms(mass, reach, s))
-    tip = Phase("toe", COORDINATES, s.intervals[1], s.toe_s, tip_terms, (box,), scales=SCALES)
-    return flat, tip
 
 
 def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
-    stance = reach.start[1]
-    low, high = reach.inertia
+    stance, (low, high) = reach.start[1], reach.inertia
     margin = s.inertia_margin * (high - low)
     bounds = (
         Bound("inertia range", "SF-B1", "kg m^2", "q", low + margin, high - margin),
@@ -68,16 +282,19 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
         fold = s.touchdown_fold_per_m * max(0.0, parameters["platform"])
         return (s.touchdown_length[0] - fold) * stance
 
-    leg = (shortest, s.touchdown_length[1] * stance, 1.0)
-    constants = {"L": (*s.momentum, 10.0), "com_x": (*COM_BOX_M, 1.0), "com_z": (*COM_BOX_M, 1.0),
-                 "vel_x": (*SPEED_BOX_M_S, 1.0), "vel_z": (*SPEED_BOX_M_S, 1.0), "leg": leg}  # fmt: skip
-    terms = tuple(flight_terms(s, reach))
-    return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), terms, bounds, states=("theta",),
-                 constants=constants, scales=FLIGHT_SCALES)  # fmt: skip
+    constants = {
+        "L": (*s.momentum, 10.0),
+        **{name: (*s.com_m, 1.0) for name in ("com_x", "com_z")},
+        **{name: (*s.speed_m_s, 1.0) for name in ("vel_x", "vel_z")},
+        "leg": (shortest, s.touchdown_length[1] * stance, 1.0),
+    }
+    terms, more = tuple(flight_terms(s, reach)), {"states": ("theta",), "constants": constants, "scales": FLIGHT_SCALES}
+    return Phase("flight", ("inertia",), s.intervals[2], (0.05, 2.0), terms, bounds, **more)
 
 
 def build_problem(robot: Robot, settings: SrmpSettings = SrmpSettings(), envelope: Reach | None = None) -> Problem:
     """Stage 1 as one problem over launch and flight."""
     envelope, mass = envelope or reach(robot), robot.sagittal.total_mass
     phases = (*_launch_phases(mass, envelope, settings), _flight_phase(envelope, settings))
-    return Problem("SRMP", phases, tuple(joining_terms(mass, settings)), dict(PARAMETERS))
+    sizes = {"start": 4, "distance": 1, "platform": 1, "takeoff_speed": 1, "rotation": 1, "gravity": 1}
+    return Problem("SRMP", phases, tuple(joining_terms(mass, settings)), sizes)

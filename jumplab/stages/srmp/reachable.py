@@ -1,4 +1,4 @@
-"""A target close by that stage 1 can plan, told when the one that was asked for has no plan."""
+"""Whether a target can be reached at all, by closed forms, and a target close by where stage 1 finds no plan."""
 
 from __future__ import annotations
 
@@ -15,34 +15,29 @@ from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import MAX_HEIGHT_M, JumpTask
 
 # verdict ------------------------------------------------------------------------------------------
-SWING_GAIN = 1.06  # our choice: the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
-DIP_M_S = 1.0  # our choice: downward speed in the crouch that a push may start from; 0.64 was seen to matter
-STROKE_POINTS = 200  # our choice: the push's quadrature is exact to 1e-3 m/s
-GRID = (41, 121)  # our choice: leans and horizontal speeds that are tried; nearest numbers are exact to 2 %
+SWING_GAIN = 1.06  # [1] the rod's swing adds to a straight push; stage 1 was seen up to 5.6 % beyond it
+DIP_M_S = 1.0  # downward speed in the crouch that a push may start from; 0.64 was seen to matter
+STROKE_POINTS = 200  # the push's quadrature is exact to 1e-3 m/s
+PLATFORM_POINTS = 400  # steps of a few millimetres
+GRID = (41, 121)  # leans and horizontal speeds that are tried; nearest numbers are exact to 2 %
 LOWEST_M = 0.02  # least CoM rise that a task may ask for
-CHECK_STEP_M = 0.01  # our choice: nearest numbers are told in steps of a centimetre
+STEP_M = 0.01  # targets are told in centimetres
 
 
 @dataclass(frozen=True)
 class Capability:
     """What the closed forms need to know of robot, settings and gravity.
 
-    Attributes
-    ----------
-    speed : greatest speed along the leg at take-off [m/s]:  max over phi of min(v(phi), share S(phi)), times the
-        swing's gain, where  m v dv = (min(F, F (S - v) / ((1 - corner) S)) - m g) dphi  from rest in a deep crouch.
-    stroke : leg stroke of the push, deepest crouch to longest leg at take-off [m].
-    mean_force : average of F over the stroke [N].
-    takeoff_length : longest leg at take-off [m].
-    mass, gravity, settings, envelope : as given.
+    The greatest speed is max over phi of min(v(phi), share S(phi)), times the swing's gain, where
+    m v dv = (min(F, F (S - v) / ((1 - corner) S)) - m g) dphi  from rest in a deep crouch.
     """
 
-    speed: float
-    stroke: float
-    mean_force: float
-    takeoff_length: float
-    mass: float
-    gravity: float
+    speed: float  # greatest speed along the leg at take-off [m/s]
+    stroke: float  # leg stroke of the push, deepest crouch to longest leg at take-off [m]
+    mean_force: float  # average of F over the stroke [N]
+    takeoff_length: float  # longest leg at take-off [m]
+    mass: float  # [kg]
+    gravity: float  # [m/s^2]
     settings: SrmpSettings
     envelope: Reach
 
@@ -59,8 +54,8 @@ def capability(envelope: Reach, gravity: float, settings: SrmpSettings = SrmpSet
         square = max(square + 2 * step * push, 0.0)
         reached[k] = math.sqrt(square)
     best = float(np.max(np.minimum(reached, settings.speed_share * speed)))
-    return Capability(SWING_GAIN * best, float(phi[-1] - phi[0]), float(force.mean()), float(longest),
-                      float(envelope.mass), gravity, settings, envelope)  # fmt: skip
+    stroke, mean = float(phi[-1] - phi[0]), float(force.mean())
+    return Capability(SWING_GAIN * best, stroke, mean, float(longest), envelope.mass, gravity, settings, envelope)
 
 
 def needed_force(can: Capability, height_m: float) -> float:
@@ -70,8 +65,12 @@ def needed_force(can: Capability, height_m: float) -> float:
 
 def highest(can: Capability) -> float:
     """Greatest CoM rise [m]:  speed^2 / (2 g), and not more than the average force gives,  stroke (F / m g - 1)."""
+    return max(min(_rises(can).values()), 0.0)
+
+
+def _rises(can: Capability) -> dict[str, float]:
     by_force = can.stroke * (can.mean_force / (can.mass * can.gravity) - 1)
-    return max(min(can.speed**2 / (2 * can.gravity), by_force), 0.0)
+    return {"speed": can.speed**2 / (2 * can.gravity), "force": by_force}
 
 
 def farthest(can: Capability, task: JumpTask) -> float:
@@ -121,7 +120,7 @@ def highest_platform(can: Capability, height_m: float, distance_m: float) -> flo
     rise_s, ahead = math.sqrt(2 * height_m / can.gravity), distance_m >= 0
     v_x = (abs(distance_m) + _trailing_edge(can, ahead)) / (rise_s + can.settings.capture_slope_s)
     lead = _lead(can, v_x, ahead)
-    grid = np.linspace(0.0, can.takeoff_length + height_m, 400)  # our choice: steps of a few millimetres
+    grid = np.linspace(0.0, can.takeoff_length + height_m, PLATFORM_POINTS)
     room = can.takeoff_length + height_m - grid - _landing_height(can, grid, lead)
     return float(grid[room >= 0].max(initial=0.0))
 
@@ -167,23 +166,17 @@ def check_reachable(task: JumpTask, envelope: Reach, robot: Robot, settings: Srm
 
     The conditions, in this order, are those of :func:`highest` (take-off speed, average force over the stroke),
     :func:`highest_platform` (apex over the bent landing leg), :func:`farthest` (extension speed, falling forward,
-    friction, time in the air) and :func:`least_momentum` (rotation).
-
-    Raises
-    ------
-    InfeasibleError
-        With the value asked for, the limit, where it comes from and what to ask for instead.
+    friction, time in the air) and :func:`least_momentum` (rotation). Raises :class:`InfeasibleError` with the value
+    asked for, the limit, where it comes from and what to ask for instead.
     """
     can = capability(envelope, task.gravity, settings)
-    _check_height(task, can, robot.name)
-    _check_platform(task, can, robot.name)
-    _check_distance(task, can, robot.name)
-    _check_rotation(task, can, robot.name)
+    for check in (_check_height, _check_platform, _check_distance, _check_rotation):
+        check(task, can, robot.name)
 
 
 def _check_height(task: JumpTask, can: Capability, name: str) -> None:
     limit = highest(can)
-    if limit < CHECK_STEP_M:
+    if limit < STEP_M:
         why = f"its legs give {can.mean_force:.0f} N on average for a weight of {can.mass * can.gravity:.0f} N"
         if can.mean_force > can.mass * can.gravity:
             why += f" and reach {can.speed:.2f} m/s"
@@ -201,8 +194,8 @@ def _check_height(task: JumpTask, can: Capability, name: str) -> None:
 
 def _limiting(can: Capability) -> str:
     """The joint that limits the rise, as a person would name it."""
-    by_force = can.stroke * (can.mean_force / (can.mass * can.gravity) - 1)
-    what = "force" if by_force < can.speed**2 / (2 * can.gravity) else "speed"
+    rises = _rises(can)
+    what = min(rises, key=rises.get)
     return f"limited by the {what} of {can.envelope.weakest[what]}"
 
 
@@ -210,8 +203,7 @@ def _check_platform(task: JumpTask, can: Capability, name: str) -> None:
     limit = highest_platform(can, task.height_m, task.distance_m)
     if task.platform_m <= limit:
         return
-    heights = _heights(can, task.height_m)
-    enough = [h for h in heights if highest_platform(can, h, task.distance_m) >= task.platform_m]
+    enough = [h for h in _heights(can, task.height_m) if highest_platform(can, h, task.distance_m) >= task.platform_m]
     higher = f", or for a height of {_above(enough[0])} m" if enough else ""
     raise InfeasibleError(
         f"platform = {task.platform_m:g} m: at a height of {task.height_m:g} m the CoM of {name} rises to at most "
@@ -226,9 +218,8 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
         return
     heights = [h for h in _heights(can, LOWEST_M) if task.platform_m <= highest_platform(can, h, task.distance_m)]
     best = max(((farthest(can, _at(task, h)), h) for h in heights), default=(0.0, task.height_m))
-    more = (
-        f"; farthest is {_below(best[0])} m, at a height of {best[1]:.2f} m" if best[0] > limit + CHECK_STEP_M else ""
-    )
+    found = best[0] > limit + STEP_M
+    more = f"; farthest is {_below(best[0])} m, at a height of {best[1]:.2f} m" if found else ""
     way, sign = ("forward", "") if task.distance_m >= 0 else ("backward", "-")
     raise InfeasibleError(
         f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, {name} "
@@ -239,7 +230,7 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
 
 def _heights(can: Capability, first: float) -> np.ndarray:
     """CoM rises to look for a better number among [m]."""
-    return np.arange(first, min(highest(can), MAX_HEIGHT_M), CHECK_STEP_M)
+    return np.arange(first, min(highest(can), MAX_HEIGHT_M), STEP_M)
 
 
 def _at(task: JumpTask, height_m: float) -> JumpTask:
@@ -261,17 +252,16 @@ def _check_rotation(task: JumpTask, can: Capability, name: str) -> None:
 
 
 def _below(limit: float) -> str:
-    return f"{math.floor(limit / CHECK_STEP_M + 1e-9) * CHECK_STEP_M:.2f}"
+    return f"{math.floor(limit / STEP_M + 1e-9) * STEP_M:.2f}"
 
 
 def _above(limit: float) -> str:
-    return f"{math.ceil(limit / CHECK_STEP_M - 1e-9) * CHECK_STEP_M:.2f}"
+    return f"{math.ceil(limit / STEP_M - 1e-9) * STEP_M:.2f}"
 
 
 # nearest ------------------------------------------------------------------------------------------
-STEPS = (4, 10)  # our choice: the closed forms pass targets that are so many steps too hard, seldom more
-STEP_M = 0.01  # our choice: targets are told in centimetres
-DISTANCE_STEP_M = 0.05  # our choice: distance has the widest range of the three
+STEPS = (4, 10)  # the closed forms pass targets that are so many steps too hard, seldom more
+DISTANCE_STEP_M = 0.05  # distance has the widest range of the three
 
 
 def nearest(task: JumpTask, failure: SolverError, plan: Callable[[JumpTask], object]) -> SolverError:
@@ -288,16 +278,14 @@ def nearest(task: JumpTask, failure: SolverError, plan: Callable[[JumpTask], obj
 
 def _easier(task: JumpTask, violations: str) -> Iterator[tuple[JumpTask, str]]:
     """Easier targets, the least change first, along the number that the violated terms point to."""
+    high = task.platform_m > 0 and ("touchdown" in violations or "take-off length" in violations)
+    key = "height" if "take-off speed" in violations else "platform" if high else "distance"
+    asked = getattr(task, f"{key}_m")
     for k in STEPS:
+        easier = float(_below(asked - k * STEP_M))
+        if key == "distance":
+            easier = math.copysign(max(abs(asked) - k * DISTANCE_STEP_M, 0.0), asked)
         try:
-            if "take-off speed" in violations:
-                height = math.floor((task.height_m - k * STEP_M) / STEP_M + 1e-9) * STEP_M
-                yield replace(task, height_m=height), f"the same target with a height of {height:.2f} m"
-            elif task.platform_m > 0 and ("touchdown" in violations or "take-off length" in violations):
-                platform = math.floor((task.platform_m - k * STEP_M) / STEP_M + 1e-9) * STEP_M
-                yield replace(task, platform_m=platform), f"the same target with a platform of {platform:.2f} m"
-            else:
-                distance = math.copysign(max(abs(task.distance_m) - k * DISTANCE_STEP_M, 0.0), task.distance_m)
-                yield replace(task, distance_m=distance), f"the same target with a distance of {distance:.2f} m"
+            yield replace(task, **{f"{key}_m": easier}), f"the same target with a {key} of {easier:.2f} m"
         except InputError:  # beyond what a target can be
             return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,12 +33,7 @@ def crouched(robot: Robot) -> Robot:
 
     Planners begin there, landings end there, and the standing controller holds it: all of them ask the robot.
     """
-    text = robot.config_text
-    for key, value in CROUCH.items():
-        text, found = re.subn(rf"(?m)^(\s*{key}\s*=\s*)[-+.\deE]+", rf"\g<1>{value}", text, count=1)
-        if not found:
-            return robot
-    other = Robot.from_text(robot.urdf, text)
+    other = robot.with_stance(**CROUCH)
     try:
         check_stance(other)
     except RobotError:

@@ -3,16 +3,18 @@
 The paper gives 42 kg, about 1.5 m, 14 joints and nine links (Sec. VI-A), nothing else. All other values below are *our
 choice*; each row carries its reason. They are not the authors' robot.
 
-``python -m jumplab.robot.bhr.table`` rewrites ``bhr.urdf`` beside this file; a test asserts that the two agree.
+``python -m paper.bhr_table``, run in this folder's parent, rewrites the package's ``bhr.urdf``; a test asserts that
+the two agree.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
-URDF_PATH = Path(__file__).with_name("bhr.urdf")
+from jumplab.robot.description import SHIPPED
+
+URDF_PATH = SHIPPED["bhr"].with_name("bhr.urdf")
 
 
 @dataclass(frozen=True)
