@@ -18,15 +18,16 @@ from jumplab.io.folder import write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
 from jumplab.show import scene as stage
-from jumplab.show.render import ABOVE_M, LIMB_SHARE
+from jumplab.show.bodies import ABOVE_M, LIMB_SHARE
 from jumplab.show.style import PHASE_COLORS, describe_task, tint
 from jumplab.sim.scene import Scene
 from jumplab.task import JumpTask
 
-FPS = 50.0  # our choice: frames a second; every twentieth sample of a log, and the page turns smoothly between them
-AHEAD_M = 0.75  # our choice: ground that is seen behind the start and beyond the end of the jump
-RULER_M = 0.5  # our choice: spacing of the numbers along the ground
-NOTEBOOK_HEIGHT_PX = 520  # our choice: height of the frame in a notebook
+FPS = 50.0  # frames a second: every twentieth sample of a log; the page turns smoothly between them
+AHEAD_M = 0.75  # ground that is seen behind the start and beyond the end of the jump
+RULER_M = 0.5  # spacing of the numbers along the ground
+NOTEBOOK_HEIGHT_PX = 520  # height of the frame in a notebook
+GHOST_ALPHA = 0.35  # strength of the plan where simulation and plan are shown together
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,11 @@ def page(
         If there is nothing to show, or ``fps`` cannot be meant.
     """
     records = {"simulation": simulation, "plan": plan}
-    motions = {k: _motion(v).every(fps) for k, v in records.items() if v is not None}
+    motions = {
+        name: (record if isinstance(record, Motion) else Motion.of(record)).every(fps)
+        for name, record in records.items()
+        if record is not None
+    }
     if not motions:
         raise InputError("a page needs a plan or a simulation to show")
     scene = scene or Scene.flat()
@@ -98,10 +103,10 @@ def page(
         painted = stage.add_robot(vis, robot, name)
         paths.append(stage.add_trail(vis, motion, robot, name))
         clips.append({"name": name, **painted, **_clip(motion, robot)})
-    start, end = (float(f(p[:, 0])) for f, p in ((min, np.concatenate(paths)), (max, np.concatenate(paths))))
+    x = np.concatenate(paths)[:, 0]
     toe = robot.foot.toe - float(robot.foot.center[0])
-    marks = [toe, *(toe + x for x in ([task.distance_m] if task else []) + list(marks_m))]
-    span = min(start, *marks) - AHEAD_M, max(end, *marks) + AHEAD_M
+    marks = [toe, *(toe + goal for goal in ([task.distance_m] if task else []) + list(marks_m))]
+    span = min(float(x.min()), *marks) - AHEAD_M, max(float(x.max()), *marks) + AHEAD_M
     stage.lay_ground(vis, scene, span, marks)
     facts: dict[str, Any] = {  # what player.js reads
         "title": title or (describe_task(task) if task else "A jump"),
@@ -115,14 +120,10 @@ def page(
             for p, c in PHASE_COLORS.items()
         },
         "css": PHASE_COLORS,
-        "ghost": stage.GHOST_ALPHA,
+        "ghost": GHOST_ALPHA,
     }
     title = f"{facts['title']}: {' and '.join(motions)}"
     return Page(_assemble(title, facts, commands.sent), title)
-
-
-def _motion(record: Record | Motion) -> Motion:
-    return record if isinstance(record, Motion) else Motion.of(record)
 
 
 def _clip(motion: Motion, robot: Robot) -> dict[str, Any]:

@@ -1,9 +1,4 @@
-"""Colours, sizes and saving: everything that makes two jumplab figures look alike.
-
->>> from jumplab import plotting
->>> plotting.use_style()                                   # once per notebook, for plots of your own
->>> fig = plotting.new_figure(plotting.COLUMN_IN, 2.0)     # or any of the package's figure functions
->>> plotting.save_figure(fig, "my_figure", "figures", "What the reader sees.", task=task, robot=robot)
+"""Colours, sizes, curves by phase, and saving: what makes two figures look alike.
 
 Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one when it is the last expression of a cell
 (:func:`save_figure` returns it), nothing is shown twice, and nothing has to be closed.
@@ -38,11 +33,8 @@ R = TypeVar("R")
 LAUNCH, FLIGHT, LANDING = "#0072B2", "#E69F00", "#009E73"
 PURPLE, SKY, VERMILION = "#CC79A7", "#56B4E9", "#D55E00"
 PHASE_COLORS = {"launch": LAUNCH, "flight": FLIGHT, "landing": LANDING}
-REFERENCE = "#222222"  # dashed, thin: what was asked for
-LIMIT = "#999999"  # thin: a bound
-ELLIPSE = "#B8E6B0"  # the paper draws the inertia ellipse in light green
 INK = "#222222"  # text and outlines
-GROUND = "#8C8C8C"
+LIMIT, GROUND, NOTE = "#999999", "#8C8C8C", "#666666"
 
 COLUMN_IN = 3.5  # width of one column of an IEEE page [in]
 PAGE_IN = 7.16  # width of both columns [in]
@@ -50,9 +42,10 @@ DPI = 200  # of the PNG
 PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
 PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
 MIN_FONT_PT = 6.5  # smallest text in any figure; tests look for smaller
-REFERENCE_STYLE = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.9}
-LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}
-
+REFERENCE_STYLE = {"color": INK, "linestyle": (0, (4, 2)), "linewidth": 0.9}  # what was asked for
+LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
+BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
+NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": NOTE}  # keywords of Axes.annotate
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
@@ -111,11 +104,28 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
     phase = np.asarray(phase)
-    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
     lines = []
-    for part in np.split(np.arange(len(phase)), cuts):
+    for part in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
         lines += ax.plot(t[part], y[part], **({"color": PHASE_COLORS[str(phase[part[0]])]} | kwargs))
     return lines
+
+
+def compare(
+    ax: Axes,
+    t: np.ndarray,
+    y: np.ndarray,
+    phase: np.ndarray,
+    *references: tuple[np.ndarray, np.ndarray],
+    label: str = "",
+    marks: Iterable[float] = (),
+    **kwargs,
+) -> None:
+    """A curve :func:`by_phase`, references (t, y) dashed over it, ``marks`` where phases change [s]."""
+    by_phase(ax, t, y, phase, **kwargs)
+    for reference in references:
+        ax.plot(*reference, **REFERENCE_STYLE)
+    mark_time(ax, marks)
+    ax.set_ylabel(label)
 
 
 def mark_time(ax: Axes, times: Iterable[float]) -> None:
@@ -124,19 +134,23 @@ def mark_time(ax: Axes, times: Iterable[float]) -> None:
         ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
 
 
+def limits(ax: Axes, *bounds: float) -> None:
+    """Thin horizontal lines at bounds."""
+    for bound in bounds:
+        ax.axhline(bound, **LIMIT_STYLE)
+
+
 def phase_handles(*phases: str, reference: str | None = None, limit: str | None = None) -> list[Line2D]:
     """Legend entries: phases by name, then texts for the dashed reference and the thin limits."""
     handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
-    if reference:
-        handles.append(Line2D([], [], **REFERENCE_STYLE, label=reference))
-    if limit:
-        handles.append(Line2D([], [], **LIMIT_STYLE, label=limit))
+    for text, look in ((reference, REFERENCE_STYLE), (limit, LIMIT_STYLE)):
+        handles += [Line2D([], [], **look, label=text)] if text else []
     return handles
 
 
-def legend_above(fig: Figure, handles: list, columns: int | None = None) -> None:
+def legend_above(fig: Figure, handles: list) -> None:
     """One legend over all panels, outside of them."""
-    fig.legend(handles=handles, loc="outside upper center", ncols=columns or len(handles), columnspacing=1.4)
+    fig.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
 
 
 def panel_letters(axes: Iterable[Axes]) -> None:
@@ -153,8 +167,15 @@ def bare(ax: Axes) -> None:
 
 
 # saving ---------------------------------------------------------------------------------------------------------
-def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *,
-                task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> Figure:  # fmt: skip
+def save_figure(
+    fig: Figure,
+    name: str,
+    folder: str | Path,
+    caption: str = "",
+    *,
+    task: JumpTask | Sequence[JumpTask] | None = None,
+    robot: Robot | None = None,
+) -> Figure:
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
 
     The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
