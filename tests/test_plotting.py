@@ -63,8 +63,8 @@ FIGURES = {
     "joint_trajectories": lambda m, r: plotting.joint_trajectories(m["tape"], r),
     "joint_trajectories, guess": lambda m, r: plotting.joint_trajectories(m["tape"], r, guess=m["guess"]),
     "inertia_and_momentum": lambda m, r: plotting.inertia_and_momentum(m["tape"]),
-    "snapshots": lambda m, r: plotting.snapshots(m["tape"], r),
-    "snapshots, platform": lambda m, r: plotting.snapshots(m["high"].tape, r),
+    "snapshots": lambda m, r: drawings.snapshots(m["tape"], r),
+    "snapshots, platform": lambda m, r: drawings.snapshots(m["high"].tape, r),
     "margins": lambda m, r: plotting.margins(m["tape"], r),
     "contact_comparison": lambda m, r: drawings.contact_comparison(
         {"flat": plotting.ground_reaction(m["tape"], r), "high": plotting.ground_reaction(m["high"].tape, r)}, r

@@ -18,7 +18,7 @@ from typing import Any
 
 _PLACES = {  # module: its public names, loaded when they are first used
     # for plans
-    "plans": "joint_trajectories inertia_and_momentum snapshots margins ground_reaction",
+    "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
     # for simulations
     "simulations": "jump_strobe momentum landing_loads frame_rows",
     "render": "frame_strip draw_frames Renderer Camera",
