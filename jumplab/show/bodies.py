@@ -1,19 +1,13 @@
 """Drawing robots: the full robot from its URDF, the five-link model as sticks, and the sheet of a robot.
 
-A picture of one instant is a "frame". The full robot is drawn by a :class:`Silhouette`, made once per robot:
-
->>> body = Silhouette(robot)                         # side view; view="front" looks along -x
->>> draw_robot(ax, body, tape.q[0], LAUNCH)          # one frame at its true place
->>> strobe(ax, body, tape.q[rows], colors)           # several
->>> film_strip(ax, body, tape.q[rows], times, colors, shifts)  # side by side, when the robot hardly moves
-
+A picture of one instant is a "frame"; a :class:`Silhouette`, made once per robot, has the outlines that are drawn.
 Angles are positive about +y, x forward, z up; all lengths in metres. Axes that pass through here get equal scales.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
@@ -23,10 +17,10 @@ from matplotlib.patches import Circle, Polygon
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
-from jumplab.robot import Robot, SagittalModel
+from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.show import style
-from jumplab.show.style import GROUND, INK, VERMILION, shade, tint
+from jumplab.show.style import FLIGHT, GROUND, INK, LANDING, LAUNCH, PURPLE, VERMILION, shade, tint
 
 ROUNDING_M = 0.018  # radius by which drawn boxes are rounded
 CIRCLE = np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 12, endpoint=False)), np.sin(a)], -1)  # (12, 2)
@@ -36,21 +30,13 @@ LIMB_SHARE = 0.5  # strength of a colour there on limbs, whose trunk has all of 
 ABOVE_M = 0.36  # seen there above the highest base: a head is 0.3 m above the shoulders
 SHADES = {"trunk": 1.0, "limb": 0.78, "far": 0.45}  # strength of the colour per part
 BODY = "#5B6B7F"  # a robot outside of any phase
-ROLE_COLORS = {
-    "hip_pitch": style.LAUNCH,
-    "knee": style.FLIGHT,
-    "ankle_pitch": style.LANDING,
-    "shoulder_pitch": style.PURPLE,
-}
+ROLE_COLORS = {"hip_pitch": LAUNCH, "knee": FLIGHT, "ankle_pitch": LANDING, "shoulder_pitch": PURPLE}
 
 
 class Silhouette:
-    """Outlines of a robot's visual shapes, projected on a vertical plane.
+    """Outlines of the shapes in a robot's URDF: boxes exactly, others as their bounding boxes.
 
-    Parameters
-    ----------
-    robot : its URDF gives the shapes; boxes are drawn exactly, other primitives as their bounding boxes.
-    view : "side" (x to the right) or "front" (y to the right).
+    ``view`` is "side" (x to the right) or "front" (y to the right).
     """
 
     def __init__(self, robot: Robot, view: str = "side"):
@@ -97,22 +83,11 @@ class Silhouette:
 
 
 def draw_robot(
-    ax: Axes,
-    body: Silhouette,
-    q: np.ndarray,
-    color: str,
-    *,
-    strength: float = 1.0,
-    shift: float = 0.0,
-    zorder: float = 2.0,
+    ax: Axes, body: Silhouette, q: np.ndarray, color: str, *, strength: float = 1, shift: float = 0, zorder: float = 2
 ) -> None:
-    """One frame of the full robot, its pitch joints as discs.
+    """One frame of the full robot at configuration ``q`` (nq,), its pitch joints as discs.
 
-    Parameters
-    ----------
-    q : configuration (nq,).
-    strength : 0 ... 1, how much of the colour; less is nearer to white.
-    shift : added to the horizontal coordinate [m].
+    ``strength`` 0 ... 1 is how much of the colour is used, less is nearer to white; ``shift`` moves it forward [m].
     """
     look = dict(edgecolor=tint(shade(color, 0.55), 0.25 + 0.75 * strength), linewidth=0.5, zorder=zorder)
     for part, outline in body.outlines(q):
@@ -128,15 +103,9 @@ def draw_robot(
 
 
 def strobe(
-    ax: Axes,
-    body: Silhouette,
-    frames: Sequence[np.ndarray],
-    colors: Sequence[str],
-    *,
-    strengths: ArrayLike = 1.0,
-    shifts: ArrayLike = 0.0,
+    ax: Axes, body: Silhouette, frames: ArrayLike, colors: list[str], *, strengths: ArrayLike = 1, shifts: ArrayLike = 0
 ) -> None:
-    """Several frames, later ones in front; one strength and one shift as in :func:`draw_robot`, or one per frame."""
+    """Frames (n, nq), later ones in front; one strength and one shift as in :func:`draw_robot`, or one per frame."""
     n = len(frames)
     looks = zip(frames, colors, np.broadcast_to(strengths, n), np.broadcast_to(shifts, n), strict=True)
     for k, (q, color, strength, shift) in enumerate(looks):
@@ -147,48 +116,30 @@ def strobe(
 def film_strip(
     ax: Axes,
     body: Silhouette,
-    frames: Sequence[np.ndarray],
-    times: Sequence[float],
-    colors: Sequence[str],
-    shifts: np.ndarray,
-    *,
-    centered: bool = False,
-    below: float = 0.05,
+    frames: np.ndarray,
+    times: np.ndarray,
+    colors: list[str],
+    places: np.ndarray,
+    below: float,
 ) -> None:
-    """Frames moved by ``shifts`` (n,) [m], or with their CoM put there; each with its time ``below`` [m] the ground."""
-    moved = shifts - np.array([body.com(q)[0] for q in frames]) if centered else shifts
-    strobe(ax, body, frames, colors, shifts=moved)
-    for place, t in zip(shifts, times, strict=True):
+    """Frames (n, nq) with their CoM at ``places`` (n,) [m], each with its time ``below`` [m] the ground."""
+    strobe(ax, body, frames, colors, shifts=places - np.array([body.com(q)[0] for q in frames]))
+    for place, t in zip(places, times, strict=True):
         ax.text(place, -below, f"{t:.2f} s", ha="center", va="top", fontsize=7)
 
 
 def draw_five_link(
-    ax: Axes,
-    model: SagittalModel,
-    angles: np.ndarray,
-    toe: ArrayLike = (0.0, 0.0),
-    color: str = INK,
-    *,
-    linewidth: float = 1.6,
+    ax: Axes, model: SagittalModel, angles: np.ndarray, toe: ArrayLike = (0.0, 0.0), color: str = BODY
 ) -> dict[str, np.ndarray]:
-    """One frame of the five-link model as sticks; returns the places (2,) of its points by name.
-
-    Parameters
-    ----------
-    angles : absolute link angles (5,): foot, shank, thigh, trunk, arm [rad].
-    toe : (2,) place of the toe [m].
-    """
+    """The five-link model as sticks: link angles (5,) [rad], toe at (2,) [m]; returns its :func:`five_link_points`."""
     p = five_link_points(model, angles, toe)
-    look = dict(color=color, zorder=2.0)
-    ends = dict(solid_capstyle="round", solid_joinstyle="round")
-    sole, body, arm = (
-        np.array([p[name] for name in names.split()]).T
-        for names in ("heel toe ankle heel", "ankle knee hip shoulder", "shoulder hand")
-    )
-    ax.fill(*sole, linewidth=linewidth / 2, **look)
-    ax.plot(*body, linewidth=linewidth, **look, **ends)
-    ax.plot(*arm, linewidth=0.7 * linewidth, **look, **ends)
-    dots = dict(markersize=1.6 * linewidth, markerfacecolor="white", markeredgewidth=0.6 * linewidth)
+    look, ends = dict(color=color, zorder=2.0), dict(solid_capstyle="round", solid_joinstyle="round")
+    parts = ("heel toe ankle heel", "ankle knee hip shoulder", "shoulder hand")
+    sole, body, arm = (np.array([p[name] for name in part.split()]).T for part in parts)
+    ax.fill(*sole, linewidth=1.5, **look)
+    ax.plot(*body, linewidth=3.0, **look, **ends)
+    ax.plot(*arm, linewidth=2.1, **look, **ends)
+    dots = dict(markersize=4.8, markerfacecolor="white", markeredgewidth=1.8)
     ax.plot(*body, linestyle="none", marker="o", **dots, **look)
     equal_scales(ax)
     return p
@@ -206,13 +157,11 @@ def five_link_points(model: SagittalModel, angles: np.ndarray, toe: ArrayLike = 
     return dict(zip(names, tips, strict=True)) | dict(toe=start, heel=start + turns[0] @ model.heel, com=com)
 
 
-def draw_ground(
-    ax: Axes, left: float, right: float, *, edge: float | None = None, height: float = 0.0, level: float = 0.0
-) -> None:
-    """The ground from ``left`` to ``right`` [m] at ``level``; with ``edge``, a step there to ``height``."""
-    x, z = [left, right], [level, level]
+def draw_ground(ax: Axes, left: float, right: float, *, edge: float | None = None, height: float = 0.0) -> None:
+    """The ground from ``left`` to ``right`` [m]; with ``edge``, a step there to ``height``."""
+    x, z = [left, right], [0.0, 0.0]
     if edge is not None and height:
-        x, z = [left, edge, edge, right], [level, level, height, height]
+        x, z = [left, edge, edge, right], [0.0, 0.0, height, height]
     ax.fill_between(x, z, min(*z, 0.0) - 0.04, facecolor=tint(GROUND, 0.35), edgecolor="none", zorder=1)
     ax.plot(x, z, color=GROUND, linewidth=0.8, zorder=1.5)
 
@@ -289,15 +238,11 @@ def _sheet_joints(ax: Axes, robot: Robot, q: np.ndarray, top: float) -> None:
 
 def _sheet_links(ax: Axes, robot: Robot, top: float) -> None:
     m = robot.sagittal
-    p = draw_five_link(ax, m, stance_angles(robot), -m.sole_center, BODY, linewidth=3.0)
-    middles = {
-        "foot": p["toe"] + [0.0, 0.03 * top],
-        "shank": (p["ankle"] + p["knee"]) / 2,
-        "thigh": (p["knee"] + p["hip"]) / 2,
-        "trunk": (p["hip"] + p["shoulder"]) / 2,
-        "arm": p["hand"],
-    }
-    for (name, at), mass in zip(middles.items(), m.mass, strict=True):
+    p = draw_five_link(ax, m, stance_angles(robot), -m.sole_center)
+    links = ("ankle", "knee", "hip", "shoulder")
+    middles = [(p[a] + p[b]) / 2 for a, b in itertools.pairwise(links)]
+    places = (p["toe"] + [0.0, 0.03 * top], *middles, p["hand"])
+    for name, at, mass in zip(SAGITTAL_LINKS, places, m.mass, strict=True):
         if mass > 0:
             ax.text(at[0] + 0.06 * top, at[1], f"{name} {mass:.1f} kg", va="center", fontsize=7, color="#444444")
     draw_com(ax, p["com"])

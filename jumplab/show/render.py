@@ -10,7 +10,7 @@ is needed. Nothing here is simulated: a state is taken from a log, the robot is 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -33,46 +33,28 @@ if TYPE_CHECKING:
 
 OVERSAMPLING = 2  # the renderer does not smooth edges, so pictures are drawn larger and averaged
 STRIPE_M = 0.25  # the ground is striped, so that distances can be counted
-SEEN_M = (-4.5, 4.5)  # how much of the ground is built; the longest jump allowed is 3 m
-HALF_WIDTH_M = 0.45  # of the ground that is shown
+SEEN_M, HALF_WIDTH_M = (-4.5, 4.5), 0.45  # what is built of the ground; the longest jump allowed is 3 m
 GREYS, JOINT_GREY = (0.87, 0.76), 0.35
 COLUMNS = 6  # frames per line of a page-wide strip, each then 1.2 in wide
 TITLE_IN = 0.17  # room for a frame's title
 MARK_M = 0.015  # width of a line on the ground
-LIGHT = {
-    "lightDirection": (0.4, -1.6, 2.4),
-    "lightColor": (1, 1, 1),
-    "lightDistance": 4.0,
-    "lightAmbientCoeff": 0.65,
-    "lightDiffuseCoeff": 0.4,
-    "lightSpecularCoeff": 0.0,
-    "shadow": 0,
-}
+LIGHT = {"lightDirection": (0.4, -1.6, 2.4), "lightColor": (1, 1, 1), "lightDistance": 4.0, "shadow": 0}
+SHINE = {"lightAmbientCoeff": 0.65, "lightDiffuseCoeff": 0.4, "lightSpecularCoeff": 0.0}
 DISTANCE_M = 10.0  # far away, so that near and far legs look equally large
-PIXELS_PER_M = 240  # 280 pixels per inch of a page-wide strip
-FRAME_M = 1.3  # width of a frame, enough for stretched arms
 BELOW_M = 0.14  # seen below the ground
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the camera is and what it sees.
+    """What the picture shows, in the plane through ``x`` that faces the camera."""
 
-    Attributes
-    ----------
-    width, bottom, top : what the picture shows, in the plane through ``x`` that faces the camera [m].
-    x : middle of the picture along the jump [m].
-    yaw_deg : 0 looks along +y, with x to the right;  pitch_deg : negative looks down.
-    pixels_per_m : resolution.
-    """
-
-    width: float = FRAME_M
-    bottom: float = -BELOW_M
-    top: float = 1.65
-    x: float = 0.0
-    yaw_deg: float = 0.0
-    pitch_deg: float = -7.0
-    pixels_per_m: float = PIXELS_PER_M
+    width: float = 1.3  # [m], enough for stretched arms
+    bottom: float = -BELOW_M  # [m]
+    top: float = 1.65  # [m]
+    x: float = 0.0  # middle of the picture along the jump [m]
+    yaw_deg: float = 0.0  # 0 looks along +y, with x to the right
+    pitch_deg: float = -7.0  # negative looks down
+    pixels_per_m: float = 240  # 280 pixels per inch of a page-wide strip
 
     @property
     def size(self) -> tuple[int, int]:
@@ -89,13 +71,9 @@ class Camera:
 
 
 class Renderer(AbstractContextManager):
-    """A robot, the ground, and a camera. Use as a context manager, or call :meth:`close`.
+    """A robot on the ground of a scene (flat if None), with lines across at ``marks`` [m].
 
-    Parameters
-    ----------
-    robot : its URDF gives the shapes.
-    scene : ground; flat if None.
-    marks : places of lines across the ground [m].
+    Use as a context manager, or call :meth:`close`.
     """
 
     def __init__(self, robot: Robot, *, scene: Scene | None = None, marks: Sequence[float] = ()):
@@ -135,8 +113,8 @@ class Renderer(AbstractContextManager):
             paint = (*tint(color, 1.0 if link == -1 else LIMB_SHARE), 1.0) if painted else own
             bullet.changeVisualShape(self._body, link, rgbaColor=paint, **self._here)
         width, height = (OVERSAMPLING * n for n in camera.size)
-        options = {"renderer": bullet.ER_TINY_RENDERER, **self._here, **LIGHT}
-        shot = bullet.getCameraImage(width, height, *camera.matrices(), **options)
+        look = {"renderer": bullet.ER_TINY_RENDERER, **LIGHT, **SHINE}
+        shot = bullet.getCameraImage(width, height, *camera.matrices(), **look, **self._here)
         image = np.reshape(shot[2], (height, width, 4))[:, :, :3] / 255.0
         image[np.reshape(shot[4], (height, width)) < 0] = 1.0  # where no body is: white
         return image.reshape(camera.size[1], OVERSAMPLING, camera.size[0], OVERSAMPLING, 3).mean(axis=(1, 3))
@@ -185,12 +163,7 @@ class Renderer(AbstractContextManager):
 
 
 def draw_frames(
-    axes: Iterable[Axes],
-    studio: Renderer,
-    result: SimulationResult,
-    rows: Iterable[int],
-    camera: Camera,
-    fontsize: float = 8,
+    axes: np.ndarray, studio: Renderer, result: SimulationResult, rows: np.ndarray, camera: Camera, fontsize: float = 8
 ) -> None:
     """Rendered frames ``rows`` of a log, one per axes, in the colours of the phases; the camera follows the CoM."""
     for ax, row in zip(axes, rows, strict=True):
@@ -206,20 +179,14 @@ def draw_frames(
 def frame_strip(
     result: SimulationResult, robot: Robot, *, scene: Scene | None = None, marks: Sequence[float] = ()
 ) -> Figure:
-    """F-11: rendered frames of a simulated jump, in the colours of launch, flight and landing.
+    """F-11: rendered frames of a simulated jump; the stripes on the ground are 0.25 m wide.
 
-    The camera follows the CoM; the stripes on the ground are 0.25 m wide.
-
-    Parameters
-    ----------
-    scene : ground; flat if None.
-    marks : places of lines across the ground [m], such as where the toes started and where they should land.
+    ``marks`` are places of lines across the ground [m], such as where the toes started and where they should land.
     """
     rows = frame_rows(result)
     floor = min(0.0, scene.top_at(float(result.com[-1, 0]))) if scene else 0.0
     camera = Camera(bottom=floor - BELOW_M, top=float(result.q[rows, 2].max()) + ABOVE_M)
-    width = PAGE_IN / COLUMNS
-    lines = -(-len(rows) // COLUMNS)
+    width, lines = PAGE_IN / COLUMNS, len(rows) // COLUMNS
     fig = new_figure(PAGE_IN, lines * (width * camera.size[1] / camera.size[0] + TITLE_IN))
     axes = fig.subplots(lines, COLUMNS)
     with Renderer(robot, scene=scene, marks=marks) as studio:

@@ -39,7 +39,7 @@ def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
     ax = fig.subplots()
     places = STRIP_M * np.arange(len(rows))
     colors = [PHASE_COLORS[str(phase)] for phase in result.phase[rows]]
-    film_strip(ax, Silhouette(robot), result.q[rows], result.t[rows], colors, places, centered=True, below=0.07)
+    film_strip(ax, Silhouette(robot), result.q[rows], result.t[rows], colors, places, below=0.07)
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(style.shade(color, 0.8))
     air = (result.phase == "flight") & (result.t >= result.t[rows[0]])

@@ -12,7 +12,7 @@ from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, FancyBboxP
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.show.bodies import BODY, Silhouette, draw_com, draw_five_link, draw_ground, draw_robot
-from jumplab.show.render import PIXELS_PER_M, Camera, Renderer
+from jumplab.show.render import Camera, Renderer
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -190,7 +190,7 @@ def _nine_links(ax, body, q):
 def _five_links(ax, robot):
     angles, m = stance_angles(robot, 1.0), robot.sagittal
     angles = angles + np.array([0.0, 0.0, 0.0, 0.25, -0.6])
-    p = draw_five_link(ax, m, angles, -m.sole_center, BODY, linewidth=3.0)
+    p = draw_five_link(ax, m, angles, -m.sole_center)
     points = ("hip", "knee", "ankle", "shoulder")
     offsets = ((-0.09, 0.02), (0.09, 0.0), (-0.10, 0.03), (-0.09, 0.02))
     for point, offset in zip(points, offsets, strict=True):
@@ -223,7 +223,7 @@ def simulation_model(robot: Robot) -> Figure:
     fig = new_figure(COLUMN_IN, 2.9)
     axes = fig.subplots(1, 2)
     q = stance_configuration(robot)
-    side = Camera(width=1.0, bottom=-0.22, x=float(q[0]), pixels_per_m=2 * PIXELS_PER_M)
+    side = Camera(width=1.0, bottom=-0.22, x=float(q[0]), pixels_per_m=480)
     with Renderer(robot) as studio:
         for ax, camera in zip(axes, (replace(side, yaw_deg=40.0, pitch_deg=-14.0), side), strict=True):
             ax.imshow(studio.picture(q, camera))

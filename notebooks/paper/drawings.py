@@ -357,7 +357,7 @@ def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> 
         chosen = np.linspace(rows.start, rows.stop - 1, count + again).astype(int)[again:]  # the launch shows take-off
         places, frames = place + PITCH_M * np.arange(count), plan.q[chosen]
         com = np.array([body.com(q) for q in frames])
-        film_strip(ax, body, frames, plan.t[chosen], [color] * count, places, centered=True, below=0.06)
+        film_strip(ax, body, frames, plan.t[chosen], [color] * count, places, below=0.06)
         ax.plot(places, com[:, 1], "o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
         left, right = place - PITCH_M / 2, places[-1] + PITCH_M / 2
         edge = right - PITCH_M if phase == "flight" and abs(platform_m) > LEVEL_M else None
@@ -515,7 +515,9 @@ def snapshots(tape: Tape, robot: Robot) -> Figure:
     body, takeoff = Silhouette(robot), tape.takeoff_index
     rows = np.linspace(0, takeoff - 1, FRAMES_LAUNCH).astype(int)
     places = SNAPSHOT_M * np.arange(FRAMES_LAUNCH)
-    film_strip(ax, body, tape.q[rows], tape.t[rows], [LAUNCH] * FRAMES_LAUNCH, places)
+    strobe(ax, body, tape.q[rows], [LAUNCH] * FRAMES_LAUNCH, shifts=places)
+    for place, t in zip(places, tape.t[rows], strict=True):
+        ax.text(place, -0.05, f"{t:.2f} s", ha="center", va="top", fontsize=7)
     first, width = -0.3, SNAPSHOT_M * FRAMES_LAUNCH
     draw_ground(ax, first, width - 0.25)
     right = _true_flight(ax, tape, body, width + 0.45)
