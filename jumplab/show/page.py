@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import matplotlib.colors as mcolors
@@ -47,18 +48,13 @@ TRACK_COLOR, TRACK_SIDE = "#F4F5F7", "#C9CED6"
 GRIDS = {"fine": (0.1, 1.0, "#DDE1E7"), "coarse": (0.5, 1.3, "#AEB6C2")}  # spacing [m], lift [LINE_LIFT_M], colour
 REST_COLOR = "#42474F"  # feet and skeleton, whose colour stays
 ROOT = "jump"
-_UUID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+FILES = {"PAGE": "page.html", "STYLE": "page.css", "PLAYER": "player.js"}
+_UUID = re.compile(rb"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 @dataclass(frozen=True)
 class Page:
-    """A finished page; a notebook shows it, :meth:`save` writes it.
-
-    Attributes
-    ----------
-    html : the whole page; it refers to nothing outside itself.
-    title : what it shows.
-    """
+    """A finished page, which refers to nothing outside itself; a notebook shows it, :meth:`save` writes it."""
 
     html: str = field(repr=False)
     title: str
@@ -92,18 +88,14 @@ def page(
 
     Parameters
     ----------
-    plan, simulation : a ``Tape``, a ``SimulationResult`` or a ``Motion``; at least one of them. With both, the page
-        offers each alone and both together.
+    plan, simulation : at least one of them; with both, the page offers each alone and both together.
     task : what was asked, for the title and the line where the toes should land.
     scene : ground; flat if None.
     marks_m : further places where the toes should land, from where they start [m].
     title : instead of the task's.
     fps : frames a second.
 
-    Raises
-    ------
-    InputError
-        If there is nothing to show, or ``fps`` cannot be meant.
+    Raises :class:`InputError` if there is nothing to show, or ``fps`` cannot be meant.
     """
     given = {name: record for name, record in (("simulation", simulation), ("plan", plan)) if record is not None}
     if not given:
@@ -172,19 +164,12 @@ def _assemble(title: str, facts: Mapping[str, Any], commands: list[str]) -> str:
     if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
 
-    def data(value: Any) -> str:
-        return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-
-    parts = {
-        "TITLE": html.escape(title),
-        "STYLE": (files / "page.css").read_text(encoding="utf-8"),
-        "ENGINE": engine,
-        "FACTS": data(facts),
-        "COMMANDS": data(commands),
-        "PLAYER": (files / "player.js").read_text(encoding="utf-8"),
+    form = dict(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    data = {
+        name: json.dumps(x, **form).replace("<", "\\u003c") for name, x in (("FACTS", facts), ("COMMANDS", commands))
     }
-    pieces = (files / "page.html").read_text(encoding="utf-8").split("@@")  # text, NAME, text, NAME, text ...
-    return "".join(parts[p] if i % 2 else p for i, p in enumerate(pieces))
+    texts = {name: (files / file).read_text(encoding="utf-8") for name, file in FILES.items()}
+    return Template(texts.pop("PAGE")).substitute(TITLE=html.escape(title), ENGINE=engine, **data, **texts)
 
 
 # the scene ------------------------------------------------------------------------------------------------------
@@ -192,22 +177,16 @@ class _Commands:
     """Stands in for meshcat's window: keeps every command instead of sending it to a server."""
 
     def __init__(self):
-        self.sent: list[str] = []
-        self._names: dict[str, str] = {}
+        self.sent: list[str] = []  # base64 text of the bytes that a server would pass on
+        self._names: dict[bytes, bytes] = {}
 
     def send(self, command: Any) -> None:
-        """Keep one command, as base64 text of the bytes that a server would pass on."""
-        self.sent.append(base64.b64encode(umsgpack.packb(self._numbered(command.lower()))).decode("ascii"))
+        """Keep one command. Its identifiers tell the machine and the time; counted ones make equal files."""
+        packed = _UUID.sub(self._counted, umsgpack.packb(command.lower()))
+        self.sent.append(base64.b64encode(packed).decode("ascii"))
 
-    def _numbered(self, data: Any) -> Any:
-        """meshcat's identifiers tell the machine and the time; counted ones make equal scenes equal files."""
-        if isinstance(data, dict):
-            return {key: self._numbered(value) for key, value in data.items()}
-        if isinstance(data, list):
-            return [self._numbered(value) for value in data]
-        if isinstance(data, str) and _UUID.fullmatch(data):
-            return self._names.setdefault(data, f"{len(self._names):08x}-0000-4000-8000-000000000000")
-        return data
+    def _counted(self, found: re.Match[bytes]) -> bytes:
+        return self._names.setdefault(found[0], b"%08x-0000-4000-8000-000000000000" % len(self._names))
 
 
 class _Loader(MeshcatVisualizer):

@@ -41,7 +41,7 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
     for k, (y, low, high, label) in enumerate(rows):
         for i, ax in enumerate(axes[k]):
             dashed = [] if guess is None else [(guess[0], guess[1 + k][:, i])]
-            compare(ax, tape.t, y[:, i], tape.phase, *dashed, marks=[heel_up_time(tape)])
+            compare(ax, (tape.t, y[:, i], tape.phase), *dashed, marks=[heel_up_time(tape)])
             style.limits(ax, low[i], high[i])
             room = 0.06 * (high[i] - low[i])
             ax.set_ylim(low[i] - room, high[i] + room)
@@ -74,7 +74,7 @@ def inertia_and_momentum(tape: Tape) -> Figure:
             starts = {"launch": takeoff - e["srmp_launch_t"][-1], "flight": takeoff}
             asked = [(e[f"srmp_{p}_t"] + start, e[f"srmp_{p}_{key}"][part]) for p, start in starts.items()]
         marks = (heel_up_time(tape), takeoff)
-        compare(ax, tape.t, e[f"planar_{key}"][part], tape.phase, *asked, label=label, marks=marks)
+        compare(ax, (tape.t, e[f"planar_{key}"][part], tape.phase), *asked, label=label, marks=marks)
     for ax in axes[1]:
         ax.set_xlabel("time [s]")
     fig.align_ylabels()

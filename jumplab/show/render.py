@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import matplotlib.colors as mcolors
 import numpy as np
 import pinocchio as pin
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jumplab.robot import Robot

@@ -109,7 +109,7 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
         if name == "L":
             a, p, marks = seen & (result.phase == "launch"), tape.phase == "launch", []
         curve = (result.t[a], actual[a], result.phase[a])
-        compare(axes[name], *curve, (tape.t[p], planned[p]), label=label, marks=marks)
+        compare(axes[name], curve, (tape.t[p], planned[p]), label=label, marks=marks)
     for name in ("vx", "vz", "rho"):
         axes[name].set_xlabel("time [s]")
     style.panel_letters(axes[name] for name in curves)
@@ -135,7 +135,7 @@ def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     pushes = [smooth(f[:, :, 2].sum(axis=1), step) / 1000 for f in (result.foot_wrench, tape.f)]
     panels = ((pitch, angles, "trunk pitch [deg]"), (force, pushes, "mean vertical force [kN]"))
     for ax, (actual, planned), label in panels:
-        compare(ax, result.t[seen], actual[seen], result.phase[seen], (tape.t, planned), label=label)
+        compare(ax, (result.t[seen], actual[seen], result.phase[seen]), (tape.t, planned), label=label)
         ax.set_xlabel("time [s]")
     style.limits(force, weight)
     force.annotate("weight", (result.t[seen][-1], weight), xytext=(0, 2), ha="right", **style.NOTE_STYLE)

@@ -28,6 +28,7 @@ REFUSED = {
     VERDICT: ("#D5D5D5", "refused before solving"),
     BEYOND: ("#F0F0F0", "not tried"),
 }
+TOLERANCE_M = (0.05, 0.03)  # of distance and rise
 MOST_TICKS = 14  # more would touch
 AROUND_M, BELOW_M = 0.45, 0.05  # what is shown of the ground beyond the soles of a chain, and below it
 WAITING = 0.55  # strength of a robot between jumps
@@ -37,24 +38,14 @@ BAR = 0.62  # height of a bar of the timeline
 
 
 @style.styled
-def trials(
-    rows: Sequence[Metrics],
-    task: JumpTask,
-    *,
-    nominal: Metrics | None = None,
-    tolerance: tuple[float, float] = (0.05, 0.03),
-) -> Figure:
-    """Travel of the feet against rise of the CoM for many robots: landed, fallen, the robot as planned, the target.
+def trials(rows: Sequence[Metrics], task: JumpTask, *, nominal: Metrics | None = None) -> Figure:
+    """Travel of the feet against rise of the CoM for many robots: landed, fallen, as planned (``nominal``), the target.
 
-    Parameters
-    ----------
-    rows : one per robot; those that never left the ground or never came down are not drawn.
-    nominal : of the robot as planned.
-    tolerance : half-widths of the box around the target: distance, rise [m].
+    Robots that never left the ground or never came down are not drawn; the box is :data:`TOLERANCE_M` around it.
     """
     fig = new_figure(COLUMN_IN, 2.5)
     ax = fig.subplots()
-    corner, size = np.array([task.distance_m, task.height_m]) - tolerance, 2 * np.array(tolerance)
+    corner, size = np.array([task.distance_m, task.height_m]) - TOLERANCE_M, 2 * np.array(TOLERANCE_M)
     box = dict(facecolor=tint(INK, 0.06), edgecolor=INK, linestyle=(0, (4, 2)), linewidth=0.8)
     ax.add_patch(Rectangle(corner, *size, **box))
     ax.plot(task.distance_m, task.height_m, "+", color=INK, markersize=7, label="target")

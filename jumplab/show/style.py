@@ -6,13 +6,10 @@ Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one wh
 
 from __future__ import annotations
 
-import functools
 import io
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import matplotlib.colors as mcolors
 import matplotlib.pyplot as plt
@@ -26,18 +23,15 @@ from jumplab.io.folder import versions
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
+Tasks = JumpTask | Sequence[JumpTask] | None
 # Okabe and Ito's palette, which stays apart for every kind of colour vision
 LAUNCH, FLIGHT, LANDING = "#0072B2", "#E69F00", "#009E73"
 PURPLE, SKY, VERMILION = "#CC79A7", "#56B4E9", "#D55E00"
 PHASE_COLORS = {"launch": LAUNCH, "flight": FLIGHT, "landing": LANDING}
 INK = "#222222"  # text and outlines
-LIMIT, GROUND, NOTE = "#999999", "#8C8C8C", "#666666"
+LIMIT, GROUND = "#999999", "#8C8C8C"
 
-COLUMN_IN = 3.5  # width of one column of an IEEE page [in]
-PAGE_IN = 7.16  # width of both columns [in]
+COLUMN_IN, PAGE_IN = 3.5, 7.16  # width of one column of an IEEE page, and of both [in]
 DPI = 200  # of the PNG
 PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
 PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
@@ -45,7 +39,7 @@ MIN_FONT_PT = 6.5  # smallest text in any figure; tests look for smaller
 REFERENCE_STYLE = {"color": INK, "linestyle": (0, (4, 2)), "linewidth": 0.9}  # what was asked for
 LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
 BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
-NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": NOTE}  # keywords of Axes.annotate
+NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}  # keywords of Axes.annotate
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
@@ -54,36 +48,24 @@ def use_style() -> None:
     plt.style.use(STYLE_FILE)
 
 
-def style_context() -> AbstractContextManager:
-    """The style for a ``with`` block only."""
-    return plt.style.context(STYLE_FILE)
-
-
-def styled(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: the figure function draws in the package's style whatever the caller's settings are."""
-
-    @functools.wraps(function)
-    def inner(*args: P.args, **kwargs: P.kwargs) -> R:
-        with style_context():
-            return function(*args, **kwargs)
-
-    return inner
+# decorator or ``with`` block: the style, whatever the caller's settings are
+styled = plt.style.context(STYLE_FILE)
 
 
 class Picture(Figure):
     """A figure that shows itself in a notebook, whatever backend is chosen there."""
 
+    @styled
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        with style_context():
-            self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+        self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
         return buffer.getvalue()
 
 
+@styled
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, width and height in inches."""
-    with style_context():
-        return Picture(figsize=(width, height))
+    return Picture(figsize=(width, height))
 
 
 def tint(color: str, share: float) -> tuple[float, float, float]:
@@ -103,25 +85,15 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
-    phase = np.asarray(phase)
-    lines = []
+    phase, lines = np.asarray(phase), []
     for part in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
         lines += ax.plot(t[part], y[part], **({"color": PHASE_COLORS[str(phase[part[0]])]} | kwargs))
     return lines
 
 
-def compare(
-    ax: Axes,
-    t: np.ndarray,
-    y: np.ndarray,
-    phase: np.ndarray,
-    *references: tuple[np.ndarray, np.ndarray],
-    label: str = "",
-    marks: Iterable[float] = (),
-    **kwargs,
-) -> None:
-    """A curve :func:`by_phase`, references (t, y) dashed over it, ``marks`` where phases change [s]."""
-    by_phase(ax, t, y, phase, **kwargs)
+def compare(ax: Axes, curve: tuple, *references: tuple, label: str = "", marks: Iterable[float] = (), **kwargs) -> None:
+    """A curve (t, y, phase) :func:`by_phase`, references (t, y) dashed, ``marks`` where phases change [s]."""
+    by_phase(ax, *curve, **kwargs)
     for reference in references:
         ax.plot(*reference, **REFERENCE_STYLE)
     mark_time(ax, marks)
@@ -167,14 +139,9 @@ def bare(ax: Axes) -> None:
 
 
 # saving ---------------------------------------------------------------------------------------------------------
+@styled
 def save_figure(
-    fig: Figure,
-    name: str,
-    folder: str | Path,
-    caption: str = "",
-    *,
-    task: JumpTask | Sequence[JumpTask] | None = None,
-    robot: Robot | None = None,
+    fig: Figure, name: str, folder: str | Path, caption: str = "", *, task: Tasks = None, robot: Robot | None = None
 ) -> Figure:
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
 
@@ -191,17 +158,16 @@ def save_figure(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with style_context():
-            fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
-            fig.set_layout_engine("none")
-            fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
+        fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
+        fig.set_layout_engine("none")
+        fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
         (folder / f"{name}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
     except OSError as e:
         raise InputError(f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}") from e
     return fig
 
 
-def caption_text(caption: str, task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> str:
+def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """What NAME.txt says: the caption, then target or targets, robot and versions, one line each."""
     lines = [caption.strip() or "No caption."]
     tasks = [task] if isinstance(task, JumpTask) else list(task or ())

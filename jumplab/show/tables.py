@@ -14,18 +14,11 @@ import numpy as np
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """A finished table of texts; make one with :func:`table`.
+    """A finished table of texts; make one with :func:`table`."""
 
-    Attributes
-    ----------
-    columns : headings.
-    rows : texts, one tuple per row.
-    right : which columns are numbers, set flush right.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # headings
     rows: tuple[tuple[str, ...], ...]
-    right: tuple[bool, ...]
+    right: tuple[bool, ...]  # which columns are numbers, set flush right
 
     def __repr__(self) -> str:
         widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
@@ -47,22 +40,16 @@ class Table:
 
 
 def table(
-    rows: Iterable[Mapping[str, Any]],
-    columns: Sequence[str] | Mapping[str, str] | None = None,
-    *,
-    digits: int = 4,
-    decimals: int | None = None,
+    rows: Iterable[Mapping], columns: Iterable[str] | None = None, *, digits: int = 4, decimals: int | None = None
 ) -> Table:
     """Rows of named values as a :class:`Table`.
 
     Parameters
     ----------
     rows : mappings with the same keys (a missing one is left blank).
-    columns : which keys, in which order; a mapping also renames them ("key": "heading"); None takes those of the first
-        row.
+    columns : which keys, in which order, those of the first row if None; a mapping renames them ("key": "heading").
     digits : significant digits of numbers.
-    decimals : places after the point instead, the same for every number that is not whole by its type; for tables of
-        quantities of one size, where 1.000 beside 0.997 should not shrink to 1.
+    decimals : places after the point instead, for numbers that are not whole by type: 1.000 beside 0.997, not 1.
     """
     rows = list(rows)
     if columns is None:

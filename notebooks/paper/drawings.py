@@ -597,11 +597,11 @@ def flip_shaping(srmp: SrmpPlan, tape: Tape, result: SimulationResult, robot: Ro
         (axes[1, 0], r"$L$ [kg m$^2$/s]", momentum, planned[1], one.L),
     )
     for ax, label, actual, plan, first in rows:
-        compare(ax, t, actual, phase, (tape.t, plan), label=label)
+        compare(ax, (t, actual, phase), (tape.t, plan), label=label)
         ax.plot(start + one.t, first, **thin)
     ax = axes[1, 1]
     planned_turn, turn = np.degrees(trunk_angle(tape.q)), np.degrees(trunk_angle(result.q))
-    compare(ax, t, turn[seen], phase, (tape.t, planned_turn), label="trunk [deg]")
+    compare(ax, (t, turn[seen], phase), (tape.t, planned_turn), label="trunk [deg]")
     tuck = ax.twinx()
     knee = 7 + robot.joint_names.index(robot.joints["knee"][0])
     tuck.plot(t, np.degrees(result.q[seen, knee]), color="0.45", linewidth=0.8)

@@ -171,7 +171,7 @@ def measured_jump(measured: Measurement, tape: Tape, robot: Robot) -> Figure:
         seen = np.full(len(measured.t), True) if both else measured.phase == "launch"
         part = np.full(len(tape.t), True) if both else tape.phase == "launch"
         curve, plan = (measured.t[seen], actual[seen], measured.phase[seen]), (tape.t[part], planned[part])
-        compare(ax, *curve, plan, label=label, marks=[tape.takeoff_time] if both else [], linewidth=1.0)
+        compare(ax, curve, plan, label=label, marks=[tape.takeoff_time] if both else [], linewidth=1.0)
         ax.set_xlabel("time [s]")
     panel_letters(axes)
     legend_above(fig, phase_handles("launch", "flight", reference="plan"))
