@@ -15,10 +15,12 @@ from jumplab.stages.joint_qp import JointMapper, map_to_joints
 ROWS = [
     {"target": target, "start": start, "iterations": n, "cost": cost}
     for target, start, n, cost in (
-        ((1.0, 0.5), "crouch", 30, 1.0), ((1.0, 0.5), "stage 2", 20, 1.0),
-        ((0.5, 0.3), "crouch", 50, 1.02), ((0.5, 0.3), "stage 2", None, None),
+        ((1.0, 0.5), "crouch", 30, 1.0),
+        ((1.0, 0.5), "stage 2", 20, 1.0),
+        ((0.5, 0.3), "crouch", 50, 1.02),
+        ((0.5, 0.3), "stage 2", None, None),
     )
-]  # fmt: skip
+]
 PANELS = {"iterations": "iterations [1]", "cost": "cost [best]"}
 
 
