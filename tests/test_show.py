@@ -177,6 +177,13 @@ def test_sources_neither_show_nor_print(path):
     assert not names & {"show", "print", "ion", "savefig"} - ({"savefig"} if path.name == "style.py" else set())
 
 
+def test_every_public_name_is_there():
+    """They are loaded when they are first used; another name is refused with the list of them."""
+    assert all(hasattr(plotting, name) for name in plotting.__all__) and set(dir(plotting)) == set(plotting.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'jump_strobes'; it has joint_trajectories, "):
+        plotting.jump_strobes  # noqa: B018
+
+
 # files ------------------------------------------------------------------------------------------------------------
 def test_saving_writes_three_files_without_dates(tmp_path, bhr):
     task = JumpTask(-0.2, 0.5, platform_m=0.3, rotation_rad=-2 * np.pi)
