@@ -47,7 +47,7 @@ _PLACES = {
 }
 _MODULES = {"errors": "errors", "plots": "show"}
 
-__all__ = [*_PLACES, *_MODULES]  # noqa: PLE0604
+__all__ = [*_PLACES, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:

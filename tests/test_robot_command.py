@@ -5,7 +5,7 @@ from fixtures_robots import GOOD, config, mirrored, write
 
 from jumplab.cli.main import main
 from jumplab.robot import Robot
-from jumplab.show.robots import robot_sheet
+from jumplab.show.bodies import robot_sheet
 
 
 def quoted(capsys, *argv) -> tuple[int, str, str]:

@@ -45,7 +45,7 @@ def _envelope(args: argparse.Namespace) -> None:
     robot = Robot.load(args.robot)
     store.ensure_writable(out)
 
-    from jumplab.show.envelope import envelope_map
+    from jumplab.show.studies import envelope_map
     from jumplab.show.style import save_figure
     from jumplab.studies.envelope import measure
 

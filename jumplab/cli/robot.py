@@ -120,7 +120,7 @@ def _write(out: str, text: str) -> Path:
 
 
 def _draw(robot, out: str) -> None:
-    from jumplab.show.robots import robot_sheet
+    from jumplab.show.bodies import robot_sheet
     from jumplab.show.style import save_figure
 
     caption = "Side view, moving joints from the front, and the five links of the sagittal plane, standing."

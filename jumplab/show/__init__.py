@@ -1,105 +1,48 @@
-"""Pictures of robots, plans and simulations.
+"""Pictures, tables and the 3-D page of robots, plans, simulations and studies.
 
 Every figure function takes results, draws, and returns a matplotlib figure; none solves, prints or shows. Colours are
 launch blue, flight orange, landing green; the reference is dashed, a limit thin and grey.
 
->>> from jumplab import plotting
->>> plotting.use_style()
->>> fig = plotting.joint_trajectories(tape, robot)
->>> plotting.save_figure(fig, "f08_joint_trajectories", "figures", "Joints of the plan.", task=task, robot=robot)
+>>> jl.plots.use_style()  # once per notebook, for plots of your own
+>>> fig = jl.plots.joint_trajectories(plan.tape, robot)
+>>> jl.plots.save_figure(fig, "joints", "figures", "Joints of the plan.", task=plan.task, robot=robot)
 
-New figures: :func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide), :func:`by_phase` for curves, :class:`Silhouette`
-with :func:`draw_robot`, :func:`strobe`, :func:`film_strip` for bodies, :func:`draw_srmp` for the pendulum,
-:func:`legend_above` with :func:`phase_handles`; decorate the function with :func:`styled`. Small tables: :func:`table`.
+A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide)
+and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what was asked for; :class:`Silhouette` with
+:func:`draw_robot`, :func:`strobe` or :func:`film_strip` draws bodies; :func:`legend_above` takes :func:`phase_handles`.
+The page is in :mod:`jumplab.show.page`, progress bars are in :mod:`jumplab.show.widgets`.
 """
 
-from jumplab.show.bodies import (
-    Silhouette,
-    draw_five_link,
-    draw_ground,
-    draw_robot,
-    draw_srmp,
-    equal_scales,
-    film_strip,
-    five_link_points,
-    strobe,
-)
-from jumplab.show.limits import contact_comparison, ground_reaction, margins
-from jumplab.show.simulation import jump_strobe, momentum
-from jumplab.show.stages import draw_flight, inertia_and_momentum, joint_trajectories, snapshots
-from jumplab.show.style import (
-    COLUMN_IN,
-    FLIGHT,
-    INK,
-    LANDING,
-    LAUNCH,
-    LIMIT_STYLE,
-    PAGE_IN,
-    PHASE_COLORS,
-    PURPLE,
-    REFERENCE_STYLE,
-    SKY,
-    VERMILION,
-    bare,
-    by_phase,
-    describe_task,
-    legend_above,
-    mark_time,
-    new_figure,
-    panel_letters,
-    phase_handles,
-    save_figure,
-    shade,
-    styled,
-    tint,
-    use_style,
-)
-from jumplab.show.tables import Table, table
+from importlib import import_module
+from typing import Any
 
-__all__ = [
-    "COLUMN_IN",
-    "FLIGHT",
-    "INK",
-    "LANDING",
-    "LAUNCH",
-    "LIMIT_STYLE",
-    "PAGE_IN",
-    "PHASE_COLORS",
-    "PURPLE",
-    "REFERENCE_STYLE",
-    "SKY",
-    "VERMILION",
-    "Silhouette",
-    "Table",
-    "bare",
-    "by_phase",
-    "contact_comparison",
-    "describe_task",
-    "draw_five_link",
-    "draw_flight",
-    "draw_ground",
-    "draw_robot",
-    "draw_srmp",
-    "equal_scales",
-    "film_strip",
-    "five_link_points",
-    "ground_reaction",
-    "inertia_and_momentum",
-    "joint_trajectories",
-    "jump_strobe",
-    "legend_above",
-    "margins",
-    "mark_time",
-    "momentum",
-    "new_figure",
-    "panel_letters",
-    "phase_handles",
-    "save_figure",
-    "shade",
-    "snapshots",
-    "strobe",
-    "styled",
-    "table",
-    "tint",
-    "use_style",
-]
+_PLACES = {  # module: its public names, loaded when they are first used
+    # for plans
+    "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
+    # for simulations
+    "simulations": "jump_strobe momentum landing_loads frame_rows",
+    "render": "frame_strip draw_frames Renderer Camera",
+    # for studies
+    "studies": "trials envelope_map chain_strobe chain_timeline draw_scene",
+    # helpers: bodies, with the sheet of a robot; curves, colours and saving; tables; what moves
+    "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "
+    "draw_path draw_com equal_scales",
+    "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
+    "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
+    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE",
+    "tables": "Table table",
+    "page": "Page",
+    "widgets": "progress watched",
+}
+_MODULE_OF = {name: module for module, names in _PLACES.items() for name in names.split()}
+__all__ = list(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -18,18 +18,12 @@ const clips = facts.clips.map((clip) => ({
 let duration = 0, now = 0, playing = false, before = 0, lead = clips[0];
 
 // Column-major matrix of the pose between two frames; `u` is the share of the way.
+const { Matrix4, Quaternion, Vector3 } = MeshCat.THREE;
+const point = (poses, k) => new Vector3().fromArray(poses, k);
+const turn = (poses, k) => new Quaternion().fromArray(poses, k + 3);
 function between(poses, a, b, u) {
-  const p = [];
-  const sign = [3, 4, 5, 6].reduce((s, i) => s + poses[a + i] * poses[b + i], 0) < 0 ? -1 : 1;
-  for (let i = 0; i < 7; i++) p[i] = poses[a + i] + u * ((i < 3 ? 1 : sign) * poses[b + i] - poses[a + i]);
-  const norm = Math.hypot(p[3], p[4], p[5], p[6]);
-  const [x, y, z, w] = p.slice(3).map((c) => c / norm);
-  return [
-    1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w), 0,
-    2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w), 0,
-    2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y), 0,
-    p[0], p[1], p[2], 1,
-  ];
+  const place = point(poses, a).lerp(point(poses, b), u), attitude = turn(poses, a).slerp(turn(poses, b), u);
+  return new Matrix4().compose(place, attitude, new Vector3(1, 1, 1)).toArray();
 }
 
 const phaseAt = (clip, time) => clip.phases.filter(([start]) => start <= time + 1e-9).at(-1)[1];
@@ -106,13 +100,11 @@ const labels = facts.ruler.map(({ at, text }) => {
 });
 function place_labels() {
   viewer.camera.updateMatrixWorld();
-  const view = viewer.camera.matrixWorldInverse.elements, lens = viewer.camera.projectionMatrix.elements;
-  const times = (m, v) => [0, 1, 2, 3].map((i) => m[i] * v[0] + m[4 + i] * v[1] + m[8 + i] * v[2] + m[12 + i] * v[3]);
   for (const { at, span } of labels) {
-    const c = times(lens, times(view, [at[0], at[2], -at[1], 1])); // the engine's y points up
-    span.style.display = c[3] > 0 ? "" : "none";
-    span.style.left = `${((c[0] / c[3] + 1) / 2) * innerWidth}px`;
-    span.style.top = `${((1 - c[1] / c[3]) / 2) * innerHeight}px`;
+    const p = new Vector3(at[0], at[2], -at[1]).project(viewer.camera); // the engine's y points up
+    span.style.display = p.z < 1 ? "" : "none"; // not behind the camera
+    span.style.left = `${((p.x + 1) / 2) * innerWidth}px`;
+    span.style.top = `${((1 - p.y) / 2) * innerHeight}px`;
   }
 }
 

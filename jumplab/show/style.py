@@ -1,9 +1,4 @@
-"""Colours, sizes and saving: everything that makes two jumplab figures look alike.
-
->>> from jumplab import plotting
->>> plotting.use_style()                                   # once per notebook, for plots of your own
->>> fig = plotting.new_figure(plotting.COLUMN_IN, 2.0)     # or any of the package's figure functions
->>> plotting.save_figure(fig, "my_figure", "figures", "What the reader sees.", task=task, robot=robot)
+"""Colours, sizes, curves by phase, and saving: what makes two figures look alike.
 
 Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one when it is the last expression of a cell
 (:func:`save_figure` returns it), nothing is shown twice, and nothing has to be closed.
@@ -11,13 +6,10 @@ Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one wh
 
 from __future__ import annotations
 
-import functools
 import io
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import ParamSpec, TypeVar
 
 import matplotlib.colors as mcolors
 import matplotlib.pyplot as plt
@@ -31,28 +23,23 @@ from jumplab.io.folder import versions
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
+Tasks = JumpTask | Sequence[JumpTask] | None
 # Okabe and Ito's palette, which stays apart for every kind of colour vision
 LAUNCH, FLIGHT, LANDING = "#0072B2", "#E69F00", "#009E73"
 PURPLE, SKY, VERMILION = "#CC79A7", "#56B4E9", "#D55E00"
 PHASE_COLORS = {"launch": LAUNCH, "flight": FLIGHT, "landing": LANDING}
-REFERENCE = "#222222"  # dashed, thin: what was asked for
-LIMIT = "#999999"  # thin: a bound
-ELLIPSE = "#B8E6B0"  # the paper draws the inertia ellipse in light green
 INK = "#222222"  # text and outlines
-GROUND = "#8C8C8C"
+LIMIT, GROUND = "#999999", "#8C8C8C"
 
-COLUMN_IN = 3.5  # width of one column of an IEEE page [in]
-PAGE_IN = 7.16  # width of both columns [in]
+COLUMN_IN, PAGE_IN = 3.5, 7.16  # width of one column of an IEEE page, and of both [in]
 DPI = 200  # of the PNG
 PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
 PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
 MIN_FONT_PT = 6.5  # smallest text in any figure; tests look for smaller
-REFERENCE_STYLE = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.9}
-LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}
-
+REFERENCE_STYLE = {"color": INK, "linestyle": (0, (4, 2)), "linewidth": 0.9}  # what was asked for
+LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
+BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
+NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}  # keywords of Axes.annotate
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
@@ -61,36 +48,24 @@ def use_style() -> None:
     plt.style.use(STYLE_FILE)
 
 
-def style_context() -> AbstractContextManager:
-    """The style for a ``with`` block only."""
-    return plt.style.context(STYLE_FILE)
-
-
-def styled(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: the figure function draws in the package's style whatever the caller's settings are."""
-
-    @functools.wraps(function)
-    def inner(*args: P.args, **kwargs: P.kwargs) -> R:
-        with style_context():
-            return function(*args, **kwargs)
-
-    return inner
+# decorator or ``with`` block: the style, whatever the caller's settings are
+styled = plt.style.context(STYLE_FILE)
 
 
 class Picture(Figure):
     """A figure that shows itself in a notebook, whatever backend is chosen there."""
 
+    @styled
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        with style_context():
-            self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+        self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
         return buffer.getvalue()
 
 
+@styled
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, width and height in inches."""
-    with style_context():
-        return Picture(figsize=(width, height))
+    return Picture(figsize=(width, height))
 
 
 def tint(color: str, share: float) -> tuple[float, float, float]:
@@ -110,12 +85,19 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
-    phase = np.asarray(phase)
-    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
-    lines = []
-    for part in np.split(np.arange(len(phase)), cuts):
+    phase, lines = np.asarray(phase), []
+    for part in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
         lines += ax.plot(t[part], y[part], **({"color": PHASE_COLORS[str(phase[part[0]])]} | kwargs))
     return lines
+
+
+def compare(ax: Axes, curve: tuple, *references: tuple, label: str = "", marks: Iterable[float] = (), **kwargs) -> None:
+    """A curve (t, y, phase) :func:`by_phase`, references (t, y) dashed, ``marks`` where phases change [s]."""
+    by_phase(ax, *curve, **kwargs)
+    for reference in references:
+        ax.plot(*reference, **REFERENCE_STYLE)
+    mark_time(ax, marks)
+    ax.set_ylabel(label)
 
 
 def mark_time(ax: Axes, times: Iterable[float]) -> None:
@@ -124,19 +106,23 @@ def mark_time(ax: Axes, times: Iterable[float]) -> None:
         ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
 
 
+def limits(ax: Axes, *bounds: float) -> None:
+    """Thin horizontal lines at bounds."""
+    for bound in bounds:
+        ax.axhline(bound, **LIMIT_STYLE)
+
+
 def phase_handles(*phases: str, reference: str | None = None, limit: str | None = None) -> list[Line2D]:
     """Legend entries: phases by name, then texts for the dashed reference and the thin limits."""
     handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
-    if reference:
-        handles.append(Line2D([], [], **REFERENCE_STYLE, label=reference))
-    if limit:
-        handles.append(Line2D([], [], **LIMIT_STYLE, label=limit))
+    for text, look in ((reference, REFERENCE_STYLE), (limit, LIMIT_STYLE)):
+        handles += [Line2D([], [], **look, label=text)] if text else []
     return handles
 
 
-def legend_above(fig: Figure, handles: list, columns: int | None = None) -> None:
+def legend_above(fig: Figure, handles: list) -> None:
     """One legend over all panels, outside of them."""
-    fig.legend(handles=handles, loc="outside upper center", ncols=columns or len(handles), columnspacing=1.4)
+    fig.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
 
 
 def panel_letters(axes: Iterable[Axes]) -> None:
@@ -153,8 +139,10 @@ def bare(ax: Axes) -> None:
 
 
 # saving ---------------------------------------------------------------------------------------------------------
-def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *,
-                task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> Figure:  # fmt: skip
+@styled
+def save_figure(
+    fig: Figure, name: str, folder: str | Path, caption: str = "", *, task: Tasks = None, robot: Robot | None = None
+) -> Figure:
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
 
     The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
@@ -170,17 +158,16 @@ def save_figure(fig: Figure, name: str, folder: str | Path, caption: str = "", *
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with style_context():
-            fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
-            fig.set_layout_engine("none")
-            fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
+        fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
+        fig.set_layout_engine("none")
+        fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
         (folder / f"{name}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
     except OSError as e:
         raise InputError(f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}") from e
     return fig
 
 
-def caption_text(caption: str, task: JumpTask | Sequence[JumpTask] | None = None, robot: Robot | None = None) -> str:
+def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
     """What NAME.txt says: the caption, then target or targets, robot and versions, one line each."""
     lines = [caption.strip() or "No caption."]
     tasks = [task] if isinstance(task, JumpTask) else list(task or ())

@@ -6,84 +6,72 @@ import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Table:
-    """A finished table of texts; make one with :func:`table`.
+    """A finished table of texts; make one with :func:`table`."""
 
-    Attributes
-    ----------
-    columns : headings.
-    rows : texts, one tuple per row.
-    right : which columns are numbers, set flush right.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # headings
     rows: tuple[tuple[str, ...], ...]
-    right: tuple[bool, ...]
+    right: tuple[bool, ...]  # which columns are numbers, set flush right
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
-
-        def line(cells):
-            pairs = zip(cells, widths, self.right, strict=True)
-            return "  ".join(c.rjust(w) if right else c.ljust(w) for c, w, right in pairs).rstrip()
-
-        return "\n".join([line(self.columns), line(["-" * w for w in widths]), *map(line, self.rows)])
+        lines = []
+        for row in (self.columns, ["-" * w for w in widths], *self.rows):
+            pairs = zip(row, widths, self.right, strict=True)
+            cells = (text.rjust(width) if right else text.ljust(width) for text, width, right in pairs)
+            lines.append("  ".join(cells).rstrip())
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        def row(cells, tag):
+        def row(cells: Sequence[str], tag: str) -> str:
             sides = ("right" if right else "left" for right in self.right)
-            texts = (
-                f'<{tag} style="text-align:{side}">{html.escape(c)}</{tag}>'
-                for c, side in zip(cells, sides, strict=True)
-            )
-            return f"<tr>{''.join(texts)}</tr>"
+            pairs = zip(sides, map(html.escape, cells), strict=True)
+            return "".join(["<tr>", *(f'<{tag} style="text-align:{side}">{c}</{tag}>' for side, c in pairs), "</tr>"])
 
-        head, body = row(self.columns, "th"), "".join(row(r, "td") for r in self.rows)
-        return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
-
-    __repr__ = __str__
+        body = "".join(row(r, "td") for r in self.rows)
+        return f"<table><thead>{row(self.columns, 'th')}</thead><tbody>{body}</tbody></table>"
 
 
-def table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | Mapping[str, str] | None = None, *,
-          digits: int = 4, decimals: int | None = None) -> Table:  # fmt: skip
+def table(
+    rows: Iterable[Mapping], columns: Iterable[str] | None = None, *, digits: int = 4, decimals: int | None = None
+) -> Table:
     """Rows of named values as a :class:`Table`.
 
     Parameters
     ----------
     rows : mappings with the same keys (a missing one is left blank).
-    columns : which keys, in which order; a mapping also renames them ("key": "heading"); None takes those of the first
-        row.
+    columns : which keys, in which order, those of the first row if None; a mapping renames them ("key": "heading").
     digits : significant digits of numbers.
-    decimals : places after the point instead, the same for every number that is not whole by its type; for tables of
-        quantities of one size, where 1.000 beside 0.997 should not shrink to 1.
+    decimals : places after the point instead, for numbers that are not whole by type: 1.000 beside 0.997, not 1.
     """
-    rows = [dict(r) for r in rows]
+    rows = list(rows)
     if columns is None:
         columns = list(rows[0]) if rows else []
     names = dict(columns) if isinstance(columns, Mapping) else {c: c for c in columns}
-    cells = [tuple(_text(r.get(key), digits, decimals) for key in names) for r in rows]
+    form = f".{digits}g" if decimals is None else f"z.{decimals}f"  # z: no minus before a zero
+    cells = [tuple(_text(r.get(key), form) for key in names) for r in rows]
     right = tuple(bool(rows) and all(_number(r.get(key)) or r.get(key) is None for r in rows) for key in names)
     return Table(tuple(names.values()), tuple(cells), right)
 
 
 def _number(x: Any) -> bool:
-    return isinstance(x, int | float | np.integer | np.floating) and not isinstance(x, bool)
+    return isinstance(x, Real) and not isinstance(x, bool)
 
 
-def _text(x: Any, digits: int, decimals: int | None) -> str:
+def _text(x: Any, form: str) -> str:
     if x is None:
         return ""
     if isinstance(x, bool | np.bool_):
         return "yes" if x else "no"
-    if isinstance(x, int | np.integer):
+    if isinstance(x, Integral):
         return str(int(x))
     if _number(x):
-        form = f".{digits}g" if decimals is None else f"z.{decimals}f"  # z: no minus before a zero
         return f"{float(x):{form}}" if math.isfinite(x) else "—"
     return str(x)

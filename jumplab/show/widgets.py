@@ -1,6 +1,6 @@
-"""Progress bars for notebooks, shown only while somebody looks.
+"""Progress bars, shown only while somebody looks.
 
-A notebook that papermill executes keeps everything that its cells print, so bars would litter it; there they stay away.
+A notebook that papermill executes keeps everything that its cells print; there bars stay away.
 """
 
 from __future__ import annotations
@@ -9,6 +9,9 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
+
+from tqdm import tqdm
+from tqdm.notebook import tqdm as notebook_tqdm
 
 T = TypeVar("T")
 SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that somebody has opened
@@ -29,24 +32,16 @@ def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterat
     label : what is being counted.
     total : how many there are, where ``len(items)`` does not tell.
     """
-    if watched():
-        yield from _notebook_bar(items, label, total)
-    elif sys.stderr is not None and sys.stderr.isatty():
-        from tqdm import tqdm
-
-        yield from tqdm(items, desc=label, total=total, leave=False)
-    else:
-        yield from items
-
-
-def _notebook_bar(items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
-    """A bar of the browser; at the end its place in the notebook is empty, not a bar that stands still."""
+    how = dict(desc=label, total=total, leave=False)
+    if not watched():
+        shown = sys.stderr is not None and sys.stderr.isatty()
+        yield from tqdm(items, **how) if shown else items
+        return
     from IPython.display import display
-    from tqdm.notebook import tqdm
 
-    bar = tqdm(items, desc=label, total=total, leave=False, display=False)
+    bar = notebook_tqdm(items, display=False, **how)
     place = display(bar.container, display_id=True)
     try:
         yield from bar
     finally:
-        place.update({"text/plain": ""}, raw=True)
+        place.update({"text/plain": ""}, raw=True)  # a bar that stands still would stay

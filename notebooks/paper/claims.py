@@ -26,7 +26,7 @@ from jumplab.task import GRAVITY, JumpTask
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
-LOOSE_MESH = Mesh(13, 10, 15)  # our choice: half of stage 3's mesh ...
+LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 READINGS = ("the paper says", "we do", "because", "effect")
 HEADING = "## Differences from the paper"
@@ -93,8 +93,16 @@ def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[st
     angles = random.uniform([0.0, -0.2, -1.2, -0.2, -2.0], [0.6, 1.2, 0.6, 0.9, 1.0], (samples, 5))
     rates, accels = random.normal(0, 4, (samples, 5)), random.normal(0, 40, (samples, 5))
     rest = np.zeros((samples, 2))
-    motion = dict(t=np.arange(samples) / 1000, angles=angles, rates=rates, accels=accels, toe=rest, toe_velocity=rest,
-                  toe_acceleration=rest, flying=np.zeros(samples, bool))  # fmt: skip
+    motion = dict(
+        t=np.arange(samples) / 1000,
+        angles=angles,
+        rates=rates,
+        accels=accels,
+        toe=rest,
+        toe_velocity=rest,
+        toe_acceleration=rest,
+        flying=np.zeros(samples, bool),
+    )
     tape = expand(motion, robot, GRAVITY)
     five = planar_quantities(robot, angles, rates, accels, rest, GRAVITY)
     body = FullBody(robot)
@@ -185,8 +193,10 @@ def against_crouch(rows: Sequence[Start]) -> list[dict]:
             "stage 3 alone, share": [r.alone_s / c.alone_s for r, c in both],
             "with the guess, share": [r.total_s / c.total_s for r, c in both],
         }
-        out.append({"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
-                   | {key: float(np.median(x)) if x else None for key, x in shares.items()})  # fmt: skip
+        out.append(
+            {"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
+            | {key: float(np.median(x)) if x else None for key, x in shares.items()}
+        )
     return out
 
 
@@ -211,8 +221,10 @@ def readings(notebooks: Iterable[str | Path]) -> list[dict[str, str]]:
         for line in _lines(path):
             cells = [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
             if len(cells) != len(READINGS):
-                raise InputError(f"{path.name}: the row {line!r} of its differences from the paper has {len(cells)} "
-                                 f"columns, not {len(READINGS)}; write \\| for a bar inside a column")  # fmt: skip
+                raise InputError(
+                    f"{path.name}: the row {line!r} of its differences from the paper has {len(cells)} "
+                    f"columns, not {len(READINGS)}; write \\| for a bar inside a column"
+                )
             rows.append({"notebook": path.stem, **dict(zip(READINGS, cells, strict=True))})
     return rows
 
@@ -230,8 +242,10 @@ def _lines(path: Path) -> list[str]:
             lines = [line.strip() for line in after.split("\n## ")[0].splitlines() if line.strip().startswith("|")]
             head = [c.strip() for c in lines[0].strip("|").split("|")] if lines else []
             if lines and tuple(head) != READINGS:
-                raise InputError(f"{path.name}: its differences from the paper have the columns {', '.join(head)}; "
-                                 f"they must be {', '.join(READINGS)}")  # fmt: skip
+                raise InputError(
+                    f"{path.name}: its differences from the paper have the columns {', '.join(head)}; "
+                    f"they must be {', '.join(READINGS)}"
+                )
             return lines[2:]
     return []
 

@@ -11,8 +11,8 @@ from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.task import JumpTask
 
 TOLERANCE = 0.02  # share of the goal
-LEAST_TOLERANCE_M = 0.005  # our choice: where 2 % of the goal is less, as in a jump on the spot
-TRIES = 6  # our choice: "a few jumps"; the correction usually needs two or three
+LEAST_TOLERANCE_M = 0.005  # where 2 % of the goal is less, as in a jump on the spot
+TRIES = 6  # "a few jumps"; the correction usually needs two or three
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,10 @@ def reach_goal(
             distance_m=target.distance_m - jumps[-1].distance_error_m,
             height_m=target.height_m - jumps[-1].rise_error_m,
         )
-    raise InfeasibleError(f"the goal was not hit within {tries} jumps; {_last(jumps)}; allow more tries, or a larger "
-                          f"tolerance than {tolerance:.1%}")  # fmt: skip
+    raise InfeasibleError(
+        f"the goal was not hit within {tries} jumps; {_last(jumps)}; allow more tries, or a larger "
+        f"tolerance than {tolerance:.1%}"
+    )
 
 
 def _plan(planner: Planner, target: JumpTask, method: str, jumps: list[BiasedJump]) -> JumpPlan:
@@ -126,8 +128,10 @@ def _plan(planner: Planner, target: JumpTask, method: str, jumps: list[BiasedJum
     except (InputError, InfeasibleError) as e:
         if not jumps:
             raise
-        raise InfeasibleError(f"the target {target.distance_m:.3f} m with a rise of {target.height_m:.3f} m, which the "
-                              f"goal's bias asks for, cannot be planned ({e}); {_last(jumps)}") from e  # fmt: skip
+        raise InfeasibleError(
+            f"the target {target.distance_m:.3f} m with a rise of {target.height_m:.3f} m, which the "
+            f"goal's bias asks for, cannot be planned ({e}); {_last(jumps)}"
+        ) from e
 
 
 def _judge(goal: JumpTask, target: JumpTask, result: SimulationResult, tolerance: float) -> BiasedJump:
@@ -144,5 +148,7 @@ def _judge(goal: JumpTask, target: JumpTask, result: SimulationResult, tolerance
 def _last(jumps: list[BiasedJump]) -> str:
     j = jumps[-1]
     said = "landed" if j.landed else j.reason
-    return (f"the last one, planned for {j.target.distance_m:.3f} m and {j.target.height_m:.3f} m, reached "
-            f"{j.distance_m:.3f} m and {j.rise_m:.3f} m ({said})")  # fmt: skip
+    return (
+        f"the last one, planned for {j.target.distance_m:.3f} m and {j.target.height_m:.3f} m, reached "
+        f"{j.distance_m:.3f} m and {j.rise_m:.3f} m ({said})"
+    )

@@ -29,14 +29,14 @@ from jumplab.task import GRAVITY, JumpTask
 
 PRINTED_COSTS = ("jerk", "CoM velocity", "L rate", "turn", "L range")  # of the launch, SL-J1..J4 and SL-P5
 PRINTED_FLIGHT = ("inertia acceleration", "inertia jerk", "rotation")  # SF-J1, SF-D1
-LAUNCH_S = (0.3, 1.2)  # [s] our choice: printed is only that the time costs something
-RATE_BOX = (10.0, 6.0, 15.0, 3.0)  # [1/s] our choice of SL-B1: beyond what any solution here uses
-ACCEL_BOX = (150.0, 100.0, 200.0, 50.0)  # [1/s^2] our choice of SL-B1, likewise
-FORCE_BOX = (300.0, 4000.0, 300.0, 4000.0)  # [N m, N] our choice of SL-B1 on tau_l, F_phi, tau_pl, F_varphi, likewise
-INERTIA_JERK_BOX = 2e4  # [kg m^2/s^3] our choice of SF-B1: reaches the inertia acceleration's box in 30 ms
-WINDOW_MARGIN = 0.25  # our choice: share of the inertia range kept free on either side, for take-off and for the mean
-WINDOW_RATE = 10.0  # [kg m^2/s] our choice: stopped at the flight's acceleration box within a tenth of the range
-WINDOW_ACCEL = 200.0  # [kg m^2/s^2] our choice: a third of the flight's box
+LAUNCH_S = (0.3, 1.2)  # [s] printed is only that the time costs something
+RATE_BOX = (10.0, 6.0, 15.0, 3.0)  # [1/s] of SL-B1: beyond what any solution here uses
+ACCEL_BOX = (150.0, 100.0, 200.0, 50.0)  # [1/s^2] of SL-B1, likewise
+FORCE_BOX = (300.0, 4000.0, 300.0, 4000.0)  # [N m, N] of SL-B1 on tau_l, F_phi, tau_pl, F_varphi, likewise
+INERTIA_JERK_BOX = 2e4  # [kg m^2/s^3] of SF-B1: reaches the inertia acceleration's box in 30 ms
+WINDOW_MARGIN = 0.25  # share of the inertia range kept free on either side, for take-off and for the mean
+WINDOW_RATE = 10.0  # [kg m^2/s] stopped at the flight's acceleration box within a tenth of the range
+WINDOW_ACCEL = 200.0  # [kg m^2/s^2] a third of the flight's box
 PARAMETERS = dict(start=4, distance=1, takeoff_speed=1, flight_time=1, rotation=1, gravity=1)
 FLIGHT_PARAMETERS = dict(start=4, L=1, flight_time=1, rotation=1)
 
@@ -140,7 +140,7 @@ def build_printed_launch(robot: Robot, settings: SrmpSettings, envelope: Reach, 
     """SL-*: the launch problem alone (Sec. III-A); with ``window`` also what the flight needs of its end."""
     mass = robot.sagittal.total_mass
     low, high = envelope.length
-    box_low = [settings.takeoff_lean[0], low, -2.5, 0.1]  # our choice: as in the joint problem
+    box_low = [settings.takeoff_lean[0], low, -2.5, 0.1]  # as in the joint problem
     box_high = [settings.takeoff_lean[1], high, 2.5, 1.0]
     start = Bound("start posture", "SL-P3; ours: the stance", "rad, m", "q", _start, _start, "start")
     bounds = (

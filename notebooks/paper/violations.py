@@ -11,7 +11,7 @@ from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
 from jumplab.task import JumpTask
 from paper.whole_body_printed import MOTION, PaperCoordinates, PrintedPlan, planar_numbers
 
-# what a violation is, our choice
+# what a violation is
 HEEL_UP_M, MOMENT_NM = 0.005, 5.0  # a heel is up, and a moment about the toe is one, beyond these
 LOADED_N = 100.0  # CoP and friction are quotients by F_z: looked at beyond a quarter of the weight
 FRICTION = 0.5  # the lowest that the simulations use
@@ -49,8 +49,11 @@ def violations(plan: Any, robot: Robot) -> tuple[dict, ...]:
         planned = plan.tape.f.sum(axis=1)[:, [0, 2]]
     x = planar_numbers(robot, motion, task.gravity)
     down = {k: v[~motion["flying"]] for k, v in {**x, **{k: motion[k] for k in MOTION}}.items()}
-    rows = (*_contact_rows(down, note), *_joint_rows(robot.sagittal, x),
-            *_motion_rows(robot.sagittal, motion, x, planned, task))  # fmt: skip
+    rows = (
+        *_contact_rows(down, note),
+        *_joint_rows(robot.sagittal, x),
+        *_motion_rows(robot.sagittal, motion, x, planned, task),
+    )
     keys = ("name", "amount", "unit", "limit", "note")
     return tuple(dict(zip(keys, r, strict=True), kept=bool(r[1] <= r[3])) for r in rows)
 

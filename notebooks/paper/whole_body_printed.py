@@ -35,12 +35,12 @@ COORDINATES = ("x", "z", "pitch", *SAGITTAL_JOINTS)
 LINK_OF_THETA = np.hstack([np.zeros((5, 2)), np.rint(np.linalg.inv(np.vstack([np.eye(5)[3], JOINT_OF_ANGLES])))])
 MOTION = ("angles", "rates", "accels", "toe", "toe_velocity", "toe_acceleration")
 INTERVALS = 30  # our choice, per phase: 29 ms of launch, 21 ms of flight
-# our choice: the launch has several local solutions, and with "adaptive" a guess changed by 1e-12 ends in another one;
+# the launch has several local solutions, and with "adaptive" a guess changed by 1e-12 ends in another one;
 # so it stays with the same one for guesses changed by 0.01
 OPTIONS = {"mu_strategy": "monotone"}
-BASE_BOX, BASE_RATE_BOX = (3.0, 3.0, 8.0), (10.0, 10.0, 20.0)  # [m, m, rad], [.../s] our choice: beyond any jump here
-ACCEL_BOX, JERK_BOX, FORCE_BOX_N = 1e3, 1e5, 4000.0  # [1/s^2, 1/s^3, N] our choice: far beyond what ours uses
-FORCE_WEIGHT = 1e-6  # [1] / [N]^2 / [s] our choice: standing costs as much as joint accelerations of 6 rad/s^2
+BASE_BOX, BASE_RATE_BOX = (3.0, 3.0, 8.0), (10.0, 10.0, 20.0)  # [m, m, rad], [.../s] beyond any jump here
+ACCEL_BOX, JERK_BOX, FORCE_BOX_N = 1e3, 1e5, 4000.0  # [1/s^2, 1/s^3, N] far beyond what ours uses
+FORCE_WEIGHT = 1e-6  # [1] / [N]^2 / [s] standing costs as much as joint accelerations of 6 rad/s^2
 SCALES = {"q": 1.0, "v": 10.0, "a": 100.0, "j": 2000.0, "z": 400.0}  # as ours; z is about the weight
 AT_TAKEOFF = "base rows at take-off"  # of the flight, its first node
 

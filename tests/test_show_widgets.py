@@ -77,7 +77,7 @@ def test_explore_without_reader_is_a_picture(unwatched, planner, capsys):
 
 def test_explore_with_reader_solves_what_the_sliders_ask(watched, planner, monkeypatch):
     asked = []
-    monkeypatch.setattr(live, "_picture_or_refusal", lambda planner, task: asked.append(task))
+    monkeypatch.setattr(explore, "_picture_or_refusal", lambda planner, task: asked.append(task))
     box = explore.explore_stage1(planner, JumpTask(0.5, 0.4))
     (distance, height, turn), picture = box.children[0].children, box.children[1]
     assert type(picture).__name__ == "Output"

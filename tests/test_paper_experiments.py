@@ -7,9 +7,9 @@ import pytest
 from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from paper import experiments as pictures
 from paper.measurement import measure
 
-from jumplab.show import experiments as pictures
 from jumplab.show import render
 from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
 from jumplab.sim import Scene, SensorNoise, simulate_jump

@@ -15,10 +15,12 @@ from jumplab.stages.joint_qp import JointMapper, map_to_joints
 ROWS = [
     {"target": target, "start": start, "iterations": n, "cost": cost}
     for target, start, n, cost in (
-        ((1.0, 0.5), "crouch", 30, 1.0), ((1.0, 0.5), "stage 2", 20, 1.0),
-        ((0.5, 0.3), "crouch", 50, 1.02), ((0.5, 0.3), "stage 2", None, None),
+        ((1.0, 0.5), "crouch", 30, 1.0),
+        ((1.0, 0.5), "stage 2", 20, 1.0),
+        ((0.5, 0.3), "crouch", 50, 1.02),
+        ((0.5, 0.3), "stage 2", None, None),
     )
-]  # fmt: skip
+]
 PANELS = {"iterations": "iterations [1]", "cost": "cost [best]"}
 
 
@@ -58,7 +60,7 @@ def test_snapshots_end_at_touchdown_at_their_true_heights(mapped, bhr):
     said = [t.get_text() for t in ax.texts]
     assert said[0] == "0.00 s" and f"{mapped.t[-1]:.2f} s" in said and {"launch", "flight"} <= set(said)
     body = plotting.Silhouette(bhr)
-    heights = [line.get_ydata()[0] for line in ax.lines if line.get_marker() == "o"]
+    heights = np.concatenate([line.get_ydata() for line in ax.lines if line.get_marker() == "o"])
     assert len(heights) == 11
     assert heights[0] == pytest.approx(body.com(mapped.q[0])[1]) and heights[-1] == pytest.approx(
         body.com(mapped.q[-1])[1]

@@ -1,36 +1,38 @@
-"""The three experiments (Figs. 13 and 14), a jump in its scene, and what makes robots fall."""
+"""One-off figures of many jumps: the three experiments (Figs. 13 and 14), robots that fall, wrong states, chains."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.show.bodies import Silhouette, draw_robot, equal_scales
-from jumplab.show.render import ABOVE_M, BELOW_M, TITLE_IN, Camera, Renderer
-from jumplab.show.simulation import frame_rows
+from jumplab.show.bodies import ABOVE_M, Silhouette, draw_path, strobe
+from jumplab.show.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames
+from jumplab.show.simulations import frame_rows
+from jumplab.show.studies import LEGEND_IN, draw_goals, draw_scene, span
 from jumplab.show.style import (
     COLUMN_IN,
-    GROUND,
+    FLIGHT,
     INK,
     LANDING,
+    LIMIT_STYLE,
     PAGE_IN,
     PHASE_COLORS,
+    PURPLE,
     REFERENCE_STYLE,
     VERMILION,
     bare,
     by_phase,
+    compare,
     legend_above,
-    mark_time,
+    limits,
     new_figure,
     panel_letters,
     phase_handles,
@@ -38,27 +40,29 @@ from jumplab.show.style import (
     styled,
     tint,
 )
+from jumplab.studies.trials import wilson
 
 if TYPE_CHECKING:  # pictures need no simulator
-    from paper.measurement import Measurement
-
     from jumplab.sim import Scene, SimulationResult
     from jumplab.studies.basin import BasinReport
+    from jumplab.studies.chain import ChainResult, ChainTrial
     from jumplab.studies.trials import Trial
+    from paper.measurement import Measurement
 
-APART_M = 1.2  # our choice: how far start and end are moved away from the jump
-DITCH_SHOWN_M = 0.25  # our choice: a ditch that nobody falls into is cut off at this depth
+APART_M = 1.2  # how far start and end are moved away from the jump
+DITCH_SHOWN_M = 0.25  # a ditch that nobody falls into is cut off at this depth
 GROUND_SHOWN_M = 0.04
-LABEL_ROOM_M = 0.14  # our choice: for a frame's time above a head
+LABEL_ROOM_M = 0.14  # for a frame's time above a head
 LABEL_SIDES = {"launch": "right", "flight": "center", "landing": "left"}  # away from the neighbour's head
-LEGEND_IN, TALLEST_IN = 0.3, 3.2
-WIDE_FRAME_M = 1.5  # our choice: wide enough for a ditch of 0.8 m and its edges
-WIDE_PIXELS_PER_M = 180  # our choice: 235 pixels per inch of a page-wide line, where a PNG has 200
+TALLEST_IN = 3.2  # of a jump in its scene
+WIDE_FRAME_M = 1.5  # wide enough for a ditch of 0.8 m and its edges
+WIDE_PIXELS_PER_M = 180  # 235 pixels per inch of a page-wide line, where a PNG has 200
 FRAMES = (0, 1, 3, 5, 8, 11)  # of the twelve of frame_rows: start, crouch, lift-off, flight, touchdown, end
 ROW_LABEL_IN = 0.25
-BASIN_SINGLE_IN, BASIN_ROW_IN = 2.4, 1.55  # our choice: height of a single map, of each of several rows
-PER_BIN = 10  # our choice: robots per bin of the map; fewer would make its intervals meaningless
+BASIN_SINGLE_IN, BASIN_ROW_IN = 2.4, 1.55  # height of a single map, of each of several rows
+PER_BIN = 10  # robots per bin of the map; fewer would make its intervals meaningless
 MAX_BINS = 5
+TOLERANCE_M = 0.03  # what a jump of a chain may miss by
 # feature, label, factor to the label's unit
 FEATURES = (
     ("friction", "friction of the soles", 1.0),
@@ -78,9 +82,11 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
     The start is moved back and the end forward by :data:`APART_M`; a fall is shown in its
     place.
     """
-    frames = _strobe_rows(result)
-    body, halo = Silhouette(robot), withStroke(linewidth=2, foreground="white")
-    outlines = [[(part, np.add(o, [shift, 0.0])) for part, o in body.outlines(result.q[row])] for row, shift in frames]
+    rows, shifts = zip(*_strobe_rows(result), strict=True)
+    body, halo, frames = Silhouette(robot), withStroke(linewidth=2, foreground="white"), result.q[list(rows)]
+    outlines = [
+        [(part, o + np.array([dx, 0.0])) for part, o in body.outlines(q)] for q, dx in zip(frames, shifts, strict=True)
+    ]
     corners = np.vstack([o for frame in outlines for _, o in frame])
     (left, low), (right, high) = corners.min(axis=0) - 0.1, corners.max(axis=0)
     right += 0.1
@@ -89,18 +95,17 @@ def scene_strobe(result: SimulationResult, robot: Robot, scene: Scene) -> Figure
     top = high + LABEL_ROOM_M
     fig = new_figure(PAGE_IN, min(LEGEND_IN + PAGE_IN * (top - bottom) / (right - left), TALLEST_IN))
     ax = fig.subplots()
-    for k, ((row, shift), frame) in enumerate(zip(frames, outlines, strict=True)):
-        phase = str(result.phase[row])
-        color = PHASE_COLORS[phase]
-        draw_robot(ax, body, result.q[row], color, shift=shift, zorder=2 + k / len(frames))
+    phases = [str(result.phase[row]) for row in rows]
+    strobe(ax, body, frames, [PHASE_COLORS[p] for p in phases], shifts=shifts)
+    for row, shift, phase, frame in zip(rows, shifts, phases, outlines, strict=True):
         trunk = np.vstack([o for part, o in frame if part == "trunk"])
         x, z = trunk[np.argmax(trunk[:, 1])]
-        ax.text(x, z + 0.02, f"{result.t[row]:.2f} s", ha=LABEL_SIDES[phase] if shift == 0 else "center", va="bottom",
-                fontsize=7, color=shade(color, 0.8), zorder=6, path_effects=[halo])  # fmt: skip
+        look = dict(fontsize=7, color=shade(PHASE_COLORS[phase], 0.8), zorder=6, path_effects=[halo])
+        side = LABEL_SIDES[phase] if shift == 0 else "center"
+        ax.text(x, z + 0.02, f"{result.t[row]:.2f} s", ha=side, va="bottom", **look)
     flight = result.phase == "flight"
-    ax.plot(result.com[flight, 0], result.com[flight, 2], color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=5)
+    draw_path(ax, result.com[flight, 0], result.com[flight, 2])
     draw_scene(ax, scene, left, right, bottom)
-    equal_scales(ax)
     ax.set(xlim=(left, right), ylim=(bottom, top))
     legend_above(fig, phase_handles("launch", "flight", "landing"))
     bare(ax)
@@ -120,21 +125,6 @@ def _strobe_rows(result: SimulationResult) -> list[tuple[int, float]]:
     return rows
 
 
-def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float) -> None:
-    """Cross-section of the ground from ``left`` to ``right``, cut off at ``bottom`` [m]."""
-    for block in sorted(scene.blocks, key=lambda b: b.top):
-        start, end = max(left, block.x_from), min(right, block.x_to)
-        if start >= end or block.top <= bottom:
-            continue
-        ax.add_patch(Rectangle((start, bottom), end - start, block.top - bottom, facecolor=tint(GROUND, 0.35),
-                               edgecolor="none", zorder=1))  # fmt: skip
-        ax.plot([start, end], [block.top] * 2, color=GROUND, linewidth=0.8, zorder=1.5)
-        for x in (block.x_from, block.x_to):
-            if left < x < right:
-                below = max((b.top for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to), default=bottom)
-                ax.plot([x, x], [max(below, bottom), block.top], color=GROUND, linewidth=0.8, zorder=1.5)
-
-
 # Fig. 13 ---------------------------------------------------------------------------------------------------------
 @styled
 def experiment_frames(runs: Sequence[tuple[str, SimulationResult, Scene]], robot: Robot) -> Figure:
@@ -150,13 +140,7 @@ def experiment_frames(runs: Sequence[tuple[str, SimulationResult, Scene]], robot
     axes = fig.subplots(len(runs), len(FRAMES), squeeze=False, height_ratios=heights)
     for (name, result, scene), line, camera in zip(runs, axes, cameras, strict=True):
         with Renderer(robot, scene=scene) as studio:
-            for ax, row in zip(line, frame_rows(result)[list(FRAMES)], strict=True):
-                phase = str(result.phase[row])
-                shot = replace(camera, x=float(result.com[row, 0]))
-                ax.imshow(studio.picture(result.q[row], shot, PHASE_COLORS[phase]))
-                bare(ax)
-                ax.set_title(f"{phase}, {result.t[row]:.2f} s", loc="center", fontsize=7,
-                             color=shade(PHASE_COLORS[phase], 0.8))  # fmt: skip
+            draw_frames(line, studio, result, frame_rows(result)[list(FRAMES)], camera, fontsize=7)
         line[0].text(-0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center", fontsize=8)
     return fig
 
@@ -186,10 +170,9 @@ def measured_jump(measured: Measurement, tape: Tape, robot: Robot) -> Figure:
         both = label.startswith("$\\rho")
         seen = np.full(len(measured.t), True) if both else measured.phase == "launch"
         part = np.full(len(tape.t), True) if both else tape.phase == "launch"
-        by_phase(ax, measured.t[seen], actual[seen], measured.phase[seen], linewidth=1.0)
-        ax.plot(tape.t[part], planned[part], **REFERENCE_STYLE)
-        mark_time(ax, [tape.takeoff_time] if both else [])
-        ax.set(xlabel="time [s]", ylabel=label)
+        curve, plan = (measured.t[seen], actual[seen], measured.phase[seen]), (tape.t[part], planned[part])
+        compare(ax, curve, plan, label=label, marks=[tape.takeoff_time] if both else [], linewidth=1.0)
+        ax.set_xlabel("time [s]")
     panel_letters(axes)
     legend_above(fig, phase_handles("launch", "flight", reference="plan"))
     return fig
@@ -209,19 +192,29 @@ def trial_map(trials: Sequence[Trial]) -> Figure:
         values = factor * np.array([t.features[name] for t in trials])
         _rates(ax, values, landed)
         for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
-            ax.plot(values[mask], np.full(mask.sum(), height), linestyle="none", marker=marker, color=color,
-                    markersize=3.0, markeredgewidth=0.8, alpha=0.7)  # fmt: skip
+            ax.plot(
+                values[mask],
+                np.full(mask.sum(), height),
+                linestyle="none",
+                marker=marker,
+                color=color,
+                markersize=3.0,
+                markeredgewidth=0.8,
+                alpha=0.7,
+            )
         ax.margins(x=0.04)
-        ax.set(xlabel=label, ylim=(-0.3, 1.3), yticks=[-0.2, 0, 0.5, 1, 1.2],
-               yticklabels=["fell", "0 %", "50 %", "100 %", "landed"])  # fmt: skip
+        ax.set(
+            xlabel=label,
+            ylim=(-0.3, 1.3),
+            yticks=[-0.2, 0, 0.5, 1, 1.2],
+            yticklabels=["fell", "0 %", "50 %", "100 %", "landed"],
+        )
     panel_letters(axes.flat)
     return fig
 
 
 def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
     """Success rate with its interval over equally filled bins."""
-    from jumplab.studies.trials import wilson
-
     bins = int(np.clip(len(values) // PER_BIN, 1, MAX_BINS))
     for part in np.array_split(np.argsort(values, kind="stable"), bins):
         if len(part):
@@ -271,3 +264,63 @@ def _basin_panel(ax: Axes, states: Sequence[Trial]) -> None:
         ax.plot(x, y, linestyle="none", marker=marker, color=color, markersize=5, markeredgewidth=1.2)
     ax.plot(0, 0, marker="o", markersize=9, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=0.7)
     ax.margins(0.15)
+
+
+# Chains ----------------------------------------------------------------------------------------------------------
+@styled
+def chain_path(result: ChainResult) -> Figure:
+    """Path of the CoM through the chain, by phase; dashed each jump's plan, from where the toes stood."""
+    fig = new_figure(PAGE_IN, 2.4)
+    ax = fig.subplots()
+    foot = result.robot.foot
+    zero = foot.toe - float(foot.center[0])
+    by_phase(ax, result.com[:, 0], result.com[:, 2], result.phase)
+    for jump, place in zip(result.jumps, result.places_m, strict=False):
+        if jump.ahead is not None and jump.ahead.plan is not None:
+            com = jump.ahead.plan.tape.extra["planar_com"] + [zero + place[0], place[2]]
+            com[:, 0] -= jump.ahead.plan.tape.extra["planar_toe"][0, 0]
+            ax.plot(*com.T, **REFERENCE_STYLE)
+    left, right = span(result)
+    low = float(result.com[:, 2].min()) - 0.1
+    draw_scene(ax, result.scene, left, right, min(0.0, low) - 0.05)
+    draw_goals(ax, result)
+    ax.set(xlabel="$x$ [m]", ylabel="CoM $z$ [m]", xlim=(left, right))
+    legend_above(fig, phase_handles("launch", "flight", "landing", reference="plan"))
+    return fig
+
+
+@styled
+def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figure:
+    """Distance error of each jump, and planning time against air time; grey the perturbed robots."""
+    fig = new_figure(PAGE_IN, 2.3)
+    error, clock = fig.subplots(1, 2)
+    number = 1 + np.arange(len(result.jumps))
+    for trial in trials:
+        grey = dict(color=tint(INK, 0.45), linewidth=0.7, marker=".", markersize=3)
+        error.plot(1 + np.arange(len(trial.errors_m)), 1000 * np.array(trial.errors_m), **grey)
+        clock.plot(
+            [1 + p["jump"] for p in trial.plans], [p["solve_s"] for p in trial.plans], **grey | {"linestyle": ""}
+        )
+    error.plot(number, 1000 * result.errors_m, color=shade(PHASE_COLORS["landing"], 0.9), marker="o", markersize=4)
+    limits(error, -1000 * TOLERANCE_M, 1000 * TOLERANCE_M)
+    error.set(xlabel="jump", ylabel="distance error [mm]")
+    air = np.array([np.nan if j.air_s is None else j.air_s for j in result.jumps])
+    clock.plot(number, air, color=FLIGHT, marker="o", markersize=4, label="in the air")
+    for in_air, face, label in ((True, PURPLE, "planned in the air"), (False, "white", "planned standing")):
+        known = [(1 + p.number, p.solve_s) for j in result.jumps for p in j.plans if p.air == in_air]
+        clock.plot(
+            *np.reshape(known, (-1, 2)).T,
+            color=PURPLE,
+            linestyle="",
+            marker="o",
+            markersize=4,
+            markerfacecolor=face,
+            label=label,
+        )
+    clock.set(xlabel="jump", ylabel="time [s]", ylim=(0.0, None))
+    for ax in (error, clock):
+        ax.set_xticks(number)
+    panel_letters((error, clock))
+    handles, _ = clock.get_legend_handles_labels()
+    legend_above(fig, [*handles, Line2D([], [], **LIMIT_STYLE, label=f"{100 * TOLERANCE_M:g} cm")])
+    return fig

@@ -7,13 +7,14 @@ import pytest
 from fixtures_core import jump
 from matplotlib.path import Path
 from matplotlib.text import Text
+from paper import diagrams
 from scipy.ndimage import binary_dilation
 
 from jumplab import show as plotting
 from jumplab.errors import RobotError
 from jumplab.robot.stance import stance_configuration
 from jumplab.show import render
-from jumplab.show import simulation as pictures
+from jumplab.show import simulations as pictures
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
 from jumplab.task import JumpTask
@@ -111,12 +112,12 @@ def test_trials_sort_robots_by_their_fate(result):
     m = result.metrics
     fell = replace(m, landed=False)
     rows = [m, replace(m, foot_distance_m=0.9), fell, replace(fell, foot_distance_m=None)]
-    fig = pictures.trials(rows, TASK, nominal=m)
+    fig = plotting.trials(rows, TASK, nominal=m)
     (ax,) = fig.axes
     drawn = {line.get_label(): np.column_stack(line.get_data()) for line in ax.lines}
     assert {k: len(v) for k, v in drawn.items()} == {"target": 1, "landed": 2, "fell": 1, "as planned": 1}
     assert drawn["landed"][1] == pytest.approx([0.9, m.com_rise_m])
-    assert [len(pictures.trials(some, TASK).axes) for some in ([], rows[3:])] == [1, 1]
+    assert [len(plotting.trials(some, TASK).axes) for some in ([], rows[3:])] == [1, 1]
     assert smallest_font(fig) >= MIN_FONT_PT
 
 
@@ -220,6 +221,6 @@ def test_frame_strip_and_model_can_be_read(result, bhr, tmp_path):
     assert width == plotting.PAGE_IN and height < 5
     stored = []
     for folder in ("one", "two"):
-        plotting.save_figure(render.simulation_model(bhr), "model", tmp_path / folder)
+        plotting.save_figure(diagrams.simulation_model(bhr), "model", tmp_path / folder)
         stored.append([(tmp_path / folder / f"model.{kind}").read_bytes() for kind in ("png", "pdf")])
     assert stored[0] == stored[1]

@@ -6,7 +6,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from fixtures_core import jump
-from test_viewer import CHROMIUM, FLAGS, browser, count
+from test_show_page import CHROMIUM, FLAGS, browser, count
 
 from jumplab.show import page as viewer
 from jumplab.show.page import FPS

@@ -211,8 +211,9 @@ def picture(url, folder):
     shot = folder / "shot.png"
     with tempfile.TemporaryDirectory(dir=folder) as profile:
         command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", f"--screenshot={shot}", url]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=180, cwd=folder,
-                              env=os.environ | {"HOME": str(folder)})  # fmt: skip
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=180, cwd=folder, env=os.environ | {"HOME": str(folder)}
+        )
     assert shot.is_file(), done.stderr[-2000:]
     assert "Uncaught" not in done.stderr, [line for line in done.stderr.splitlines() if "Uncaught" in line]
     image = matplotlib.image.imread(shot)[:, :, :3]
@@ -239,8 +240,11 @@ def rows_of(image, phase):
 def test_browser_shows_launch_flight_and_landing(page, tmp_path):
     """The robot is painted in its phase's colour, and higher in flight than before and after."""
     url = Path(page.save(tmp_path / "jump.html")).as_uri()
-    seen = {"launch": picture(f"{url}#t=0.4", tmp_path), "flight": picture(f"{url}#t=1.1", tmp_path),
-            "landing": picture(f"{url}#t=3.5&view=corner", tmp_path)}  # fmt: skip
+    seen = {
+        "launch": picture(f"{url}#t=0.4", tmp_path),
+        "flight": picture(f"{url}#t=1.1", tmp_path),
+        "landing": picture(f"{url}#t=3.5&view=corner", tmp_path),
+    }
     for phase, image in seen.items():
         others = [count(image, p) for p in PHASE_COLORS if p != phase]
         assert count(image, phase) > 6000 and max(others) < 1500, (phase, count(image, phase), others)
