@@ -78,10 +78,10 @@ def data_vector(a: Assembled, rng) -> np.ndarray:
 def physical(a: Assembled, x, name):
     """Nodes, jerks and constants of one phase in physical units."""
     layout = a.layouts[name]
-    n, phase = layout.phase.intervals, layout.phase
-    nodes = np.array([x[layout.node(k)] for k in range(n + 1)]) * layout.node_scales()
-    jerks = np.array([x[layout.jerk(k)] for k in range(n)]) * phase.scale("j", layout.nq)
-    return nodes, jerks, x[layout.constants()] * layout.constant_scales()
+    phase = layout.phase
+    nodes = x[layout.nodes] * layout.node_scales
+    jerks = x[layout.jerks] * phase.scale("j")
+    return nodes, jerks, x[layout.constants] * layout.constant_scales
 
 
 def random_point(a: Assembled, seed):
@@ -92,8 +92,7 @@ def random_point(a: Assembled, seed):
 def test_every_variable_has_one_place(assembled):
     seen = []
     for layout in assembled.layouts.values():
-        n = layout.phase.intervals
-        seen += [layout.constants(), *(layout.node(k) for k in range(n + 1)), *(layout.jerk(k) for k in range(n))]
+        seen += [layout.constants, layout.nodes.ravel(), layout.jerks.ravel()]
     np.testing.assert_array_equal(np.sort(np.concatenate(seen)), np.arange(assembled.size))
 
 
@@ -177,7 +176,7 @@ def test_state_equation_is_the_chain(assembled):
         step, nq = constants[0] / layout.phase.intervals, layout.nq
         state = rng.normal(size=(3, nq))
         for k in range(layout.phase.intervals + 1):
-            place, scales = layout.node(k), layout.node_scales()
+            place, scales = layout.nodes[k], layout.node_scales
             x[place[: 3 * nq]] = state.ravel() / scales[: 3 * nq]
             if k < layout.phase.intervals:
                 state = np.array(chain(*state, jerks[k], step))

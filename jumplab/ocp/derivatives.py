@@ -1,9 +1,8 @@
-"""One repeated small function as a part of a sparse NLP: values and exact derivatives for all repetitions at a time."""
+"""Exact sparse derivatives: each place of a problem is one small function, differentiated once, called everywhere."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,10 +11,9 @@ import numpy as np
 
 from jumplab.ocp.problem import PhaseLayout, Point, Problem, Term
 
-# elements ------------------------------------------------------------------------------------------
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
-RARE = ("gauss_newton",)  # evaluated seven times a plan: the search for what its entries share would not pay
 FUNCTIONS = ("costs", "gradient", "rows", "jacobian", "hessian", "gauss_newton")  # that an element may be asked for
+RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
 def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
@@ -99,17 +97,25 @@ class Formulas:
 
 
 class Element:
-    """One small function, repeated: its terms, its variables in each repetition, its nodes.
+    """One small function, repeated: its terms, and what is made of them for all meshes.
 
     Attributes
     ----------
     owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.  ny : number of its variables.
     costs : its cost terms.  rows : its constraint terms, each with its number of rows.
-    made : name -> function, rows and columns of its nonzeros; shared by all meshes.
+    made : name -> function, rows and columns of its nonzeros.
     """
 
-    def __init__(self, owner: str, place: str, ny: int, costs: list[Term], rows: list[tuple[Term, int]],
-                 formulas: Formulas | None = None, made: dict | None = None):  # fmt: skip
+    def __init__(
+        self,
+        owner: str,
+        place: str,
+        ny: int,
+        costs: list[Term],
+        rows: list[tuple[Term, int]],
+        formulas: Formulas | None = None,
+        made: dict | None = None,
+    ):
         self.owner, self.place, self.ny, self.costs, self.rows = owner, place, ny, costs, rows
         self._formulas, self.made = formulas, made or {}
 
@@ -119,24 +125,21 @@ class Element:
             self.made[name] = self._formulas.make(name)
         return self.made[name]
 
-    def on(self, layouts: dict[str, PhaseLayout]) -> Element:
-        """The same functions on a mesh: their variables ``index`` (n, ny), their ``nodes``, ``share`` of a step."""
-        new = copy(self)
+    def on(self, layouts: dict[str, PhaseLayout]) -> tuple[range, np.ndarray]:
+        """(nodes at which it is called, its variables (n, ny) each time) on a mesh."""
         if self.place == "problem":
-            parts = [(x.constants(), x.node(0), x.node(x.phase.intervals)) for x in layouts.values()]
-            new.index, new.nodes, new.share = np.concatenate([x for part in parts for x in part])[None], [0], None
-            return new
+            parts = [y for x in layouts.values() for y in (x.constants, x.nodes[0], x.nodes[-1])]
+            return range(1), np.concatenate(parts)[None]
         layout = layouts[self.owner]
         n = layout.phase.intervals
-        new.nodes = {"node": range(n + 1), "start": (0,), "end": (n,), "interval": range(n)}[self.place]
-        new.share, ends = 1 / n, [(layout.constants(), layout.node(k)) for k in new.nodes]
+        nodes = {"node": range(n + 1), "start": range(1), "end": range(n, n + 1), "interval": range(n)}[self.place]
+        parts = [np.broadcast_to(layout.constants, (len(nodes), len(layout.constants))), layout.nodes[nodes]]
         if self.place == "interval":
-            ends = [(*e, layout.jerk(k), layout.node(k + 1)) for e, k in zip(ends, new.nodes, strict=True)]
-        new.index = np.array([np.concatenate(e) for e in ends])
-        return new
+            parts += [layout.jerks, layout.nodes[1:]]
+        return nodes, np.concatenate(parts, axis=1)
 
 
-def _columns(expression):
+def _column(expression):
     return ca.vertcat(*expression) if isinstance(expression, (list, tuple)) else ca.SX(expression)
 
 
@@ -145,35 +148,25 @@ class ElementBuilder:
 
     def __init__(self, problem: Problem, layouts: dict[str, PhaseLayout]):
         self.problem, self.layouts = problem, layouts
-        self.parameters = SimpleNamespace()
-        symbols = []
-        for name, size in problem.parameters.items():
-            symbol = ca.SX.sym(name, size)
-            setattr(self.parameters, name, symbol)
-            symbols.append(symbol)
-        self.parameter_vector = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+        symbols = {name: ca.SX.sym(name, size) for name, size in problem.parameters.items()}
+        self.parameters, self.parameter_vector = SimpleNamespace(**symbols), ca.vertcat(ca.SX(0, 1), *symbols.values())
         self.elements = [e for layout in layouts.values() for e in self._phase(layout)]
         if problem.joints:
             self.elements.append(self._joints())
 
     def _point(self, layout, state, jerk, constants, s, refs):
         nq, phase = layout.nq, layout.phase
-        x = ca.DM(layout.node_scales()) * state
-        const = ca.DM(layout.constant_scales()) * constants
+        x, const = ca.DM(layout.node_scales) * state, ca.DM(layout.constant_scales) * constants
         names = SimpleNamespace(**{n: const[1 + i] for i, n in enumerate(phase.constants)})
-        ref, at = SimpleNamespace(), 0
-        for name, size in phase.references.items():
-            setattr(ref, name, refs[at : at + size])
-            at += size
-        j = jerk * ca.DM(phase.scale("j", nq)) if jerk is not None else None
-        return Point(
-            x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], j, x[3 * nq :], const[0], s, names, self.parameters, ref
-        )
+        ends = np.cumsum([0, *phase.references.values()]).tolist()
+        ref = SimpleNamespace(**{n: refs[ends[i] : ends[i + 1]] for i, n in enumerate(phase.references)})
+        j = jerk * ca.DM(phase.scale("j")) if jerk is not None else None
+        q, v, a, z = x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], x[3 * nq :]
+        return Point(q, v, a, j, z, const[0], s, names, self.parameters, ref)
 
     def _phase(self, layout):
-        phase = layout.phase
-        nx, nref = 3 * layout.nq + layout.nz, sum(layout.phase.references.values())
-        constants, refs, s = ca.SX.sym("const", layout.n_const), ca.SX.sym("ref", nref), ca.SX.sym("s")
+        phase, nx, nref = layout.phase, layout.nx, sum(layout.phase.references.values())
+        constants, refs, s = ca.SX.sym("const", len(layout.constants)), ca.SX.sym("ref", nref), ca.SX.sym("s")
         state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
         share = ca.SX.sym("share")  # of the phase, between two nodes
         step, data = constants[0] * share, ca.vertcat(s, refs, share)
@@ -182,47 +175,45 @@ class ElementBuilder:
             terms = [t for t in phase.terms if t.at == place]
             if terms:
                 part = step * _trapezoid(s) if place == "node" else 1.0
-                out = [self._weighted(t, _columns(t.expression(at_node)), part) for t in terms]
+                out = [_weighted(t, t.expression(at_node), part) for t in terms]
                 yield self._element(phase.name, place, ca.vertcat(constants, state), data, out, terms)
         left = self._point(layout, state, jerk, constants, s, refs)
         after = self._point(layout, right, None, constants, s + share, refs)
         q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
         mid = Point(q, v, a, left.j, left.z, left.duration, s + share / 2, left.c, left.p, left.ref)
-        terms, out = [defect_term()], [_defect(layout, left, after, step)]
+        terms, out = [defect_term()], [_defect(phase, left, after, step)]
         for t in phase.terms:
             if t.at == "mid":
                 terms.append(t)
-                out.append(self._weighted(t, _columns(t.expression(mid)), step))
+                out.append(_weighted(t, t.expression(mid), step))
             elif t.at == "interval":
                 terms.append(t)
-                out.append(self._weighted(t, _columns(t.expression(left, after, step)), 1.0))
+                out.append(_weighted(t, t.expression(left, after, step), 1.0))
         yield self._element(phase.name, "interval", ca.vertcat(constants, state, jerk, right), data, out, terms)
 
     def _joints(self):
         ends, symbols = {}, []
         for name, layout in self.layouts.items():
-            nx = 3 * layout.nq + layout.nz
-            constants, first, last = ca.SX.sym("const", layout.n_const), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
+            sizes = {"const": len(layout.constants), "x0": layout.nx, "x1": layout.nx}
+            constants, first, last = (ca.SX.sym(n, size) for n, size in sizes.items())
             refs = ca.SX.zeros(sum(layout.phase.references.values()))
-            ends[name] = SimpleNamespace(
-                start=self._point(layout, first, None, constants, 0.0, refs),
-                end=self._point(layout, last, None, constants, 1.0, refs),
-            )
+            start = self._point(layout, first, None, constants, 0.0, refs)
+            ends[name] = SimpleNamespace(start=start, end=self._point(layout, last, None, constants, 1.0, refs))
             symbols += [constants, first, last]
         terms = list(self.problem.joints)
-        out = [self._weighted(t, _columns(t.expression(ends)), 1.0) for t in terms]
+        out = [_weighted(t, t.expression(ends), 1.0) for t in terms]
         return self._element(self.problem.name, "problem", ca.vertcat(*symbols), ca.SX(0, 1), out, terms)
 
     def _element(self, owner, place, local, data, outputs, terms) -> Element:
-        costs = [(t, e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]
-        rows = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
+        pairs = list(zip(terms, outputs, strict=True))
+        costs, rows = [x for x in pairs if x[0].is_cost], [x for x in pairs if not x[0].is_cost]
         formulas = Formulas(local, data, self.parameter_vector, [e for _, e in costs], [e for _, e in rows])
         return Element(owner, place, local.numel(), [t for t, _ in costs], [(t, e.numel()) for t, e in rows], formulas)
 
-    @staticmethod
-    def _weighted(term, expression, step):
-        """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
-        return (step, expression) if term.is_cost else expression / term.scale
+
+def _weighted(term, expression, step):
+    """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
+    return (step, _column(expression)) if term.is_cost else _column(expression) / term.scale
 
 
 def _trapezoid(s):
@@ -235,25 +226,21 @@ def defect_term() -> Term:
     return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None, identity=True)
 
 
-def _defect(layout, left, right, step):
-    q, v, a = chain(left.q, left.v, left.a, left.j, step)
-    p, nq = layout.phase, layout.nq
-    return ca.vertcat(
-        (right.q - q) / p.scale("q", nq), (right.v - v) / p.scale("v", nq), (right.a - a) / p.scale("a", nq)
-    )
+def _defect(phase, left, right, step):
+    reached = chain(left.q, left.v, left.a, left.j, step)
+    return ca.vertcat(*((getattr(right, key) - x) / phase.scale(key) for key, x in zip("qva", reached, strict=True)))
 
 
-# pieces ------------------------------------------------------------------------------------------
 def scatter(index: np.ndarray, size: int) -> ca.DM:
-    """0/1 matrix that adds entry i of a vector to position index[i]."""
+    """0/1 matrix (size, len(index)) that adds entry i of a vector to position index[i]."""
     index = np.asarray(index, int)
     return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
 
 
-def gather(pieces: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
+def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
-    values = ca.vertcat(*(piece[0] for piece in pieces))
-    rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
+    values = ca.vertcat(*(x[0] for x in entries))
+    rows, cols = (np.concatenate([x[k] for x in entries]) for k in (1, 2))
     key = cols.astype(np.int64) * shape[0] + rows
     unique, inverse = np.unique(key, return_inverse=True)
     pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
@@ -262,59 +249,59 @@ def gather(pieces: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     return ca.MX(pattern, scatter(inverse, len(unique)) @ values)
 
 
-class Piece:
-    """What one element contributes to the NLP: its small functions, called for all repetitions."""
+class Block:
+    """What one element contributes to the NLP: its small functions, called for all repetitions.
 
-    def __init__(self, element: Element, inputs, weights, keep, first_row):
-        self.e, self.keep, self.first_row = element, keep, first_row
-        self.n, self.count = len(element.index), sum(count for _, count in element.rows)
+    Attributes
+    ----------
+    e : the element.  index : its variables (n, ny).  keep : which of its rows, over all repetitions, are in the NLP;
+        there they begin at ``first_row``.
+    """
+
+    def __init__(self, element: Element, index: np.ndarray, inputs, weights, keep: np.ndarray, first_row: int):
+        self.e, self.index, self.keep, self.first_row = element, index, keep, first_row
+        self.n, self.count = len(index), sum(count for _, count in element.rows)
         self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
         self.weights = ca.repmat(weights, 1, self.n)
 
-    def _map(self, function, values):
+    def _map(self, function, values=()):
         return function.map(self.n)(*self.inputs, *values)
 
-    def costs(self) -> tuple[ca.MX, ca.MX] | None:
-        """(weighted sum, unweighted parts) or None."""
-        if not self.e.costs:
-            return None
-        parts = ca.sum2(self._map(self.e.function("costs")[0], []))
+    def costs(self) -> tuple[ca.MX, ca.MX]:
+        """(weighted sum, unweighted parts)."""
+        parts = ca.sum2(self._map(self.e.function("costs")[0]))
         return ca.dot(self.weights[:, 0], parts), parts
 
-    def gradient(self) -> ca.MX:
-        """Local gradients, one under the other."""
-        return ca.vec(self._map(self.e.function("gradient")[0], [self.weights]))
+    def gradient(self, size: int) -> ca.MX:
+        """Of the costs with respect to all variables (size,)."""
+        local = self._map(self.e.function("gradient")[0], [self.weights])
+        return scatter(self.index.ravel(), size) @ ca.vec(local)
 
     def rows(self) -> ca.MX:
-        """Kept constraint rows."""
-        return ca.vec(self._map(self.e.function("rows")[0], []))[self.keep.tolist()]
+        """Constraint rows."""
+        return ca.vec(self._map(self.e.function("rows")[0]))[self.keep.tolist()]
 
     def jacobian(self) -> tuple:
-        """(values, rows, columns) of the kept rows' Jacobian."""
+        """(values, rows, columns) of the rows' Jacobian."""
         function, rows, cols = self.e.function("jacobian")
         row_of = np.full(self.count * self.n, -1)
         row_of[self.keep] = self.first_row + np.arange(len(self.keep))
         i = row_of[(np.arange(self.n)[:, None] * self.count + rows[None]).ravel()]
         used = i >= 0
-        values = ca.vec(self._map(function, []))[np.flatnonzero(used).tolist()]
-        return values, i[used], self.e.index[:, cols].ravel()[used]
+        values = ca.vec(self._map(function))[np.flatnonzero(used).tolist()]
+        return values, i[used], self.index[:, cols].ravel()[used]
 
-    def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple | None:
-        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
-        function, rows, cols = self.e.function("hessian")
-        if not len(rows):
-            return None
+    def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple:
+        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian."""
         mine = lam_g[self.first_row : self.first_row + len(self.keep)]
         spread = ca.reshape(scatter(self.keep, self.count * self.n) @ mine, self.count, self.n)
-        return self._upper(self._map(function, [self.weights, spread, ca.repmat(lam_f, 1, self.n)]), rows, cols)
+        return self._upper("hessian", [self.weights, spread, ca.repmat(lam_f, 1, self.n)])
 
-    def gauss_newton(self) -> tuple | None:
-        """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian, or None if it is zero."""
-        if not self.e.costs:
-            return None
-        function, rows, cols = self.e.function("gauss_newton")
-        return self._upper(self._map(function, [self.weights]), rows, cols)
+    def gauss_newton(self) -> tuple:
+        """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian."""
+        return self._upper("gauss_newton", [self.weights])
 
-    def _upper(self, values, rows, cols) -> tuple:
-        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
-        return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
+    def _upper(self, name, arguments) -> tuple:
+        function, rows, cols = self.e.function(name)
+        i, j = self.index[:, rows].ravel(), self.index[:, cols].ravel()
+        return ca.vec(self._map(function, arguments)), np.minimum(i, j), np.maximum(i, j)

@@ -17,7 +17,7 @@ from scipy.optimize import root
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.models.srmp import COORDINATES
-from jumplab.ocp.nlp import Nlp, PhaseGuess, PhaseSolution, Statistics
+from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach

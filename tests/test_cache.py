@@ -5,7 +5,7 @@ import pytest
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
-from jumplab.ocp import cache as kept
+from jumplab.ocp import cache
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
 
@@ -27,12 +27,12 @@ def counted(monkeypatch):
                 fresh.append(problem.name)
             super().__init__(problem, elements)
 
-    monkeypatch.setattr(kept, "Assembled", Counting)
+    monkeypatch.setattr(cache, "Assembled", Counting)
     return fresh
 
 
-def test_kept_is_the_same(place, counted):
-    first, again = (kept.assembled(toy(), "a") for _ in range(2))
+def test_what_is_kept_is_the_same(place, counted):
+    first, again = (cache.assembled(toy(), "a") for _ in range(2))
     assert counted == ["toy"] and len(list(place.iterdir())) == 1
     x, p, rng = random_point(first, 3)
     lam = rng.normal(size=first.n_rows)
@@ -55,7 +55,7 @@ def test_solves_alike(place):
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "bit", "words", "folder"])
 def test_a_damaged_file_is_passed_over_and_replaced(place, counted, damage):
-    kept.assembled(toy(), "a")
+    cache.assembled(toy(), "a")
     (path,) = place.iterdir()
     data = path.read_bytes()
     if damage == "folder":
@@ -64,7 +64,7 @@ def test_a_damaged_file_is_passed_over_and_replaced(place, counted, damage):
     else:
         flipped = data[:5000] + bytes([data[5000] ^ 1]) + data[5001:]
         path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "bit": flipped, "words": b"good\nday\n"}[damage])
-    assert kept.assembled(toy(), "a").n_rows > 0
+    assert cache.assembled(toy(), "a").n_rows > 0
     assert len(counted) == 2
     if damage != "folder":
         assert path.read_bytes() == data and [p.name for p in place.iterdir()] == [path.name]
@@ -72,18 +72,18 @@ def test_a_damaged_file_is_passed_over_and_replaced(place, counted, damage):
 
 def test_other_keys_are_other_files(place, counted):
     for key in ("a", "b", "a"):
-        kept.assembled(toy(), key)
+        cache.assembled(toy(), key)
     assert len(counted) == 2 and len(list(place.iterdir())) == 2
 
 
 def test_nothing_is_kept_unasked(place, counted, monkeypatch):
-    kept.assembled(toy())
+    cache.assembled(toy())
     assert not place.exists()
     monkeypatch.setenv("JUMPLAB_CACHE", "")
-    assert kept.folder() is None and kept.assembled(toy(), "a").n_rows > 0
+    assert cache.folder() is None and cache.assembled(toy(), "a").n_rows > 0
     assert len(counted) == 2
 
 
 def test_a_folder_that_cannot_be_written_is_no_failure(monkeypatch, counted):
     monkeypatch.setenv("JUMPLAB_CACHE", "/dev/null/x")
-    assert kept.assembled(toy(), "a").n_rows > 0 and counted == ["toy"]
+    assert cache.assembled(toy(), "a").n_rows > 0 and counted == ["toy"]
