@@ -21,15 +21,15 @@ from jumplab.task import GRAVITY
 NEGLIGIBLE = 1e-14  # share of the largest of some coefficients: below it is rounding
 
 
-def _turned(arms: np.ndarray, turns) -> tuple:
-    """(x, z) of the sum over j of arms (5, 2), each turned by its CasADi pair (cos, sin), skipping zeros."""
+def _turned(arms: np.ndarray, turns) -> list:
+    """(x, z) of the sum over j of arms (5, 2), each by its CasADi matrix ((xx, xz), (zx, zz)), skipping zeros."""
     x, z = 0, 0
-    for (dx, dz), (c, s) in zip(arms, turns, strict=True):
+    for (dx, dz), ((xx, xz), (zx, zz)) in zip(arms, turns, strict=True):
         if dx:
-            x, z = x + dx * c, z - dx * s
+            x, z = x + dx * xx, z + dx * zx
         if dz:
-            x, z = x + dz * s, z + dz * c
-    return x, z
+            x, z = x + dz * xz, z + dz * zz
+    return [x, z]
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,15 @@ class PlanarState:
 
     @cached_property
     def _turns(self):
-        """Per order of differentiation, and per angle, (cos, sin) and their derivatives in time."""
+        """Per order of differentiation in time, and per angle, its rotation matrix ((xx, xz), (zx, zz))."""
         place, velocity, acceleration = [], [], []
         for j in range(5):
             c, s = ca.cos(self.angles[j]), ca.sin(self.angles[j])
             w, a = self.rates[j], self.accels[j]
-            place.append((c, s))
-            velocity.append((-s * w, c * w))
-            acceleration.append((-s * a - c * w * w, c * a - s * w * w))
+            place.append(((c, s), (-s, c)))
+            velocity.append(((-s * w, c * w), (-c * w, -s * w)))
+            p, q = -s * a - c * w * w, c * a - s * w * w
+            acceleration.append(((p, q), (-q, p)))
         return place, velocity, acceleration
 
     def point(self, name_or_arms: str | np.ndarray, order: int = 0) -> ca.SX:
@@ -231,5 +232,5 @@ def evaluator(model: SagittalModel, gravity: float = GRAVITY) -> ca.Function:
         "sole": s.point(sole),
         "heel": s.point("heel"),
     }
-    return ca.Function("planar", [a, w, b, toe], list(outputs.values()), ["angles", "rates", "accels", "toe"],
-                       list(outputs))  # fmt: skip
+    inputs = {"angles": a, "rates": w, "accels": b, "toe": toe}
+    return ca.Function("planar", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
