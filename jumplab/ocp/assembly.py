@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from jumplab.errors import InputError
-from jumplab.ocp.derivatives import Block, Element, ElementBuilder, gather
+from jumplab.ocp.derivatives import Block, Element, ElementBuilder, gather, scatter
 from jumplab.ocp.problem import PhaseLayout, Problem, Term
 from jumplab.ocp.solution import Multipliers, PhaseGuess, PhaseSolution, resampled
 
@@ -27,26 +27,6 @@ class Row:
     term: Term
     node: int
     component: int
-
-
-@dataclass(frozen=True)
-class RowGroup:
-    """All rows of one term: ``index`` (K, C) in the row vector, ``nodes`` (K,), ``share`` (K,) of the phase."""
-
-    owner: str
-    term: Term
-    index: np.ndarray
-    nodes: np.ndarray
-    share: np.ndarray
-    intervals: int  # 0 for terms that join phases
-
-    @property
-    def density(self) -> float:
-        """What makes a multiplier independent of the mesh: limits along a phase share their force among the nodes.
-
-        Links of the motion have costates, which do not depend on the number of nodes; neither do rows at one instant.
-        """
-        return float(self.intervals) if self.term.at in ("node", "mid") and not self.term.identity else 1.0
 
 
 class Assembled:
@@ -95,9 +75,9 @@ class Assembled:
             first_row, keep = len(self.rows), self._add_rows(e, nodes)
             weights = p[weight_at : weight_at + len(e.costs)]
             weight_at += len(e.costs)
-            local = ca.reshape(x[index.ravel().tolist()], index.shape[1], len(index))
-            inputs = (local, self._data(p, e, nodes), p[: self.n_par])
-            yield Block(e, index, inputs, weights, keep, first_row)
+            local, n = ca.reshape(x[index.ravel().tolist()], index.shape[1], len(index)), len(index)
+            inputs = (local, self._data(p, e, nodes), ca.repmat(p[: self.n_par], 1, n))
+            yield Block(e, index, keep, first_row, inputs, ca.repmat(weights, 1, n))
 
     def _add_rows(self, e: Element, nodes: range) -> np.ndarray:
         """Record the constraint rows of an element; return which of its local rows are kept."""
@@ -120,9 +100,10 @@ class Assembled:
     def _assemble(self) -> None:
         x, p, lam_f, lam_g = self._x, self._p, ca.MX.sym("lam_f"), ca.MX.sym("lam_g", self.n_rows)
         priced, bound = [b for b in self._blocks if b.e.costs], [b for b in self._blocks if b.e.rows]
-        costs, g = [b.costs() for b in priced], ca.vertcat(*(b.rows() for b in bound))
-        f, parts = sum(c[0] for c in costs), ca.vertcat(*(c[1] for c in costs))
-        grad = sum(b.gradient(self.size) for b in priced)
+        parts = [ca.sum2(b("costs")) for b in priced]
+        f = sum(ca.dot(b.weights[:, 0], part) for b, part in zip(priced, parts, strict=True))
+        g = ca.vertcat(*(ca.vec(b("rows"))[b.keep.tolist()] for b in bound))
+        grad = sum(scatter(b.index.ravel(), self.size) @ ca.vec(b("gradient", b.weights)) for b in priced)
         jac = gather([b.jacobian() for b in bound], (self.n_rows, self.size))
         hess = gather([b.hessian(lam_f, lam_g) for b in self._blocks], (self.size, self.size))
         names, of_hessian = ["x", "p"], ["x", "p", "lam_f", "lam_g"]
@@ -130,7 +111,7 @@ class Assembled:
         self.grad_f = ca.Function("nlp_grad_f", [x, p], [f, grad], names, ["f", "grad_f_x"])
         self.jac_g = ca.Function("nlp_jac_g", [x, p], [g, jac], names, ["g", "jac_g_x"])
         self.hess_lag = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess], of_hessian, ["triu_hess_gamma_x_x"])
-        self.cost_parts = ca.Function("cost_parts", [x, p], [parts])
+        self.cost_parts = ca.Function("cost_parts", [x, p], [ca.vertcat(*parts)])
 
     @cached_property
     def gauss_newton(self) -> ca.Function:
@@ -139,19 +120,13 @@ class Assembled:
         return ca.Function("gauss_newton", [self._x, self._p], [hess], ["x", "p"], ["triu_hess_f"])
 
     @cached_property
-    def groups(self) -> tuple[RowGroup, ...]:
-        """The rows by term."""
+    def groups(self) -> list[tuple[str, Term, np.ndarray]]:
+        """The rows by term: (owner, term, their indices (K, C)), at K places C components."""
         found: dict[tuple, list] = {}
         for i, row in enumerate(self.rows):
             found.setdefault((row.owner, row.term.name), []).append(i)
-        out = []
-        for (owner, _), places in found.items():
-            term, count = self.rows[places[0]].term, 1 + max(self.rows[i].component for i in places)
-            nodes = np.array([self.rows[i].node for i in places[::count]])
-            n = self.layouts[owner].phase.intervals if owner in self.layouts else 0
-            share = (nodes + (0.5 if term.at in ("mid", "interval") else 0.0)) / max(n, 1)
-            out.append(RowGroup(owner, term, np.array(places).reshape(-1, count), nodes, share, n))
-        return tuple(out)
+        firsts = ((self.rows[i[0]], 1 + max(self.rows[k].component for k in i), i) for i in found.values())
+        return [(row.owner, row.term, np.array(i).reshape(-1, count)) for row, count, i in firsts]
 
 
 @dataclass(frozen=True)
@@ -241,11 +216,10 @@ def _is_off(owner: str, name: str, off: Container[str]) -> bool:
 def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of all rows (n_rows,), scaled; none for terms that are ``off``."""
     low, high = np.full(a.n_rows, -np.inf), np.full(a.n_rows, np.inf)
-    for g in a.groups:
-        if not _is_off(g.owner, g.term.name, off):
-            count = g.index.shape[1]
-            low[g.index] = _resolve(g.term.lower, parameters, count) / g.term.scale
-            high[g.index] = _resolve(g.term.upper, parameters, count) / g.term.scale
+    for owner, term, index in a.groups:
+        if not _is_off(owner, term.name, off):
+            low[index] = _resolve(term.lower, parameters, index.shape[1]) / term.scale
+            high[index] = _resolve(term.upper, parameters, index.shape[1]) / term.scale
     return low, high
 
 
@@ -330,9 +304,24 @@ def unpack(a: Assembled, x: np.ndarray) -> dict[str, PhaseSolution]:
     return out
 
 
+def _along(a: Assembled, owner: str, term: Term, index: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shares of the phase (K,) at which rows (K, C) stand, and what makes their multipliers independent of the mesh.
+
+    Limits along a phase share their force among the nodes. Links of the motion have costates, which do not depend on
+    the number of nodes; neither do rows at one instant.
+    """
+    n = a.layouts[owner].phase.intervals if owner in a.layouts else 1
+    nodes = np.array([a.rows[i].node for i in index[:, 0]])
+    share = (nodes + (0.5 if term.at in ("mid", "interval") else 0.0)) / n
+    return share, float(n) if term.at in ("node", "mid") and not term.identity else 1.0
+
+
 def unpack_multipliers(a: Assembled, lam_x: np.ndarray, lam_g: np.ndarray) -> Multipliers:
     """Multipliers of rows and bounds by name and share of the phase, so that another mesh can begin with them."""
-    rows = {(g.owner, g.term.name): (g.share, lam_g[g.index] * g.density) for g in a.groups}
+    rows = {}
+    for owner, term, index in a.groups:
+        share, density = _along(a, owner, term, index)
+        rows[owner, term.name] = share, lam_g[index] * density
     nodes = {n: lam_x[x.nodes] * x.phase.intervals for n, x in a.layouts.items()}
     return Multipliers(rows, nodes, {n: lam_x[x.constants] for n, x in a.layouts.items()})
 
@@ -340,9 +329,9 @@ def unpack_multipliers(a: Assembled, lam_x: np.ndarray, lam_g: np.ndarray) -> Mu
 def pack_multipliers(a: Assembled, given: Multipliers) -> tuple[np.ndarray, np.ndarray]:
     """(lam_x, lam_g) for this mesh from multipliers of the same problem on any mesh."""
     lam_x, lam_g = np.zeros(a.size), np.zeros(a.n_rows)
-    for g in a.groups:
-        share, values = given.rows[g.owner, g.term.name]
-        lam_g[g.index] = resampled(share, values, g.share) / g.density
+    for owner, term, index in a.groups:
+        share, density = _along(a, owner, term, index)
+        lam_g[index] = resampled(*given.rows[owner, term.name], share) / density
     for name, layout in a.layouts.items():
         n, nodes = layout.phase.intervals, given.nodes[name]
         lam_x[layout.nodes] = resampled(np.linspace(0, 1, len(nodes)), nodes, np.linspace(0, 1, n + 1)) / n

@@ -21,7 +21,7 @@ from platformdirs import user_cache_path
 from jumplab.errors import InputError
 from jumplab.io.files import write_file
 from jumplab.ocp.assembly import Assembled
-from jumplab.ocp.derivatives import FUNCTIONS, Element, defect_term
+from jumplab.ocp.derivatives import FUNCTIONS, Element, chain_term
 from jumplab.ocp.problem import Problem
 
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
@@ -89,7 +89,7 @@ def _told(e: Element) -> dict:
     names = [name for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
     made = {name: e.function(name) for name in names}
     return {
-        "place": [e.owner, e.place, e.ny],
+        "place": [e.owner, e.place],
         "costs": [t.name for t in e.costs],
         "rows": [(t.name, count) for t, count in e.rows],
         "made": {name: (f.serialize(), rows.tolist(), cols.tolist()) for name, (f, rows, cols) in made.items()},
@@ -103,17 +103,18 @@ def _read(path: Path, problem: Problem) -> list[Element] | None:
         if hashlib.sha256(body).hexdigest().encode() != total:
             return None
         terms = {(owner, t.name): t for owner, t in problem.terms()}
-        terms |= {(phase.name, defect_term().name): defect_term() for phase in problem.phases}
+        chains = {p.name: chain_term(p) for p in problem.phases}
+        terms |= {(owner, t.name): t for owner, t in chains.items()}
         return [_element(e, terms) for e in json.loads(body)]
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):
         return None
 
 
 def _element(e: dict, terms: dict) -> Element:
-    owner, place, ny = e["place"]
+    owner, place = e["place"]
     costs, rows = [terms[owner, name] for name in e["costs"]], [(terms[owner, name], n) for name, n in e["rows"]]
     made = {
         name: (ca.Function.deserialize(text), np.array(i, int), np.array(j, int))
         for name, (text, i, j) in e["made"].items()
     }
-    return Element(owner, place, ny, costs, rows, made=made)
+    return Element(owner, place, costs, rows, made=made)

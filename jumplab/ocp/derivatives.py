@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from jumplab.ocp.problem import PhaseLayout, Point, Problem, Term
+from jumplab.ocp.problem import Phase, PhaseLayout, Point, Problem, Term
 
+JERK_CHAIN = "jerk chain"  # the term that every phase has
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
-FUNCTIONS = ("costs", "gradient", "rows", "jacobian", "hessian", "gauss_newton")  # that an element may be asked for
+MATRICES = ("jacobian", "hessian", "gauss_newton")  # of the symmetric ones the upper triangle
+FUNCTIONS = ("costs", "gradient", "rows", *MATRICES)  # that an element may be asked for
 RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
@@ -21,108 +24,105 @@ def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
     return q + h * v + h * h / 2 * a + h**3 / 6 * j, v + h * a + h * h / 2 * j, a + h * j
 
 
+@dataclass
 class Formulas:
-    """One element in symbols, from which its functions are made.
+    """One element in symbols: its variables, its data (share of the phase, references, step), the parameters.
 
-    Their arguments are the element's variables, its data (share of the phase, references, step), the parameters, and as
-    needed the weights of the costs, the multipliers of the rows, and the multiplier of the cost.
+    ``costs`` are (share, column), meaning share |column|^2; ``rows`` are scaled columns.
     """
 
-    def __init__(self, local, data, parameters, costs, rows):
-        """``costs`` are (share, column), meaning share |column|^2; ``rows`` scaled columns."""
-        self.local, self.costs, self.ny = local, costs, local.numel()
-        self.arguments = [local, data, parameters]
-        self.w = ca.SX.sym("w", len(costs))
-        self.parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for share, y in costs))
-        self.g = ca.vertcat(ca.SX(0, 1), *rows)
+    local: ca.SX
+    data: ca.SX
+    parameters: ca.SX
+    costs: list[tuple]
+    rows: list[ca.SX]
+
+    def __post_init__(self):
+        self.w, self.lam_f = ca.SX.sym("w", len(self.costs)), ca.SX.sym("lam_f")  # weights, multiplier of the cost
+        self.parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for share, y in self.costs))
+        self.g = ca.vertcat(ca.SX(0, 1), *self.rows)
+        self.lam = ca.SX.sym("lam", self.g.numel())  # multipliers of the rows
 
     def make(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
-        """One of :data:`FUNCTIONS` as (function of a column of values, their rows, their columns)."""
-        symbols, output, sparsity = getattr(self, f"_{name}")()
-        function = ca.Function(name, [*self.arguments, *symbols], [output], {"cse": name not in RARE})
-        places = sparsity.get_triplet() if sparsity is not None else ((), ())
-        return function, *(np.array(z, int) for z in places)
+        """One of :data:`FUNCTIONS`: (function of a column of values, and of a matrix its values' rows, columns)."""
+        more = {"gradient": [self.w], "hessian": [self.w, self.lam, self.lam_f], "gauss_newton": [self.w]}
+        expression, rows, cols = getattr(self, f"_{name}")(), (), ()
+        if name in MATRICES:
+            rows, cols = expression.sparsity().get_triplet()
+            expression = ca.vertcat(ca.SX(0, 1), *expression.nonzeros())
+        arguments = [self.local, self.data, self.parameters, *more.get(name, [])]
+        function = ca.Function(name, arguments, [expression], {"cse": name not in RARE})
+        return function, np.array(rows, int), np.array(cols, int)
 
     def _costs(self):
-        return [], self.parts, None
+        return self.parts
 
     def _gradient(self):
-        return [self.w], ca.gradient(ca.dot(self.w, self.parts) if self.costs else ca.SX(0), self.local), None
+        return ca.gradient(ca.dot(self.w, self.parts) if self.costs else ca.SX(0), self.local)
 
     def _rows(self):
-        return [], self.g, None
+        return self.g
 
     def _jacobian(self):
-        j = ca.jacobian(self.g, self.local)
-        return [], ca.vertcat(*j.nonzeros()), j.sparsity()
+        return ca.jacobian(self.g, self.local)
 
     def _hessian(self):
-        """Upper triangle of the Lagrangian's Hessian."""
-        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
-        h = ca.triu(self._curvature(lam, scale))
-        return [self.w, lam, scale], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
+        return ca.triu(self._curvature())
 
     def _gauss_newton(self):
-        """Upper triangle of the costs' Hessian without their own curvature."""
-        h = ca.triu(self._squares(1.0)[0])
-        return [self.w], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
+        return ca.triu(self._squares(1.0)[0])
 
     def _squares(self, scale) -> tuple:
         """(2 w J^T J summed over the costs w |y|^2, [(share, y, J, 2 w) of each])."""
-        total, parts = ca.SX(self.ny, self.ny), []
+        ny = self.local.numel()
+        total, parts = ca.SX(ny, ny), []
         for k, (share, y) in enumerate(self.costs):
-            jacobian = ca.jacobian(y, self.local)
-            weight = 2 * scale * self.w[k] * share
+            jacobian, weight = ca.jacobian(y, self.local), 2 * scale * self.w[k] * share
             total += weight * (jacobian.T @ jacobian)
             parts.append((share, y, jacobian, weight))
         return total, parts
 
-    def _curvature(self, lam, scale):
-        """Hessian of scale * cost + lam . g.
+    def _curvature(self):
+        """Hessian of the Lagrangian, lam_f * cost + lam . g.
 
         A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
         everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
         """
         x, ys, mus = self.local, [], []
-        extra, parts = self._squares(scale)
+        extra, parts = self._squares(self.lam_f)
         for k, (share, y, jacobian, weight) in enumerate(parts):
-            mixed = ca.jacobian(share, x).T @ (2 * scale * self.w[k] * (y.T @ jacobian))
+            mixed = ca.jacobian(share, x).T @ (2 * self.lam_f * self.w[k] * (y.T @ jacobian))
             extra += mixed + mixed.T
             ys, mus = [*ys, y], [*mus, weight * y]
         y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
         held = ca.SX.sym("mu", y.numel())
-        bent = ca.hessian(ca.dot(held, y) + ca.dot(lam, self.g), x)[0]
-        symbols = [x, self.arguments[1], self.arguments[2], lam, held]
+        bent = ca.hessian(ca.dot(held, y) + ca.dot(self.lam, self.g), x)[0]
+        symbols = [x, self.data, self.parameters, self.lam, held]
         return extra + ca.Function("bent", symbols, [bent])(*symbols[:-1], mu)
 
 
+@dataclass
 class Element:
     """One small function, repeated: its terms, and what is made of them for all meshes.
 
     Attributes
     ----------
-    owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.  ny : number of its variables.
-    costs : its cost terms.  rows : its constraint terms, each with its number of rows.
-    made : name -> function, rows and columns of its nonzeros.
+    owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.
+    costs, rows : its cost terms, and its constraint terms, each with its number of rows.
+    formulas : None if all functions are already ``made``: name -> (function, rows, columns), see :class:`Formulas`.
     """
 
-    def __init__(
-        self,
-        owner: str,
-        place: str,
-        ny: int,
-        costs: list[Term],
-        rows: list[tuple[Term, int]],
-        formulas: Formulas | None = None,
-        made: dict | None = None,
-    ):
-        self.owner, self.place, self.ny, self.costs, self.rows = owner, place, ny, costs, rows
-        self._formulas, self.made = formulas, made or {}
+    owner: str
+    place: str
+    costs: list[Term]
+    rows: list[tuple[Term, int]]
+    formulas: Formulas | None = None
+    made: dict = field(default_factory=dict)
 
     def function(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS`, made when it is first asked for."""
         if name not in self.made:
-            self.made[name] = self._formulas.make(name)
+            self.made[name] = self.formulas.make(name)
         return self.made[name]
 
     def on(self, layouts: dict[str, PhaseLayout]) -> tuple[range, np.ndarray]:
@@ -137,10 +137,6 @@ class Element:
         if self.place == "interval":
             parts += [layout.jerks, layout.nodes[1:]]
         return nodes, np.concatenate(parts, axis=1)
-
-
-def _column(expression):
-    return ca.vertcat(*expression) if isinstance(expression, (list, tuple)) else ca.SX(expression)
 
 
 class ElementBuilder:
@@ -170,26 +166,20 @@ class ElementBuilder:
         state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
         share = ca.SX.sym("share")  # of the phase, between two nodes
         step, data = constants[0] * share, ca.vertcat(s, refs, share)
-        at_node = self._point(layout, state, None, constants, s, refs)
+        here = self._point(layout, state, None, constants, s, refs)
+        left = self._point(layout, state, jerk, constants, s, refs)
+        after = self._point(layout, right, None, constants, s + share, refs)
+        mid = replace(left, s=s + share / 2, memo={})
+        mid.q, mid.v, mid.a = chain(left.q, left.v, left.a, left.j, step / 2)
+        seen = {"node": (here,), "start": (here,), "end": (here,), "mid": (mid,), "interval": (left, after, step)}
+        spans = {"node": step * _trapezoid(s), "mid": step}
+        node, span = ca.vertcat(constants, state), ca.vertcat(constants, state, jerk, right)
         for place in ("node", "start", "end"):
             terms = [t for t in phase.terms if t.at == place]
             if terms:
-                part = step * _trapezoid(s) if place == "node" else 1.0
-                out = [_weighted(t, t.expression(at_node), part) for t in terms]
-                yield self._element(phase.name, place, ca.vertcat(constants, state), data, out, terms)
-        left = self._point(layout, state, jerk, constants, s, refs)
-        after = self._point(layout, right, None, constants, s + share, refs)
-        q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
-        mid = Point(q, v, a, left.j, left.z, left.duration, s + share / 2, left.c, left.p, left.ref)
-        terms, out = [defect_term()], [_defect(phase, left, after, step)]
-        for t in phase.terms:
-            if t.at == "mid":
-                terms.append(t)
-                out.append(_weighted(t, t.expression(mid), step))
-            elif t.at == "interval":
-                terms.append(t)
-                out.append(_weighted(t, t.expression(left, after, step), 1.0))
-        yield self._element(phase.name, "interval", ca.vertcat(constants, state, jerk, right), data, out, terms)
+                yield self._element(phase.name, place, node, data, terms, seen, spans)
+        terms = [chain_term(phase), *(t for t in phase.terms if t.at in ("mid", "interval"))]
+        yield self._element(phase.name, "interval", span, data, terms, seen, spans)
 
     def _joints(self):
         ends, symbols = {}, []
@@ -200,20 +190,22 @@ class ElementBuilder:
             start = self._point(layout, first, None, constants, 0.0, refs)
             ends[name] = SimpleNamespace(start=start, end=self._point(layout, last, None, constants, 1.0, refs))
             symbols += [constants, first, last]
-        terms = list(self.problem.joints)
-        out = [_weighted(t, t.expression(ends), 1.0) for t in terms]
-        return self._element(self.problem.name, "problem", ca.vertcat(*symbols), ca.SX(0, 1), out, terms)
+        local, seen = ca.vertcat(*symbols), {"problem": (ends,)}
+        return self._element(self.problem.name, "problem", local, ca.SX(0, 1), self.problem.joints, seen, {})
 
-    def _element(self, owner, place, local, data, outputs, terms) -> Element:
-        pairs = list(zip(terms, outputs, strict=True))
-        costs, rows = [x for x in pairs if x[0].is_cost], [x for x in pairs if not x[0].is_cost]
-        formulas = Formulas(local, data, self.parameter_vector, [e for _, e in costs], [e for _, e in rows])
-        return Element(owner, place, local.numel(), [t for t, _ in costs], [(t, e.numel()) for t, e in rows], formulas)
-
-
-def _weighted(term, expression, step):
-    """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
-    return (step, _column(expression)) if term.is_cost else _column(expression) / term.scale
+    def _element(self, owner, place, local, data, terms, seen, spans) -> Element:
+        """Terms evaluated on the points that they see; costs count for the share of the phase that they span."""
+        costs, rows, counts = [], [], []
+        for t in terms:
+            y = t.expression(*seen[t.at])
+            y = ca.vertcat(*y) if isinstance(y, (list, tuple)) else ca.SX(y)
+            if t.is_cost:
+                costs.append((spans.get(t.at, 1.0), y))
+            else:
+                rows.append(y / t.scale)
+                counts.append((t, y.numel()))
+        formulas = Formulas(local, data, self.parameter_vector, costs, rows)
+        return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
 
 
 def _trapezoid(s):
@@ -221,14 +213,15 @@ def _trapezoid(s):
     return 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
 
 
-def defect_term() -> Term:
-    """The exact step under constant jerk from node to node, as a term."""
-    return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None, identity=True)
+def chain_term(phase: Phase) -> Term:
+    """The exact step under constant jerk from node to node, as a term of every phase."""
 
+    def defect(left, right, step):
+        reached = chain(left.q, left.v, left.a, left.j, step)
+        off = zip("qva", (right.q, right.v, right.a), reached, strict=True)
+        return ca.vertcat(*((there - x) / phase.scale(key) for key, there, x in off))
 
-def _defect(phase, left, right, step):
-    reached = chain(left.q, left.v, left.a, left.j, step)
-    return ca.vertcat(*((getattr(right, key) - x) / phase.scale(key) for key, x in zip("qva", reached, strict=True)))
+    return Term(JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval", defect, identity=True)
 
 
 def scatter(index: np.ndarray, size: int) -> ca.DM:
@@ -249,59 +242,50 @@ def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     return ca.MX(pattern, scatter(inverse, len(unique)) @ values)
 
 
+@dataclass
 class Block:
     """What one element contributes to the NLP: its small functions, called for all repetitions.
 
     Attributes
     ----------
-    e : the element.  index : its variables (n, ny).  keep : which of its rows, over all repetitions, are in the NLP;
-        there they begin at ``first_row``.
+    e : the element.  index : its variables (n, ny).
+    keep : which of its rows, over all repetitions, are in the NLP; there they begin at ``first_row``.
+    inputs, weights : MX columns for every repetition.
     """
 
-    def __init__(self, element: Element, index: np.ndarray, inputs, weights, keep: np.ndarray, first_row: int):
-        self.e, self.index, self.keep, self.first_row = element, index, keep, first_row
-        self.n, self.count = len(index), sum(count for _, count in element.rows)
-        self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
-        self.weights = ca.repmat(weights, 1, self.n)
+    e: Element
+    index: np.ndarray
+    keep: np.ndarray
+    first_row: int
+    inputs: tuple
+    weights: ca.MX
 
-    def _map(self, function, values=()):
-        return function.map(self.n)(*self.inputs, *values)
-
-    def costs(self) -> tuple[ca.MX, ca.MX]:
-        """(weighted sum, unweighted parts)."""
-        parts = ca.sum2(self._map(self.e.function("costs")[0]))
-        return ca.dot(self.weights[:, 0], parts), parts
-
-    def gradient(self, size: int) -> ca.MX:
-        """Of the costs with respect to all variables (size,)."""
-        local = self._map(self.e.function("gradient")[0], [self.weights])
-        return scatter(self.index.ravel(), size) @ ca.vec(local)
-
-    def rows(self) -> ca.MX:
-        """Constraint rows."""
-        return ca.vec(self._map(self.e.function("rows")[0]))[self.keep.tolist()]
+    def __call__(self, name: str, *more: ca.MX) -> ca.MX:
+        """Values (.., n) of one of :data:`FUNCTIONS`."""
+        return self.e.function(name)[0].map(len(self.index))(*self.inputs, *more)
 
     def jacobian(self) -> tuple:
         """(values, rows, columns) of the rows' Jacobian."""
-        function, rows, cols = self.e.function("jacobian")
-        row_of = np.full(self.count * self.n, -1)
+        _, rows, cols = self.e.function("jacobian")
+        n, count = len(self.index), sum(count for _, count in self.e.rows)
+        row_of = np.full(count * n, -1)
         row_of[self.keep] = self.first_row + np.arange(len(self.keep))
-        i = row_of[(np.arange(self.n)[:, None] * self.count + rows[None]).ravel()]
+        i = row_of[(np.arange(n)[:, None] * count + rows[None]).ravel()]
         used = i >= 0
-        values = ca.vec(self._map(function))[np.flatnonzero(used).tolist()]
-        return values, i[used], self.index[:, cols].ravel()[used]
+        return ca.vec(self("jacobian"))[np.flatnonzero(used).tolist()], i[used], self.index[:, cols].ravel()[used]
 
     def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple:
         """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian."""
+        n, count = len(self.index), sum(count for _, count in self.e.rows)
         mine = lam_g[self.first_row : self.first_row + len(self.keep)]
-        spread = ca.reshape(scatter(self.keep, self.count * self.n) @ mine, self.count, self.n)
-        return self._upper("hessian", [self.weights, spread, ca.repmat(lam_f, 1, self.n)])
+        spread = ca.reshape(scatter(self.keep, count * n) @ mine, count, n)
+        return self._upper("hessian", self.weights, spread, ca.repmat(lam_f, 1, n))
 
     def gauss_newton(self) -> tuple:
         """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian."""
-        return self._upper("gauss_newton", [self.weights])
+        return self._upper("gauss_newton", self.weights)
 
-    def _upper(self, name, arguments) -> tuple:
-        function, rows, cols = self.e.function(name)
+    def _upper(self, name, *more) -> tuple:
+        _, rows, cols = self.e.function(name)
         i, j = self.index[:, rows].ravel(), self.index[:, cols].ravel()
-        return ca.vec(self._map(function, arguments)), np.minimum(i, j), np.maximum(i, j)
+        return ca.vec(self(name, *more)), np.minimum(i, j), np.maximum(i, j)

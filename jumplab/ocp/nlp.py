@@ -12,7 +12,7 @@ import numpy as np
 
 from jumplab.ocp.assembly import Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
-from jumplab.ocp.derivatives import defect_term
+from jumplab.ocp.derivatives import JERK_CHAIN
 from jumplab.ocp.diagnosis import failure
 from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
@@ -150,24 +150,11 @@ class Nlp:
         residual = float(np.max(posed.beyond(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
             raise failure(a, posed, x, status, iterations, explain)
-        return Solution(
-            unpack(a, x),
-            Statistics(
-                iterations,
-                status,
-                self.build_s,
-                solve_s,
-                len(x),
-                len(g),
-                objective=float(answer["f"]),
-                residual=residual,
-                functions_s=sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_")),
-            ),
-            self.problem,
-            self._cost_shares(x, posed.p),
-            self._constraint_report(g, posed),
-            unpack_multipliers(a, lam_x, lam_g),
-        )
+        sizes, cost = (len(x), len(g)), float(answer["f"])
+        functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
+        statistics = Statistics(iterations, status, self.build_s, solve_s, *sizes, cost, residual, functions_s)
+        tables = self._cost_shares(x, posed.p), self._constraint_report(g, posed)
+        return Solution(unpack(a, x), statistics, self.problem, *tables, unpack_multipliers(a, lam_x, lam_g))
 
     def _cost_shares(self, x: np.ndarray, p: np.ndarray) -> tuple[dict, ...]:
         a = self.assembled
@@ -182,15 +169,13 @@ class Nlp:
 
     def _constraint_report(self, g: np.ndarray, posed: Posed) -> tuple[dict, ...]:
         """The tightest row of each constraint."""
-        out, (low, high) = [], posed.rows
-        for group in self.assembled.groups:
-            term, i = group.term, group.index
+        out, (low, high), rows = [], posed.rows, self.assembled.rows
+        for owner, term, i in self.assembled.groups:
             slack = np.minimum(g[i] - low[i], high[i] - g[i])
-            if term.name == defect_term().name or not np.any(np.isfinite(slack)):
+            if term.name == JERK_CHAIN or not np.any(np.isfinite(slack)):
                 continue
-            k, c = np.unravel_index(np.argmin(slack), slack.shape)
-            row = i[k, c]
-            found = dict(phase=group.owner, name=term.name, equation=term.equation, unit=term.unit)
-            found |= dict(kind="equality" if low[row] == high[row] else "inequality", node=int(group.nodes[k]))
-            out.append(found | dict(value=float(g[row] * term.scale), slack=float(slack[k, c] * term.scale)))
+            row, least = i.flat[np.argmin(slack)], float(slack.min() * term.scale)
+            kind, value = "equality" if low[row] == high[row] else "inequality", float(g[row] * term.scale)
+            about = dict(phase=owner, name=term.name, equation=term.equation, unit=term.unit, kind=kind)
+            out.append(about | dict(node=rows[row].node, value=value, slack=least))
         return tuple(out)
