@@ -1,5 +1,10 @@
 """Problems kept between processes: the same functions, and no trust in a file that was touched."""
 
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import grimp
 import numpy as np
 import pytest
 from test_solver import flat_guess, move
@@ -8,6 +13,8 @@ from test_transcription import random_point, toy
 from jumplab.ocp import cache
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
+from jumplab.stages.srmp import SrmpPlanner
+from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 
 
 @pytest.fixture
@@ -36,8 +43,8 @@ def test_what_is_kept_is_the_same(place, counted):
     assert counted == ["toy"] and len(list(place.iterdir())) == 1
     x, p, rng = random_point(first, 3)
     lam = rng.normal(size=first.n_rows)
-    for name, arguments in {"nlp": (x, p), "grad_f": (x, p), "jac_g": (x, p), "hess_lag": (x, p, 1.0, lam),
-                            "cost_parts": (x, p), "gauss_newton": (x, p)}.items():  # fmt: skip
+    functions = dict.fromkeys(("nlp", "grad_f", "jac_g", "cost_parts", "gauss_newton"), (x, p))
+    for name, arguments in {**functions, "hess_lag": (x, p, 1.0, lam)}.items():
         one, two = (getattr(a, name).call(list(arguments)) for a in (first, again))
         for u, v in zip(one, two, strict=True):
             np.testing.assert_array_equal(u.full(), v.full())
@@ -74,6 +81,41 @@ def test_other_keys_are_other_files(place, counted):
     for key in ("a", "b", "a"):
         cache.assembled(toy(), key)
     assert len(counted) == 2 and len(list(place.iterdir())) == 2
+
+
+def test_other_words_are_other_files(place, counted):
+    """A term with another equation or place, a bound with another name: not what is on file."""
+    problem, phase = toy(), toy().phases[1]
+    (jerk,) = phase.terms
+    for other in (replace(jerk, equation="ours"), replace(jerk, at="interval"), replace(jerk, name="push")):
+        if other.at == "interval":
+            other = replace(other, expression=lambda left, right, step: left.j)
+        cache.assembled(replace(problem, phases=(problem.phases[0], replace(phase, terms=(other,)))), "a")
+    cache.assembled(problem, "a")
+    assert len(counted) == len(list(place.iterdir())) == 4
+
+
+def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
+    """Whatever the modules of the problems import, at any depth, is in the key; and every name listed is there."""
+    graph, package = grimp.build_graph("jumplab", cache_dir=None), Path(cache.__file__).parent.parent
+    planners = SrmpPlanner(bhr, keep=True), WholeBodyPlanner(bhr, Mesh(3, 2, 4), refine=False, keep=True)
+    assert len(list(place.iterdir())) == 2
+    roots = {Assembled.__module__} | {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}
+    roots |= {t.expression.__module__ for p in planners for _, t in p.nlp.problem.terms()}
+    found = roots.union(*(graph.find_upstream_modules(root) for root in roots))
+    listed = tuple(f"jumplab.{name}" for name in cache.BUILT_BY)
+    assert len(found) > 15
+    assert [m for m in sorted(found) if not any(m == name or m.startswith(f"{name}.") for name in listed)] == []
+    for name in cache.BUILT_BY:
+        place = package.joinpath(*name.split("."))
+        assert place.is_dir() or place.with_suffix(".py").is_file(), name
+
+
+def test_the_folder_is_the_systems(monkeypatch, tmp_path):
+    monkeypatch.delenv("JUMPLAB_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache.folder().name == "jumplab"
+    assert sys.platform != "linux" or cache.folder() == tmp_path / "jumplab"
 
 
 def test_nothing_is_kept_unasked(place, counted, monkeypatch):

@@ -75,7 +75,7 @@ def test_gauss_newton_is_the_hessian_without_curvature(assembled):
     """Sums of squares: 2 J^T W J, never indefinite; J by differences of the costs is too rough, so by the parts."""
     x, p, _ = random_point(assembled, 5)
     own = symmetric(assembled.gauss_newton(x, np.abs(p)))
-    x[[layout.first for layout in assembled.layouts.values()]] = 1.0  # durations are positive
+    x[[layout.constants[0] for layout in assembled.layouts.values()]] = 1.0  # durations are positive
     own = symmetric(assembled.gauss_newton(x, np.abs(p)))
     assert np.linalg.eigvalsh(own)[0] > -1e-8 * np.abs(own).max()
 
@@ -84,7 +84,7 @@ def test_of_linear_residuals_it_is_the_hessian():
     nlp = Nlp(move(duration=(1.0, 1.0)))
     a, (x, p, _) = nlp.assembled, random_point(nlp.assembled, 6)
     full = symmetric(a.hess_lag(x, p, 1.0, np.zeros(a.n_rows)))
-    free = np.setdiff1d(np.arange(a.size), [layout.first for layout in a.layouts.values()])
+    free = np.setdiff1d(np.arange(a.size), [layout.constants[0] for layout in a.layouts.values()])
     at = np.ix_(free, free)
     np.testing.assert_allclose(symmetric(a.gauss_newton(x, p))[at], full[at], atol=1e-9)
 

@@ -1,5 +1,6 @@
 """From terms to a sparse program: every place, skip, scale and derivative, by hand and by CasADi's own means."""
 
+import doctest
 import re
 
 import casadi as ca
@@ -9,6 +10,7 @@ from fixtures_core import srmp_planner
 from scipy.sparse import csc_matrix
 
 from jumplab.errors import InputError
+from jumplab.ocp import problem as problem_words
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Bound, Phase, Problem, Term
@@ -247,6 +249,11 @@ def test_references_reach_their_node(assembled):
 
 
 # words ----------------------------------------------------------------------------------------------------------
+def test_the_first_example_runs():
+    assert doctest.testmod(problem_words).attempted >= 7
+    assert doctest.testmod(problem_words).failed == 0
+
+
 def test_places_are_checked():
     with pytest.raises(InputError) as e:
         Term("lost", "-", "m", "nowhere", lambda p: p.q)

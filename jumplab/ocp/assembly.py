@@ -45,7 +45,7 @@ class Assembled:
         self.problem = problem
         self.layouts, self.size = {}, 0
         for phase in problem.phases:
-            self.layouts[phase.name] = PhaseLayout(phase, self.size)
+            self.layouts[phase.name] = PhaseLayout.of(phase, self.size)
             self.size += self.layouts[phase.name].size
         self.n_par = sum(problem.parameters.values())
         self.elements = elements or ElementBuilder(problem, self.layouts).elements

@@ -21,7 +21,7 @@ from platformdirs import user_cache_path
 from jumplab.errors import InputError
 from jumplab.io.files import write_file
 from jumplab.ocp.assembly import Assembled
-from jumplab.ocp.derivatives import FUNCTIONS, Element, chain_term
+from jumplab.ocp.derivatives import FUNCTIONS, JERK_CHAIN, Element, chain_term
 from jumplab.ocp.problem import Problem
 
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
@@ -81,19 +81,15 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
 
 
 def _write(path: Path, elements: list[Element]) -> None:
-    body = json.dumps([_told(e) for e in elements]).encode()
+    """One list per element: owner, place, names of costs, names and counts of rows, functions with their places."""
+    told = []
+    for e in elements:
+        names = [name for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
+        made = [(name, *e.function(name)) for name in names]
+        functions = [(name, f.serialize(), rows.tolist(), cols.tolist()) for name, f, rows, cols in made]
+        told.append((e.owner, e.place, [t.name for t in e.costs], [(t.name, n) for t, n in e.rows], functions))
+    body = json.dumps(told).encode()
     write_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
-
-
-def _told(e: Element) -> dict:
-    names = [name for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
-    made = {name: e.function(name) for name in names}
-    return {
-        "place": [e.owner, e.place],
-        "costs": [t.name for t in e.costs],
-        "rows": [(t.name, count) for t, count in e.rows],
-        "made": {name: (f.serialize(), rows.tolist(), cols.tolist()) for name, (f, rows, cols) in made.items()},
-    }
 
 
 def _read(path: Path, problem: Problem) -> list[Element] | None:
@@ -103,18 +99,12 @@ def _read(path: Path, problem: Problem) -> list[Element] | None:
         if hashlib.sha256(body).hexdigest().encode() != total:
             return None
         terms = {(owner, t.name): t for owner, t in problem.terms()}
-        chains = {p.name: chain_term(p) for p in problem.phases}
-        terms |= {(owner, t.name): t for owner, t in chains.items()}
-        return [_element(e, terms) for e in json.loads(body)]
+        terms |= {(phase.name, JERK_CHAIN): chain_term(phase) for phase in problem.phases}
+        found = []
+        for owner, place, costs, rows, functions in json.loads(body):
+            made = {n: (ca.Function.deserialize(f), np.array(i, int), np.array(j, int)) for n, f, i, j in functions}
+            counts = [(terms[owner, name], n) for name, n in rows]
+            found.append(Element(owner, place, [terms[owner, name] for name in costs], counts, made=made))
+        return found
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):
         return None
-
-
-def _element(e: dict, terms: dict) -> Element:
-    owner, place = e["place"]
-    costs, rows = [terms[owner, name] for name in e["costs"]], [(terms[owner, name], n) for name, n in e["rows"]]
-    made = {
-        name: (ca.Function.deserialize(text), np.array(i, int), np.array(j, int))
-        for name, (text, i, j) in e["made"].items()
-    }
-    return Element(owner, place, costs, rows, made=made)

@@ -45,32 +45,22 @@ class Formulas:
 
     def make(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS`: (function of a column of values, and of a matrix its values' rows, columns)."""
-        more = {"gradient": [self.w], "hessian": [self.w, self.lam, self.lam_f], "gauss_newton": [self.w]}
-        expression, rows, cols = getattr(self, f"_{name}")(), (), ()
+        cost = ca.dot(self.w, self.parts) if self.costs else ca.SX(0)
+        more, expression = {
+            "costs": lambda: ([], self.parts),
+            "gradient": lambda: ([self.w], ca.gradient(cost, self.local)),
+            "rows": lambda: ([], self.g),
+            "jacobian": lambda: ([], ca.jacobian(self.g, self.local)),
+            "hessian": lambda: ([self.w, self.lam, self.lam_f], ca.triu(self._curvature())),
+            "gauss_newton": lambda: ([self.w], ca.triu(self._squares(1.0)[0])),
+        }[name]()
+        rows, cols = (), ()
         if name in MATRICES:
             rows, cols = expression.sparsity().get_triplet()
             expression = ca.vertcat(ca.SX(0, 1), *expression.nonzeros())
-        arguments = [self.local, self.data, self.parameters, *more.get(name, [])]
+        arguments = [self.local, self.data, self.parameters, *more]
         function = ca.Function(name, arguments, [expression], {"cse": name not in RARE})
         return function, np.array(rows, int), np.array(cols, int)
-
-    def _costs(self):
-        return self.parts
-
-    def _gradient(self):
-        return ca.gradient(ca.dot(self.w, self.parts) if self.costs else ca.SX(0), self.local)
-
-    def _rows(self):
-        return self.g
-
-    def _jacobian(self):
-        return ca.jacobian(self.g, self.local)
-
-    def _hessian(self):
-        return ca.triu(self._curvature())
-
-    def _gauss_newton(self):
-        return ca.triu(self._squares(1.0)[0])
 
     def _squares(self, scale) -> tuple:
         """(2 w J^T J summed over the costs w |y|^2, [(share, y, J, 2 w) of each])."""

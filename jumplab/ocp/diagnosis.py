@@ -12,16 +12,8 @@ from jumplab.ocp.derivatives import scatter
 NAMED = 4  # so many terms are named at most
 CONFLICT_LIMIT = 1e-3  # scaled row error that is worth a word
 COST_SHARE = 1e-4  # enough of the cost to keep the motion sane, too little to buy violations
-ELASTIC = {
-    "tol": 1e-4,
-    "acceptable_tol": 1e-3,
-    "max_iter": 200,
-    "max_wall_time": 15.0,  # [s]
-    "print_level": 0,
-    "sb": "yes",
-    "mu_strategy": "adaptive",
-    "nlp_scaling_method": "none",
-}
+ELASTIC = {"tol": 1e-4, "acceptable_tol": 1e-3, "max_iter": 200, "max_wall_time": 15.0}  # [s]
+ELASTIC |= {"mu_strategy": "adaptive", "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"}
 
 
 def failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iterations: int, explain: bool) -> SolverError:

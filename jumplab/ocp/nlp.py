@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from copy import copy
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -85,23 +86,15 @@ class Nlp:
     def _gauss_newton(self) -> GaussNewton:
         return GaussNewton(self.assembled)
 
-    def gauss_newton_steps(
-        self,
-        parameters: Mapping,
-        guess: Mapping[str, PhaseGuess],
-        *,
-        references: Mapping | None = None,
-        weights: Mapping[str, float] | None = None,
-        off: tuple[str, ...] = (),
-    ) -> Near:
-        """Come near a solution in a few steps; arguments as of :meth:`solve`.
+    def gauss_newton_steps(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], **how: Any) -> Near:
+        """Come near a solution in a few steps; ``how`` are references, weights, off as of :meth:`solve`.
 
         Raises
         ------
         SolverError
             If a step is no number.
         """
-        a, posed = self.assembled, pose(self.assembled, parameters, guess, references, weights, off)
+        a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
         method, began = self._gauss_newton, time.perf_counter()
         x, count = method.steps(posed)
         f, g = (y.full().ravel() for y in a.nlp(x, posed.p))

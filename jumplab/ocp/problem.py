@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from types import SimpleNamespace
 
 import casadi as ca
@@ -231,58 +230,31 @@ def _text(bound) -> str:
 class PhaseLayout:
     """Where the variables of a phase stand in the decision vector; the only place that knows their order.
 
-    First its duration and constants; then node by node q, v, a and z, and after each but the last a jerk.
+    First its duration and constants; then node by node q, v, a and z, and after each node but the last a jerk.
 
     Attributes
     ----------
-    phase : the phase.  first : index of its duration.
+    phase : the phase.  nq, nx : numbers of coordinates, and of variables of a node.  size : of all its variables.
+    constants, nodes, jerks : indices (1 + constants,), (N + 1, nx), (N, nq).
+    constant_scales, node_scales : sizes by which constants and nodes are divided (1 + constants,), (nx,).
     """
 
     phase: Phase
-    first: int
+    nq: int
+    nx: int
+    size: int
+    constants: np.ndarray
+    nodes: np.ndarray
+    jerks: np.ndarray
+    constant_scales: np.ndarray
+    node_scales: np.ndarray
 
-    @property
-    def nq(self) -> int:
-        """Number of coordinates."""
-        return len(self.phase.coordinates)
-
-    @property
-    def nx(self) -> int:
-        """Number of variables of a node: q, v, a, z."""
-        return 3 * self.nq + len(self.phase.states)
-
-    @property
-    def size(self) -> int:
-        """Number of all variables of the phase."""
-        return len(self.constants) + self.nodes.size + self.jerks.size
-
-    @cached_property
-    def constants(self) -> np.ndarray:
-        """Indices of duration and constants (1 + constants,)."""
-        return self.first + np.arange(1 + len(self.phase.constants))
-
-    @cached_property
-    def _grid(self) -> np.ndarray:
-        stride = self.nx + self.nq
-        rows = np.arange((self.phase.intervals + 1) * stride).reshape(-1, stride)
-        return self.first + len(self.constants) + rows
-
-    @property
-    def nodes(self) -> np.ndarray:
-        """Indices of the states at all nodes (N + 1, nx)."""
-        return self._grid[:, : self.nx]
-
-    @property
-    def jerks(self) -> np.ndarray:
-        """Indices of the jerks of all steps (N, nq)."""
-        return self._grid[:-1, self.nx :]
-
-    @property
-    def node_scales(self) -> np.ndarray:
-        """Sizes by which the states of a node are divided (nx,)."""
-        return np.concatenate([self.phase.scale(key) for key in "qvaz"])
-
-    @property
-    def constant_scales(self) -> np.ndarray:
-        """Sizes by which duration and constants are divided (1 + constants,)."""
-        return np.array([1.0, *(c[2] for c in self.phase.constants.values())])
+    @classmethod
+    def of(cls, phase: Phase, first: int) -> PhaseLayout:
+        """The layout of a phase whose duration has the index ``first``."""
+        nq, nc, steps = len(phase.coordinates), 1 + len(phase.constants), phase.intervals
+        nx = 3 * nq + len(phase.states)
+        grid = first + nc + np.arange((steps + 1) * (nx + nq)).reshape(steps + 1, nx + nq)
+        size, constant_scales = nc + grid.size - nq, np.array([1.0, *(c[2] for c in phase.constants.values())])
+        places = first + np.arange(nc), grid[:, :nx], grid[:-1, nx:]
+        return cls(phase, nq, nx, size, *places, constant_scales, np.concatenate([phase.scale(k) for k in "qvaz"]))
