@@ -28,8 +28,13 @@ def random_states(count, seed=0):
         yield rng.uniform(-1.5, 1.5, 5), rng.normal(scale=4, size=5), rng.normal(scale=30, size=5)
 
 
-PAIRS = [("com", "com_velocity"), ("com_velocity", "com_acceleration"), ("L", "L_rate"), ("rho", "rho_rate"),
-         ("joints", "joint_rates")]  # fmt: skip
+PAIRS = [
+    ("com", "com_velocity"),
+    ("com_velocity", "com_acceleration"),
+    ("L", "L_rate"),
+    ("rho", "rho_rate"),
+    ("joints", "joint_rates"),
+]
 
 
 @pytest.mark.parametrize("quantity, rate", PAIRS)

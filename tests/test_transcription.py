@@ -40,25 +40,42 @@ def _first_terms():
         Term("node cost", "-", "m", "node", lambda p: ca.vertcat(p.q[0] * p.v[1] + p.s, p.a[0] * p.c.k), weight=2.0),
         Term("mid cost", "-", "m", "mid", lambda p: p.j[0] * p.q[1] + p.s * p.duration, weight=0.5),
         Term("start cost", "-", "m", "start", lambda p: p.z[0] * p.q[0], weight=3.0),
-        Term("node row", "-", "m", "node", lambda p: ca.vertcat(p.q[0] ** 2 - p.ref.r[0], p.z[0] * p.v[0]), scale=4.0,
-             skip=(1, 2)),
+        Term(
+            "node row",
+            "-",
+            "m",
+            "node",
+            lambda p: ca.vertcat(p.q[0] ** 2 - p.ref.r[0], p.z[0] * p.v[0]),
+            scale=4.0,
+            skip=(1, 2),
+        ),
         Term("track", "-", "m", "node", lambda p: ca.sin(p.q[1]) - p.ref.r[1] * p.p.m, weight=1.5),
         Term("mid row", "-", "m", "mid", lambda p: p.q[0] * p.q[1] * p.v[0], lower=-np.inf, upper=3.0),
         Term("drift", "-", "m", "interval", lambda a, b, h: b.z - a.z - h * a.q[0] * b.q[1] - a.j[1] * 1e-3, scale=2.0),
         Term("end row", "-", "m", "end", lambda p: p.q[0] - p.p.goal[1] * p.time),
-    )  # fmt: skip
+    )
 
 
 def toy() -> Problem:
-    first = Phase("one", ("x", "y"), 5, (0.5, 2.0), _first_terms(), (Bound("rest", "-", "m", "v", 0.0, 0.0, "start"),),
-                  states=("w",), constants={"k": (-1.0, 1.0, 0.5)}, references={"r": 2},
-                  scales={"q": [1.0, 2.0], "v": 3.0, "a": 10.0, "j": [100.0, 50.0], "z": 0.5})  # fmt: skip
+    first = Phase(
+        "one",
+        ("x", "y"),
+        5,
+        (0.5, 2.0),
+        _first_terms(),
+        (Bound("rest", "-", "m", "v", 0.0, 0.0, "start"),),
+        states=("w",),
+        constants={"k": (-1.0, 1.0, 0.5)},
+        references={"r": 2},
+        scales={"q": [1.0, 2.0], "v": 3.0, "a": 10.0, "j": [100.0, 50.0], "z": 0.5},
+    )
     second = Phase("two", ("u",), 3, (0.1, 1.0), (Term("jerk", "-", "m", "mid", lambda p: p.j, weight=1e-3),))
     joints = (
-        Term("meet", "-", "m", "problem", lambda e: e["one"].end.q[0] * e["one"].end.c.k - e["two"].start.q[0],
-             scale=3.0),
-        Term("short", "-", "s", "problem", lambda e: e["one"].end.duration + e["two"].end.duration**2, weight=7.0),
-    )  # fmt: skip
+        Term(
+            "meet", "-", "m", "problem", lambda e: e["one"].end.q[0] * e["one"].end.c.k - e["two"].start.q[0], scale=3.0
+        ),
+        Term("short", "-", "s", "problem", lambda e: e["one"].end.duration + e["two"].end.duration ** 2, weight=7.0),
+    )
     return Problem("toy", (first, second), joints, {"goal": 2, "m": 1})
 
 

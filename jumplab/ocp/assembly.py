@@ -116,7 +116,7 @@ class Assembled:
     @cached_property
     def gauss_newton(self) -> ca.Function:
         """(x, p) -> upper triangle of the cost's Hessian without the curvature of what it squares."""
-        hess = gather([b.gauss_newton() for b in self._blocks if b.e.costs], (self.size, self.size))
+        hess = gather([b.upper("gauss_newton", b.weights) for b in self._blocks if b.e.costs], (self.size, self.size))
         return ca.Function("gauss_newton", [self._x, self._p], [hess], ["x", "p"], ["triu_hess_f"])
 
     @cached_property
@@ -262,11 +262,11 @@ def _checked_guess(problem: Problem, guess: Mapping[str, PhaseGuess], layout: Ph
     if name not in guess:
         raise InputError(f"{problem.name}: the guess has no phase {name!r}")
     g = guess[name]
-    for key, size in (("q", nq), ("v", nq), ("a", nq), ("z", layout.nx - 3 * nq)):
-        x = getattr(g, key)
+    for key, x in (("q", g.q), ("v", g.v), ("a", g.a), ("z", g.z)):
+        shape = (n + 1, layout.nx - 3 * nq if key == "z" else nq)
         what = f"{problem.name}: guess {key!r} of phase {name!r}"
-        if x is not None and np.shape(x) != (n + 1, size):
-            raise InputError(f"{what} has shape {np.shape(x)}, must be {(n + 1, size)}")
+        if x is not None and np.shape(x) != shape:
+            raise InputError(f"{what} has shape {np.shape(x)}, must be {shape}")
         if x is not None and not np.all(np.isfinite(x)):
             raise InputError(f"{what} is not finite")
     if not (np.isfinite(g.duration) and g.duration > 0):

@@ -162,7 +162,8 @@ class ElementBuilder:
         mid = replace(left, s=s + share / 2, memo={})
         mid.q, mid.v, mid.a = chain(left.q, left.v, left.a, left.j, step / 2)
         seen = {"node": (here,), "start": (here,), "end": (here,), "mid": (mid,), "interval": (left, after, step)}
-        spans = {"node": step * _trapezoid(s), "mid": step}
+        inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))  # trapezoid rule: both ends count half
+        spans = {"node": step * inner, "mid": step}
         node, span = ca.vertcat(constants, state), ca.vertcat(constants, state, jerk, right)
         for place in ("node", "start", "end"):
             terms = [t for t in phase.terms if t.at == place]
@@ -174,12 +175,11 @@ class ElementBuilder:
     def _joints(self):
         ends, symbols = {}, []
         for name, layout in self.layouts.items():
-            sizes = {"const": len(layout.constants), "x0": layout.nx, "x1": layout.nx}
-            constants, first, last = (ca.SX.sym(n, size) for n, size in sizes.items())
-            refs = ca.SX.zeros(sum(layout.phase.references.values()))
-            start = self._point(layout, first, None, constants, 0.0, refs)
-            ends[name] = SimpleNamespace(start=start, end=self._point(layout, last, None, constants, 1.0, refs))
-            symbols += [constants, first, last]
+            nx, refs = layout.nx, ca.SX.zeros(sum(layout.phase.references.values()))
+            constants, *nodes = ca.SX.sym("const", len(layout.constants)), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
+            start, end = (self._point(layout, x, None, constants, float(s), refs) for s, x in enumerate(nodes))
+            ends[name] = SimpleNamespace(start=start, end=end)
+            symbols += [constants, *nodes]
         local, seen = ca.vertcat(*symbols), {"problem": (ends,)}
         return self._element(self.problem.name, "problem", local, ca.SX(0, 1), self.problem.joints, seen, {})
 
@@ -196,11 +196,6 @@ class ElementBuilder:
                 counts.append((t, y.numel()))
         formulas = Formulas(local, data, self.parameter_vector, costs, rows)
         return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
-
-
-def _trapezoid(s):
-    """Trapezoid rule: a phase's first and last node count half."""
-    return 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
 
 
 def chain_term(phase: Phase) -> Term:
@@ -250,32 +245,30 @@ class Block:
     inputs: tuple
     weights: ca.MX
 
+    def __post_init__(self):
+        self.n, self.count = len(self.index), sum(count for _, count in self.e.rows)
+
     def __call__(self, name: str, *more: ca.MX) -> ca.MX:
         """Values (.., n) of one of :data:`FUNCTIONS`."""
-        return self.e.function(name)[0].map(len(self.index))(*self.inputs, *more)
+        return self.e.function(name)[0].map(self.n)(*self.inputs, *more)
 
     def jacobian(self) -> tuple:
         """(values, rows, columns) of the rows' Jacobian."""
         _, rows, cols = self.e.function("jacobian")
-        n, count = len(self.index), sum(count for _, count in self.e.rows)
-        row_of = np.full(count * n, -1)
+        row_of = np.full(self.count * self.n, -1)
         row_of[self.keep] = self.first_row + np.arange(len(self.keep))
-        i = row_of[(np.arange(n)[:, None] * count + rows[None]).ravel()]
+        i = row_of[(np.arange(self.n)[:, None] * self.count + rows[None]).ravel()]
         used = i >= 0
         return ca.vec(self("jacobian"))[np.flatnonzero(used).tolist()], i[used], self.index[:, cols].ravel()[used]
 
     def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple:
         """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian."""
-        n, count = len(self.index), sum(count for _, count in self.e.rows)
         mine = lam_g[self.first_row : self.first_row + len(self.keep)]
-        spread = ca.reshape(scatter(self.keep, count * n) @ mine, count, n)
-        return self._upper("hessian", self.weights, spread, ca.repmat(lam_f, 1, n))
+        spread = ca.reshape(scatter(self.keep, self.count * self.n) @ mine, self.count, self.n)
+        return self.upper("hessian", self.weights, spread, ca.repmat(lam_f, 1, self.n))
 
-    def gauss_newton(self) -> tuple:
-        """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian."""
-        return self._upper("gauss_newton", self.weights)
-
-    def _upper(self, name, *more) -> tuple:
+    def upper(self, name: str, *more: ca.MX) -> tuple:
+        """(values, rows, columns) of the upper triangle of a symmetric matrix, "hessian" or "gauss_newton"."""
         _, rows, cols = self.e.function(name)
         i, j = self.index[:, rows].ravel(), self.index[:, cols].ravel()
         return ca.vec(self(name, *more)), np.minimum(i, j), np.maximum(i, j)
