@@ -39,7 +39,7 @@ class TimeOrder:
     ----------
     N, nx, nu, ng : last stage; numbers of states, controls and rows besides links, stage by stage.
     source : (nw,) the problem's variable that each one in the order of time copies.
-    copy : (n,) the place of each variable; of a constant, of its first copy.
+    copy : (n,) the place of each variable; of a constant, of its first copy as a state.
     local, place : (n_rows,) whether a row can be told stage by stage, and where it stands then.
     links : (n, 3) further rows, their next and their present variable: copies of what is constant.
     """
@@ -54,24 +54,21 @@ class TimeOrder:
         self._number_variables(known)
         self._number_rows(stage, known)
         self._used = np.flatnonzero(self.local[self._rows])
-        self._jac_at = self.place[self._rows[self._used]], self._where(at[self._used], self._cols[self._used])
+        self._jac_at = self.place[self._rows[self._used]], self._table[at[self._used], self._cols[self._used]]
         self._hess_at = self._place_hessian()
 
     def _read_stages(self) -> None:
         """States and controls of each stage; of each variable its stage, or the phase whose constant it is, else -1."""
-        self._states, self._controls, self._starts = [], [], []
+        self._states, self._controls, starts = [], [], []
         self._stage, self._phase = np.full(self.a.size, -1), np.full(self.a.size, -1)
         for number, layout in enumerate(self.a.layouts.values()):
-            self._starts.append(len(self._states))
+            starts.append(len(self._states))
             self._phase[layout.constants] = number
             for node, jerks in zip(layout.nodes, [*layout.jerks, np.zeros(0, int)], strict=True):
                 self._stage[np.concatenate([node, jerks])] = len(self._states)
-                self._states.append(np.concatenate([layout.constants, node]))
-                self._controls.append(jerks.tolist())
-
-    def _phase_at(self, stage: int | np.ndarray) -> np.ndarray:
-        """Number of the phase that a stage belongs to."""
-        return np.searchsorted(self._starts, stage, side="right") - 1
+                self._states.append([*layout.constants, *node])
+                self._controls.append([*jerks])
+        self._starts = np.array(starts)
 
     def _stage_of_rows(self) -> np.ndarray:
         """The stage of each row: that of its node, and for rows that join phases, the last of the phase before."""
@@ -86,7 +83,8 @@ class TimeOrder:
     def _stage_of_columns(self, stage: np.ndarray) -> np.ndarray:
         """The stage whose copy each entry of the Jacobian belongs to."""
         own, phase = stage[self._rows], self._phase[self._cols]
-        at = np.where(phase < 0, self._stage[self._cols], np.where(phase == self._phase_at(own), own, own + 1))
+        own_phase = np.searchsorted(self._starts, own, side="right") - 1
+        at = np.where(phase < 0, self._stage[self._cols], np.where(phase == own_phase, own, own + 1))
         identity = np.array([row.term.identity for row in self.a.rows])
         far = (at != own) & ~((at == own + 1) & identity[self._rows])
         self.local = ~np.isin(np.arange(self.a.n_rows), self._rows[far])
@@ -106,49 +104,37 @@ class TimeOrder:
         return known
 
     def _number_variables(self, known: dict) -> None:
-        """Sets the order of the variables."""
+        """Sets the order of the variables, and a table of their places (stages, n), -1 where a stage has no copy."""
         for k in self._starts[1:]:  # constants that no link sets are chosen at the end of the phase before
-            constants = self._states[k][self._phase[self._states[k]] >= 0]
-            self._controls[k - 1] = self._controls[k - 1] + [v for v in constants if (k, v) not in known]
+            self._controls[k - 1] += [v for v in self._states[k] if self._phase[v] >= 0 and (k, v) not in known]
         self.nx, self.nu = [len(x) for x in self._states], [len(x) for x in self._controls]
-        self.N, self._first = len(self.nx) - 1, np.cumsum([0, *np.add(self.nx, self.nu)])[:-1]
-        both = zip(self._states, self._controls, strict=True)
-        self.source = np.concatenate([np.concatenate(pair) for pair in both]).astype(int)
-        self.copy = np.zeros(self.a.size, int)
-        own = np.flatnonzero(self._phase[self.source] < 0)
-        self.copy[self.source[own]] = own
-        for k in self._starts:
-            self.copy[self._states[k]] = self._first[k] + np.arange(self.nx[k])
-
-    def _where(self, k, v) -> np.ndarray:
-        """Places of variables ``v``, the constants among them as states of the stages ``k``."""
-        start = np.array(self._starts)[self._phase_at(k)]
-        return np.where(self._phase[v] >= 0, self._first[k] + self.copy[v] - self._first[start], self.copy[v])
-
-    def _before(self, k: int, v: int) -> int:
-        """The place at stage ``k`` of what is copied to variable ``v`` of the next."""
-        if self._phase[v] < 0:
-            raise ValueError(f"{self.a.problem.name}: nothing says what a variable of stage {k + 1} follows from")
-        if self._phase_at(k) == self._phase[v]:
-            return int(self._where(k, v))
-        return int(self._first[k] + self.nx[k] + self._controls[k].index(v))
+        self.N, self._table, source = len(self.nx) - 1, np.full((len(self.nx), self.a.size), -1), []
+        for k, (states, controls) in enumerate(zip(self._states, self._controls, strict=True)):
+            self._table[k, states + controls] = len(source) + np.arange(len(states) + len(controls))
+            source += states + controls
+        self.source = np.array(source)
+        home = np.where(self._phase < 0, self._stage, self._starts[self._phase])
+        self.copy = self._table[home, np.arange(self.a.size)]
 
     def _number_rows(self, stage: np.ndarray, known: dict) -> None:
         """Sets the places of the rows and the links that copy constants."""
         self.place, links, self.ng, at = np.full(self.a.n_rows, -1), [], [], 0
         free = self.local & ~np.isin(np.arange(self.a.n_rows), list(known.values()))
         for k in range(self.N + 1):
-            for i, v in enumerate(self._states[k + 1] if k < self.N else ()):
+            for v in self._states[k + 1] if k < self.N else ():
                 if (k + 1, v) in known:
                     self.place[known[k + 1, v]] = at
                 else:
-                    links.append((at, self._first[k + 1] + i, self._before(k, v)))
+                    links.append((at, self._table[k + 1, v], self._table[k, v]))
                 at += 1
             others = np.flatnonzero(free & (stage == k))
             self.place[others] = at + np.arange(len(others))
             self.ng.append(len(others))
             at += len(others)
         self.links, self.n_rows = np.array(links, int).reshape(-1, 3), at
+        if np.any(self.links < 0):
+            k = self._stage[self.source[self.links[self.links[:, 2] < 0, 1]]].min()
+            raise ValueError(f"{self.a.problem.name}: nothing says what a variable of stage {k} follows from")
 
     def _place_hessian(self) -> tuple[np.ndarray, np.ndarray]:
         """(row, column) of each entry of the Gauss-Newton Hessian.
@@ -157,20 +143,12 @@ class TimeOrder:
         next phase at the end of its own, where that is chosen.
         """
         i, j = (np.array(z, int) for z in self.a.gauss_newton.sparsity_out(0).get_triplet())
-        nodes, phase = self._stage, self._phase
-        k = np.maximum(nodes[i], nodes[j])
-        both = k < 0
-        k[both] = np.array(self._starts)[phase[i[both]]]
-        apart = (nodes[i] >= 0) & (nodes[j] >= 0) & (nodes[i] != nodes[j])
-        for x in (i, j):
-            apart |= ~both & (phase[x] >= 0) & (phase[x] != self._phase_at(k))
-        if apart.any():
+        phase, k = self._phase, np.maximum(self._stage[i], self._stage[j])
+        start = self._starts[np.maximum(phase[i], phase[j])]
+        k = np.where(k >= 0, k, np.where(phase[i] == phase[j], start, start - 1))
+        rows, cols = self._table[k, i], self._table[k, j]
+        if np.any(np.minimum(rows, cols) < 0):
             raise ValueError(f"{self.a.problem.name}: a cost joins different nodes")
-        rows, cols = self._where(k, i), self._where(k, j)
-        for e in np.flatnonzero(both & (phase[i] != phase[j])):
-            v, w = sorted((i[e], j[e]))
-            last = self._starts[phase[w]] - 1
-            rows[e], cols[e] = self._where(last, v), self._before(last, w)
         return rows, cols
 
     def jacobian(self, values: ca.MX) -> ca.MX:
