@@ -5,7 +5,7 @@ All variables and rows are divided by their scales here; guesses, bounds and sol
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -304,36 +304,32 @@ def unpack(a: Assembled, x: np.ndarray) -> dict[str, PhaseSolution]:
     return out
 
 
-def _along(a: Assembled, owner: str, term: Term, index: np.ndarray) -> tuple[np.ndarray, float]:
-    """Shares of the phase (K,) at which rows (K, C) stand, and what makes their multipliers independent of the mesh.
+def _along(a: Assembled) -> Iterator[tuple]:
+    """(name, 0 for variables or 1 for rows, indices (K, C), shares of the phase (K,), density) of what has multipliers.
 
-    Limits along a phase share their force among the nodes. Links of the motion have costates, which do not depend on
-    the number of nodes; neither do rows at one instant.
+    Times its density a multiplier is independent of the mesh: limits along a phase share their force among the nodes.
+    Links of the motion have costates, which do not depend on the number of nodes; neither do rows at one instant.
     """
-    n = a.layouts[owner].phase.intervals if owner in a.layouts else 1
-    nodes = np.array([a.rows[i].node for i in index[:, 0]])
-    share = (nodes + (0.5 if term.at in ("mid", "interval") else 0.0)) / n
-    return share, float(n) if term.at in ("node", "mid") and not term.identity else 1.0
+    for owner, term, index in a.groups:
+        n = a.layouts[owner].phase.intervals if owner in a.layouts else 1
+        share = np.array([a.rows[i].node for i in index[:, 0]]) + (0.5 if term.at in ("mid", "interval") else 0.0)
+        limits = term.at in ("node", "mid") and not term.identity
+        yield (owner, term.name), 1, index, share / n, float(n) if limits else 1.0
+    for name, layout in a.layouts.items():
+        n = layout.phase.intervals
+        yield (name, "bounds of nodes"), 0, layout.nodes, np.linspace(0, 1, n + 1), n
+        yield (name, "bounds of constants"), 0, layout.constants[None], np.zeros(1), 1.0
 
 
 def unpack_multipliers(a: Assembled, lam_x: np.ndarray, lam_g: np.ndarray) -> Multipliers:
-    """Multipliers of rows and bounds by name and share of the phase, so that another mesh can begin with them."""
-    rows = {}
-    for owner, term, index in a.groups:
-        share, density = _along(a, owner, term, index)
-        rows[owner, term.name] = share, lam_g[index] * density
-    nodes = {n: lam_x[x.nodes] * x.phase.intervals for n, x in a.layouts.items()}
-    return Multipliers(rows, nodes, {n: lam_x[x.constants] for n, x in a.layouts.items()})
+    """Multipliers of bounds and rows by name and share of the phase, so that another mesh can begin with them."""
+    lam = lam_x, lam_g
+    return Multipliers({name: (share, lam[which][i] * density) for name, which, i, share, density in _along(a)})
 
 
 def pack_multipliers(a: Assembled, given: Multipliers) -> tuple[np.ndarray, np.ndarray]:
     """(lam_x, lam_g) for this mesh from multipliers of the same problem on any mesh."""
-    lam_x, lam_g = np.zeros(a.size), np.zeros(a.n_rows)
-    for owner, term, index in a.groups:
-        share, density = _along(a, owner, term, index)
-        lam_g[index] = resampled(*given.rows[owner, term.name], share) / density
-    for name, layout in a.layouts.items():
-        n, nodes = layout.phase.intervals, given.nodes[name]
-        lam_x[layout.nodes] = resampled(np.linspace(0, 1, len(nodes)), nodes, np.linspace(0, 1, n + 1)) / n
-        lam_x[layout.constants] = given.constants[name]
-    return lam_x, lam_g
+    lam = np.zeros(a.size), np.zeros(a.n_rows)
+    for name, which, index, share, density in _along(a):
+        lam[which][index] = resampled(*given.rows[name], share) / density
+    return lam

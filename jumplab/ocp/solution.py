@@ -86,13 +86,10 @@ class Multipliers:
     Attributes
     ----------
     rows : (owner, term name) -> shares of the phase (K,), values (K, C); of limits along a phase per unit of share.
-    nodes : phase -> (N + 1, nx) of the bounds on node variables, per unit of share.
-    constants : phase -> of the bounds on duration and constants.
+        Box bounds stand there as (phase, "bounds of nodes") and (phase, "bounds of constants").
     """
 
     rows: dict
-    nodes: dict
-    constants: dict
 
 
 @dataclass(frozen=True)
