@@ -64,8 +64,7 @@ class Formulas:
 
     def _squares(self, scale) -> tuple:
         """(2 w J^T J summed over the costs w |y|^2, [(share, y, J, 2 w) of each])."""
-        ny = self.local.numel()
-        total, parts = ca.SX(ny, ny), []
+        total, parts = ca.SX(self.local.numel(), self.local.numel()), []
         for k, (share, y) in enumerate(self.costs):
             jacobian, weight = ca.jacobian(y, self.local), 2 * scale * self.w[k] * share
             total += weight * (jacobian.T @ jacobian)
@@ -78,13 +77,12 @@ class Formulas:
         A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
         everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
         """
-        x, ys, mus = self.local, [], []
-        extra, parts = self._squares(self.lam_f)
-        for k, (share, y, jacobian, weight) in enumerate(parts):
+        x, (extra, parts) = self.local, self._squares(self.lam_f)
+        for k, (share, y, jacobian, _) in enumerate(parts):
             mixed = ca.jacobian(share, x).T @ (2 * self.lam_f * self.w[k] * (y.T @ jacobian))
             extra += mixed + mixed.T
-            ys, mus = [*ys, y], [*mus, weight * y]
-        y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
+        y = ca.vertcat(ca.SX(0, 1), *(y for _, y, _, _ in parts))
+        mu = ca.vertcat(ca.SX(0, 1), *(w * y for _, y, _, w in parts))
         held = ca.SX.sym("mu", y.numel())
         bent = ca.hessian(ca.dot(held, y) + ca.dot(self.lam, self.g), x)[0]
         symbols = [x, self.data, self.parameters, self.lam, held]

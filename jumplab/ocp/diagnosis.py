@@ -55,7 +55,7 @@ def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> tuple[str, ..
 
 def _conflicts(a: Assembled, posed: Posed) -> tuple[str, ...]:
     """The terms that the least violating motion violates most, where and by how much, in their units."""
-    x, beyond = least_violation(a, posed)
+    x, beyond = _least_violation(a, posed)
     phases, worst = unpack(a, x), {}
     for row, amount in zip(a.rows, beyond, strict=True):
         name = f"{row.owner}/{row.term.name}"
@@ -66,13 +66,10 @@ def _conflicts(a: Assembled, posed: Posed) -> tuple[str, ...]:
     return tuple(text for _, text in ranked[:NAMED])
 
 
-def least_violation(a: Assembled, posed: Posed) -> tuple[np.ndarray, np.ndarray]:
-    """Minimise the sum of row violations (L1) plus a trace of the cost.
+def _least_violation(a: Assembled, posed: Posed) -> tuple[np.ndarray, np.ndarray]:
+    """The motion (n,) with the least sum of row violations plus a trace of the cost, and its violations (n_rows,).
 
-    Returns
-    -------
-    x, beyond : the motion found (n,), and how far each row (n_rows,), scaled, lies outside its bounds; identities,
-        which say only that the motion is one motion, stay hard.
+    Identities, which say only that the motion is one motion, stay hard.
     """
     index = np.flatnonzero([not row.term.identity for row in a.rows])
     n, m, place = a.size, len(index), scatter(index, a.n_rows)

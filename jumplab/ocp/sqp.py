@@ -195,16 +195,9 @@ class GaussNewton:
         return ca.Function("step", [x, p, low, high, row_low, row_high], [step, lam, f, ca.dot(slope, step), g])
 
     def steps(self, posed: Posed) -> tuple[np.ndarray, int]:
-        """From the start of ``posed`` towards a solution.
+        """A point (n,) near a solution, its rows not yet met, and the number of steps that led to it.
 
-        Returns
-        -------
-        x, count : a point (n,) near the solution, its rows not yet met, and the number of steps.
-
-        Raises
-        ------
-        SolverError
-            If a QP has no solution, or a step is no number.
+        Raises :class:`SolverError` if a QP has no solution, or a step is no number.
         """
         x, p, penalty, name = posed.x0, posed.p, 0.0, self.a.problem.name
         for count in range(1, STEPS + 1):
