@@ -16,9 +16,14 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 
+PARALLEL_TOLERANCE = 1e-6  # how far an axis may be off before a robot counts as crooked
 CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
+# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
+SLOPE = np.zeros((16, 6))
+SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
+SLOPE[1, 5] = -1.0
 
 
 def skew(x: np.ndarray) -> np.ndarray:
@@ -128,13 +133,6 @@ def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, mome
     return np.concatenate([mass * (np.asarray(com_acceleration) + lift), momentum_rate])
 
 
-PARALLEL_TOLERANCE = 1e-6  # how far an axis may be off before a robot counts as crooked
-# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
-SLOPE = np.zeros((16, 6))
-SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
-SLOPE[1, 5] = -1.0
-
-
 class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
 
@@ -183,11 +181,11 @@ class FullBody:
     def _read_feet(self):
         model, foot, data = self.model, self.robot.foot, self.data
         frames = [model.frames[model.getFrameId(name)] for name in foot.frames]
-        self.foot_joints = [f.parentJoint for f in frames]
+        self._foot_joints = [f.parentJoint for f in frames]
         middles = [foot.toe, 0.0, foot.sole_z], [foot.heel, 0.0, foot.sole_z], foot.center  # tiptoe, heel, sole
         self._points = np.array([[f.placement.act(np.array(x, float)) for x in middles] for f in frames])
         self._foot_turn = np.array([f.placement.rotation for f in frames])
-        self._foot_bodies = [j - 1 for j in self.foot_joints]
+        self._foot_bodies = [j - 1 for j in self._foot_joints]
         self._foot_carries = self._carries[self._foot_bodies]  # (2, nv)
         pin.framesForwardKinematics(model, data, pin.neutral(model))
         for name in foot.frames:
@@ -206,7 +204,7 @@ class FullBody:
         model, data, roles = self.model, self.data, self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
         shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
-        legs = [self._chain(j) for j in self.foot_joints]
+        legs = [self._chain(j) for j in self._foot_joints]
         hip = self._chain(model.getJointId(roles["hip_pitch"][0]))
         pairs, groups = [], {"hip": [], "knee": [], "ankle": [], "shoulder": []}
         for chains, arm in ((legs, False), (shoulders, True)):

@@ -106,7 +106,7 @@ class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
 
     With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
-    With ``approach`` the coarse mesh only takes the few steps of :meth:`jumplab.ocp.nlp.Nlp.gauss_newton_steps`; where they lead
+    With ``approach`` the coarse mesh only takes the few steps of ``Nlp.gauss_newton_steps``; where they lead
     nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes.
     """
 
