@@ -20,6 +20,7 @@ from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("JUMPLAB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(cache, "HOME", (*cache.HOME, "test_"))
     return tmp_path / "cache"
 
 
@@ -126,6 +127,13 @@ def test_nothing_is_kept_unasked(place, counted, monkeypatch):
     assert len(counted) == 2
 
 
-def test_a_folder_that_cannot_be_written_is_no_failure(monkeypatch, counted):
+def test_terms_from_elsewhere_are_not_kept(place, counted, monkeypatch):
+    """A lambda of a notebook may change under the same name: then the file would be another problem's."""
+    monkeypatch.setattr(cache, "HOME", ("jumplab.",))
+    assert [cache.assembled(toy(), "a").n_rows > 0 for _ in range(2)] == [True, True]
+    assert len(counted) == 2 and not place.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_no_failure(place, monkeypatch, counted):
     monkeypatch.setenv("JUMPLAB_CACHE", "/dev/null/x")
     assert cache.assembled(toy(), "a").n_rows > 0 and counted == ["toy"]

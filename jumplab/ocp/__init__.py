@@ -7,11 +7,10 @@ Start reading in :mod:`jumplab.ocp.problem`; then ``nlp.py``, which solves what 
 
 from jumplab.ocp.nlp import Nlp
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
-from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, PhaseSolution, Solution, Statistics
+from jumplab.ocp.solution import Near, PhaseGuess, PhaseSolution, Solution, Statistics
 
 __all__ = [
     "Bound",
-    "Multipliers",
     "Near",
     "Nlp",
     "Phase",

@@ -24,6 +24,7 @@ from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import FUNCTIONS, JERK_CHAIN, Element, chain_term
 from jumplab.ocp.problem import Problem
 
+HOME = ("jumplab.",)  # a problem with terms from elsewhere is not kept: no key would know a change of them
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
 BUILT_BY = ("errors", "task", "ocp", "models", "robot", "robot_import", "stages.srmp", "stages.whole_body")
 
@@ -61,10 +62,10 @@ def _words(problem: Problem) -> list:
 def assembled(problem: Problem, key: str | None = None) -> Assembled:
     """The problem assembled, from the file of ``key`` if there is a sound one, else anew and then kept.
 
-    ``key`` says what the problem was made of, and what the expressions of terms from elsewhere do; None keeps nothing.
+    ``key`` says what the problem was made of besides its words; None keeps nothing.
     """
-    place = None if key is None else folder()
-    if place is None:
+    place, modules = folder(), {str(t.expression.__module__) for _, t in problem.terms()}
+    if key is None or place is None or not all(module.startswith(HOME) for module in modules):
         return Assembled(problem)
     made_of = [_sources(), ca.CasadiMeta.version(), _words(problem), key]
     name = hashlib.sha256(json.dumps(made_of, default=lambda array: array.tolist()).encode()).hexdigest()
