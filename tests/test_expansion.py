@@ -6,7 +6,7 @@ import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, replay
 
 from jumplab.models.planar import evaluator
-from jumplab.ocp.nlp import PhaseSolution
+from jumplab.ocp import PhaseSolution
 from jumplab.robot.stance import stance_angles
 from jumplab.stages.planner import to_link_angles
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities

@@ -4,8 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from fixtures_core import chain_motion
+from paper.lagrange import five_links
 
-from jumplab.models.planar import PlanarState, evaluator, lagrangian, symbols
+from jumplab.models.planar import PlanarState, evaluator, symbols
 from jumplab.robot.stance import stance_angles
 
 STEP = 1e-5
@@ -27,8 +28,13 @@ def random_states(count, seed=0):
         yield rng.uniform(-1.5, 1.5, 5), rng.normal(scale=4, size=5), rng.normal(scale=30, size=5)
 
 
-PAIRS = [("com", "com_velocity"), ("com_velocity", "com_acceleration"), ("L", "L_rate"), ("rho", "rho_rate"),
-         ("joints", "joint_rates")]  # fmt: skip
+PAIRS = [
+    ("com", "com_velocity"),
+    ("com_velocity", "com_acceleration"),
+    ("L", "L_rate"),
+    ("rho", "rho_rate"),
+    ("joints", "joint_rates"),
+]
 
 
 @pytest.mark.parametrize("quantity, rate", PAIRS)
@@ -118,7 +124,7 @@ def test_newton_and_euler_of_the_whole(bhr, planar):
 
 def test_against_lagrange(bhr, planar):
     """M theta'' + H = S tau + J' F of the paper's coordinates, from the toe-rooted recursion."""
-    s, second = bhr.sagittal, lagrangian(bhr.sagittal)
+    s, second = bhr.sagittal, five_links(bhr.sagittal)
     for i, (q, v, a) in enumerate(random_states(6, seed=7)):
         jolt = np.zeros(2) if i % 2 else np.array([3.0, -5.0])
         out = at(planar, q, v, a, jolt)
@@ -138,7 +144,7 @@ def test_against_lagrange(bhr, planar):
 
 def test_flight_without_torque_on_the_whole(bhr, planar):
     """With the toe falling so that the CoM falls freely, the torques are those of a robot that nothing touches."""
-    s, second = bhr.sagittal, lagrangian(bhr.sagittal)
+    s, second = bhr.sagittal, five_links(bhr.sagittal)
     q, v, a = next(random_states(1, seed=8))
     inertia = at(planar, q, v, np.eye(5)[4])["L_rate"] - at(planar, q, v, np.zeros(5))["L_rate"]
     a[4] -= at(planar, q, v, a)["L_rate"][0] / inertia[0]  # the arm swings so that L is constant

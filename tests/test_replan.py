@@ -11,7 +11,7 @@ from test_transcription import toy
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
-from jumplab.ocp.assembly import Assembled, group_rows, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.ocp.assembly import Assembled, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
 from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess
 from jumplab.ocp.problem import Term
 from jumplab.robot import Robot
@@ -31,40 +31,36 @@ def test_packing_and_unpacking_are_inverse(assembled):
     again = {n: PhaseGuess(p.duration, p.q, p.v, p.a, p.z, p.constants) for n, p in phases.items()}
     packed = pack(assembled, again)
     for layout in assembled.layouts.values():  # jerks follow from the accelerations, so they are another matter
-        for index in (layout.nodes(), layout.constants()):
+        for index in (layout.nodes, layout.constants):
             np.testing.assert_allclose(packed[index], x[index], rtol=1e-14)
-        for k in range(layout.phase.intervals + 1):
-            np.testing.assert_array_equal(layout.nodes()[k], layout.node(k))
-        for k in range(layout.phase.intervals):
-            np.testing.assert_array_equal(layout.jerks()[k], layout.jerk(k))
 
 
 def test_every_row_is_in_one_group(assembled):
-    groups = group_rows(assembled)
-    found = np.concatenate([g.index.ravel() for g in groups])
+    found = np.concatenate([index.ravel() for _, _, index in assembled.groups])
     np.testing.assert_array_equal(np.sort(found), np.arange(assembled.n_rows))
-    for g in groups:
-        for (k, c), i in np.ndenumerate(g.index):
+    for owner, term, index in assembled.groups:
+        for (_, c), i in np.ndenumerate(index):
             row = assembled.rows[i]
-            assert (row.owner, row.term.name, row.node, row.component) == (g.owner, g.term.name, g.nodes[k], c)
+            assert (row.owner, row.term.name, row.component) == (owner, term.name, c)
+        for places in index:
+            assert len({assembled.rows[i].node for i in places}) == 1
 
 
 def test_rows_that_are_off_have_no_bounds(assembled):
-    groups = group_rows(assembled)
-    low, high = row_bounds(groups, assembled.n_rows, {}, ("one/mid row", "meet"))
+    low, high = row_bounds(assembled, {}, ("one/mid row", "meet"))
     for i, row in enumerate(assembled.rows):
         expected = (-np.inf, np.inf) if row.term.name in ("mid row", "meet") else (0.0, 0.0)
         assert (low[i], high[i]) == expected
 
 
 def test_multipliers_survive_on_their_own_mesh(assembled):
-    rng, groups = np.random.default_rng(1), group_rows(assembled)
+    rng = np.random.default_rng(1)
     lam_x, lam_g = rng.normal(size=assembled.size), rng.normal(size=assembled.n_rows)
-    x, g = pack_multipliers(assembled, groups, unpack_multipliers(assembled, groups, lam_x, lam_g))
+    x, g = pack_multipliers(assembled, unpack_multipliers(assembled, lam_x, lam_g))
     np.testing.assert_allclose(g, lam_g, rtol=1e-14)
     for layout in assembled.layouts.values():
-        np.testing.assert_allclose(x[layout.nodes()], lam_x[layout.nodes()], rtol=1e-14)
-        np.testing.assert_array_equal(x[layout.constants()], lam_x[layout.constants()])
+        np.testing.assert_allclose(x[layout.nodes], lam_x[layout.nodes], rtol=1e-14)
+        np.testing.assert_array_equal(x[layout.constants], lam_x[layout.constants])
 
 
 def test_multipliers_of_two_meshes_say_the_same():
@@ -77,11 +73,11 @@ def test_multipliers_of_two_meshes_say_the_same():
         guess = {"go": flat_guess()["go"].resampled(n)}
         found[n] = nlp.solve({"goal": 1.0}, guess), nlp
     share, values = found[60][0].multipliers.rows["go", "wall"]
-    coarse = pack_multipliers(found[60][1].assembled, found[60][1].groups, found[30][0].multipliers)[1]
-    group = next(g for g in found[60][1].groups if g.term.name == "wall")
+    coarse = pack_multipliers(found[60][1].assembled, found[30][0].multipliers)[1]
+    index = next(index for _, term, index in found[60][1].assembled.groups if term.name == "wall")
     total = {n: f[0].multipliers.rows["go", "wall"][1].sum() / n for n, f in found.items()}
     assert total[30] == pytest.approx(total[60], rel=0.05) and total[60] > 1.0
-    assert coarse[group.index].sum() == pytest.approx(total[60], rel=0.1)
+    assert coarse[index].sum() == pytest.approx(total[60], rel=0.1)
     assert share[np.argmax(values[:, 0])] == pytest.approx(0.5, abs=0.1)
 
 

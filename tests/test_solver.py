@@ -119,8 +119,11 @@ def test_one_sided_rows_can_be_switched_off():
 
 
 def test_bounds_on_each_kind_of_variable():
-    boxes = (Bound("jerk box", "-", "m/s^3", "j", -45.0, 45.0), Bound("far end", "-", "m", "q", 0.9, 1.1, "end"),
-             Bound("inside", "-", "m", "q", -0.001, 1.05, "inner"))  # fmt: skip
+    boxes = (
+        Bound("jerk box", "-", "m/s^3", "j", -45.0, 45.0),
+        Bound("far end", "-", "m", "q", 0.9, 1.1, "end"),
+        Bound("inside", "-", "m", "q", -0.001, 1.05, "inner"),
+    )
     phase = Nlp(move(bounds=boxes), None).solve({"goal": 1.0}, flat_guess()).phases["go"]
     assert np.abs(phase.j).max() <= 45.0 + 1e-5 and phase.q.min() >= -0.001 - 1e-8
     free = Nlp(move()).solve({"goal": 1.0}, flat_guess()).phases["go"]
@@ -236,13 +239,17 @@ def test_too_few_iterations_is_not_an_answer():
 @pytest.mark.parametrize(
     ("term", "named"),
     [
-        (Term("root", "-", "m", "node", lambda p: ca.sqrt(p.q - 2), lower=0.0, upper=9.0),
-         ("go/root at node 0, t = 0.000 s of the phase",)),
-        (Term("tip", "-", "m", "end", lambda p: ca.sqrt(p.q), lower=-np.inf, upper=9.0),
-         (f"go/tip at node {N}, t = 1.000 s of the phase",)),
+        (
+            Term("root", "-", "m", "node", lambda p: ca.sqrt(p.q - 2), lower=0.0, upper=9.0),
+            ("go/root at node 0, t = 0.000 s of the phase",),
+        ),
+        (
+            Term("tip", "-", "m", "end", lambda p: ca.sqrt(p.q), lower=-np.inf, upper=9.0),
+            (f"go/tip at node {N}, t = 1.000 s of the phase",),
+        ),
         (Term("log", "-", "m", "mid", lambda p: ca.log(p.q - 1), weight=1.0), ("go/log",)),
     ],
-)  # fmt: skip
+)
 def test_a_term_that_is_no_number_is_named(capfd, term, named):
     """Or whose slope is none; CasADi itself knows only row and column."""
     with pytest.raises(SolverError, match="no finite value or slope at the initial guess has go/") as e:
@@ -277,7 +284,7 @@ class Pretender:
         "solve_succeeded",
     ],
 )
-def test_only_listed_statuses_are_believed(status):  # fmt: skip
+def test_only_listed_statuses_are_believed(status):
     nlp = Nlp(move())
     nlp._solver = Pretender(nlp._solver, status, 0.0)
     with pytest.raises(SolverError) as e:

@@ -3,13 +3,26 @@
 import casadi as ca
 import numpy as np
 import pytest
+from paper.lagrange import pendulum
 from scipy.integrate import solve_ivp
 
-from jumplab.models.srmp import COORDINATES, SrmpState, lagrangian
+from jumplab.models.srmp import COORDINATES, SrmpState
 
 MASS, G = 42.0, 9.8
-NAMES = ("com", "com_velocity", "com_acceleration", "inertia", "inertia_rate", "inertia_accel", "angular_momentum",
-         "angular_momentum_rate", "ground_force", "pivot_torque", "rod_force", "barbell_force")  # fmt: skip
+NAMES = (
+    "com",
+    "com_velocity",
+    "com_acceleration",
+    "inertia",
+    "inertia_rate",
+    "inertia_accel",
+    "angular_momentum",
+    "angular_momentum_rate",
+    "ground_force",
+    "pivot_torque",
+    "rod_force",
+    "barbell_force",
+)
 STEP = 1e-5
 
 
@@ -38,7 +51,7 @@ def test_coordinates():
 
 
 def test_lagrange_agrees():  # M-1
-    second = lagrangian(MASS, G)
+    second = pendulum(MASS, G)
     for q, v, a in random_states(20):
         x = at(q, v, a)
         want = [x["pivot_torque"], x["rod_force"], x["angular_momentum_rate"], x["barbell_force"]]
@@ -79,9 +92,16 @@ def test_two_masses_make_the_same(bhr):
         assert at(q, v, np.zeros(4))["angular_momentum"] == pytest.approx(spin, rel=1e-7)
 
 
-@pytest.mark.parametrize("quantity, rate", [("com", "com_velocity"), ("com_velocity", "com_acceleration"),
-                                            ("inertia", "inertia_rate"), ("inertia_rate", "inertia_accel"),
-                                            ("angular_momentum", "angular_momentum_rate")])  # fmt: skip
+@pytest.mark.parametrize(
+    "quantity, rate",
+    [
+        ("com", "com_velocity"),
+        ("com_velocity", "com_acceleration"),
+        ("inertia", "inertia_rate"),
+        ("inertia_rate", "inertia_accel"),
+        ("angular_momentum", "angular_momentum_rate"),
+    ],
+)
 def test_rates_are_derivatives(quantity, rate):
     for q, v, a in random_states(5, seed=4):
         before, after = (at(q + t * v + t * t / 2 * a, v + t * a, a)[quantity] for t in (-STEP, STEP))

@@ -1,5 +1,6 @@
 """From terms to a sparse program: every place, skip, scale and derivative, by hand and by CasADi's own means."""
 
+import doctest
 import re
 
 import casadi as ca
@@ -9,6 +10,7 @@ from fixtures_core import srmp_planner
 from scipy.sparse import csc_matrix
 
 from jumplab.errors import InputError
+from jumplab.ocp import problem as problem_words
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Bound, Phase, Problem, Term
@@ -38,25 +40,42 @@ def _first_terms():
         Term("node cost", "-", "m", "node", lambda p: ca.vertcat(p.q[0] * p.v[1] + p.s, p.a[0] * p.c.k), weight=2.0),
         Term("mid cost", "-", "m", "mid", lambda p: p.j[0] * p.q[1] + p.s * p.duration, weight=0.5),
         Term("start cost", "-", "m", "start", lambda p: p.z[0] * p.q[0], weight=3.0),
-        Term("node row", "-", "m", "node", lambda p: ca.vertcat(p.q[0] ** 2 - p.ref.r[0], p.z[0] * p.v[0]), scale=4.0,
-             skip=(1, 2)),
+        Term(
+            "node row",
+            "-",
+            "m",
+            "node",
+            lambda p: ca.vertcat(p.q[0] ** 2 - p.ref.r[0], p.z[0] * p.v[0]),
+            scale=4.0,
+            skip=(1, 2),
+        ),
         Term("track", "-", "m", "node", lambda p: ca.sin(p.q[1]) - p.ref.r[1] * p.p.m, weight=1.5),
         Term("mid row", "-", "m", "mid", lambda p: p.q[0] * p.q[1] * p.v[0], lower=-np.inf, upper=3.0),
         Term("drift", "-", "m", "interval", lambda a, b, h: b.z - a.z - h * a.q[0] * b.q[1] - a.j[1] * 1e-3, scale=2.0),
         Term("end row", "-", "m", "end", lambda p: p.q[0] - p.p.goal[1] * p.time),
-    )  # fmt: skip
+    )
 
 
 def toy() -> Problem:
-    first = Phase("one", ("x", "y"), 5, (0.5, 2.0), _first_terms(), (Bound("rest", "-", "m", "v", 0.0, 0.0, "start"),),
-                  states=("w",), constants={"k": (-1.0, 1.0, 0.5)}, references={"r": 2},
-                  scales={"q": [1.0, 2.0], "v": 3.0, "a": 10.0, "j": [100.0, 50.0], "z": 0.5})  # fmt: skip
+    first = Phase(
+        "one",
+        ("x", "y"),
+        5,
+        (0.5, 2.0),
+        _first_terms(),
+        (Bound("rest", "-", "m", "v", 0.0, 0.0, "start"),),
+        states=("w",),
+        constants={"k": (-1.0, 1.0, 0.5)},
+        references={"r": 2},
+        scales={"q": [1.0, 2.0], "v": 3.0, "a": 10.0, "j": [100.0, 50.0], "z": 0.5},
+    )
     second = Phase("two", ("u",), 3, (0.1, 1.0), (Term("jerk", "-", "m", "mid", lambda p: p.j, weight=1e-3),))
     joints = (
-        Term("meet", "-", "m", "problem", lambda e: e["one"].end.q[0] * e["one"].end.c.k - e["two"].start.q[0],
-             scale=3.0),
-        Term("short", "-", "s", "problem", lambda e: e["one"].end.duration + e["two"].end.duration**2, weight=7.0),
-    )  # fmt: skip
+        Term(
+            "meet", "-", "m", "problem", lambda e: e["one"].end.q[0] * e["one"].end.c.k - e["two"].start.q[0], scale=3.0
+        ),
+        Term("short", "-", "s", "problem", lambda e: e["one"].end.duration + e["two"].end.duration ** 2, weight=7.0),
+    )
     return Problem("toy", (first, second), joints, {"goal": 2, "m": 1})
 
 
@@ -78,10 +97,10 @@ def data_vector(a: Assembled, rng) -> np.ndarray:
 def physical(a: Assembled, x, name):
     """Nodes, jerks and constants of one phase in physical units."""
     layout = a.layouts[name]
-    n, phase = layout.phase.intervals, layout.phase
-    nodes = np.array([x[layout.node(k)] for k in range(n + 1)]) * layout.node_scales()
-    jerks = np.array([x[layout.jerk(k)] for k in range(n)]) * phase.scale("j", layout.nq)
-    return nodes, jerks, x[layout.constants()] * layout.constant_scales()
+    phase = layout.phase
+    nodes = x[layout.nodes] * layout.node_scales
+    jerks = x[layout.jerks] * phase.scale("j")
+    return nodes, jerks, x[layout.constants] * layout.constant_scales
 
 
 def random_point(a: Assembled, seed):
@@ -92,8 +111,7 @@ def random_point(a: Assembled, seed):
 def test_every_variable_has_one_place(assembled):
     seen = []
     for layout in assembled.layouts.values():
-        n = layout.phase.intervals
-        seen += [layout.constants(), *(layout.node(k) for k in range(n + 1)), *(layout.jerk(k) for k in range(n))]
+        seen += [layout.constants, layout.nodes.ravel(), layout.jerks.ravel()]
     np.testing.assert_array_equal(np.sort(np.concatenate(seen)), np.arange(assembled.size))
 
 
@@ -177,7 +195,7 @@ def test_state_equation_is_the_chain(assembled):
         step, nq = constants[0] / layout.phase.intervals, layout.nq
         state = rng.normal(size=(3, nq))
         for k in range(layout.phase.intervals + 1):
-            place, scales = layout.node(k), layout.node_scales()
+            place, scales = layout.nodes[k], layout.node_scales
             x[place[: 3 * nq]] = state.ravel() / scales[: 3 * nq]
             if k < layout.phase.intervals:
                 state = np.array(chain(*state, jerks[k], step))
@@ -248,6 +266,11 @@ def test_references_reach_their_node(assembled):
 
 
 # words ----------------------------------------------------------------------------------------------------------
+def test_the_first_example_runs():
+    assert doctest.testmod(problem_words).attempted >= 7
+    assert doctest.testmod(problem_words).failed == 0
+
+
 def test_places_are_checked():
     with pytest.raises(InputError) as e:
         Term("lost", "-", "m", "nowhere", lambda p: p.q)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, turned
+from paper.lagrange import five_links
 from paper.violations import violations
 from paper.whole_body_printed import (
     LINK_OF_THETA,
@@ -20,7 +21,6 @@ from paper.whole_body_printed import (
 )
 
 from jumplab.errors import InputError
-from jumplab.models.planar import lagrangian
 from jumplab.ocp.problem import Point
 from jumplab.robot.stance import stance_configuration
 from jumplab.stages.reconstruction import expand
@@ -124,7 +124,7 @@ def test_start_is_the_stance(bhr, planner, printed):
 # rows -----------------------------------------------------------------------------------------------------------
 def test_rows_against_lagrange(bhr):
     """First three of M theta'' + H with the base at the hip; the third is then taken about the trunk's top."""
-    rows, second, s = rows_function(bhr, True), lagrangian(bhr.sagittal), bhr.sagittal
+    rows, second, s = rows_function(bhr, True), five_links(bhr.sagittal), bhr.sagittal
     for theta, rate, accel in zip(*states(5, seed=4), strict=True):
         arm = -turned(theta[2], s.base)  # from the trunk's top to the hip
         across = np.array([arm[1], -arm[0]])

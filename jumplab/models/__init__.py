@@ -1,1 +1,5 @@
-"""The models of the three stages: reaction mass pendulum, five links in the plane, nine links in space."""
+"""What the three stages know of the robot, each as a source of named quantities at one instant.
+
+In: states and their rates. Out: momentum, inertia, forces, torques, and for the nine links their Jacobians.
+Start reading in :mod:`jumplab.models.srmp` (stage 1); then ``planar.py`` (stage 3), ``full.py`` (stage 2).
+"""

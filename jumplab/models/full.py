@@ -8,7 +8,7 @@ axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -16,10 +16,14 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 
-# full_terms ------------------------------------------------------------------------------------------
+PARALLEL_TOLERANCE = 1e-6  # how far an axis may be off before a robot counts as crooked
 CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
+# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
+SLOPE = np.zeros((16, 6))
+SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
+SLOPE[1, 5] = -1.0
 
 
 def skew(x: np.ndarray) -> np.ndarray:
@@ -27,28 +31,19 @@ def skew(x: np.ndarray) -> np.ndarray:
     return (x @ CROSS).reshape(*x.shape, 3)
 
 
-class FullTerms(NamedTuple):
-    """Every quantity of the nine-link robot that the QPs need, at one (q, v); feet are ordered left, right.
-
-    In each "drift" the acceleration is that of theta'' = 0, so ``x'' = J_x theta'' + drift``.
+@dataclass(frozen=True)
+class FullMotion:
+    """What feedback needs to know of the robot at one (q, v); feet are ordered left, right.
 
     Attributes
     ----------
     q, v : configuration (nq,) and rates (nv,).
     base_rotation : of the base link (3, 3).
-    M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
     com, com_velocity : c and its rate (3,) [m, m/s].
-    A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
     momentum : linear then centroidal angular momentum (6,) [kg m/s, kg m^2/s]; ``momentum[4]`` is L.
-    A_h, B_h : centroidal momentum matrix (6, nv) and drift (6,).
-    rho : pitch inertia about the CoM, rho_total [kg m^2].
-    J_rho, drift_rho : its Jacobian (nv,) and drift [kg m^2/s^2].
+    rho, rho_rate : pitch inertia about the CoM, rho_total [kg m^2], and its rate [kg m^2/s].
     toe, heel, sole : places of the middles of the soles' front edge, rear edge, and of the sole itself (2, 3) [m].
     toe_velocity, heel_velocity, sole_velocity : (2, 3) [m/s].
-    J_toe, drift_toe : Jacobian (2, 6, nv), linear then angular, and drift (2, 6) of the tiptoes; J^js of the paper.
-    J_heel, drift_heel : linear Jacobian (2, 3, nv) and drift (2, 3) of the heels.
-    foot_com, foot_com_rate : sole minus CoM, p_rd, and its rate (2, 3).
-    J_rd, drift_rd : Jacobian (2, 3, nv) and drift (2, 3) of p_rd.
     foot_rotation : rotation matrices of the feet (2, 3, 3).
     foot_spin : angular velocity of the feet, world axes (2, 3) [rad/s].
     """
@@ -56,34 +51,67 @@ class FullTerms(NamedTuple):
     q: np.ndarray
     v: np.ndarray
     base_rotation: np.ndarray
-    M: np.ndarray
-    H: np.ndarray
     com: np.ndarray
     com_velocity: np.ndarray
-    A_c: np.ndarray
-    B_c: np.ndarray
     momentum: np.ndarray
-    A_h: np.ndarray
-    B_h: np.ndarray
     rho: float
-    J_rho: np.ndarray
-    drift_rho: float
+    rho_rate: float
     toe: np.ndarray
     heel: np.ndarray
     sole: np.ndarray
     toe_velocity: np.ndarray
     heel_velocity: np.ndarray
     sole_velocity: np.ndarray
+    foot_rotation: np.ndarray
+    foot_spin: np.ndarray
+
+    @property
+    def foot_com(self) -> np.ndarray:
+        """p_rd (2, 3): sole minus CoM [m]."""
+        return self.sole - self.com
+
+    @property
+    def foot_com_rate(self) -> np.ndarray:
+        """Rate of p_rd (2, 3) [m/s]."""
+        return self.sole_velocity - self.com_velocity
+
+    @property
+    def foot_pitch(self) -> np.ndarray:
+        """Pitch of the feet (2,) [rad]; positive is heel up."""
+        return np.arctan2(-self.foot_rotation[:, 2, 0], self.foot_rotation[:, 0, 0])
+
+
+@dataclass(frozen=True)
+class FullTerms(FullMotion):
+    """Every quantity of the nine-link robot that the QPs need, at one (q, v).
+
+    A "drift" is the acceleration of theta'' = 0, so ``x'' = J_x theta'' + drift``.
+
+    Attributes
+    ----------
+    M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
+    A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
+    A_h, B_h : centroidal momentum matrix (6, nv) and drift (6,).
+    J_rho, drift_rho : Jacobian (nv,) and drift of rho [kg m^2/s^2].
+    J_toe, drift_toe : Jacobian (2, 6, nv), linear then angular, and drift (2, 6) of the tiptoes; J^js of the paper.
+    J_heel, drift_heel : linear Jacobian (2, 3, nv) and drift (2, 3) of the heels.
+    J_rd, drift_rd : Jacobian (2, 3, nv) and drift (2, 3) of p_rd.
+    """
+
+    M: np.ndarray
+    H: np.ndarray
+    A_c: np.ndarray
+    B_c: np.ndarray
+    A_h: np.ndarray
+    B_h: np.ndarray
+    J_rho: np.ndarray
+    drift_rho: float
     J_toe: np.ndarray
     drift_toe: np.ndarray
     J_heel: np.ndarray
     drift_heel: np.ndarray
-    foot_com: np.ndarray
-    foot_com_rate: np.ndarray
     J_rd: np.ndarray
     drift_rd: np.ndarray
-    foot_rotation: np.ndarray
-    foot_spin: np.ndarray
 
     @property
     def J(self) -> np.ndarray:
@@ -98,67 +126,11 @@ class FullTerms(NamedTuple):
         out[3:, :3], out[3:, 6:9] = left, right
         return out
 
-    @property
-    def rho_rate(self) -> float:
-        """d rho / dt [kg m^2/s]."""
-        return float(self.J_rho @ self.v)
-
-    @property
-    def foot_pitch(self) -> np.ndarray:
-        """Pitch of the feet (2,) [rad]; positive is heel up."""
-        return pitch_of(self.foot_rotation)
-
-
-class FullMotion(NamedTuple):
-    """What feedback needs to know at one (q, v): names and values as in :class:`FullTerms`, at less than half the cost.
-
-    ``rho_rate`` is d rho / dt [kg m^2/s].
-    """
-
-    q: np.ndarray
-    v: np.ndarray
-    base_rotation: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    momentum: np.ndarray
-    rho: float
-    rho_rate: float
-    toe: np.ndarray
-    heel: np.ndarray
-    toe_velocity: np.ndarray
-    heel_velocity: np.ndarray
-    foot_com: np.ndarray
-    foot_com_rate: np.ndarray
-    foot_rotation: np.ndarray
-    foot_spin: np.ndarray
-
-    @property
-    def foot_pitch(self) -> np.ndarray:
-        """Pitch of the feet (2,) [rad]; positive is heel up."""
-        return pitch_of(self.foot_rotation)
-
-
-def pitch_of(rotation: np.ndarray) -> np.ndarray:
-    """Pitch (n,) of rotations (n, 3, 3) about +y [rad]."""
-    return np.arctan2(-rotation[:, 2, 0], rotation[:, 0, 0])
-
 
 def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, momentum_rate: np.ndarray) -> np.ndarray:
     """B_f (6,): what A_f F must be for a CoM acceleration (3,) and a rate of centroidal angular momentum (3,)."""
     lift = np.array([0.0, 0.0, gravity])
     return np.concatenate([mass * (np.asarray(com_acceleration) + lift), momentum_rate])
-
-
-# full ------------------------------------------------------------------------------------------
-LATERAL = np.array([0.0, 1.0, 0.0])  # the pitch axis, world
-PARALLEL_TOLERANCE = 1e-6  # our choice: how far an axis may be off before a robot counts as crooked
-POINTS = ("toe", "heel", "sole")
-__all__ = ["FullBody", "FullMotion", "FullTerms", "force_target", "skew"]
-
-# D (4 x 4, row by row) times this is half the slope of D_xx + D_zz along a twist (linear, angular) about the origin
-SLOPE = np.zeros((16, 6))
-SLOPE[3, 0] = SLOPE[11, 2] = SLOPE[9, 3] = 1.0
-SLOPE[1, 5] = -1.0
 
 
 class FullBody:
@@ -184,13 +156,10 @@ class FullBody:
         self.nq, self.nv = self.model.nq, self.model.nv
         self.mass = robot.total_mass
         self.gravity = -float(self.model.gravity.linear[2])
-        self._upper = np.triu(np.ones((self.nv, self.nv)))
-        self._above_diagonal = np.triu(np.ones((self.nv, self.nv)), 1)
         self._read_tree()
         self._read_feet()
         self.pairs, self.groups = self._pair_joints()
 
-    # constants of the robot -------------------------------------------------------------------------------------
     def _read_tree(self):
         model, n = self.model, self.model.njoints - 1
         self._column_joint = np.concatenate([[j - 1] * model.joints[j].nv for j in range(1, n + 1)])  # (nv,)
@@ -212,12 +181,11 @@ class FullBody:
     def _read_feet(self):
         model, foot, data = self.model, self.robot.foot, self.data
         frames = [model.frames[model.getFrameId(name)] for name in foot.frames]
-        self.foot_joints = [f.parentJoint for f in frames]
-        middle = {"toe": [foot.toe, 0.0, foot.sole_z], "heel": [foot.heel, 0.0, foot.sole_z], "sole": foot.center}
-        self._points = np.array([[f.placement.act(np.array(middle[p], float)) for p in POINTS] for f in frames])
+        self._foot_joints = [f.parentJoint for f in frames]
+        middles = [foot.toe, 0.0, foot.sole_z], [foot.heel, 0.0, foot.sole_z], foot.center  # tiptoe, heel, sole
+        self._points = np.array([[f.placement.act(np.array(x, float)) for x in middles] for f in frames])
         self._foot_turn = np.array([f.placement.rotation for f in frames])
-        self.foot_origin = np.array([f.placement.translation for f in frames])  # (2, 3), in the foot joint
-        self._foot_bodies = [j - 1 for j in self.foot_joints]
+        self._foot_bodies = [j - 1 for j in self._foot_joints]
         self._foot_carries = self._carries[self._foot_bodies]  # (2, nv)
         pin.framesForwardKinematics(model, data, pin.neutral(model))
         for name in foot.frames:
@@ -236,7 +204,7 @@ class FullBody:
         model, data, roles = self.model, self.data, self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
         shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
-        legs = [self._chain(j) for j in self.foot_joints]
+        legs = [self._chain(j) for j in self._foot_joints]
         hip = self._chain(model.getJointId(roles["hip_pitch"][0]))
         pairs, groups = [], {"hip": [], "knee": [], "ankle": [], "shoulder": []}
         for chains, arm in ((legs, False), (shoulders, True)):
@@ -277,42 +245,50 @@ class FullBody:
             row[right], row[left] = 1.0, -sign
         return rows[[i for g in groups for i in self.groups[g]]]
 
-    # quantities of one state ------------------------------------------------------------------------------------
     def terms(self, q: np.ndarray, v: np.ndarray) -> FullTerms:
         """All quantities at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
-        model, data = self.model, self.data
+        model, data, mass = self.model, self.data, self.mass
         pin.dccrba(model, data, q, v)
         J, dJ = data.J.copy(), data.dJ.copy()  # (6, nv) about the world origin
         A_h, B_h, com = data.Ag.copy(), data.dAg @ v, data.com[0].copy()
-        A_c, B_c, momentum = A_h[:3] / self.mass, B_h[:3] / self.mass, A_h @ v
-        velocity, place = momentum[:3] / self.mass, self._placements()
+        A_c, B_c, momentum = A_h[:3] / mass, B_h[:3] / mass, A_h @ v
+        velocity, place = momentum[:3] / mass, self._placements()
         H = pin.nonLinearEffects(model, data, q, v).copy()
-        M = pin.crba(model, data, q) * self._upper  # Pinocchio leaves the lower triangle to chance
-        M += (M * self._above_diagonal).T
+        M = np.triu(pin.crba(model, data, q))  # Pinocchio leaves the lower triangle to chance
+        M += np.triu(M, 1).T
         # linear and angular velocity, and both at theta'' = 0 differentiated, about the world origin, of each body
         twist = (self._carries @ np.concatenate([J * v, dJ * v]).T).reshape(-1, 4, 3)
         D, rho, slope = self._moments(place, com)
-        J_rho = 2 * ((J * slope).sum(0) - self.mass * (com[::2] @ A_c[::2]))  # (nv,)
-        centre = self.mass * (velocity[::2] @ velocity[::2] + com[::2] @ B_c[::2])
+        J_rho = 2 * ((J * slope).sum(0) - mass * (com[::2] @ A_c[::2]))  # (nv,)
+        centre = mass * (velocity[::2] @ velocity[::2] + com[::2] @ B_c[::2])
         drift_rho = 2 * (_half_second(D, twist) - centre)
-        feet = self._feet(J, place, twist, v, com, velocity, A_c, B_c)
-        return FullTerms(q, v, place[0, :3, :3].copy(), M, H, com, velocity, A_c, B_c, momentum, A_h, B_h,
-                         rho, J_rho, drift_rho, *feet)  # fmt: skip
+        turn, points = self._soles(place)
+        spin, drift, alpha = twist[self._foot_bodies, 1:].transpose(1, 0, 2)  # (2, 3) each
+        own = J * self._foot_carries[:, None]  # (2, 6, nv)
+        linear = own[:, None, :3] - skew(points) @ own[:, None, 3:]  # (2, 3 points, 3, nv)
+        speed = linear @ v  # (2, 3 points, 3)
+        turning, spinning = skew(alpha).transpose(0, 2, 1), skew(spin).transpose(0, 2, 1)  # (2, 3, 3)
+        bias = drift[:, None] + points @ turning + speed @ spinning  # (2, 3 points, 3)
+        J_toe, drift_toe = np.concatenate([linear[:, 0], own[:, 3:]], 1), np.concatenate([bias[:, 0], alpha], 1)
+        J_rd, drift_rd = linear[:, 2] - A_c, bias[:, 2] - B_c
+        motion = (q, v, place[0, :3, :3].copy(), com, velocity, momentum, rho, float(J_rho @ v))
+        feet = (*points.transpose(1, 0, 2), *speed.transpose(1, 0, 2), turn, spin)
+        slopes = (J_rho, drift_rho, J_toe, drift_toe, linear[:, 1], bias[:, 1], J_rd, drift_rd)
+        return FullTerms(*motion, *feet, M, H, A_c, B_c, A_h, B_h, *slopes)
 
     def motion(self, q: np.ndarray, v: np.ndarray) -> FullMotion:
-        """What feedback needs at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
-        data, m = self.data, self.mass
+        """What feedback needs at configuration ``q`` (nq,) and rates ``v`` (nv,), at less than half the cost."""
+        data, mass = self.data, self.mass
         pin.ccrba(self.model, data, q, v)
         moving, momentum, com = data.J * v, data.Ag @ v, data.com[0].copy()
-        velocity, place = momentum[:3] / m, self._placements()
+        velocity, place = momentum[:3] / mass, self._placements()
         _, rho, slope = self._moments(place, com)
-        rho_rate = 2 * ((moving * slope).sum() - m * (com[::2] @ velocity[::2]))
+        rho_rate = float(2 * ((moving * slope).sum() - mass * (com[::2] @ velocity[::2])))
         turn, points = self._soles(place)
         foot = self._foot_carries @ moving.T  # (2, 6)
         speed = foot[:, None, :3] + points @ skew(foot[:, 3:]).transpose(0, 2, 1)  # (2, 3 points, 3)
-        return FullMotion(q, v, place[0, :3, :3].copy(), com, velocity, momentum, rho, float(rho_rate),
-                          points[:, 0], points[:, 1], speed[:, 0], speed[:, 1], points[:, 2] - com,
-                          speed[:, 2] - velocity, turn @ self._foot_turn, foot[:, 3:])  # fmt: skip
+        feet = (*points.transpose(1, 0, 2), *speed.transpose(1, 0, 2), turn, foot[:, 3:])
+        return FullMotion(q, v, place[0, :3, :3].copy(), com, velocity, momentum, rho, rho_rate, *feet)
 
     def _placements(self) -> np.ndarray:
         """Placements of all bodies (n, 4, 4) as Pinocchio last left them; the next call overwrites the array."""
@@ -321,7 +297,7 @@ class FullBody:
         place[:, :3, 3] = np.concatenate(self._translations).reshape(n, 3)
         return place
 
-    def _moments(self, place, com):
+    def _moments(self, place: np.ndarray, com: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
         """D (n, 4, 4), rho, and half the slope of D_xx + D_zz along every column's twist (6, nv).
 
         With D, the integral of [x; 1][x; 1]^T dm: rho = D_xx + D_zz - m (c_x^2 + c_z^2).
@@ -331,31 +307,11 @@ class FullBody:
         rho = carried[0, 0] + carried[0, 10] - self.mass * (com[::2] @ com[::2])
         return D, rho, (carried @ SLOPE)[self._column_joint].T
 
-    def _soles(self, place):
-        """Rotations (2, 3, 3) of the feet's joints, and places of tiptoes, heels and soles (2, 3 points, 3)."""
+    def _soles(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations of the feet (2, 3, 3), and places of tiptoes, heels and soles (2, 3 points, 3)."""
         at = place[self._foot_bodies, :3]  # (2, 3, 4)
         turn = at[..., :3]
-        return turn, self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]
-
-    def _feet(self, J, place, twist, v, com, com_velocity, A_c, B_c):
-        """Places, velocities, Jacobians and drifts of tiptoes, heels and soles, and p_rd = sole - CoM."""
-        turn, points = self._soles(place)
-        moving = twist[self._foot_bodies]  # (2, 4, 3)
-        spin, drift, alpha = moving[:, 1], moving[:, 2], moving[:, 3]
-        own = J * self._foot_carries[:, None]  # (2, 6, nv)
-        linear = own[:, None, :3] - skew(points) @ own[:, None, 3:]  # (2, 3 points, 3, nv)
-        speed = linear @ v  # (2, 3 points, 3)
-        turning, spinning = skew(alpha).transpose(0, 2, 1), skew(spin).transpose(0, 2, 1)  # (2, 3, 3)
-        bias = drift[:, None] + points @ turning + speed @ spinning  # (2, 3 points, 3)
-        J_toe = np.concatenate([linear[:, 0], own[:, 3:]], 1)  # (2, 6, nv)
-        drift_toe = np.concatenate([bias[:, 0], alpha], 1)  # (2, 6)
-        return (
-            *(points[:, i] for i in range(3)),
-            *(speed[:, i] for i in range(3)),
-            J_toe, drift_toe, linear[:, 1], bias[:, 1],
-            points[:, 2] - com, speed[:, 2] - com_velocity, linear[:, 2] - A_c, bias[:, 2] - B_c,
-            turn @ self._foot_turn, spin,
-        )  # fmt: skip
+        return turn @ self._foot_turn, self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]
 
 
 def _half_second(D, twist) -> float:

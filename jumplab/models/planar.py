@@ -21,10 +21,10 @@ from jumplab.task import GRAVITY
 NEGLIGIBLE = 1e-14  # share of the largest of some coefficients: below it is rounding
 
 
-def _dot(vectors: np.ndarray, columns) -> list:
-    """Sum over j of (2,) numbers times CasADi (2, 1) columns given as (x, z) pairs, skipping zeros."""
+def _turned(arms: np.ndarray, turns) -> list:
+    """(x, z) of the sum over j of arms (5, 2), each by its CasADi matrix ((xx, xz), (zx, zz)), skipping zeros."""
     x, z = 0, 0
-    for (dx, dz), ((xx, xz), (zx, zz)) in zip(vectors, columns, strict=True):
+    for (dx, dz), ((xx, xz), (zx, zz)) in zip(arms, turns, strict=True):
         if dx:
             x, z = x + dx * xx, z + dx * zx
         if dz:
@@ -50,8 +50,8 @@ class PlanarState:
     gravity: float = GRAVITY
 
     @cached_property
-    def _turn(self):
-        """Per angle the columns of R, R' w and R' a - R w^2 as ((xx, xz), (zx, zz))."""
+    def _turns(self):
+        """Per order of differentiation in time, and per angle, its rotation matrix ((xx, xz), (zx, zz))."""
         place, velocity, acceleration = [], [], []
         for j in range(5):
             c, s = ca.cos(self.angles[j]), ca.sin(self.angles[j])
@@ -67,12 +67,12 @@ class PlanarState:
         arms = name_or_arms
         if isinstance(name_or_arms, str):
             arms = self.model.point_arms(*self.model.points[name_or_arms])
-        return ca.vertcat(*_dot(arms, self._turn[order]))
+        return ca.vertcat(*_turned(arms, self._turns[order]))
 
     @cached_property
     def _com(self):
         arms = np.einsum("i,ijk->jk", self.model.mass, self.model.com_arms()) / self.model.total_mass
-        return [_dot(arms, turn) for turn in self._turn]
+        return [_turned(arms, turns) for turns in self._turns]
 
     @property
     def com(self) -> ca.SX:
@@ -141,7 +141,7 @@ class PlanarState:
         """(x, z) of the links' masses times their places from a point with complex arms (5,) [kg m]."""
         links = list(links)
         arms = self.model.mass[links] @ (self._arms()[links] - about)
-        return _dot(np.stack([arms.real, arms.imag], -1), self._turn[0])
+        return _turned(np.stack([arms.real, arms.imag], -1), self._turns[0])
 
     def _central(self) -> np.ndarray:
         """P of both sums taken from the CoM."""
@@ -232,30 +232,5 @@ def evaluator(model: SagittalModel, gravity: float = GRAVITY) -> ca.Function:
         "sole": s.point(sole),
         "heel": s.point("heel"),
     }
-    return ca.Function("planar", [a, w, b, toe], list(outputs.values()), ["angles", "rates", "accels", "toe"],
-                       list(outputs))  # fmt: skip
-
-
-def lagrangian(model: SagittalModel, gravity: float = GRAVITY) -> ca.Function:
-    """Independent derivation: Lagrange's equations in theta = [x; z; pitch; q] (Sec. II-C), base at the hip.
-
-    Returns a function (theta, theta_rate, theta_accel) -> (M theta'' + H) of size 7; x, z are the hip's position.
-    """
-    theta, rate, accel = (ca.SX.sym(n, 7) for n in ("theta", "rate", "accel"))
-    hip, pitch, q = theta[:2], theta[2], theta[3:]
-    thigh = pitch + q[0]
-    shank = thigh + q[1]
-    angles = [shank + q[2], shank, thigh, pitch, pitch + q[3]]
-    turn = [((ca.cos(x), ca.sin(x)), (-ca.sin(x), ca.cos(x))) for x in angles]
-    to_hip = model.point_arms(3, np.zeros(2))
-    kinetic, potential = 0, 0
-    for i, arms in enumerate(model.com_arms()):
-        place = hip + ca.vertcat(*_dot(arms - to_hip, turn))
-        speed = ca.jacobian(place, theta) @ rate
-        spin = ca.jacobian(angles[i], theta) @ rate
-        kinetic += model.mass[i] * ca.dot(speed, speed) / 2 + model.inertia[i] * spin**2 / 2
-        potential += model.mass[i] * gravity * place[1]
-    momentum = ca.gradient(kinetic, rate)
-    force = ca.jacobian(momentum, rate) @ accel + ca.jacobian(momentum, theta) @ rate
-    force += ca.gradient(potential - kinetic, theta)
-    return ca.Function("lagrangian", [theta, rate, accel], [force], ["theta", "rate", "accel"], ["force"])
+    inputs = {"angles": a, "rates": w, "accels": b, "toe": toe}
+    return ca.Function("planar", list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))

@@ -96,18 +96,3 @@ class SrmpState:
     def barbell_force(self) -> ca.SX:
         """F_varphi = m (varphi'' - varphi (omega_l + omega_pl)^2) [N]."""
         return self.mass * (self.a[3] - self.q[3] * (self.v[0] + self.v[2]) ** 2)
-
-
-def lagrangian(mass: float, gravity: float = GRAVITY) -> ca.Function:
-    """Independent derivation of (tau_l, F_phi, tau_pl, F_varphi) by Lagrange's equation (Eq. 2): (q, v, a) -> (4,)."""
-    q, v, a = (ca.SX.sym(n, 4) for n in "qva")
-    centre = q[1] * ca.vertcat(ca.sin(q[0]), ca.cos(q[0]))
-    offset = q[3] * ca.vertcat(ca.sin(q[0] + q[2]), ca.cos(q[0] + q[2]))
-    kinetic, potential = 0, 0
-    for end in (centre + offset, centre - offset):
-        speed = ca.jacobian(end, q) @ v
-        kinetic += mass / 2 * ca.dot(speed, speed) / 2
-        potential += mass / 2 * gravity * end[1]
-    momentum = ca.gradient(kinetic, v)
-    force = ca.jacobian(momentum, v) @ a + ca.jacobian(momentum, q) @ v + ca.gradient(potential - kinetic, q)
-    return ca.Function("srmp_lagrangian", [q, v, a], [force])

@@ -1,10 +1,9 @@
-"""Problems kept between processes: the small functions they are made of, serialised by CasADi, in a folder that may be
-deleted.
+"""Built problems for later processes: their small functions, serialised by CasADi, in a folder that may be deleted.
 
-A file is found by a hash of everything that its content depends on: this package's sources, CasADi's version, the robot
-and the settings. It begins with a check sum; one that does not fit, for whatever reason, is passed over and replaced.
-The folder is ``$JUMPLAB_CACHE``, or ``jumplab`` in ``$XDG_CACHE_HOME`` or ``~/.cache``; an empty ``$JUMPLAB_CACHE``
-means that nothing is kept.
+A file is named by a hash of all that its content depends on: what it is built by (:data:`BUILT_BY`), CasADi's version,
+the problem's own words, and the caller's key (robot and settings). It begins with a check sum; a file that does not fit
+it is passed over and replaced. The folder is ``$JUMPLAB_CACHE``, else the user's cache folder of this system; an empty
+``$JUMPLAB_CACHE`` means that nothing is kept.
 """
 
 from __future__ import annotations
@@ -17,69 +16,81 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from platformdirs import user_cache_path
 
+from jumplab.errors import InputError
+from jumplab.io.files import write_file
 from jumplab.ocp.assembly import Assembled
-from jumplab.ocp.derivatives import FUNCTIONS, Element, defect_term
+from jumplab.ocp.derivatives import FUNCTIONS, JERK_CHAIN, Element, chain_term
 from jumplab.ocp.problem import Problem
 
-PLACES = ("*.py", "ocp/*.py", "models/*.py", "robot/*.py", "robot_import/*.py", "stages/srmp/*.py")
-SOURCES = (*PLACES, "stages/whole_body/*.py")  # all that a problem is built by
+HOME = ("jumplab.",)  # a problem with terms from elsewhere is not kept: no key would know a change of them
+# modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
+BUILT_BY = ("errors", "task", "ocp", "models", "robot", "robot_import", "stages.srmp", "stages.whole_body")
 
 
 def folder() -> Path | None:
     """Where files are kept; None if nowhere."""
     named = os.environ.get("JUMPLAB_CACHE")
-    if named is not None:
-        return Path(named) if named.strip() else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jumplab"
+    if named is None:
+        return user_cache_path("jumplab")
+    return Path(named) if named.strip() else None
 
 
 @cache
 def _sources() -> str:
-    here, found = Path(__file__).parent.parent, hashlib.sha256(ca.CasadiMeta.version().encode())
-    for path in sorted(path for pattern in SOURCES for path in here.glob(pattern)):
-        found.update(path.read_bytes())
+    """Hash of the sources of :data:`BUILT_BY`."""
+    package, found = Path(__file__).parent.parent, hashlib.sha256()
+    for name in BUILT_BY:
+        place = package.joinpath(*name.split("."))
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]:
+            found.update(path.read_bytes())
     return found.hexdigest()
+
+
+def _words(problem: Problem) -> list:
+    """What a problem says of itself, but for its mesh and the values of bounds and weights, which are data."""
+    phases = [
+        (p.name, p.coordinates, p.states, {name: c[2] for name, c in p.constants.items()}, p.references, p.scales)
+        for p in problem.phases
+    ]
+    terms = [(owner, t.name, t.equation, t.at, t.is_cost, t.scale) for owner, t in problem.terms()]
+    bounds = [(owner, b.name, b.equation, b.on, b.where) for owner, b in problem.bounds()]
+    return [problem.name, problem.parameters, phases, terms, bounds]
 
 
 def assembled(problem: Problem, key: str | None = None) -> Assembled:
     """The problem assembled, from the file of ``key`` if there is a sound one, else anew and then kept.
 
-    ``key`` says everything that the problem was made of besides the sources and its mesh, which the file does not
-    depend on; None keeps nothing.
+    ``key`` says what the problem was made of besides its words; None keeps nothing.
     """
-    place = None if key is None else folder()
-    if place is None:
+    place, modules = folder(), {str(t.expression.__module__) for _, t in problem.terms()}
+    if key is None or place is None or not all(module.startswith(HOME) for module in modules):
         return Assembled(problem)
-    path = place / (hashlib.sha256(f"{_sources()} {problem.name} {key}".encode()).hexdigest()[:32] + ".casadi")
+    made_of = [_sources(), ca.CasadiMeta.version(), _words(problem), key]
+    name = hashlib.sha256(json.dumps(made_of, default=lambda array: array.tolist()).encode()).hexdigest()
+    path = place / f"{name[:32]}.casadi"
     known = _read(path, problem)
     if known is not None:
         return Assembled(problem, known)
     fresh = Assembled(problem)
-    _write(path, fresh)
+    try:
+        _write(path, fresh.elements)
+    except InputError:
+        pass  # a folder that cannot be written is no reason to fail
     return fresh
 
 
-def _write(path: Path, a: Assembled) -> None:
-    """Whole or not at all; a folder that cannot be written is no reason to fail."""
-    head, texts = [], []
-    for e in a.elements:
-        made = [(name, *e.function(name)) for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
-        head.append({
-            "owner": e.owner, "place": e.place, "ny": e.ny, "costs": [t.name for t in e.costs],
-            "rows": [(t.name, count) for t, count in e.rows],
-            "made": [(name, rows.tolist(), cols.tolist()) for name, _, rows, cols in made],
-        })  # fmt: skip
-        texts += [function.serialize().encode() for _, function, *_ in made]
-    head = json.dumps({"elements": head, "sizes": [len(text) for text in texts]}).encode()
-    body = b"\n".join([head, b"".join(texts)])
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        part.write_bytes(hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
-        os.replace(part, path)
-    except OSError:
-        part.unlink(missing_ok=True) if part.parent.is_dir() else None
+def _write(path: Path, elements: list[Element]) -> None:
+    """One list per element: owner, place, names of costs, names and counts of rows, functions with their places."""
+    told = []
+    for e in elements:
+        names = [name for name in FUNCTIONS if e.costs or name not in ("costs", "gauss_newton")]
+        made = [(name, *e.function(name)) for name in names]
+        functions = [(name, f.serialize(), rows.tolist(), cols.tolist()) for name, f, rows, cols in made]
+        told.append((e.owner, e.place, [t.name for t in e.costs], [(t.name, n) for t, n in e.rows], functions))
+    body = json.dumps(told).encode()
+    write_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
 
 
 def _read(path: Path, problem: Problem) -> list[Element] | None:
@@ -88,20 +99,13 @@ def _read(path: Path, problem: Problem) -> list[Element] | None:
         total, _, body = path.read_bytes().partition(b"\n")
         if hashlib.sha256(body).hexdigest().encode() != total:
             return None
-        head, _, texts = body.partition(b"\n")
-        known, at, functions = json.loads(head), 0, []
-        for size in known["sizes"]:
-            functions.append(ca.Function.deserialize(texts[at : at + size].decode()))
-            at += size
         terms = {(owner, t.name): t for owner, t in problem.terms()}
-        terms |= {(phase.name, defect_term().name): defect_term() for phase in problem.phases}
-        return [_element(e, terms, functions) for e in known["elements"]]
+        terms |= {(phase.name, JERK_CHAIN): chain_term(phase) for phase in problem.phases}
+        found = []
+        for owner, place, costs, rows, functions in json.loads(body):
+            made = {n: (ca.Function.deserialize(f), np.array(i, int), np.array(j, int)) for n, f, i, j in functions}
+            counts = [(terms[owner, name], n) for name, n in rows]
+            found.append(Element(owner, place, [terms[owner, name] for name in costs], counts, made=made))
+        return found
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):
         return None
-
-
-def _element(e: dict, terms: dict, functions: list[ca.Function]) -> Element:
-    """One element of a file; takes its functions from the front of the list."""
-    made = {name: (functions.pop(0), np.array(rows, int), np.array(cols, int)) for name, rows, cols in e["made"]}
-    rows = [(terms[e["owner"], name], count) for name, count in e["rows"]]
-    return Element(e["owner"], e["place"], e["ny"], [terms[e["owner"], name] for name in e["costs"]], rows, made=made)

@@ -1,21 +1,22 @@
-"""One repeated small function as a part of a sparse NLP: values and exact derivatives for all repetitions at a time."""
+"""Exact sparse derivatives: each place of a problem is one small function, differentiated once, called everywhere."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from jumplab.ocp.problem import PhaseLayout, Point, Problem, Term
+from jumplab.ocp.problem import Phase, PhaseLayout, Point, Problem, Term
 
-# elements ------------------------------------------------------------------------------------------
+JERK_CHAIN = "jerk chain"  # the term that every phase has
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
-RARE = ("gauss_newton",)  # evaluated seven times a plan: the search for what its entries share would not pay
-FUNCTIONS = ("costs", "gradient", "rows", "jacobian", "hessian", "gauss_newton")  # that an element may be asked for
+MATRICES = ("jacobian", "hessian", "gauss_newton")  # of the symmetric ones the upper triangle
+FUNCTIONS = ("costs", "gradient", "rows", *MATRICES)  # that an element may be asked for
+RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
 def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
@@ -23,121 +24,107 @@ def chain(q: Any, v: Any, a: Any, j: Any, h: Any) -> tuple[Any, Any, Any]:
     return q + h * v + h * h / 2 * a + h**3 / 6 * j, v + h * a + h * h / 2 * j, a + h * j
 
 
+@dataclass
 class Formulas:
-    """One element in symbols, from which its functions are made.
+    """One element in symbols: its variables, its data (share of the phase, references, step), the parameters.
 
-    Their arguments are the element's variables, its data (share of the phase, references, step), the parameters, and as
-    needed the weights of the costs, the multipliers of the rows, and the multiplier of the cost.
+    ``costs`` are (share, column), meaning share |column|^2; ``rows`` are scaled columns.
     """
 
-    def __init__(self, local, data, parameters, costs, rows):
-        """``costs`` are (share, column), meaning share |column|^2; ``rows`` scaled columns."""
-        self.local, self.costs, self.ny = local, costs, local.numel()
-        self.arguments = [local, data, parameters]
-        self.w = ca.SX.sym("w", len(costs))
-        self.parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for share, y in costs))
-        self.g = ca.vertcat(ca.SX(0, 1), *rows)
+    local: ca.SX
+    data: ca.SX
+    parameters: ca.SX
+    costs: list[tuple]
+    rows: list[ca.SX]
+
+    def __post_init__(self):
+        self.w, self.lam_f = ca.SX.sym("w", len(self.costs)), ca.SX.sym("lam_f")  # weights, multiplier of the cost
+        self.parts = ca.vertcat(ca.SX(0, 1), *(share * ca.sumsqr(y) for share, y in self.costs))
+        self.g = ca.vertcat(ca.SX(0, 1), *self.rows)
+        self.lam = ca.SX.sym("lam", self.g.numel())  # multipliers of the rows
 
     def make(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
-        """One of :data:`FUNCTIONS` as (function of a column of values, their rows, their columns)."""
-        symbols, output, sparsity = getattr(self, f"_{name}")()
-        function = ca.Function(name, [*self.arguments, *symbols], [output], {"cse": name not in RARE})
-        places = sparsity.get_triplet() if sparsity is not None else ((), ())
-        return function, *(np.array(z, int) for z in places)
-
-    def _costs(self):
-        return [], self.parts, None
-
-    def _gradient(self):
-        return [self.w], ca.gradient(ca.dot(self.w, self.parts) if self.costs else ca.SX(0), self.local), None
-
-    def _rows(self):
-        return [], self.g, None
-
-    def _jacobian(self):
-        j = ca.jacobian(self.g, self.local)
-        return [], ca.vertcat(*j.nonzeros()), j.sparsity()
-
-    def _hessian(self):
-        """Upper triangle of the Lagrangian's Hessian."""
-        lam, scale = ca.SX.sym("lam", self.g.numel()), ca.SX.sym("lam_f")
-        h = ca.triu(self._curvature(lam, scale))
-        return [self.w, lam, scale], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
-
-    def _gauss_newton(self):
-        """Upper triangle of the costs' Hessian without their own curvature."""
-        h = ca.triu(self._squares(1.0)[0])
-        return [self.w], ca.vertcat(ca.SX(0, 1), *h.nonzeros()), h.sparsity()
+        """One of :data:`FUNCTIONS`: (function of a column of values, and of a matrix its values' rows, columns)."""
+        cost = ca.dot(self.w, self.parts) if self.costs else ca.SX(0)
+        more, expression = {
+            "costs": lambda: ([], self.parts),
+            "gradient": lambda: ([self.w], ca.gradient(cost, self.local)),
+            "rows": lambda: ([], self.g),
+            "jacobian": lambda: ([], ca.jacobian(self.g, self.local)),
+            "hessian": lambda: ([self.w, self.lam, self.lam_f], ca.triu(self._curvature())),
+            "gauss_newton": lambda: ([self.w], ca.triu(self._squares(1.0)[0])),
+        }[name]()
+        rows, cols = (), ()
+        if name in MATRICES:
+            rows, cols = expression.sparsity().get_triplet()
+            expression = ca.vertcat(ca.SX(0, 1), *expression.nonzeros())
+        arguments = [self.local, self.data, self.parameters, *more]
+        function = ca.Function(name, arguments, [expression], {"cse": name not in RARE})
+        return function, np.array(rows, int), np.array(cols, int)
 
     def _squares(self, scale) -> tuple:
         """(2 w J^T J summed over the costs w |y|^2, [(share, y, J, 2 w) of each])."""
-        total, parts = ca.SX(self.ny, self.ny), []
+        total, parts = ca.SX(self.local.numel(), self.local.numel()), []
         for k, (share, y) in enumerate(self.costs):
-            jacobian = ca.jacobian(y, self.local)
-            weight = 2 * scale * self.w[k] * share
+            jacobian, weight = ca.jacobian(y, self.local), 2 * scale * self.w[k] * share
             total += weight * (jacobian.T @ jacobian)
             parts.append((share, y, jacobian, weight))
         return total, parts
 
-    def _curvature(self, lam, scale):
-        """Hessian of scale * cost + lam . g.
+    def _curvature(self):
+        """Hessian of the Lagrangian, lam_f * cost + lam . g.
 
         A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
         everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
         """
-        x, ys, mus = self.local, [], []
-        extra, parts = self._squares(scale)
-        for k, (share, y, jacobian, weight) in enumerate(parts):
-            mixed = ca.jacobian(share, x).T @ (2 * scale * self.w[k] * (y.T @ jacobian))
+        x, (extra, parts) = self.local, self._squares(self.lam_f)
+        for k, (share, y, jacobian, _) in enumerate(parts):
+            mixed = ca.jacobian(share, x).T @ (2 * self.lam_f * self.w[k] * (y.T @ jacobian))
             extra += mixed + mixed.T
-            ys, mus = [*ys, y], [*mus, weight * y]
-        y, mu = ca.vertcat(ca.SX(0, 1), *ys), ca.vertcat(ca.SX(0, 1), *mus)
+        y = ca.vertcat(ca.SX(0, 1), *(y for _, y, _, _ in parts))
+        mu = ca.vertcat(ca.SX(0, 1), *(w * y for _, y, _, w in parts))
         held = ca.SX.sym("mu", y.numel())
-        bent = ca.hessian(ca.dot(held, y) + ca.dot(lam, self.g), x)[0]
-        symbols = [x, self.arguments[1], self.arguments[2], lam, held]
+        bent = ca.hessian(ca.dot(held, y) + ca.dot(self.lam, self.g), x)[0]
+        symbols = [x, self.data, self.parameters, self.lam, held]
         return extra + ca.Function("bent", symbols, [bent])(*symbols[:-1], mu)
 
 
+@dataclass
 class Element:
-    """One small function, repeated: its terms, its variables in each repetition, its nodes.
+    """One small function, repeated: its terms, and what is made of them for all meshes.
 
     Attributes
     ----------
-    owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.  ny : number of its variables.
-    costs : its cost terms.  rows : its constraint terms, each with its number of rows.
-    made : name -> function, rows and columns of its nonzeros; shared by all meshes.
+    owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.
+    costs, rows : its cost terms, and its constraint terms, each with its number of rows.
+    formulas : None if all functions are already ``made``: name -> (function, rows, columns), see :class:`Formulas`.
     """
 
-    def __init__(self, owner: str, place: str, ny: int, costs: list[Term], rows: list[tuple[Term, int]],
-                 formulas: Formulas | None = None, made: dict | None = None):  # fmt: skip
-        self.owner, self.place, self.ny, self.costs, self.rows = owner, place, ny, costs, rows
-        self._formulas, self.made = formulas, made or {}
+    owner: str
+    place: str
+    costs: list[Term]
+    rows: list[tuple[Term, int]]
+    formulas: Formulas | None = None
+    made: dict = field(default_factory=dict)
 
     def function(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS`, made when it is first asked for."""
         if name not in self.made:
-            self.made[name] = self._formulas.make(name)
+            self.made[name] = self.formulas.make(name)
         return self.made[name]
 
-    def on(self, layouts: dict[str, PhaseLayout]) -> Element:
-        """The same functions on a mesh: their variables ``index`` (n, ny), their ``nodes``, ``share`` of a step."""
-        new = copy(self)
+    def on(self, layouts: dict[str, PhaseLayout]) -> tuple[range, np.ndarray]:
+        """(nodes at which it is called, its variables (n, ny) each time) on a mesh."""
         if self.place == "problem":
-            parts = [(x.constants(), x.node(0), x.node(x.phase.intervals)) for x in layouts.values()]
-            new.index, new.nodes, new.share = np.concatenate([x for part in parts for x in part])[None], [0], None
-            return new
+            parts = [y for x in layouts.values() for y in (x.constants, x.nodes[0], x.nodes[-1])]
+            return range(1), np.concatenate(parts)[None]
         layout = layouts[self.owner]
         n = layout.phase.intervals
-        new.nodes = {"node": range(n + 1), "start": (0,), "end": (n,), "interval": range(n)}[self.place]
-        new.share, ends = 1 / n, [(layout.constants(), layout.node(k)) for k in new.nodes]
+        nodes = {"node": range(n + 1), "start": range(1), "end": range(n, n + 1), "interval": range(n)}[self.place]
+        parts = [np.broadcast_to(layout.constants, (len(nodes), len(layout.constants))), layout.nodes[nodes]]
         if self.place == "interval":
-            ends = [(*e, layout.jerk(k), layout.node(k + 1)) for e, k in zip(ends, new.nodes, strict=True)]
-        new.index = np.array([np.concatenate(e) for e in ends])
-        return new
-
-
-def _columns(expression):
-    return ca.vertcat(*expression) if isinstance(expression, (list, tuple)) else ca.SX(expression)
+            parts += [layout.jerks, layout.nodes[1:]]
+        return nodes, np.concatenate(parts, axis=1)
 
 
 class ElementBuilder:
@@ -145,115 +132,91 @@ class ElementBuilder:
 
     def __init__(self, problem: Problem, layouts: dict[str, PhaseLayout]):
         self.problem, self.layouts = problem, layouts
-        self.parameters = SimpleNamespace()
-        symbols = []
-        for name, size in problem.parameters.items():
-            symbol = ca.SX.sym(name, size)
-            setattr(self.parameters, name, symbol)
-            symbols.append(symbol)
-        self.parameter_vector = ca.vertcat(*symbols) if symbols else ca.SX(0, 1)
+        symbols = {name: ca.SX.sym(name, size) for name, size in problem.parameters.items()}
+        self.parameters, self.parameter_vector = SimpleNamespace(**symbols), ca.vertcat(ca.SX(0, 1), *symbols.values())
         self.elements = [e for layout in layouts.values() for e in self._phase(layout)]
         if problem.joints:
             self.elements.append(self._joints())
 
     def _point(self, layout, state, jerk, constants, s, refs):
         nq, phase = layout.nq, layout.phase
-        x = ca.DM(layout.node_scales()) * state
-        const = ca.DM(layout.constant_scales()) * constants
+        x, const = ca.DM(layout.node_scales) * state, ca.DM(layout.constant_scales) * constants
         names = SimpleNamespace(**{n: const[1 + i] for i, n in enumerate(phase.constants)})
-        ref, at = SimpleNamespace(), 0
-        for name, size in phase.references.items():
-            setattr(ref, name, refs[at : at + size])
-            at += size
-        j = jerk * ca.DM(phase.scale("j", nq)) if jerk is not None else None
-        return Point(
-            x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], j, x[3 * nq :], const[0], s, names, self.parameters, ref
-        )
+        ends = np.cumsum([0, *phase.references.values()]).tolist()
+        ref = SimpleNamespace(**{n: refs[ends[i] : ends[i + 1]] for i, n in enumerate(phase.references)})
+        j = jerk * ca.DM(phase.scale("j")) if jerk is not None else None
+        q, v, a, z = x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], x[3 * nq :]
+        return Point(q, v, a, j, z, const[0], s, names, self.parameters, ref)
 
     def _phase(self, layout):
-        phase = layout.phase
-        nx, nref = 3 * layout.nq + layout.nz, sum(layout.phase.references.values())
-        constants, refs, s = ca.SX.sym("const", layout.n_const), ca.SX.sym("ref", nref), ca.SX.sym("s")
+        phase, nx, nref = layout.phase, layout.nx, sum(layout.phase.references.values())
+        constants, refs, s = ca.SX.sym("const", len(layout.constants)), ca.SX.sym("ref", nref), ca.SX.sym("s")
         state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
         share = ca.SX.sym("share")  # of the phase, between two nodes
         step, data = constants[0] * share, ca.vertcat(s, refs, share)
-        at_node = self._point(layout, state, None, constants, s, refs)
+        here = self._point(layout, state, None, constants, s, refs)
+        left = self._point(layout, state, jerk, constants, s, refs)
+        after = self._point(layout, right, None, constants, s + share, refs)
+        mid = replace(left, s=s + share / 2, memo={})
+        mid.q, mid.v, mid.a = chain(left.q, left.v, left.a, left.j, step / 2)
+        seen = {"node": (here,), "start": (here,), "end": (here,), "mid": (mid,), "interval": (left, after, step)}
+        inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))  # trapezoid rule: both ends count half
+        spans = {"node": step * inner, "mid": step}
+        node, span = ca.vertcat(constants, state), ca.vertcat(constants, state, jerk, right)
         for place in ("node", "start", "end"):
             terms = [t for t in phase.terms if t.at == place]
             if terms:
-                part = step * _trapezoid(s) if place == "node" else 1.0
-                out = [self._weighted(t, _columns(t.expression(at_node)), part) for t in terms]
-                yield self._element(phase.name, place, ca.vertcat(constants, state), data, out, terms)
-        left = self._point(layout, state, jerk, constants, s, refs)
-        after = self._point(layout, right, None, constants, s + share, refs)
-        q, v, a = chain(left.q, left.v, left.a, left.j, step / 2)
-        mid = Point(q, v, a, left.j, left.z, left.duration, s + share / 2, left.c, left.p, left.ref)
-        terms, out = [defect_term()], [_defect(layout, left, after, step)]
-        for t in phase.terms:
-            if t.at == "mid":
-                terms.append(t)
-                out.append(self._weighted(t, _columns(t.expression(mid)), step))
-            elif t.at == "interval":
-                terms.append(t)
-                out.append(self._weighted(t, _columns(t.expression(left, after, step)), 1.0))
-        yield self._element(phase.name, "interval", ca.vertcat(constants, state, jerk, right), data, out, terms)
+                yield self._element(phase.name, place, node, data, terms, seen, spans)
+        terms = [chain_term(phase), *(t for t in phase.terms if t.at in ("mid", "interval"))]
+        yield self._element(phase.name, "interval", span, data, terms, seen, spans)
 
     def _joints(self):
         ends, symbols = {}, []
         for name, layout in self.layouts.items():
-            nx = 3 * layout.nq + layout.nz
-            constants, first, last = ca.SX.sym("const", layout.n_const), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
-            refs = ca.SX.zeros(sum(layout.phase.references.values()))
-            ends[name] = SimpleNamespace(
-                start=self._point(layout, first, None, constants, 0.0, refs),
-                end=self._point(layout, last, None, constants, 1.0, refs),
-            )
-            symbols += [constants, first, last]
-        terms = list(self.problem.joints)
-        out = [self._weighted(t, _columns(t.expression(ends)), 1.0) for t in terms]
-        return self._element(self.problem.name, "problem", ca.vertcat(*symbols), ca.SX(0, 1), out, terms)
+            nx, refs = layout.nx, ca.SX.zeros(sum(layout.phase.references.values()))
+            constants, *nodes = ca.SX.sym("const", len(layout.constants)), ca.SX.sym("x0", nx), ca.SX.sym("x1", nx)
+            start, end = (self._point(layout, x, None, constants, float(s), refs) for s, x in enumerate(nodes))
+            ends[name] = SimpleNamespace(start=start, end=end)
+            symbols += [constants, *nodes]
+        local, seen = ca.vertcat(*symbols), {"problem": (ends,)}
+        return self._element(self.problem.name, "problem", local, ca.SX(0, 1), self.problem.joints, seen, {})
 
-    def _element(self, owner, place, local, data, outputs, terms) -> Element:
-        costs = [(t, e) for t, e in zip(terms, outputs, strict=True) if t.is_cost]
-        rows = [(t, e) for t, e in zip(terms, outputs, strict=True) if not t.is_cost]
-        formulas = Formulas(local, data, self.parameter_vector, [e for _, e in costs], [e for _, e in rows])
-        return Element(owner, place, local.numel(), [t for t, _ in costs], [(t, e.numel()) for t, e in rows], formulas)
-
-    @staticmethod
-    def _weighted(term, expression, step):
-        """A cost as (share, column), meaning share |column|^2; a constraint as its scaled column."""
-        return (step, expression) if term.is_cost else expression / term.scale
-
-
-def _trapezoid(s):
-    """Trapezoid rule: a phase's first and last node count half."""
-    return 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))
+    def _element(self, owner, place, local, data, terms, seen, spans) -> Element:
+        """Terms evaluated on the points that they see; costs count for the share of the phase that they span."""
+        costs, rows, counts = [], [], []
+        for t in terms:
+            y = t.expression(*seen[t.at])
+            y = ca.vertcat(*y) if isinstance(y, (list, tuple)) else ca.SX(y)
+            if t.is_cost:
+                costs.append((spans.get(t.at, 1.0), y))
+            else:
+                rows.append(y / t.scale)
+                counts.append((t, y.numel()))
+        formulas = Formulas(local, data, self.parameter_vector, costs, rows)
+        return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
 
 
-def defect_term() -> Term:
-    """The exact step under constant jerk from node to node, as a term."""
-    return Term("jerk chain", "state equation, Sec. III-A, V-A", "scaled", "interval", None, identity=True)
+def chain_term(phase: Phase) -> Term:
+    """The exact step under constant jerk from node to node, as a term of every phase."""
+
+    def defect(left, right, step):
+        reached = chain(left.q, left.v, left.a, left.j, step)
+        off = zip("qva", (right.q, right.v, right.a), reached, strict=True)
+        return ca.vertcat(*((there - x) / phase.scale(key) for key, there, x in off))
+
+    return Term(JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval", defect, identity=True)
 
 
-def _defect(layout, left, right, step):
-    q, v, a = chain(left.q, left.v, left.a, left.j, step)
-    p, nq = layout.phase, layout.nq
-    return ca.vertcat(
-        (right.q - q) / p.scale("q", nq), (right.v - v) / p.scale("v", nq), (right.a - a) / p.scale("a", nq)
-    )
-
-
-# pieces ------------------------------------------------------------------------------------------
 def scatter(index: np.ndarray, size: int) -> ca.DM:
-    """0/1 matrix that adds entry i of a vector to position index[i]."""
+    """0/1 matrix (size, len(index)) that adds entry i of a vector to position index[i]."""
     index = np.asarray(index, int)
     return ca.DM.triplet(index.tolist(), list(range(len(index))), ca.DM.ones(len(index)), size, len(index))
 
 
-def gather(pieces: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
+def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     """Sparse MX matrix from (values, rows, columns) triples; entries that meet are added."""
-    values = ca.vertcat(*(piece[0] for piece in pieces))
-    rows, cols = (np.concatenate([piece[k] for piece in pieces]) for k in (1, 2))
+    values = ca.vertcat(*(x[0] for x in entries))
+    rows, cols = (np.concatenate([x[k] for x in entries]) for k in (1, 2))
     key = cols.astype(np.int64) * shape[0] + rows
     unique, inverse = np.unique(key, return_inverse=True)
     pattern = ca.Sparsity.triplet(*shape, (unique % shape[0]).tolist(), (unique // shape[0]).tolist())
@@ -262,59 +225,48 @@ def gather(pieces: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
     return ca.MX(pattern, scatter(inverse, len(unique)) @ values)
 
 
-class Piece:
-    """What one element contributes to the NLP: its small functions, called for all repetitions."""
+@dataclass
+class Block:
+    """What one element contributes to the NLP: its small functions, called for all repetitions.
 
-    def __init__(self, element: Element, inputs, weights, keep, first_row):
-        self.e, self.keep, self.first_row = element, keep, first_row
-        self.n, self.count = len(element.index), sum(count for _, count in element.rows)
-        self.inputs = [*inputs[:2], ca.repmat(inputs[2], 1, self.n)]
-        self.weights = ca.repmat(weights, 1, self.n)
+    Attributes
+    ----------
+    e : the element.  index : its variables (n, ny).
+    keep : which of its rows, over all repetitions, are in the NLP; there they begin at ``first_row``.
+    inputs, weights : MX columns for every repetition.
+    """
 
-    def _map(self, function, values):
-        return function.map(self.n)(*self.inputs, *values)
+    e: Element
+    index: np.ndarray
+    keep: np.ndarray
+    first_row: int
+    inputs: tuple
+    weights: ca.MX
 
-    def costs(self) -> tuple[ca.MX, ca.MX] | None:
-        """(weighted sum, unweighted parts) or None."""
-        if not self.e.costs:
-            return None
-        parts = ca.sum2(self._map(self.e.function("costs")[0], []))
-        return ca.dot(self.weights[:, 0], parts), parts
+    def __post_init__(self):
+        self.n, self.count = len(self.index), sum(count for _, count in self.e.rows)
 
-    def gradient(self) -> ca.MX:
-        """Local gradients, one under the other."""
-        return ca.vec(self._map(self.e.function("gradient")[0], [self.weights]))
-
-    def rows(self) -> ca.MX:
-        """Kept constraint rows."""
-        return ca.vec(self._map(self.e.function("rows")[0], []))[self.keep.tolist()]
+    def __call__(self, name: str, *more: ca.MX) -> ca.MX:
+        """Values (.., n) of one of :data:`FUNCTIONS`."""
+        return self.e.function(name)[0].map(self.n)(*self.inputs, *more)
 
     def jacobian(self) -> tuple:
-        """(values, rows, columns) of the kept rows' Jacobian."""
-        function, rows, cols = self.e.function("jacobian")
+        """(values, rows, columns) of the rows' Jacobian."""
+        _, rows, cols = self.e.function("jacobian")
         row_of = np.full(self.count * self.n, -1)
         row_of[self.keep] = self.first_row + np.arange(len(self.keep))
         i = row_of[(np.arange(self.n)[:, None] * self.count + rows[None]).ravel()]
         used = i >= 0
-        values = ca.vec(self._map(function, []))[np.flatnonzero(used).tolist()]
-        return values, i[used], self.e.index[:, cols].ravel()[used]
+        return ca.vec(self("jacobian"))[np.flatnonzero(used).tolist()], i[used], self.index[:, cols].ravel()[used]
 
-    def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple | None:
-        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian, or None if it is zero."""
-        function, rows, cols = self.e.function("hessian")
-        if not len(rows):
-            return None
+    def hessian(self, lam_f: ca.MX, lam_g: ca.MX) -> tuple:
+        """(values, rows, columns) of the upper triangle of the Lagrangian's Hessian."""
         mine = lam_g[self.first_row : self.first_row + len(self.keep)]
         spread = ca.reshape(scatter(self.keep, self.count * self.n) @ mine, self.count, self.n)
-        return self._upper(self._map(function, [self.weights, spread, ca.repmat(lam_f, 1, self.n)]), rows, cols)
+        return self.upper("hessian", self.weights, spread, ca.repmat(lam_f, 1, self.n))
 
-    def gauss_newton(self) -> tuple | None:
-        """(values, rows, columns) of the upper triangle of the costs' Gauss-Newton Hessian, or None if it is zero."""
-        if not self.e.costs:
-            return None
-        function, rows, cols = self.e.function("gauss_newton")
-        return self._upper(self._map(function, [self.weights]), rows, cols)
-
-    def _upper(self, values, rows, cols) -> tuple:
-        i, j = self.e.index[:, rows].ravel(), self.e.index[:, cols].ravel()
-        return ca.vec(values), np.minimum(i, j), np.maximum(i, j)
+    def upper(self, name: str, *more: ca.MX) -> tuple:
+        """(values, rows, columns) of the upper triangle of a symmetric matrix, "hessian" or "gauss_newton"."""
+        _, rows, cols = self.e.function(name)
+        i, j = self.index[:, rows].ravel(), self.index[:, cols].ravel()
+        return ca.vec(self(name, *more)), np.minimum(i, j), np.maximum(i, j)

@@ -1,4 +1,24 @@
-"""Where the variables of a phase stand in the decision vector: the one place that knows the order."""
+"""The words of an optimal-control problem, and where its variables stand. Start reading here.
+
+A :class:`Problem` is a row of phases. In a :class:`Phase` some coordinates move for an unknown time, in equal steps of
+constant jerk: at every node stand coordinate, rate and acceleration (q, v, a), in every step a jerk j, and one step
+leads exactly to the next node. A :class:`Term` is one named cost or constraint: a function of a :class:`Point`. A
+:class:`Bound` is a box on variables. All units are physical; scales are for conditioning only.
+
+From rest to a goal with the least jerk:
+
+>>> import numpy as np
+>>> from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
+>>> smooth = Term("jerk", "ours: a smooth motion", "m/s^3", "mid", lambda p: p.j, weight=1.0)
+>>> goal = Term("goal", "ours", "m", "end", lambda p: p.q - p.p.goal)
+>>> rest = tuple(Bound(f"rest {k}", "ours", unit, k, 0.0, 0.0, "start") for k, unit in (("q", "m"), ("v", "m/s")))
+>>> problem = Problem("move", (Phase("go", ("x",), 30, (1.0, 1.0), (smooth, goal), rest),), parameters={"goal": 1})
+>>> solution = Nlp(problem).solve({"goal": 2.0}, {"go": PhaseGuess(1.0, np.zeros((31, 1)))})
+>>> print(f"{solution.phases['go'].q[-1, 0]:.3f} m")
+2.000 m
+
+A further wish is a further term: ``problem.with_terms("go", Term(...))``.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +31,6 @@ import numpy as np
 
 from jumplab.errors import InputError
 
-# terms ------------------------------------------------------------------------------------------
 PLACES = ("node", "mid", "interval", "start", "end", "problem")
 
 
@@ -22,10 +41,10 @@ class Point:
     Attributes
     ----------
     q, v, a, j : (nq,) coordinate, rate, acceleration and jerk (jerk only at "mid" and "interval" points).
-    z : (nz,) further states of the phase.
-    duration : of the phase [s];  s : elapsed share of the phase, 0 to 1;  c : the phase's further constants by name.
-    p : the problem's parameters by name;  ref : this node's references by name (at "mid" and "interval" those of the
-        left node, zero at "problem" points; z likewise is the left node's at "mid").
+    z : (nz,) further states of the phase; at "mid" points those of the left node.
+    duration : of the phase [s];  s : elapsed share of the phase, 0 to 1.
+    c, p : by name, the phase's further constants, and the problem's parameters.
+    ref : this node's references by name; at "mid" and "interval" those of the left node, zero at "problem" points.
     memo : scratch space, so that several terms can share one model evaluation.
     """
 
@@ -49,22 +68,21 @@ class Point:
 
 @dataclass(frozen=True)
 class Term:
-    """One named cost or constraint.
+    """One named cost or constraint: the square of an expression with a weight, or an expression with bounds.
 
     Attributes
     ----------
     name : unique in its phase.
     equation : where it comes from: an id of the paper's equations, or "ours" with the reason.
     unit : of the expression.
-    at : "node" (all nodes), "mid" (middle of every interval), "interval" (called with left, right, step), "start",
-        "end", or "problem" (called with a dict of phase name -> namespace(start, end)).
+    at : "node" (all nodes), "mid" (middle of every step), "interval" (called with left, right, step), "start", "end",
+        or "problem" (called with a dict of phase name -> namespace(start, end)).
     expression : function of a :class:`Point` that returns a column.
-    weight : cost if set, [1/unit^2] ("node", "mid": integrated over time, so also [1/s]); constraint if None.
-    lower, upper : bounds of a constraint; numbers, columns, or functions of the parameter dict, read when solving.
-    scale : nominal size of a constraint's expression, for conditioning only.
+    weight : of a cost [1/unit^2], at "node" and "mid" integrated over time [1/(unit^2 s)]; None for a constraint.
+    lower, upper : of a constraint; numbers, columns, or functions of the parameter dict, read when solving.
+    scale : nominal size of a constraint's expression.
     skip : how many nodes to leave out at the start and at the end of the phase (constraints at "node" only).
-    identity : the constraint only says that the motion is one motion (links, integration); it is never a limit that
-        could give way, and an elastic re-solve keeps it.
+    identity : it only says that the motion is one motion (links, integration); no limit that could give way.
     """
 
     name: str
@@ -95,9 +113,13 @@ class Term:
 
 @dataclass(frozen=True)
 class Bound:
-    """Box bound on the variables of a phase: ``on`` is "q", "v", "a", "j" or "z"; values as in :class:`Term`.
+    """A box on the variables of a phase.
 
-    ``where`` is "all", "start", "end" or "inner" (all but the first node).
+    Attributes
+    ----------
+    name, equation, unit, lower, upper : as in :class:`Term`.
+    on : "q", "v", "a", "j" or "z".
+    where : "all", "start", "end" or "inner" (all but the first node).
     """
 
     name: str
@@ -111,17 +133,18 @@ class Bound:
 
 @dataclass(frozen=True)
 class Phase:
-    """One phase: coordinates with jerk chains, a duration, further states and constants, terms and bounds.
+    """One phase: coordinates that move in steps of constant jerk, for a time that is free within bounds.
 
     Attributes
     ----------
-    coordinates : names of the chain coordinates.
+    coordinates : names of the coordinates.
     intervals : number of equal steps.
     duration : (lower, upper) [s]; numbers or functions of the parameter dict.
+    terms, bounds : costs, constraints and boxes.
     states : names of further node variables, tied by "interval" terms.
     constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration.
     references : name -> size, data given per node when solving.
-    scales : nominal sizes of q, v, a, j and z, for conditioning.
+    scales : nominal sizes of q, v, a, j and z; 1 where not given.
     """
 
     name: str
@@ -141,14 +164,15 @@ class Phase:
         if twice:
             raise InputError(f"phase {self.name!r}: two terms are called {twice[0]!r}; names must be unique in a phase")
 
-    def scale(self, key: str, size: int) -> np.ndarray:
-        """(size,) nominal sizes of the variables ``key``."""
+    def scale(self, key: str) -> np.ndarray:
+        """Nominal sizes (nq,) of "q", "v", "a" or "j", or (nz,) of "z"."""
+        size = len(self.states if key == "z" else self.coordinates)
         return np.broadcast_to(np.asarray(self.scales.get(key, 1.0), float), (size,))
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Phases, the terms that join them, and the names and sizes of the parameters."""
+    """Phases, the terms at "problem" that join them, and the names and sizes of the parameters."""
 
     name: str
     phases: tuple[Phase, ...]
@@ -159,45 +183,39 @@ class Problem:
         """(phase name, term) of every term, in order; joining terms carry the problem's name."""
         return [(p.name, t) for p in self.phases for t in p.terms] + [(self.name, t) for t in self.joints]
 
-    def term_names(self) -> set[str]:
-        """Names by which terms and bounds can be switched or reweighted: "name" or "phase/name"."""
-        pairs = [(owner, t.name) for owner, t in self.terms()]
-        pairs += [(p.name, b.name) for p in self.phases for b in p.bounds]
-        return {name for _, name in pairs} | {f"{owner}/{name}" for owner, name in pairs}
+    def bounds(self) -> list[tuple[str, Bound]]:
+        """(phase name, bound) of every bound, in order."""
+        return [(p.name, b) for p in self.phases for b in p.bounds]
 
     def check_names(self, names: Iterable[str], what: str) -> None:
-        """Raise :class:`InputError` if a name is not a term or bound of this problem."""
-        known = self.term_names()
+        """Raise :class:`InputError` if a name, "name" or "phase/name", is no term or bound of this problem."""
+        owned = [(owner, x.name) for owner, x in (*self.terms(), *self.bounds())]
+        short, full = {name for _, name in owned}, {f"{owner}/{name}" for owner, name in owned}
         for name in names:
-            if name not in known:
-                listed = ", ".join(sorted(n for n in known if "/" not in n))
+            if name not in short | full:
+                listed = ", ".join(sorted(short))
                 raise InputError(f"{what} {name!r}: the problem {self.name!r} has no such term; it has {listed}")
 
     def with_terms(self, phase: str, *extra: Term) -> Problem:
-        """A copy with further terms in one phase (for experiments in a notebook)."""
+        """A copy with further terms in one phase; :class:`InputError` if there is no such phase."""
         if phase not in {p.name for p in self.phases}:
             raise InputError(f"{self.name}: no phase {phase!r}; it has {', '.join(p.name for p in self.phases)}")
         phases = tuple(replace(p, terms=p.terms + extra) if p.name == phase else p for p in self.phases)
         return replace(self, phases=phases)
 
     def on_mesh(self, intervals: Mapping[str, int]) -> Problem:
-        """A copy with other numbers of intervals, phase name -> intervals; the terms are the same objects."""
+        """A copy with other numbers of steps, phase name -> intervals; the terms are the same objects."""
         return replace(self, phases=tuple(replace(p, intervals=intervals[p.name]) for p in self.phases))
 
     def table(self) -> list[dict]:
-        """One row per term and bound: phase, name, kind, at, unit, equation, weight or bounds."""
+        """One row per term and bound: phase, name, kind, at, unit, equation, value (weight or bounds)."""
         rows = []
-        for owner, t in self.terms():
-            kind = "cost" if t.is_cost else "constraint"
-            size = f"weight {t.weight:g}" if t.is_cost else f"{_text(t.lower)} ... {_text(t.upper)}"
-            rows.append(
-                dict(phase=owner, name=t.name, kind=kind, at=t.at, unit=t.unit, equation=t.equation, value=size)
-            )
-        for p in self.phases:
-            for b in p.bounds:
-                size = f"{_text(b.lower)} ... {_text(b.upper)}"
-                rows.append(dict(phase=p.name, name=b.name, kind="bound", at=f"{b.on} {b.where}", unit=b.unit,
-                                 equation=b.equation, value=size))  # fmt: skip
+        for owner, x in (*self.terms(), *self.bounds()):
+            kind = "bound" if isinstance(x, Bound) else "cost" if x.is_cost else "constraint"
+            at = f"{x.on} {x.where}" if kind == "bound" else x.at
+            value = f"weight {x.weight:g}" if kind == "cost" else f"{_text(x.lower)} ... {_text(x.upper)}"
+            row = dict(phase=owner, name=x.name, kind=kind, at=at, unit=x.unit, equation=x.equation, value=value)
+            rows.append(row)
         return rows
 
 
@@ -208,73 +226,35 @@ def _text(bound) -> str:
     return f"{values[0]:g}" if np.all(values == values[0]) else "[" + " ".join(f"{x:g}" for x in values) + "]"
 
 
-# layout ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class PhaseLayout:
-    """Where the variables of one phase stand in the decision vector.
+    """Where the variables of a phase stand in the decision vector; the only place that knows their order.
 
-    First come its duration and its constants, then node by node coordinates, rates, accelerations (nq each) and further
-    states (nz), and between two nodes the jerk (nq).
+    First its duration and constants; then node by node q, v, a and z, and after each node but the last a jerk.
 
     Attributes
     ----------
-    phase : the phase.
-    first : index of its duration.
+    phase : the phase.  nq, nx : numbers of coordinates, and of variables of a node.  size : of all its variables.
+    constants, nodes, jerks : indices (1 + constants,), (N + 1, nx), (N, nq).
+    constant_scales, node_scales : sizes by which constants and nodes are divided (1 + constants,), (nx,).
     """
 
     phase: Phase
-    first: int
+    nq: int
+    nx: int
+    size: int
+    constants: np.ndarray
+    nodes: np.ndarray
+    jerks: np.ndarray
+    constant_scales: np.ndarray
+    node_scales: np.ndarray
 
-    @property
-    def nq(self) -> int:
-        """Number of coordinates."""
-        return len(self.phase.coordinates)
-
-    @property
-    def nz(self) -> int:
-        """Number of further states."""
-        return len(self.phase.states)
-
-    @property
-    def n_const(self) -> int:
-        """Number of what is constant in the phase: its duration, and its constants."""
-        return 1 + len(self.phase.constants)
-
-    @property
-    def stride(self) -> int:
-        """Variables from one node to the next: state, further states, jerk."""
-        return 4 * self.nq + self.nz
-
-    @property
-    def size(self) -> int:
-        """Number of all variables of the phase."""
-        return self.n_const + self.phase.intervals * self.stride + 3 * self.nq + self.nz
-
-    def constants(self) -> np.ndarray:
-        """Indices of duration and constants (n_const,)."""
-        return self.first + np.arange(self.n_const)
-
-    def node(self, k: int) -> np.ndarray:
-        """Indices of the states at node k (3 nq + nz,)."""
-        return self.first + self.n_const + k * self.stride + np.arange(3 * self.nq + self.nz)
-
-    def nodes(self) -> np.ndarray:
-        """(N + 1, nx) places of all nodes."""
-        return self.node(0) + self.stride * np.arange(self.phase.intervals + 1)[:, None]
-
-    def jerks(self) -> np.ndarray:
-        """(N, nq) places of all jerks."""
-        return self.jerk(0) + self.stride * np.arange(self.phase.intervals)[:, None]
-
-    def jerk(self, k: int) -> np.ndarray:
-        """Indices of the jerk between nodes k and k + 1 (nq,)."""
-        return self.first + self.n_const + k * self.stride + 3 * self.nq + self.nz + np.arange(self.nq)
-
-    def node_scales(self) -> np.ndarray:
-        """Sizes by which the states of a node are divided (3 nq + nz,)."""
-        p = self.phase
-        return np.concatenate([p.scale(k, self.nq) for k in "qva"] + [p.scale("z", self.nz)])
-
-    def constant_scales(self) -> np.ndarray:
-        """Sizes by which duration and constants are divided (n_const,)."""
-        return np.array([1.0, *(c[2] for c in self.phase.constants.values())])
+    @classmethod
+    def of(cls, phase: Phase, first: int) -> PhaseLayout:
+        """The layout of a phase whose duration has the index ``first``."""
+        nq, nc, steps = len(phase.coordinates), 1 + len(phase.constants), phase.intervals
+        nx = 3 * nq + len(phase.states)
+        grid = first + nc + np.arange((steps + 1) * (nx + nq)).reshape(steps + 1, nx + nq)
+        size, constant_scales = nc + grid.size - nq, np.array([1.0, *(c[2] for c in phase.constants.values())])
+        places = first + np.arange(nc), grid[:, :nx], grid[:-1, nx:]
+        return cls(phase, nq, nx, size, *places, constant_scales, np.concatenate([phase.scale(k) for k in "qvaz"]))

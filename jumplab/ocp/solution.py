@@ -1,14 +1,21 @@
-"""What goes into a solve and what comes out: guesses, solutions at and between the nodes, statistics."""
+"""What goes into a solve and what comes out: guesses, solutions at and between the nodes, multipliers, statistics."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Problem
+
+
+def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Columns of ``values`` (K, C) given at ``old`` (K,), by straight lines at ``new``."""
+    if len(old) == len(new):
+        return values
+    return np.array([np.interp(new, old, column) for column in values.T]).reshape(-1, len(new)).T
 
 
 @dataclass(frozen=True)
@@ -24,16 +31,9 @@ class PhaseGuess:
 
     def resampled(self, intervals: int) -> PhaseGuess:
         """The same guess at the nodes of another mesh, by straight lines between its own."""
-        if len(self.q) == intervals + 1:
-            return self
         old, new = np.linspace(0, 1, len(self.q)), np.linspace(0, 1, intervals + 1)
-
-        def at_nodes(x):
-            if x is None:
-                return None
-            return np.array([np.interp(new, old, column) for column in x.T]).reshape(x.shape[1], -1).T
-
-        return PhaseGuess(self.duration, *(at_nodes(x) for x in (self.q, self.v, self.a, self.z)), self.constants)
+        values = {key: x for key in "qvaz" if (x := getattr(self, key)) is not None}
+        return replace(self, **{key: resampled(old, x, new) for key, x in values.items()})
 
     def smoothed(self, width: float, rate_width: float) -> PhaseGuess:
         """The same guess with a Gaussian mean over that share of the phase: of q, and of the rates v and a."""
@@ -43,8 +43,7 @@ class PhaseGuess:
             weights = np.exp(-(((s[:, None] - s) / width) ** 2) / 2)
             return None if x is None else weights / weights.sum(axis=1, keepdims=True) @ x
 
-        values = mean(self.q, width), mean(self.v, rate_width), mean(self.a, rate_width)
-        return PhaseGuess(self.duration, *values, self.z, self.constants)
+        return replace(self, q=mean(self.q, width), v=mean(self.v, rate_width), a=mean(self.a, rate_width))
 
 
 @dataclass(frozen=True)
@@ -77,9 +76,7 @@ class PhaseSolution:
     def guess(self, intervals: int | None = None) -> PhaseGuess:
         """This solution as the start of another solve, on another mesh if asked."""
         t = np.linspace(0, self.duration, (intervals or len(self.j)) + 1)
-        q, v, a = self.sample(t)
-        z = np.stack([np.interp(t, self.t, col) for col in self.z.T], -1) if self.z.shape[1] else None
-        return PhaseGuess(self.duration, q, v, a, z, dict(self.constants))
+        return PhaseGuess(self.duration, *self.sample(t), resampled(self.t, self.z, t), dict(self.constants))
 
 
 @dataclass(frozen=True)
@@ -89,13 +86,10 @@ class Multipliers:
     Attributes
     ----------
     rows : (owner, term name) -> shares of the phase (K,), values (K, C); of limits along a phase per unit of share.
-    nodes : phase -> (N + 1, nx) of the bounds on node variables, per unit of share.
-    constants : phase -> of the bounds on duration and constants.
+        Box bounds stand there as (phase, "bounds of nodes") and (phase, "bounds of constants").
     """
 
     rows: dict
-    nodes: dict
-    constants: dict
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Near:
-    """Phases near a solution: a start for a solve, no motion yet, because rows are still violated."""
+    """A start, not a solution: phases that a few steps led to, rows still violated."""
 
     phases: dict[str, PhaseSolution]
     statistics: Statistics
@@ -126,16 +120,10 @@ class Near:
 
 
 @dataclass(frozen=True)
-class Solution:
-    """Result of one solve; ``phases`` by name, tables for people."""
+class Solution(Near):
+    """Result of one solve, every row met; what each cost and the tightest row of each constraint is, for people."""
 
     problem: Problem
-    phases: dict[str, PhaseSolution]
-    statistics: Statistics
     cost_shares: tuple[dict, ...]
     constraint_report: tuple[dict, ...]
-    multipliers: Multipliers | None = None
-
-    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
-        """All phases as a warm start, on another mesh if asked."""
-        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
+    multipliers: Multipliers

@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.planar import evaluator
-from jumplab.ocp.nlp import PhaseSolution
+from jumplab.ocp import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
 

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import SolverError
 from jumplab.models.srmp import COORDINATES
-from jumplab.ocp.nlp import Nlp, PhaseGuess, PhaseSolution, Statistics
+from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import SETTINGS, Reach, reach

@@ -106,7 +106,7 @@ class WholeBodyPlanner:
     """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
 
     With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
-    With ``approach`` the coarse mesh only takes the few steps of :meth:`jumplab.ocp.nlp.Nlp.approach`; where they lead
+    With ``approach`` the coarse mesh only takes the few steps of ``Nlp.gauss_newton_steps``; where they lead
     nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes.
     """
 
@@ -190,7 +190,7 @@ class WholeBodyPlanner:
         references = self.references(srmp, mesh)
         if self._steps:
             try:
-                first = self._coarse.approach(parameters, start, references=references, **how)
+                first = self._coarse.gauss_newton_steps(parameters, start, references=references, **how)
                 return WholeBodyPlan(task, self._from(first, self._refined, srmp, parameters, how), first.statistics)
             except SolverError:
                 pass  # too far away for linear rows; what stays inside all limits finds more, and takes longer

@@ -7,9 +7,9 @@ from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
 from jumplab.errors import SolverError
-from jumplab.ocp.assembly import Assembled
+from jumplab.ocp.assembly import Assembled, Posed
 from jumplab.ocp.nlp import Nlp
-from jumplab.ocp.sqp import Approach, StagedOrder
+from jumplab.ocp.sqp import GaussNewton, TimeOrder
 from jumplab.robot import Robot
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
@@ -29,7 +29,7 @@ def assembled(request):
     return WholeBodyPlanner(Robot.load(), Mesh(3, 2, 4), refine=False).nlp.assembled
 
 
-def staged(a: Assembled, order: StagedOrder, x, p):
+def in_order(a: Assembled, order: TimeOrder, x, p):
     """Jacobian and Hessian in the order of time, as numbers."""
     jac, hess = ca.MX.sym("jac", a.jac_g.nnz_out(1)), ca.MX.sym("hess", a.gauss_newton.nnz_out(0))
     put = ca.Function("put", [jac, hess], [order.jacobian(jac), order.hessian(hess)])
@@ -39,22 +39,22 @@ def staged(a: Assembled, order: StagedOrder, x, p):
 
 def test_a_step_means_the_same_in_the_order_of_time(assembled):
     """J d and d H d do not depend on the order, and links of copies are met by copies."""
-    order, (x, p, rng) = StagedOrder(assembled), random_point(assembled, 4)
-    jac, hess = staged(assembled, order, x, p)
+    order, (x, p, rng) = TimeOrder(assembled), random_point(assembled, 4)
+    jac, hess = in_order(assembled, order, x, p)
     step = rng.normal(size=assembled.size)
     copies = step[order.source]
     rows = jac @ copies
-    kept = np.flatnonzero(order.kept)
-    np.testing.assert_allclose(rows[order.place[kept]], (assembled.jac_g(x, p)[1].full() @ step)[kept], atol=1e-9)
+    local = np.flatnonzero(order.local)
+    np.testing.assert_allclose(rows[order.place[local]], (assembled.jac_g(x, p)[1].full() @ step)[local], atol=1e-9)
     np.testing.assert_allclose(rows[order.links[:, 0]], 0.0, atol=1e-12)
     own = symmetric(assembled.gauss_newton(x, p))
     assert copies @ hess @ copies == pytest.approx(step @ own @ step, rel=1e-9)
 
 
 def test_every_row_and_variable_has_its_place(assembled):
-    order = StagedOrder(assembled)
+    order = TimeOrder(assembled)
     np.testing.assert_array_equal(order.source[order.copy], np.arange(assembled.size))
-    places = np.concatenate([order.place[order.kept], order.links[:, 0]])
+    places = np.concatenate([order.place[order.local], order.links[:, 0]])
     np.testing.assert_array_equal(np.sort(places), np.arange(order.n_rows))
     assert len(order.source) == sum(order.nx) + sum(order.nu)
     assert order.n_rows == sum(order.nx[1:]) + sum(order.ng)
@@ -63,19 +63,19 @@ def test_every_row_and_variable_has_its_place(assembled):
 def test_a_variable_that_follows_from_nothing_is_refused():
     """In the toy problem a row is nonlinear in the next node, so it is no link."""
     with pytest.raises(ValueError, match="toy: nothing says what a variable of stage 1 follows from"):
-        StagedOrder(Assembled(toy()))
+        TimeOrder(Assembled(toy()))
 
 
 def test_what_joins_far_nodes_is_left_out():
-    order = StagedOrder(SrmpPlanner(Robot.load()).nlp.assembled)
-    assert [order.a.rows[i].term.name for i in np.flatnonzero(~order.kept)] == ["symmetric landing"]
+    order = TimeOrder(SrmpPlanner(Robot.load()).nlp.assembled)
+    assert [order.a.rows[i].term.name for i in np.flatnonzero(~order.local)] == ["symmetric landing"]
 
 
 def test_gauss_newton_is_the_hessian_without_curvature(assembled):
     """Sums of squares: 2 J^T W J, never indefinite; J by differences of the costs is too rough, so by the parts."""
     x, p, _ = random_point(assembled, 5)
     own = symmetric(assembled.gauss_newton(x, np.abs(p)))
-    x[[layout.first for layout in assembled.layouts.values()]] = 1.0  # durations are positive
+    x[[layout.constants[0] for layout in assembled.layouts.values()]] = 1.0  # durations are positive
     own = symmetric(assembled.gauss_newton(x, np.abs(p)))
     assert np.linalg.eigvalsh(own)[0] > -1e-8 * np.abs(own).max()
 
@@ -84,7 +84,7 @@ def test_of_linear_residuals_it_is_the_hessian():
     nlp = Nlp(move(duration=(1.0, 1.0)))
     a, (x, p, _) = nlp.assembled, random_point(nlp.assembled, 6)
     full = symmetric(a.hess_lag(x, p, 1.0, np.zeros(a.n_rows)))
-    free = np.setdiff1d(np.arange(a.size), [layout.first for layout in a.layouts.values()])
+    free = np.setdiff1d(np.arange(a.size), [layout.constants[0] for layout in a.layouts.values()])
     at = np.ix_(free, free)
     np.testing.assert_allclose(symmetric(a.gauss_newton(x, p))[at], full[at], atol=1e-9)
 
@@ -92,15 +92,15 @@ def test_of_linear_residuals_it_is_the_hessian():
 def test_a_linear_quadratic_problem_takes_one_step():
     """Least jerk from rest to rest: with its duration fixed the QP is the problem."""
     nlp = Nlp(move(duration=(1.0, 1.0)))
-    near, exact = nlp.approach({"goal": 2.0}, flat_guess()), nlp.solve({"goal": 2.0}, flat_guess())
+    near, exact = nlp.gauss_newton_steps({"goal": 2.0}, flat_guess()), nlp.solve({"goal": 2.0}, flat_guess())
     assert near.statistics.status == "Approached" and near.statistics.residual < 1e-3
     np.testing.assert_allclose(near.phases["go"].q, exact.phases["go"].q, atol=2e-3)
 
 
 def test_a_start_without_numbers_is_refused():
     nlp = Nlp(move())
-    method, a = Approach(nlp.assembled), nlp.assembled
+    method, a = GaussNewton(nlp.assembled), nlp.assembled
     wide = np.full(a.size, -np.inf), np.full(a.size, np.inf)
     rows = np.zeros(a.n_rows), np.zeros(a.n_rows)
     with pytest.raises(SolverError, match="step 1 of the approach is no number"):
-        method.solve(np.full(a.size, np.nan), np.ones(a.p_size), wide, rows)
+        method.steps(Posed(np.full(a.size, np.nan), np.ones(a.p_size), wide, rows))
