@@ -27,7 +27,8 @@ def test_importing_the_package_imports_nothing_else():
 
 
 def test_planning_needs_neither_engine_nor_pictures():
-    assert not loaded_by("import jumplab as jl; jl.Planner, jl.JumpTask, jl.Robot, jl.Term") & {"pybullet", "matplotlib"}
+    code = "import jumplab as jl; jl.Planner, jl.JumpTask, jl.Robot, jl.Term"
+    assert not loaded_by(code) & {"pybullet", "matplotlib"}
 
 
 def test_scenes_and_perturbations_need_no_engine():

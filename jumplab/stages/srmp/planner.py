@@ -11,7 +11,8 @@ import numpy as np
 
 from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
-from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess, PhaseSolution, Solution
+from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
+from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
