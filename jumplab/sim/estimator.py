@@ -14,32 +14,23 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.perturbation import SensorNoise
-from jumplab.sim.world import STEP_S
 from jumplab.task import GRAVITY
 
-# sensors ------------------------------------------------------------------------------------------
 GRAVITY_VECTOR = np.array([0.0, 0.0, -GRAVITY])
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One sample of all sensors.
+    """One sample of all sensors; ``gyro`` and ``specific_force`` in the trunk's axes."""
 
-    Attributes
-    ----------
-    joints, rates : (nv - 6,) encoders [rad, rad/s].
-    gyro : (3,) angular velocity of the trunk in its own axes [rad/s].
-    specific_force : (3,) mean over the last step of acceleration minus gravity at the base frame's origin, in the
-        trunk's axes [m/s^2].
-    foot_force : (2,) vertical force under each foot [N].
-    """
-
-    joints: np.ndarray
-    rates: np.ndarray
-    gyro: np.ndarray
-    specific_force: np.ndarray
-    foot_force: np.ndarray
+    joints: np.ndarray  # (nv - 6,) encoders [rad]
+    rates: np.ndarray  # (nv - 6,) [rad/s]
+    gyro: np.ndarray  # (3,) angular velocity of the trunk [rad/s]
+    specific_force: np.ndarray  # (3,) acceleration of the base's origin minus gravity, mean of the last step [m/s^2]
+    foot_force: np.ndarray  # (2,) vertical force under each foot [N]
 
 
 class Sensors:
@@ -63,15 +54,12 @@ class Sensors:
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: roll and pitch a little off."""
         error = self.noise.tilt_rad * self._rng.standard_normal(2)
-        turn = pin.Quaternion(pin.exp3(np.array([*error, 0.0])))
-        start = q.copy()
-        start[3:7] = (turn * pin.Quaternion(q[6], q[3], q[4], q[5])).coeffs()
-        return start
+        return turned(q, pin.exp3(np.array([*error, 0.0])))
 
     def read(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Reading:
         """Measure the true state (q, v) and the true wrenches (2, 6) under the feet; call it once per step."""
         n, draw = self.noise, self._rng.standard_normal
-        attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
+        attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
         gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
         self._last_velocity = velocity
@@ -88,13 +76,12 @@ class Sensors:
         )
 
 
-# estimator ------------------------------------------------------------------------------------------
-LOADED_N = 30.0  # our choice: a foot with less may be sliding off the ground; ten times the sensor's noise
-TIPPED_M = 0.003  # our choice: the foot stands on the lower end of its sole, once the other is higher by this much
-FOOT_WALK = 0.01  # [m/s / sqrt(Hz)] our choice: a standing foot creeps 10 mm within a second
-SETTLE_S = 0.02  # our choice: for so long after it met the ground a foot ...
-SETTLE_WALK = 0.3  # ... is free to settle by a few centimetres: contacts slip and rebound
-LEG_M = 0.7  # [m] turns an encoder's error into one of the foot
+# The papers print none of these numbers.
+LOADED_N = 30.0  # a foot with less may be sliding off the ground; ten times the sensor's noise
+TIPPED_M = 0.003  # the foot stands on the lower end of its sole, once the other is higher by this much
+FOOT_WALK = 0.01  # [m/s / sqrt(Hz)] a standing foot creeps 10 mm within a second
+SETTLE_S, SETTLE_WALK = 0.02, 0.3  # for so long after it met the ground a foot is free to settle by centimetres
+LEG_M = 0.7  # turns an encoder's error into one of the foot
 FLOOR = SensorNoise(joint_rad=3e-4, gyro=1e-3, accel=0.05, gyro_bias=1e-5, accel_bias=1e-4, tilt_rad=1e-4)
 
 # parts of the error: attitude (world axes), velocity, place, gyro bias, accelerometer bias, left foot, right foot
@@ -113,11 +100,9 @@ class Estimator:
     """
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise):
-        self._model, self._data = robot.model, robot.model.createData()
-        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        foot = robot.foot
+        self._gauge, foot = Gauge(robot), robot.foot
         self._ends = [np.array([x, foot.center[1], foot.sole_z]) for x in (foot.toe, foot.heel)]
-        self._attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
+        self._attitude = rotation(q[3:7])
         self._place, self._velocity = q[:3].copy(), self._attitude @ v[:3]
         self._gyro_bias, self._accel_bias = np.zeros(3), np.zeros(3)
         self._foot, self._end, self._standing = np.zeros((2, 3)), [0, 0], [0, 0]  # toe or heel; for how many steps
@@ -125,8 +110,7 @@ class Estimator:
         n = self._noise
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)
-        self._step = np.eye(SIZE)
-        self._drive = np.zeros(SIZE)
+        self._step, self._drive = np.eye(SIZE), np.zeros(SIZE)
 
     def update(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
         """Estimated configuration (nq,) and velocity (nv,) at the time of ``reading``."""
@@ -160,8 +144,9 @@ class Estimator:
     def _sole_ends(self, joints: np.ndarray) -> np.ndarray:
         """Toe and heel (2, 2, 3) of both feet in the trunk's frame."""
         q = np.concatenate([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], joints])
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return np.array([[self._data.oMf[frame].act(end) for end in self._ends] for frame in self._frames])
+        data = self._gauge.data
+        pin.framesForwardKinematics(self._gauge.model, data, q)
+        return np.array([[data.oMf[frame].act(end) for end in self._ends] for frame in self._gauge.frames])
 
     def _stand(self, side: int, ends: np.ndarray, loaded: bool) -> None:
         """Let a loaded foot correct the estimate; a foot that has just met the ground stands where it is."""
@@ -243,6 +228,6 @@ def estimation_error(
     q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
 ) -> tuple[float, float]:
     """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
-    true, believed = (pin.Quaternion(x[6], x[3], x[4], x[5]).toRotationMatrix() for x in (q, believed_q))
+    true, believed = (rotation(x[3:7]) for x in (q, believed_q))
     tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))  # between the two ideas of up, in the trunk's axes
     return float(tilt), float(np.linalg.norm(believed @ believed_v[:3] - true @ v[:3]))

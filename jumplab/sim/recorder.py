@@ -7,17 +7,18 @@ import pinocchio as pin
 
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
 from jumplab.sim.actuation import Actuators
-from jumplab.sim.checks import STAND_S
-from jumplab.sim.result import Metrics, SimulationResult
-from jumplab.sim.world import STEP_S, Contacts
+from jumplab.sim.kinematics import Gauge, pitch_of
+from jumplab.sim.result import STAND_S, Metrics, SimulationResult
+from jumplab.sim.scene import Contacts
 
-CONTACT_FORCE_N = 5.0  # our choice: "a few newtons"; a height threshold would see the lift-off 20 ms late
-STILL_SPEED = 0.05  # [m/s] our choice: a CoM slower than this at the end stands
-LEVEL_TOLERANCE_M = 0.05  # our choice: soles this close to the planned height stand on the planned surface
-IMPACT_S = 0.1  # our choice: the landing impulse is summed over this time after touchdown
-SATURATED = 0.999  # our choice: share of the available torque that counts as "at the limit"
-MIN_FLIGHT_S = 0.05  # our choice: a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
+CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-off 20 ms late
+STILL_SPEED = 0.05  # [m/s] a CoM slower than this at the end stands
+LEVEL_TOLERANCE_M = 0.05  # soles this close to the planned height stand on the planned surface
+IMPACT_S = 0.1  # the landing impulse is summed over this time after touchdown
+SATURATED = 0.999  # share of the available torque that counts as "at the limit"
+MIN_FLIGHT_S = 0.05  # a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
 
 
 class Recorder:
@@ -32,7 +33,7 @@ class Recorder:
 
     def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...]):
         self._robot, self._links, self._feet = robot, links, frozenset(robot.foot.frames)
-        self._planned_end, self._rows = planned_end, []
+        self._planned_end, self._rows, self._gauge = planned_end, [], Gauge(robot)
         self.fallen_steps = 0
 
     def add(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, contacts: Contacts) -> None:
@@ -51,56 +52,60 @@ class Recorder:
             raise SolverError("PyBullet lost the robot: its state is not finite", stage="simulation")
         contacts = [row[3] for row in self._rows]
         wrench = np.array([c.wrench for c in contacts])
-        touching = np.array([[name in c.touching for name in self._links] for c in contacts])
-        colliding = np.array([bool(c.colliding) for c in contacts])
-        com, com_velocity, momentum, inertia = _centroidal(self._robot, q, v)
         liftoff, touchdown = _events(wrench[:, :, 2].sum(axis=1))
         phase = np.full(len(q), "launch", dtype="<U7")
         if liftoff is not None:
             phase[liftoff:] = "flight"
         if touchdown is not None:
             phase[touchdown:] = "landing"
-        log = dict(
-            t=np.arange(len(q)) * STEP_S, q=q, v=v, tau=tau, foot_wrench=wrench, com=com, com_velocity=com_velocity,
-            L=momentum, rho=inertia, phase=phase, touching=touching, colliding=colliding)  # fmt: skip
-        metrics = self._metrics(log, liftoff, touchdown, STEP_S * float(colliding.sum()), solves)
+        log = dict(t=np.arange(len(q)) * STEP_S, q=q, v=v, tau=tau, foot_wrench=wrench, phase=phase)
+        log |= self._centroidal(q, v)
+        log["touching"] = np.array([[name in c.touching for name in self._links] for c in contacts])
+        log["colliding"] = np.array([bool(c.colliding) for c in contacts])
         for array in log.values():
             array.setflags(write=False)
-        return SimulationResult(**log, link_names=self._links, joint_names=self._robot.joint_names, metrics=metrics,
-                                settings=settings)  # fmt: skip
+        names = dict(link_names=self._links, joint_names=self._robot.joint_names)
+        metrics = self._metrics(log, liftoff, touchdown, solves)
+        return SimulationResult(**log, **names, metrics=metrics, settings=settings)
 
-    # measuring -------------------------------------------------------------------------------------------------
+    def _centroidal(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+        model, data, rows = self._robot.model, self._gauge.data, []
+        for qk, vk in zip(q, v, strict=True):
+            pin.ccrba(model, data, qk, vk)
+            velocity = data.hg.linear / self._robot.total_mass
+            rows.append((*data.com[0], *velocity, data.hg.angular[1], data.Ig.inertia[1, 1]))
+        rows = np.array(rows)
+        return dict(com=rows[:, :3], com_velocity=rows[:, 3:6], L=rows[:, 6], rho=rows[:, 7])
 
-    def _metrics(self, log, liftoff, touchdown, collisions, solves) -> Metrics:
+    def _metrics(self, log: dict, liftoff: int | None, touchdown: int | None, solves: tuple[int, int]) -> Metrics:
         other = [i for i, name in enumerate(self._links) if name not in self._feet]
-        stray = log["touching"][:, other]
-        standing, landed, reason = self._verdict(log, stray, liftoff, touchdown)
-        air = slice(0, len(log["t"]) if touchdown is None else touchdown)
-        flew, down = liftoff is not None, touchdown is not None
-        com, velocity, force = log["com"], log["com_velocity"], log["foot_wrench"][:, :, :3].sum(axis=1)
-        start = self._feet_middle(log["q"][0], self._robot.foot.toe)[0]
-        soles_ahead = pitch = None
-        if down:
-            soles_ahead = float(self._feet_middle(log["q"][touchdown])[0] - com[touchdown, 0])
-            pitch = _counted(np.array([_pitch(q) for q in log["q"][: touchdown + 1]]))
-        return Metrics(
-            foot_distance_m=self._toe_at(log, -1) - start if down else None,
-            foot_distance_touchdown_m=self._toe_at(log, touchdown) - start if down else None,
-            com_rise_m=float(com[liftoff : (touchdown or len(com)), 2].max() - com[liftoff, 2]) if flew else None,
-            takeoff_velocity=_xz(velocity[liftoff]) if flew else None,
-            takeoff_momentum=float(log["L"][liftoff]) if flew else None,
-            standing_s=standing, landed=landed, reason=reason,
-            **self._loads(log["v"][:, 6:], log["tau"], air),
-            self_collision_s=collisions,
-            stray_contacts=tuple(self._links[other[i]] for i in np.flatnonzero(stray[air].any(axis=0))),
-            liftoff_s=float(log["t"][liftoff]) if flew else None,
-            touchdown_s=float(log["t"][touchdown]) if down else None,
-            touchdown_trunk_pitch_rad=pitch,
-            touchdown_com_velocity=_xz(velocity[touchdown]) if down else None,
-            sole_ahead_m=soles_ahead,
-            launch_impulse=_xz(force[:liftoff].sum(axis=0) * STEP_S),
-            landing_impulse=_xz(force[touchdown:][: round(IMPACT_S / STEP_S)].sum(axis=0) * STEP_S) if down else None,
-            qp_solves=solves[0], qp_failures=solves[1])  # fmt: skip
+        stray, air = log["touching"][:, other], slice(0, touchdown)
+        t, q, com, velocity = log["t"], log["q"], log["com"], log["com_velocity"]
+        force = log["foot_wrench"][:, :, :3].sum(axis=1)
+        found = self._loads(log["v"][:, 6:], log["tau"], air)
+        found["standing_s"], found["landed"], found["reason"] = self._verdict(log, stray, liftoff, touchdown)
+        found["stray_contacts"] = tuple(self._links[other[i]] for i in np.flatnonzero(stray[air].any(axis=0)))
+        found["launch_impulse"] = _xz(force[:liftoff].sum(axis=0) * STEP_S)
+        if liftoff is not None:
+            found |= dict(
+                liftoff_s=float(t[liftoff]),
+                com_rise_m=float(com[liftoff : (touchdown or len(com)), 2].max() - com[liftoff, 2]),
+                takeoff_velocity=_xz(velocity[liftoff]),
+                takeoff_momentum=float(log["L"][liftoff]),
+            )
+        if touchdown is not None:
+            start, touch, end = (float(self._gauge.toe(q[row])[0]) for row in (0, touchdown, -1))
+            found |= dict(
+                touchdown_s=float(t[touchdown]),
+                foot_distance_m=end - start,
+                foot_distance_touchdown_m=touch - start,
+                touchdown_trunk_pitch_rad=_counted(pitch_of(q[: touchdown + 1])),
+                touchdown_com_velocity=_xz(velocity[touchdown]),
+                sole_ahead_m=float(self._gauge.soles(q[touchdown])[0] - com[touchdown, 0]),
+                landing_impulse=_xz(force[touchdown:][: round(IMPACT_S / STEP_S)].sum(axis=0) * STEP_S),
+            )
+        collisions = STEP_S * float(log["colliding"].sum())
+        return Metrics(**found, self_collision_s=collisions, qp_solves=solves[0], qp_failures=solves[1])
 
     def _verdict(self, log, stray, liftoff, touchdown) -> tuple[float, bool, str]:
         """Seconds on the feet alone after touchdown, whether that is a landing, and why (not)."""
@@ -122,7 +127,7 @@ class Recorder:
             return standing, False, f"still moving at {speed:.2f} m/s at the end"
         if not (log["foot_wrench"][-1, :, 2] > CONTACT_FORCE_N).all():
             return standing, False, "a foot was in the air at the end"
-        miss = self._feet_middle(log["q"][-1])[2] - self._feet_middle(self._planned_end)[2]
+        miss = self._gauge.soles(log["q"][-1])[2] - self._gauge.soles(self._planned_end)[2]
         if abs(miss) > LEVEL_TOLERANCE_M:
             return standing, False, f"stands {miss:+.2f} m from the height it was meant to land on"
         return standing, True, f"stood for {standing:.2f} s on its feet alone"
@@ -135,38 +140,15 @@ class Recorder:
         room = np.where(tau > 0, high, -low)
         saturated = (np.abs(tau) >= SATURATED * room) & (np.abs(tau) > 0)
 
-        def by_joint(values):
+        def by_joint(values: np.ndarray) -> dict[str, float]:
             return {name: float(x) for name, x in zip(names, values, strict=True)}
 
-        return dict(
-            max_torque_ratio=float(torque.max()), max_speed_ratio=float(speed.max()),
-            max_torque_ratio_before_touchdown=float(torque[air].max()),
-            max_speed_ratio_before_touchdown=float(speed[air].max()),
-            max_torque_ratio_by_joint=by_joint(torque.max(axis=0)),
-            max_speed_ratio_by_joint=by_joint(speed.max(axis=0)),
-            saturated_s=by_joint(saturated.sum(axis=0) * STEP_S),
-            overspeed_s=by_joint((speed > 1).sum(axis=0) * STEP_S))  # fmt: skip
-
-    def _toe_at(self, log, row: int) -> float:
-        return float(self._feet_middle(log["q"][row], self._robot.foot.toe)[0])
-
-    def _feet_middle(self, q: np.ndarray, x: float | None = None) -> np.ndarray:
-        """Mean over both feet (3,) of the sole's point at ``x`` along the foot; of its middle if None [m]."""
-        model, foot = self._robot.model, self._robot.foot
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, q)
-        point = foot.center if x is None else np.array([x, 0.0, foot.sole_z])
-        return np.mean([data.oMf[model.getFrameId(name)].act(point) for name in foot.frames], axis=0)
-
-
-def _centroidal(robot: Robot, q: np.ndarray, v: np.ndarray):
-    """CoM (N, 3), its velocity (N, 3), L_y (N,), pitch inertia (N,) of a log."""
-    model, data, rows = robot.model, robot.model.createData(), []
-    for qk, vk in zip(q, v, strict=True):
-        pin.ccrba(model, data, qk, vk)
-        rows.append((*data.com[0], *(data.hg.linear / robot.total_mass), data.hg.angular[1], data.Ig.inertia[1, 1]))
-    rows = np.array(rows)
-    return rows[:, :3], rows[:, 3:6], rows[:, 6], rows[:, 7]
+        out = dict(saturated_s=by_joint(saturated.sum(axis=0) * STEP_S))
+        out["overspeed_s"] = by_joint((speed > 1).sum(axis=0) * STEP_S)
+        for name, ratio in (("max_torque_ratio", torque), ("max_speed_ratio", speed)):
+            out[name], out[f"{name}_before_touchdown"] = float(ratio.max()), float(ratio[air].max())
+            out[f"{name}_by_joint"] = by_joint(ratio.max(axis=0))
+        return out
 
 
 def _events(force: np.ndarray) -> tuple[int | None, int | None]:
@@ -181,11 +163,6 @@ def _events(force: np.ndarray) -> tuple[int | None, int | None]:
 
 def _xz(vector: np.ndarray) -> tuple[float, float]:
     return float(vector[0]), float(vector[2])
-
-
-def _pitch(q: np.ndarray) -> float:
-    x, y, z, w = q[3:7]
-    return float(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
 
 
 def _counted(pitch: np.ndarray) -> float:

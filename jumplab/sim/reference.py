@@ -1,9 +1,8 @@
-"""A landing planned anew while it goes on: the impact of a flip leaves the robot elsewhere than its plan expected.
+"""The landing to follow: planned in flight for the touchdown that is forecast, and again while it goes on.
 
-The soles of a backflip tilt up, the ankles meet their stop, and for a tenth of a second the ground pushes at the toes
-only. What stage 1 planned for flat soles is then off by 5 cm and more, and a controller that still follows it pushes
-CoM and trunk towards places that this robot cannot hold. From the measured state the rest is planned as the landing
-was: it takes its time too, so the robot follows the older plan until the newer one is there.
+The impact of a flip leaves the robot elsewhere than its plan expected: the soles of a backflip tilt up, and for a tenth
+of a second the ground pushes at the toes only. From the measured state the rest is then planned as the landing was.
+That takes its time too, so the robot follows the older plan until the newer one is there.
 """
 
 from __future__ import annotations
@@ -19,14 +18,21 @@ import pinocchio as pin
 from jumplab.errors import JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge, pitched, rotation
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
 from jumplab.task import GRAVITY
 
-# reference ------------------------------------------------------------------------------------------
-LEAD_S = 0.15  # our choice: three times what the solve takes on one core of a laptop
-KEPT_PLANNERS = 4  # our choice: robots of one session; a planner holds a few megabytes
+# The paper prints none of these numbers.
+LEAD_S = 0.15  # before touchdown a landing is planned: three times what the solve takes on one core of a laptop
+KEPT_PLANNERS = 4  # robots of one session; a planner holds a few megabytes
+FIRST_S = 0.15  # after touchdown it is planned again; before, the soles of flips are tilted, and a plan knows flat ones
+EVERY_S = 0.10  # twice what a solve takes
+UNTIL_S = 1.2  # the longest landing that is planned; afterwards the controller leads to the stance
+LATENCY_S = 0.05  # before a new plan is followed, about what its solve takes
+OFF_M = 0.03  # of the capture point; less is what the controller's own feedback mends
+LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot is still told
 
 
 class Reference(Protocol):
@@ -99,21 +105,16 @@ class Forecast:
     """
 
     def __init__(self, robot: Robot, tape: Tape, scene: Scene):
-        self._robot, self._model, self._data, self._scene = robot, robot.model, robot.model.createData(), scene
-        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        self._gauge, self._scene = Gauge(robot), scene
         self._q, self._v = tape.q[-1].copy(), tape.v[-1].copy()
-        com, soles = self._com_and_soles(self._q)
+        com, soles = self._gauge.com(self._q), self._gauge.soles(self._q)
         self._above, self._ahead = float(com[2] - soles[2]), float(soles[0] - com[0])
-
-    def _com_and_soles(self, q) -> tuple[np.ndarray, np.ndarray]:
-        com = pin.centerOfMass(self._model, self._data, q, False).copy()
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return com, np.mean([self._data.oMf[f].act(self._robot.foot.center) for f in self._frames], axis=0)
 
     def time_left(self, q: np.ndarray, v: np.ndarray) -> float:
         """Time until the soles meet the ground [s], from a measured state in flight; inf if they never do."""
-        pin.centerOfMass(self._model, self._data, q, v)
-        (x, _, z), (vx, _, vz) = self._data.com[0], self._data.vcom[0]
+        data = self._gauge.data
+        pin.centerOfMass(self._gauge.model, data, q, v)
+        (x, _, z), (vx, _, vz) = data.com[0], data.vcom[0]
         left = 0.0
         for _ in range(2):  # the ground's height depends on where, and so on when
             drop = z - self._above - self._scene.top_at(x + vx * left + self._ahead)
@@ -133,17 +134,15 @@ class Forecast:
         pitch_error : of the trunk, now [rad]; it stays.
         correction : (nv - 6,) angles that will have been added to the tape by then.
         """
-        model, data = self._model, self._data
+        model, data = self._gauge.model, self._gauge.data
         pin.ccrba(model, data, q, v)
         speed, momentum = data.vcom[0].copy(), data.hg.angular[1]
         speed[2] -= GRAVITY * self.time_left(q, v)
-        end, rates = self._q.copy(), self._v.copy()
-        turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch_error, 0.0))
-        end[3:7] = (turn * pin.Quaternion(end[6], end[3], end[4], end[5])).coeffs()
+        end, rates = pitched(self._q, pitch_error), self._v.copy()
         if correction is not None:
             end[7:] += correction
         # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM flies on
-        attitude = pin.Quaternion(end[6], end[3], end[4], end[5]).toRotationMatrix()
+        attitude = rotation(end[3:7])
         pin.ccrba(model, data, end, rates)
         spin = np.array([0.0, (momentum - data.hg.angular[1]) / data.Ig.inertia[1, 1], 0.0])
         rates[3:6] += attitude.T @ spin
@@ -185,33 +184,16 @@ class LandingAhead:
     def to_json(self) -> dict:
         """What the settings of a result say."""
         in_time = None if self.solve_s is None else self.solve_s <= max(0.0, self.time_left_s)
-        return {
-            "asked": self.source, "followed": self.followed or self.source, "planned_at_s": self.planned_s,
-            "time_left_s": self.time_left_s, "solve_s": self.solve_s, "in_time": in_time, "reason": self.reason,
-        }  # fmt: skip
-
-
-# replan ------------------------------------------------------------------------------------------
-FIRST_S = 0.15  # our choice: after touchdown; before, the soles of flips are still tilted, and a plan knows flat ones
-EVERY_S = 0.10  # our choice: twice what a solve takes
-UNTIL_S = 1.2  # our choice: the longest landing that is planned; afterwards the controller leads to the stance
-LATENCY_S = 0.05  # our choice: before a new plan is followed, about what its solve takes
-OFF_M = 0.03  # our choice: of the capture point; less is what the controller's own feedback mends
-LEAST_HEIGHT_M = 0.3  # our choice: of the CoM, where the capture point of a squatting robot is still told
+        times = dict(planned_at_s=self.planned_s, time_left_s=self.time_left_s, solve_s=self.solve_s, in_time=in_time)
+        return dict(asked=self.source, followed=self.followed or self.source, **times, reason=self.reason)
 
 
 @dataclass(frozen=True)
 class Rest:
-    """The rest of a landing.
-
-    Attributes
-    ----------
-    plan : its time begins with zero.
-    began : its time zero, since touchdown [s].
-    """
+    """The rest of a landing."""
 
     plan: Reference
-    began: float
+    began: float  # the plan's time zero, since touchdown [s]
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
         """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
@@ -232,11 +214,9 @@ class Replan:
     """
 
     def __init__(self, robot: Robot):
-        self._robot = robot
+        self._robot, self._due = robot, FIRST_S
         self._next: Rest | None = None
-        self._due = FIRST_S
-        self.made = self.refused = 0
-        self.slowest_s = 0.0
+        self.made, self.refused, self.slowest_s = 0, 0, 0.0
 
     def follow(self, time: float, q: np.ndarray, v: np.ndarray, reference: Reference) -> Reference:
         """What to follow at ``time`` since touchdown [s] from the measured state; ``reference`` is followed so far."""

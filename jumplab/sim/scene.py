@@ -1,4 +1,4 @@
-"""What the robot stands and lands on: boxes with flat tops and real edges."""
+"""What the robot stands and lands on, boxes with flat tops and real edges; and what it touches."""
 
 from __future__ import annotations
 
@@ -6,11 +6,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 
-REACH_M = 20.0  # our choice: half-size of "endless" ground, far beyond any jump
-THICKNESS_M = 1.0  # our choice: deeper than any contact can push a foot in one step
+REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
+THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What touched in one step.
+
+    Attributes
+    ----------
+    wrench : (2, 6) force and moment on each foot from the ground, world axes, at the origin of the foot link [N, N m].
+    touching : names of the robot's links that press on the ground.
+    colliding : pairs of the robot's links that press on each other.
+    """
+
+    wrench: np.ndarray
+    touching: frozenset[str]
+    colliding: frozenset[tuple[str, str]]
 
 
 @dataclass(frozen=True)

@@ -10,18 +10,16 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.errors import InfeasibleError, InputError, RobotError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.robot.stance import check_stance
 from jumplab.sim.scene import REACH_M, Block, Scene
-from jumplab.stages.planner import to_link_angles
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.stages.whole_body.settings import Limits
-from jumplab.task import GRAVITY, JumpTask
+from jumplab.task import JumpTask
 
 # posture ------------------------------------------------------------------------------------------
 # our choice: half-way between the stance and the bottom of a landing; a jump from there needs 0.70 s instead of 0.86 s,
@@ -47,64 +45,16 @@ def crouched(robot: Robot) -> Robot:
     return other
 
 
-class Gauge:
-    """Reads from a state of the full robot what a plan needs: where the toes are, and the sagittal posture."""
-
-    def __init__(self, robot: Robot):
-        self.robot, self._data = robot, robot.model.createData()
-        self._frames = [robot.model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        self._toe = np.array([robot.foot.toe, 0.0, robot.foot.sole_z])
-
-    def toe(self, q: np.ndarray) -> np.ndarray:
-        """Middle between the toes (3,) [m]."""
-        pin.framesForwardKinematics(self.robot.model, self._data, q)
-        return np.mean([self._data.oMf[f].act(self._toe) for f in self._frames], axis=0)
-
-    def heading(self, q: np.ndarray) -> float:
-        """Yaw of the feet, mean of both [rad]."""
-        pin.framesForwardKinematics(self.robot.model, self._data, q)
-        return float(np.mean([np.arctan2(*self._data.oMf[f].rotation[[1, 0], 0]) for f in self._frames]))
-
-    def posture(self, q: np.ndarray) -> np.ndarray:
-        """Absolute link angles (5,) with the feet taken as flat, mean of left and right [rad]."""
-        zero = np.zeros((1, self.robot.model.nv))
-        angles = to_link_angles(self.robot, q[None], zero, zero)[0][0]
-        angles[0] = 0.0
-        return angles
-
-    def com(self, q: np.ndarray) -> np.ndarray:
-        """CoM (3,) [m]."""
-        return pin.centerOfMass(self.robot.model, self._data, q, False).copy()
-
-    def com_velocity(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Velocity of the CoM (3,) [m/s]."""
-        pin.centerOfMass(self.robot.model, self._data, q, v, False)
-        return self._data.vcom[0].copy()
-
-    def com_ahead(self, q: np.ndarray, v: np.ndarray, left_s: float) -> np.ndarray:
-        """CoM (3,) in ``left_s`` of free flight [m]."""
-        speed = self.com_velocity(q, v)
-        return self.com(q) + speed * left_s - np.array([0.0, 0.0, GRAVITY * left_s**2 / 2])
-
-
-# course ------------------------------------------------------------------------------------------
-MOST_JUMPS = 50  # our choice: two minutes of simulated time; more is surely a typo
+MOST_JUMPS = 50  # two minutes of simulated time; more is surely a typo
 
 
 @dataclass(frozen=True)
 class Course:
-    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers.
+    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers."""
 
-    Attributes
-    ----------
-    distances_m : travel of the feet in each jump, toe to toe [m].
-    heights_m : rise of the CoM in each flight [m].
-    platforms_m : height of each landing surface above the ground that the chain begins on [m].
-    """
-
-    distances_m: tuple[float, ...]
-    heights_m: tuple[float, ...]
-    platforms_m: tuple[float, ...]
+    distances_m: tuple[float, ...]  # travel of the feet in each jump, toe to toe
+    heights_m: tuple[float, ...]  # rise of the CoM in each flight
+    platforms_m: tuple[float, ...]  # height of each landing surface above the ground that the chain begins on
 
     @classmethod
     def of(cls, distances_m: Iterable[Any], height_m: Any, platforms_m: Iterable[Any] | None = None) -> Course:
@@ -187,8 +137,10 @@ class Course:
         """Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`."""
         if any(self.platforms_m) and min(self.distances_m) < 0:
             k = int(np.argmin(self.distances_m))
-            raise InputError(f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
-                             f"chains with platforms go forward, backward jumps stay on the level")  # fmt: skip
+            raise InputError(
+                f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
+                f"chains with platforms go forward, backward jumps stay on the level"
+            )
         least = 2 * Limits().edge_before_heel_m - robot.sagittal.heel[0]
         for k in range(self.count):
             rise, distance = self.task(k).platform_m, self.distances_m[k]

@@ -6,25 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+from jumplab.sim import STEP_S
+from jumplab.sim.actuation import Command
+from jumplab.sim.kinematics import Gauge, pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
-from jumplab.sim.pilot import Pilot
-from jumplab.sim.playback import Command
-from jumplab.sim.reaim import pitch_of
-from jumplab.sim.reference import Forecast
+from jumplab.sim.pilot import AFTER_FALL_S, EXTRA_S, Pilot
+from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
-from jumplab.studies.chain.course import Gauge
 from jumplab.studies.chain.foresight import Ahead, Foresight
 
-FIRST_STAND_S = (
-    0.5  # our choice: the first plan, too, is made from a measured posture, once a push of the start is gone
-)
-# our choice: still enough to begin, found by measuring: the tape begins at rest, and what is left fades within BLEND_S
+FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
+# still enough to begin: the tape begins at rest, and what is left fades within BLEND_S
 STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25
 STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
-BLEND_S = 0.25  # our choice: a third of the launch, over before the push begins
-PATIENCE_S = 3.0  # our choice: who is not still this long after touchdown will not be
+BLEND_S = 0.25  # a third of the launch, over before the push begins
+PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
 
 
 class ChainPilot:
@@ -32,8 +29,7 @@ class ChainPilot:
 
     Parameters
     ----------
-    foresight : makes the plans.
-    robot : as planned, crouching.
+    foresight : makes the plans, for a robot that crouches.
     scene : ground of the course.
     landing : "planned" or "spring", as for a single jump.
     look_s : when the next jump is planned, from touchdown on [s]; negative: so long before it is due.
@@ -42,24 +38,21 @@ class ChainPilot:
     Attributes
     ----------
     plans : plans made for each jump, in the order in which they were made.
-    used : the plan with which each jump began.
-    began : step at which each jump began.
-    over : why the chain goes on no more; empty while it does.
+    used, pilots, began : plan, pilot and first step of each jump that began.
+    reason : why the chain goes on no more; empty while it does.
     """
 
-    def __init__(self, foresight: Foresight, robot: Robot, scene: Scene, landing: str, look_s: float,
-                 revise_s: float | None):  # fmt: skip
-        self._foresight, self._robot, self._scene, self._landing = foresight, robot, scene, landing
-        self._look_s, self._revise_s, self._gauge = look_s, revise_s, Gauge(robot)
-        self._stand, self._tau = LandingController(robot), np.zeros(len(robot.joint_names))
-        self._not_arms = ~np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
+    def __init__(self, foresight: Foresight, scene: Scene, landing: str, look_s: float, revise_s: float | None):
+        self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
+        self._landing, self._look_s, self._revise_s = landing, look_s, revise_s
+        self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
+        self._tau = np.zeros(len(self._robot.joint_names))
+        self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
         self.plans: list[list[Ahead]] = []
         self.used: list[Ahead] = []
-        self.began: list[int] = []
-        self.over = ""
-        self.pilot: Pilot | None = None
         self.pilots: list[Pilot] = []
-        self._offset = None
+        self.began: list[int] = []
+        self.reason = ""
 
     @property
     def current(self) -> int:
@@ -67,28 +60,47 @@ class ChainPilot:
         return len(self.began) - 1
 
     @property
+    def part(self) -> int:
+        """The part of the log that this is: one per jump; the stand before the first jump belongs to it."""
+        return max(self.current, 0)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Crouch (nq,) on the surface that the present jump shall land on."""
+        end = stance_configuration(self._robot)
+        end[2] += self._foresight.course.platforms_m[self.part]
+        return end
+
+    @property
     def landed(self) -> bool:
         """Whether the robot stands: before the first jump, or after a touchdown."""
-        return self.pilot is None or self.pilot.touchdown is not None
+        return not self.pilots or self.pilots[-1].touchdown is not None
 
     def since_touchdown(self, step: int) -> float:
         """Time since the last touchdown, or since the chain began [s]; negative in the air."""
-        if self.pilot is None:
+        if not self.pilots:
             return step * STEP_S
-        return -1.0 if self.pilot.touchdown is None else (step - self.began[-1] - self.pilot.touchdown) * STEP_S
+        return (step - self.began[-1] - self.pilots[-1].touchdown) * STEP_S if self.landed else -1.0
+
+    def over(self, step: int, fallen_s: float) -> bool:
+        """Whether something has ended the chain, or its last landing has been watched."""
+        if fallen_s > AFTER_FALL_S:
+            self.reason = f"the robot fell in jump {self.part + 1}"
+        last = self.current + 1 == self._foresight.course.count
+        return bool(self.reason) or (last and self.since_touchdown(step) >= STAND_S + EXTRA_S)
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` of the chain from measured state and vertical foot forces."""
-        if self.current + 1 < self._foresight.course.count and not self.over:
+        if self.current + 1 < self._foresight.course.count and not self.reason:
             self._think(step, q, v)
-        if self.pilot is None:
+        if not self.pilots:
             if step % PERIOD_STEPS == 0:
                 self._tau = self._stand.torque(step * STEP_S, q, v, force)
             return Command(tau=self._tau)
-        now = step - self.began[-1]
-        command = self.pilot.command(now, q, v, force)
-        if self.pilot.touchdown is None and now > self.pilot.last_step:
-            self.over = self.over or f"jump {self.current + 1} never touched down"
+        now, pilot = step - self.began[-1], self.pilots[-1]
+        command = pilot.command(now, q, v, force)
+        if pilot.touchdown is None and now > pilot.last_step:
+            self.reason = self.reason or f"jump {self.current + 1} never touched down"
         return command if command.q is None else self._blended(command, now * STEP_S)
 
     # deciding --------------------------------------------------------------------------------------------------
@@ -107,9 +119,9 @@ class ChainPilot:
             plans.append(self._foresight.look(number, time, *seen, last))
         elif plans and self.landed:
             if all(p.failure for p in plans) and not self._may_revise(plans):
-                self.over = f"no plan for jump {number + 1}: {plans[-1].failure}"
+                self.reason = f"no plan for jump {number + 1}: {plans[-1].failure}"
             elif self.since_touchdown(step) > PATIENCE_S + sum(p.solve_s for p in plans):
-                self.over = f"the robot did not come to rest for jump {number + 1}"
+                self.reason = f"the robot did not come to rest for jump {number + 1}"
 
     def _begun(self, plans: list[Ahead], step: int, q: np.ndarray, v: np.ndarray) -> bool:
         """Begin with the latest plan that is there, if the robot is still enough; notes when it was."""
@@ -128,7 +140,7 @@ class ChainPilot:
 
     def _sight(self, step: int, q: np.ndarray, v: np.ndarray, plans: list[Ahead]) -> tuple[np.ndarray, bool] | None:
         """Where the toes (3,) stand, or will stand, and whether the robot flies; None unless it is time to plan."""
-        if self.pilot is None:
+        if not self.pilots:
             if plans or step * STEP_S < FIRST_STAND_S:
                 return None
             self._foresight.learn_posture(q)
@@ -141,7 +153,7 @@ class ChainPilot:
             return self._gauge.toe(q), False
         if self.landed or self._look_s >= 0 or not self._airborne(step):
             return None
-        left = self._forecast.time_left(q, v)
+        left = self.pilots[-1].forecast.time_left(q, v)
         return None if left > -self._look_s else (self._gauge.toe(self._at_touchdown(step, q, v, left)), True)
 
     def _airborne(self, step: int) -> bool:
@@ -153,29 +165,24 @@ class ChainPilot:
         tape = self.used[-1].plan.tape
         row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
         turned = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)])
-        end, _ = self._forecast.state(q, v, turned)
+        end, _ = self.pilots[-1].forecast.state(q, v, turned)
         end[:3] += self._gauge.com_ahead(q, v, left) - self._gauge.com(end)
         return end
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
         """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
-        off, legs = np.abs(q[7:] - ahead.joints), self._not_arms
-        near = off[legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
+        off = np.abs(q[7:] - ahead.joints)
+        near = off[self._legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
         slow = np.abs(v[6:]).max() <= STILL_RATE and np.linalg.norm(self._gauge.com_velocity(q, v)) <= STILL_COM
         return bool(near and slow)
 
     def _begin(self, ahead: Ahead, step: int, q: np.ndarray, v: np.ndarray) -> None:
-        ahead.began_s = step * STEP_S
-        toe = self._gauge.toe(q)
+        ahead.began_s, toe, tape = step * STEP_S, self._gauge.toe(q), ahead.plan.tape
         if self.used:
             self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
-        self._from = float(toe[0])
+        self._from, self._offset = float(toe[0]), (q[7:] - tape.q[0, 7:], v[6:].copy())
         self.used.append(ahead)
-        tape = ahead.plan.tape
-        self._offset = q[7:] - tape.q[0, 7:], v[6:].copy()
-        self.pilot = Pilot(tape, self._robot, "position", self._scene, self._landing, None, True)
-        self.pilots.append(self.pilot)
-        self._forecast = Forecast(self._robot, tape, self._scene)
+        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:
@@ -186,8 +193,3 @@ class ChainPilot:
         angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
         speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
         return replace(command, q=command.q + angle, rate=command.rate + speed)
-
-    @property
-    def finished(self) -> bool:
-        """Whether the last jump of the course is under way, or over."""
-        return self.current + 1 == self._foresight.course.count
