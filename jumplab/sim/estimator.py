@@ -92,11 +92,8 @@ SIZE = 21
 class Estimator:
     """State of the full robot, from one :class:`Reading` per millisecond.
 
-    Parameters
-    ----------
-    robot : as planned; only its geometry is used.
-    q, v : (nq,), (nv,) where it starts; known but for ``noise.tilt_rad``.
-    noise : what the sensors are known to be worth.
+    Of ``robot``, as planned, only the geometry is used; it starts in ``q`` (nq,), ``v`` (nv,), known but for
+    ``noise.tilt_rad``. ``noise`` is what the sensors are known to be worth.
     """
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise):
@@ -193,19 +190,12 @@ def _foot(side: int) -> slice:
 
 
 class Perception:
-    """What the controllers are told: the truth if no sensor errs, otherwise the estimate.
-
-    Parameters
-    ----------
-    robot, q, v, noise : see :class:`Estimator`; ``seed`` of the sensors' errors.
-    """
+    """What the controllers are told: the truth if no sensor errs, otherwise the estimate, see :class:`Estimator`."""
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
-        self._sensors = Sensors(noise, seed)
-        self._estimator = None
-        if not self._sensors.exact:
-            self._estimator = Estimator(robot, self._sensors.initial(q), v, noise)
-        self._tilt, self._speed = 0.0, 0.0
+        self._sensors, self._tilt, self._speed = Sensors(noise, seed), 0.0, 0.0
+        exact = self._sensors.exact
+        self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
     def __call__(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Configuration (nq,), velocity (nv,) and vertical foot forces (2,) as far as the robot knows them."""

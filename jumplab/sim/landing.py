@@ -153,14 +153,9 @@ class LandingGains:
 class LandingController:
     """Torques that catch and hold the robot; see the module's docstring.
 
-    Parameters
-    ----------
-    robot : the robot as it was planned; the controller knows nothing of perturbations.
-    reference : followed if given; otherwise spring-dampers lead to the middle of the feet at standing height.
-
-    Attributes
-    ----------
-    solves, failures : counts of QPs posed, and of those without a solution.
+    ``robot`` is as planned: the controller knows no perturbation. ``reference`` is followed if given; otherwise
+    spring-dampers lead to the middle of the feet at standing height. ``solves`` and ``failures`` count the QPs posed,
+    and those without a solution.
     """
 
     def __init__(self, robot: Robot, *, reference: Reference | None = None, gains: LandingGains | None = None):
@@ -182,8 +177,7 @@ class LandingController:
         """Joint torques (nv - 6,) [N m], ``time`` after touchdown, from measured state and vertical foot forces."""
         body = self._terms
         body.update(q, v)
-        contact = self._contact(time, np.asarray(foot_force))
-        body.set_contact(contact)
+        body.set_contact(contact := self._contact(time, np.asarray(foot_force)))
         x = self._solve(*self._wishes(time, q, v, contact), v)
         tau = -FALLBACK_DAMPING * v[6:] + body.gravity_torque(contact) if x is None else body.torque(x)
         return np.clip(np.round(tau, TORQUE_DIGITS), *self._actuators.range(v[6:]))
@@ -196,8 +190,6 @@ class LandingController:
             return loaded
         height = self._terms.soles[:, 2]
         return loaded | (height - height[loaded].min() < NEAR_GROUND_M)
-
-    # wishes ----------------------------------------------------------------------------------------------------
 
     def _wishes(self, time, q, v, contact):
         """Least-squares rows (k, nx), targets (k,), weights (k,); wishes on joint accelerations and their weights."""
@@ -224,8 +216,8 @@ class LandingController:
         """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
         g, body = self.gains, self._terms
         rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
-        goal, speed, momentum = foot_middle + np.array([0.0, 0.0, body.standing_height]), np.zeros(3), np.zeros(3)
-        push, twist = np.zeros(3), np.zeros(3)
+        goal = foot_middle + np.array([0.0, 0.0, body.standing_height])
+        speed, momentum, push, twist = np.zeros((4, 3))
         if self.reference is not None:
             com, com_rate, momentum[1] = self.reference.at(time)
             goal[[0, 2]], speed[[0, 2]] = foot_middle[[0, 2]] + com, com_rate
@@ -264,14 +256,11 @@ class LandingController:
             wish[near], weight[near] = np.clip(needed[near], -MAX_TURN, MAX_TURN), g.stop_weight
         return wish, weight
 
-    # the QP ----------------------------------------------------------------------------------------------------
-
     def _solve(self, rows, targets, weights, joint_wish, joint_weight, v):
         """Unknowns x (nx,) of the QP, or None if the solver does not report success."""
         g, body, nv = self.gains, self._terms, self._terms.nv
         weighted = rows * weights[:, None]  # (k, nx)
-        hessian = weighted.T @ rows
-        linear = -weighted.T @ targets
+        hessian, linear = weighted.T @ rows, -weighted.T @ targets
         diagonal = np.concatenate([np.full(nv, g.acceleration_weight), np.full(12, g.wrench_weight)])
         diagonal[6:nv] += joint_weight
         linear[6:nv] -= joint_weight * joint_wish
@@ -279,9 +268,8 @@ class LandingController:
         hessian[nv:, nv:] += g.uneven_weight * UNEVEN
         low, high = self._actuators.range(v[6:])
         matrix = np.vstack([body.torque_rows, self._corners])
-        rest = np.zeros(len(self._corners))
-        lower = np.concatenate([low - body.torque_offset, rest])
-        upper = np.concatenate([high - body.torque_offset, rest + UNBOUNDED])
+        lower = np.concatenate([low - body.torque_offset, np.zeros(len(self._corners))])
+        upper = np.concatenate([high - body.torque_offset, np.full(len(self._corners), UNBOUNDED)])
         equations = (body.base_rows, -body.base_offset)
         pose = self._solver.update if self.solves else self._solver.init
         pose(hessian, linear, *equations, matrix, lower, upper)

@@ -36,11 +36,8 @@ AFTER_FALL_S = 0.5  # a fall is shown for this long
 class Pilot:
     """Decides the command of each step: playback until touchdown, landing controller afterwards.
 
-    Parameters
-    ----------
-    tape, robot, scene : as planned.
-    mode : how the tape is played, see :class:`Playback`.
-    landing, reference, reaim, stand_s : see :func:`jumplab.sim.simulate_jump`.
+    Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
+    :func:`jumplab.sim.simulate_jump`.
 
     Attributes
     ----------

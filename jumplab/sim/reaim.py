@@ -78,11 +78,8 @@ class Reaim:
     def correction(self, q: np.ndarray, v: np.ndarray, error: float, opening: float | None = None) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
 
-        Parameters
-        ----------
-        q, v : measured state.
-        error : of the trunk's pitch at touchdown, as now or as forecast [rad], within half a turn.
-        opening : in a flip, the time until touchdown [s].
+        ``error`` of the trunk's pitch at touchdown, as now or as forecast [rad], is within half a turn; ``opening`` is,
+        in a flip, the time until touchdown [s].
         """
         middle = self._gauge.soles(q)
         near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
@@ -116,19 +113,15 @@ class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
     The shift has the shape of sin^2, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
-    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum.
-
-    Attributes
-    ----------
-    miss : forecast trunk pitch at touchdown, less the planned one [rad]; whole turns counted.
+    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum; ``miss``
+    is the forecast trunk pitch at touchdown, less the planned one [rad], whole turns counted.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
         self._model, self._data = robot.model, robot.model.createData()
         self._start, self._end = tape.takeoff_time, float(tape.t[-1])
         flight = slice(tape.takeoff_index, None)
-        self._t = tape.t[flight]
-        self._inertia, self._carried = self._along(tape.q[flight], tape.v[flight])
+        self._t, (self._inertia, self._carried) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
         self._pitch = planned_pitch(tape.q[flight])
         self._size = self._shift = self._speed = 0.0
         self._turned: float | None = None

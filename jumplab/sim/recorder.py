@@ -24,11 +24,8 @@ MIN_FLIGHT_S = 0.05  # a shorter loss of contact is a hop of the launch; the low
 class Recorder:
     """Raw log of one run; :meth:`result` derives everything else.
 
-    Parameters
-    ----------
-    robot : the simulated robot, perturbed as it is.
-    planned_end : (nq,) last configuration of the tape, which tells the height to land on.
-    links : names of all links.
+    ``robot`` is the simulated one, perturbed as it is; ``planned_end`` (nq,), the last configuration of the tape, tells
+    the height to land on; ``links`` are the names of all links.
     """
 
     def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...]):

@@ -47,29 +47,16 @@ class Reference(Protocol):
 
 @dataclass(frozen=True)
 class LandingReference:
-    """A landing to follow, sampled: CoM from the middle between the soles.
+    """A landing to follow, sampled: CoM from the middle between the soles; what is None is not fed forward."""
 
-    Attributes
-    ----------
-    t : (N,) time since touchdown [s]; the last sample holds for ever.
-    com, com_velocity : (N, 2) x and z [m, m/s].
-    L : (N,) angular momentum about the pitch axis [kg m^2/s].
-    com_acceleration, L_rate : (N, 2), (N,) what is fed forward [m/s^2, N m]; nothing is if None.
-    """
+    t: np.ndarray  # (N,) time since touchdown [s]; the last sample holds for ever
+    com: np.ndarray  # (N, 2) x and z [m]
+    com_velocity: np.ndarray  # (N, 2) [m/s]
+    L: np.ndarray  # (N,) angular momentum about the pitch axis [kg m^2/s]
+    com_acceleration: np.ndarray | None = None  # (N, 2) [m/s^2]
+    L_rate: np.ndarray | None = None  # (N,) [N m]
 
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    L: np.ndarray
-    com_acceleration: np.ndarray | None = None
-    L_rate: np.ndarray | None = None
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,), its velocity (2,) and momentum at ``time`` since touchdown."""
-        x, z, dx, dz, momentum = (
-            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
-        )
-        return np.array([x, z]), np.array([dx, dz]), float(momentum)
+    at = LandingPlan.at
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
         """CoM acceleration (2,) and rate of L at ``time`` since touchdown, zero after the last sample."""
@@ -96,13 +83,7 @@ def landing_planner(robot: Robot) -> LandingPlanner:
 
 
 class Forecast:
-    """The touchdown that a measured flight leads to.
-
-    Parameters
-    ----------
-    robot, tape : as planned; the tape's last row is the posture to land in.
-    scene : ground.
-    """
+    """The touchdown that a measured flight leads to; the last row of the planned ``tape`` is the posture to land in."""
 
     def __init__(self, robot: Robot, tape: Tape, scene: Scene):
         self._gauge, self._scene = Gauge(robot), scene
@@ -129,10 +110,7 @@ class Forecast:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured state in flight.
 
-        Parameters
-        ----------
-        pitch_error : of the trunk, now [rad]; it stays.
-        correction : (nv - 6,) angles that will have been added to the tape by then.
+        The trunk's ``pitch_error`` [rad] stays; ``correction`` (nv - 6,) will have been added to the tape by then.
         """
         model, data = self._gauge.model, self._gauge.data
         pin.ccrba(model, data, q, v)
@@ -153,16 +131,10 @@ class Forecast:
 
 @dataclass
 class LandingAhead:
-    """Where the landing controller's reference comes from, and what became of it.
+    """Where the landing controller's reference comes from, and what became of it."""
 
-    Attributes
-    ----------
-    source : "planned" in flight by stage 1, "spring" (spring-dampers to the stance) or "given" by the caller.
-    followed : what was really followed, once decided; "spring" also if the planner found no landing.
-    """
-
-    source: str
-    followed: str | None = None
+    source: str  # "planned" in flight by stage 1, "spring" (spring-dampers to the stance) or "given" by the caller
+    followed: str | None = None  # really, once decided; "spring" also if the planner found no landing
     planned_s: float | None = None
     time_left_s: float | None = None
     solve_s: float | None = None
@@ -207,10 +179,7 @@ class Rest:
 class Replan:
     """Hands out the landing to follow: the one from before the touchdown, or the latest one planned after it.
 
-    Attributes
-    ----------
-    made, refused : counts of plans, and of states from which stage 1 found none.
-    slowest_s : the longest solve [s] of processor time.
+    ``made`` counts plans, ``refused`` states from which stage 1 found none; ``slowest_s`` is the longest solve [s].
     """
 
     def __init__(self, robot: Robot):

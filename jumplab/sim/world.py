@@ -10,6 +10,7 @@ import os
 import tempfile
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -19,6 +20,7 @@ import pinocchio as pin
 from jumplab.errors import JumplabError, RobotError
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import REACH_M, Block, Contacts, Scene
 from jumplab.task import GRAVITY
@@ -41,20 +43,14 @@ SETTINGS = EngineSettings()
 
 def _import_quietly() -> ModuleType:
     """Import pybullet with file descriptor 2, to which its C code greets, muted for the moment."""
-    try:
-        keep, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    except OSError:  # no standard error to protect
-        import pybullet
-
-        return pybullet
-    try:
-        os.dup2(nowhere, 2)
-        import pybullet
-    finally:
-        os.dup2(keep, 2)
-        os.close(keep)
-        os.close(nowhere)
-    return pybullet
+    with contextlib.ExitStack() as undo:
+        with contextlib.suppress(OSError):  # no standard error to protect
+            keep, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+            undo.callback(os.close, keep)
+            undo.callback(os.close, nowhere)
+            os.dup2(nowhere, 2)
+            undo.callback(os.dup2, keep, 2)
+        return import_module("pybullet")
 
 
 bullet = _import_quietly()
@@ -91,35 +87,24 @@ def load_urdf(urdf: str, name: str, client: int, flags: int = 0) -> int:
 def base_to_bullet(
     q: np.ndarray, v: np.ndarray, lever: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pinocchio base state to Bullet's: position and orientation of the base's CoM, its world velocity, world rate.
+    """Pinocchio base state to Bullet's: position [m], orientation x y z w, velocity [m/s] and rate [rad/s] of its CoM.
 
-    Parameters
-    ----------
-    q, v : configuration and velocity, of which the first 7 and 6 entries are read (link frame, twist in its own axes).
-    lever : (3,) CoM of the base link in its link frame [m].
-
-    Returns
-    -------
-    (3,) position [m], (4,) quaternion x y z w, (3,) velocity [m/s], (3,) angular velocity [rad/s], all in the world.
+    ``q`` (7,), ``v`` (6,) : pose of the link frame and twist in its own axes, further entries unread; ``lever`` (3,) :
+    CoM of the base link in its link frame [m]. What is returned is in world axes.
     """
-    rotation = _rotation(q[3:7])
-    velocity = rotation @ (v[:3] + pin.skew(v[3:6]) @ lever)
-    return q[:3] + rotation @ lever, q[3:7].copy(), velocity, rotation @ v[3:6]
+    attitude = rotation(q[3:7])
+    velocity = attitude @ (v[:3] + pin.skew(v[3:6]) @ lever)
+    return q[:3] + attitude @ lever, q[3:7].copy(), velocity, attitude @ v[3:6]
 
 
 def base_from_bullet(
     position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray, rate: np.ndarray, lever: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
-    rotation = _rotation(quaternion)
-    local_rate = rotation.T @ rate
-    local_velocity = rotation.T @ velocity - pin.skew(local_rate) @ lever
-    return np.concatenate([position - rotation @ lever, quaternion]), np.concatenate([local_velocity, local_rate])
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    x, y, z, w = quaternion
-    return pin.Quaternion(w, x, y, z).toRotationMatrix()
+    attitude = rotation(quaternion)
+    local_rate = attitude.T @ rate
+    local_velocity = attitude.T @ velocity - pin.skew(local_rate) @ lever
+    return np.concatenate([position - attitude @ lever, quaternion]), np.concatenate([local_velocity, local_rate])
 
 
 class World:
@@ -127,13 +112,9 @@ class World:
 
     Parameters
     ----------
-    robot : the robot as it really is (perturbed, if at all).
+    robot : the robot as it really is (perturbed, if at all). The names of its links are ``links``, the base first.
     q, v : initial configuration (nq,) and velocity (nv,), rest if ``v`` is None. Set once; nothing is ever reset.
     friction : effective coefficient between robot and ground.
-
-    Attributes
-    ----------
-    links : names of all links, the base first.
 
     Raises
     ------
@@ -146,7 +127,7 @@ class World:
         self._client = bullet.connect(bullet.DIRECT)
         self._bullet = _Client(self._client)
         try:
-            self._engine_settings()
+            self._set_engine()
             self._ground = [self._add_block(b) for b in self.scene.blocks]
             self._body = self._load(robot.urdf)
             self._index_links()
@@ -170,18 +151,12 @@ class World:
             self._bullet.disconnect()
             self._client = None
 
-    # building --------------------------------------------------------------------------------------------------
-
-    def _engine_settings(self) -> None:
+    def _set_engine(self) -> None:
+        s = SETTINGS
+        contact = dict(contactERP=s.contact_erp, contactSlop=s.contact_slop_m, deterministicOverlappingPairs=1)
+        steps = dict(fixedTimeStep=STEP_S, numSubSteps=0, numSolverIterations=s.solver_iterations)
         self._bullet.setGravity(0, 0, -GRAVITY)
-        self._bullet.setPhysicsEngineParameter(
-            fixedTimeStep=STEP_S,
-            numSubSteps=0,
-            numSolverIterations=SETTINGS.solver_iterations,
-            contactERP=SETTINGS.contact_erp,
-            contactSlop=SETTINGS.contact_slop_m,
-            deterministicOverlappingPairs=1,
-        )
+        self._bullet.setPhysicsEngineParameter(**steps, **contact)
 
     def _add_block(self, block: Block) -> int:
         half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
@@ -243,8 +218,6 @@ class World:
                 return True
         return False
 
-    # running ---------------------------------------------------------------------------------------------------
-
     @property
     def friction(self) -> dict[str, float]:
         """Friction coefficient of every link as the engine has it."""
@@ -280,9 +253,8 @@ class World:
 
         At the end of each step the servo asks for the rate ``velocity_gain * rate + position_gain * error / step``.
         """
+        gains = dict(positionGains=[position_gain] * len(q), velocityGains=[velocity_gain] * len(q))
         targets = dict(targetPositions=q.tolist(), targetVelocities=rate.tolist(), forces=limit.tolist())
-        n = len(self._joints)
-        gains = dict(positionGains=[position_gain] * n, velocityGains=[velocity_gain] * n)
         self._command(bullet.POSITION_CONTROL, **targets, **gains)
 
     def release(self) -> None:
@@ -320,7 +292,7 @@ class World:
                 state = self._bullet.getLinkState(self._body, link)
                 origin = np.array(state[4])
                 wrench[side, 3:] -= pin.skew(origin) @ wrench[side, :3]
-                self._note_sole((np.array(points[side]) - origin) @ _rotation(state[5]))
+                self._note_sole((np.array(points[side]) - origin) @ rotation(state[5]))
         return Contacts(wrench, frozenset(touching), frozenset(colliding))
 
     def _note_sole(self, points: np.ndarray) -> None:

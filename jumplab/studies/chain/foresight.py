@@ -82,10 +82,7 @@ class Ahead:
 class Foresight:
     """Plans the next jump of a course from measurements, and remembers what the robot's jumps taught.
 
-    Parameters
-    ----------
-    course, robot, planner, rehearsal : as planned.
-    solve_s : what each plan is charged [s]; its own wall clock if None.
+    Each plan is charged ``solve_s`` [s]; its own wall clock if None.
     """
 
     def __init__(

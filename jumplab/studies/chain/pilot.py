@@ -25,15 +25,8 @@ PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
 
 
 class ChainPilot:
-    """Commands of a whole chain.
-
-    Parameters
-    ----------
-    foresight : makes the plans, for a robot that crouches.
-    scene : ground of the course.
-    landing : "planned" or "spring", as for a single jump.
-    look_s : when the next jump is planned, from touchdown on [s]; negative: so long before it is due.
-    revise_s : when it is planned again if it was planned in the air, from touchdown on [s]; never if None.
+    """Commands of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` and ``revise_s`` are those
+    of :func:`jumplab.studies.chain.run_chain`.
 
     Attributes
     ----------
@@ -103,8 +96,6 @@ class ChainPilot:
             self.reason = self.reason or f"jump {self.current + 1} never touched down"
         return command if command.q is None else self._blended(command, now * STEP_S)
 
-    # deciding --------------------------------------------------------------------------------------------------
-
     def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
         number, time = self.current + 1, step * STEP_S
@@ -118,7 +109,8 @@ class ChainPilot:
             last = (self.used[-1], self._from) if self.used else None
             plans.append(self._foresight.look(number, time, *seen, last))
         elif plans and self.landed:
-            if all(p.failure for p in plans) and not self._may_revise(plans):
+            revisable = plans[-1].air and self._revise_s is not None
+            if all(p.failure for p in plans) and not revisable:
                 self.reason = f"no plan for jump {number + 1}: {plans[-1].failure}"
             elif self.since_touchdown(step) > PATIENCE_S + sum(p.solve_s for p in plans):
                 self.reason = f"the robot did not come to rest for jump {number + 1}"
@@ -135,9 +127,6 @@ class ChainPilot:
             self._begin(there[-1], step, q, v)
         return still and bool(there)
 
-    def _may_revise(self, plans: list[Ahead]) -> bool:
-        return plans[-1].air and self._revise_s is not None
-
     def _sight(self, step: int, q: np.ndarray, v: np.ndarray, plans: list[Ahead]) -> tuple[np.ndarray, bool] | None:
         """Where the toes (3,) stand, or will stand, and whether the robot flies; None unless it is time to plan."""
         if not self.pilots:
@@ -147,17 +136,15 @@ class ChainPilot:
             return self._gauge.toe(q), False
         since = self.since_touchdown(step)
         if plans:  # one core plans: a correction waits until the draft is done
-            due = self._may_revise(plans) and since >= self._revise_s and step * STEP_S >= plans[-1].ready_s
-            return (self._gauge.toe(q), False) if due else None
+            due = plans[-1].air and self._revise_s is not None and since >= self._revise_s
+            return (self._gauge.toe(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
         if since >= max(self._look_s, 0.0):
             return self._gauge.toe(q), False
-        if self.landed or self._look_s >= 0 or not self._airborne(step):
+        airborne = (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
+        if self.landed or self._look_s >= 0 or not airborne:
             return None
         left = self.pilots[-1].forecast.time_left(q, v)
         return None if left > -self._look_s else (self._gauge.toe(self._at_touchdown(step, q, v, left)), True)
-
-    def _airborne(self, step: int) -> bool:
-        return (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Configuration (nq,) of the touchdown to come: the posture of the tape, turned as far as the trunk is off its
