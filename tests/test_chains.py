@@ -11,7 +11,7 @@ from jumplab.sim.kinematics import Gauge
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
 from jumplab.studies.chain.course import CROUCH
-from jumplab.studies.chain.foresight import Ahead, Foresight, posture
+from jumplab.studies.chain.pilot import Ahead, Foresight, posture
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses

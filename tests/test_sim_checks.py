@@ -10,8 +10,8 @@ import pytest
 from jumplab.cli.common import print_simulation
 from jumplab.sim import Disturbance, Perturbation, World, simulate_jump, simulate_landing
 from jumplab.sim import loop as jump
-from jumplab.sim.actuation import Motors
 from jumplab.sim.checks import check
+from jumplab.sim.playback import Motors
 from jumplab.sim.result import STAND_S
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask

@@ -25,9 +25,9 @@ from jumplab.sim import (
     simulate_landing,
 )
 from jumplab.sim import simulate_jump as simulate
-from jumplab.sim.actuation import Actuators
-from jumplab.sim.recorder import Recorder, _events
+from jumplab.sim.playback import Actuators
 from jumplab.sim.reference import Forecast
+from jumplab.sim.result import Recorder, _events
 from jumplab.sim.scene import Contacts
 from jumplab.stages.planner import plan_jump
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state

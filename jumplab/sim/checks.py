@@ -11,8 +11,8 @@ import pinocchio as pin
 
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.actuation import Actuators
 from jumplab.sim.kinematics import rotation
+from jumplab.sim.playback import Actuators
 from jumplab.sim.result import STAND_S, Finding, SimulationResult
 
 WINDOW = 100  # [steps] 0.1 s; a push shorter than that counts by its mean

@@ -34,7 +34,7 @@ class Reading:
 
 
 class Sensors:
-    """Readings of the true state; exact if every deviation in ``noise`` is zero.
+    """Readings of the true state, exact if every deviation in ``noise`` is zero.
 
     Biases are drawn once. Foot forces are those of the contact itself, as if the sensor's reading were corrected for
     the foot's own weight and inertia; the accelerometer has no end of its range.
@@ -45,11 +45,6 @@ class Sensors:
         self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
         self._accel_bias = noise.accel_bias * self._rng.standard_normal(3)
         self._last_velocity: np.ndarray | None = None
-
-    @property
-    def exact(self) -> bool:
-        """True if nothing is noisy, and the true state may stand for its estimate."""
-        return self.noise == SensorNoise()
 
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: roll and pitch a little off."""
@@ -194,7 +189,7 @@ class Perception:
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
         self._sensors, self._tilt, self._speed = Sensors(noise, seed), 0.0, 0.0
-        exact = self._sensors.exact
+        exact = noise == SensorNoise()  # then the true state stands for its estimate
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
     def __call__(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,8 +16,8 @@ from proxsuite import proxqp
 
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim.actuation import Actuators
 from jumplab.sim.kinematics import Gauge
+from jumplab.sim.playback import Actuators
 from jumplab.sim.reference import Reference
 
 

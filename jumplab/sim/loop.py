@@ -12,24 +12,23 @@ from jumplab.errors import InputError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.actuation import Command, Delay, Motors
 from jumplab.sim.checks import check
 from jumplab.sim.estimator import Perception
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import Perturbation
 from jumplab.sim.pilot import Pilot
-from jumplab.sim.recorder import Recorder
+from jumplab.sim.playback import Command, Delay, Motors
 from jumplab.sim.reference import LandingSource
-from jumplab.sim.result import STAND_S, SimulationResult
+from jumplab.sim.result import STAND_S, Recorder, SimulationResult
 from jumplab.sim.scene import Scene
 from jumplab.sim.world import World
 
 
 class Commander(Protocol):
-    """Who commands a run, and says when it is over."""
+    """Who commands a run. Its log has parts, each of which shall end on the height of a goal."""
 
-    part: int  # of the run that the last command belongs to, from 0; each part has a log of its own
-    goal: np.ndarray  # (nq,) configuration on whose height this part shall end
+    part: int  # that the last command belongs to, from 0
+    goal: np.ndarray  # (nq,) of this part
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` from measured state and vertical foot forces (2,)."""
@@ -147,7 +146,7 @@ def simulate_jump(
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
     run.play(pilot, q, v, step)
     said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
-    return run.result(0, pilot.solves, landing=pilot.ahead.to_json() | {"again": pilot.replanned}, **said)
+    return run.result(0, pilot.solves, landing=pilot.landing_said(), **said)
 
 
 def simulate_landing(tape: Tape, robot: Robot, disturbance: Disturbance, **options: Any) -> SimulationResult:

@@ -10,10 +10,9 @@ from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.actuation import Command
 from jumplab.sim.kinematics import pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
-from jumplab.sim.playback import Playback
+from jumplab.sim.playback import Command, Playback
 from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
 from jumplab.sim.reference import LEAD_S, Forecast, LandingAhead, LandingSource, Replan, landing_planner
 from jumplab.sim.result import STAND_S
@@ -94,10 +93,9 @@ class Pilot:
         """QPs posed by the landing controller, and how many of them failed."""
         return self._landing.solves, self._landing.failures
 
-    @property
-    def replanned(self) -> dict | None:
-        """How often the landing of a flip was planned anew, see :meth:`Replan.to_json`."""
-        return None if self._replan is None else self._replan.to_json()
+    def landing_said(self) -> dict:
+        """What the settings of a result say about the landing, and how often that of a flip was planned anew."""
+        return self.ahead.to_json() | {"again": self._replan and self._replan.to_json()}
 
     def over(self, step: int, fallen_s: float) -> bool:
         """Whether the robot has stood or lain for long enough, or will never come down."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import thread_time
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -33,16 +32,6 @@ UNTIL_S = 1.2  # the longest landing that is planned; afterwards the controller 
 LATENCY_S = 0.05  # before a new plan is followed, about what its solve takes
 OFF_M = 0.03  # of the capture point; less is what the controller's own feedback mends
 LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot is still told
-
-
-class Reference(Protocol):
-    """A planned landing: anything that knows its CoM and momentum at a time, as :class:`LandingReference` does."""
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,) from the middle of the soles, its velocity (2,), and L about the pitch axis."""
-
-    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
-        """CoM acceleration (2,) [m/s^2] and rate of L [N m]."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +57,24 @@ class LandingReference:
         return push, twist
 
 
-LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
+@dataclass(frozen=True)
+class Rest:
+    """The rest of a landing."""
 
+    plan: Reference
+    began: float  # the plan's time zero, since touchdown [s]
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
+        return self.plan.at(max(time - self.began, 0.0))
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) and rate of L at ``time`` since touchdown."""
+        return self.plan.feed_forward(max(time - self.began, 0.0))
+
+
+Reference = LandingReference | LandingPlan | Rest  # or whatever knows ``at`` and ``feed_forward``
+LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
 _planners: dict[str, LandingPlanner] = {}
 
 
@@ -158,22 +163,6 @@ class LandingAhead:
         in_time = None if self.solve_s is None else self.solve_s <= max(0.0, self.time_left_s)
         times = dict(planned_at_s=self.planned_s, time_left_s=self.time_left_s, solve_s=self.solve_s, in_time=in_time)
         return dict(asked=self.source, followed=self.followed or self.source, **times, reason=self.reason)
-
-
-@dataclass(frozen=True)
-class Rest:
-    """The rest of a landing."""
-
-    plan: Reference
-    began: float  # the plan's time zero, since touchdown [s]
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
-        return self.plan.at(max(time - self.began, 0.0))
-
-    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
-        """CoM acceleration (2,) and rate of L at ``time`` since touchdown."""
-        return self.plan.feed_forward(max(time - self.began, 0.0))
 
 
 class Replan:

@@ -35,7 +35,7 @@ from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
 from jumplab.sim.playback import MODES
-from jumplab.sim.recorder import STAND_S
+from jumplab.sim.result import STAND_S
 from jumplab.task import JumpTask
 
 

@@ -2,7 +2,7 @@
 
 from jumplab.studies.chain.course import Course as Course
 from jumplab.studies.chain.course import crouched as crouched
-from jumplab.studies.chain.foresight import Rehearsal as Rehearsal
+from jumplab.studies.chain.pilot import Rehearsal as Rehearsal
 from jumplab.studies.chain.result import ChainResult as ChainResult
 from jumplab.studies.chain.result import write_chain as write_chain
 from jumplab.studies.chain.run import RANGES as RANGES

@@ -98,14 +98,11 @@ class Course:
         """Where the toes should be after each jump, from where they stand at first [m]."""
         return tuple(float(x) for x in np.cumsum(self.distances_m))
 
-    def level(self, k: int) -> float:
-        """Height of the surface that jump ``k`` (counted from 0) starts from [m]."""
-        return self.platforms_m[k - 1] if k else 0.0
-
     def task(self, k: int, distance_m: float | None = None) -> JumpTask:
         """Target of jump ``k`` (counted from 0), with another distance if given."""
         distance = self.distances_m[k] if distance_m is None else distance_m
-        return JumpTask(distance, self.heights_m[k], round(self.platforms_m[k] - self.level(k), 9))
+        rise = self.platforms_m[k] - (0.0, *self.platforms_m)[k]  # above the surface that it starts from
+        return JumpTask(distance, self.heights_m[k], round(rise, 9))
 
     def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
         """(x, height) where the ground changes its height, x from the toes' first place [m]."""

@@ -16,11 +16,10 @@ from jumplab.io.files import transaction
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge
-from jumplab.sim.recorder import LEVEL_TOLERANCE_M
-from jumplab.sim.result import SimulationResult
+from jumplab.sim.result import LEVEL_TOLERANCE_M, SimulationResult
 from jumplab.sim.scene import Scene
 from jumplab.studies.chain.course import Course
-from jumplab.studies.chain.foresight import Ahead
+from jumplab.studies.chain.pilot import Ahead
 
 SCHEMA = "jumplab-chain-1"
 REPORT, LOG, JUMPS = "chain.json", "chain.npz", "jumps"

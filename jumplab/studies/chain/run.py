@@ -16,8 +16,7 @@ from jumplab.sim.loop import Run
 from jumplab.sim.pilot import LANDINGS
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.studies.chain.course import Course, crouched
-from jumplab.studies.chain.foresight import Foresight, Rehearsal
-from jumplab.studies.chain.pilot import ChainPilot
+from jumplab.studies.chain.pilot import ChainPilot, Foresight, Rehearsal
 from jumplab.studies.chain.result import ChainedJump, ChainResult
 from jumplab.studies.trials import CONFIDENCE, check_numbers, in_parallel, wilson
 
