@@ -1,9 +1,8 @@
 """Where the robot is and how it moves, from its own sensors: an error-state Kalman filter, inertial unit and legs.
 
-Attitude, velocity and place of the trunk are integrated from gyro and accelerometer, which is all there is in flight.
-While a foot carries weight, the point it stands on does not move: the legs' angles then tell where the trunk is, and
-through gravity also how it is tilted. That feet are part of the state is an idea of Bloesch et al., "State estimation
-for legged robots" (2012).
+The trunk is integrated from gyro and accelerometer. While a foot carries weight, the point it stands on does not move:
+the legs' angles then tell where the trunk is, and through gravity also how it is tilted. That feet are part of the
+state is an idea of Bloesch et al., "State estimation for legged robots" (2012).
 """
 
 from __future__ import annotations

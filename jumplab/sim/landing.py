@@ -1,9 +1,8 @@
 """Landing controller: a whole-body QP in torque mode, entered at touchdown.
 
 The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not repeat it. Here, every
-2 ms, joint accelerations and two foot wrenches are chosen that obey the base dynamics, friction, the soles' edges and
-the motors' torques, and that come closest to a list of wishes: CoM, angular momentum, trunk, feet flat and still,
-posture.
+2 ms, joint accelerations and foot wrenches are chosen that obey the base dynamics, friction, the soles' edges and the
+motors' torques, and come closest to a list of wishes: CoM, angular momentum, trunk, feet flat and still, posture.
 """
 
 from __future__ import annotations
@@ -200,12 +199,8 @@ class LandingController:
         trunk_rows[:, 3:6] = np.eye(3)
         rows = [body.force_rows, body.momentum_rows / NOMINAL_INERTIA, trunk_rows]
         targets = [com_wish - body.gravity, momentum_wish / NOMINAL_INERTIA, self._trunk_wish(v)]
-        grounded = float(contact.any())  # in the air neither CoM nor momentum can be asked for
-        weights = [
-            grounded * np.array(g.com_weight),
-            np.full(3, grounded * g.momentum_weight),
-            np.full(3, g.trunk_weight),
-        ]
+        on = float(contact.any())  # in the air neither CoM nor momentum can be asked for
+        weights = [on * np.array(g.com_weight), np.full(3, on * g.momentum_weight), np.full(3, g.trunk_weight)]
         for side in (0, 1):
             rows.append(body.sole_rows[side])
             targets.append(self._foot_wish(side, contact[side], ground[:, 2].min()) - body.sole_drift[side])

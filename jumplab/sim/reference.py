@@ -1,8 +1,7 @@
-"""The landing to follow: planned in flight for the touchdown that is forecast, and again while it goes on.
+"""The landing to follow: planned in flight for the touchdown that is forecast, and in a flip again while it goes on.
 
-The impact of a flip leaves the robot elsewhere than its plan expected: the soles of a backflip tilt up, and for a tenth
-of a second the ground pushes at the toes only. From the measured state the rest is then planned as the landing was.
-That takes its time too, so the robot follows the older plan until the newer one is there.
+The impact of a flip leaves the robot elsewhere than its plan expected. From the measured state the rest is planned as
+the landing was; that takes its time too, so the robot follows the older plan until the newer one is there.
 """
 
 from __future__ import annotations

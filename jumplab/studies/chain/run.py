@@ -55,8 +55,8 @@ def run_chain(
         also refuses jumps that have no plan before anything moves. Without, every plan begins from nothing.
     solve_s : what each plan is charged [s]; its own wall clock if None.
     look_s : when the next jump is planned, after touchdown [s]; negative: so long before the touchdown that is due.
-    revise_s : when a plan made in the air is made again, from where the feet have really come down, after touchdown
-        [s]. The robot waits for neither: it begins with the latest plan that is there. Never if None.
+    revise_s : when a plan made in the air is made again from where the feet really are, after touchdown [s]; never if
+        None. The robot waits for neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
 
@@ -70,8 +70,7 @@ def run_chain(
     InputError, InfeasibleError
         If the course cannot be jumped, or the robot or a setting makes no sense; nothing has moved then.
     """
-    _check(course, robot, perturbation, landing, method)
-    _check_times(solve_s, look_s, revise_s)
+    _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
     waiting = crouched(robot)
     planner = planner or Planner(waiting, keep=True)
     if planner.robot.hash != waiting.hash:
@@ -84,22 +83,24 @@ def run_chain(
     pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s)
     run.play(pilot, stance_configuration(waiting), np.zeros(waiting.model.nv))
     settings = dict(look_s=look_s, revise_s=revise_s, landing=landing, solve_s=solve_s, method=method)
-    settings |= dict(rehearsed=rehearsal is not None, perception=run.perception)
-    settings["perturbation"] = run.perturbation.to_json()
-    jumps = tuple(_jump(k, run, pilot) for k in range(len(run.recorders)))
-    return ChainResult(course, waiting, run.scene, jumps, pilot.reason, settings)
+    drawn, rehearsed = run.perturbation.to_json(), rehearsal is not None
+    settings |= dict(rehearsed=rehearsed, perception=run.perception, perturbation=drawn)
+    return ChainResult(course, waiting, run.scene, _jumps(run, pilot), pilot.reason, settings)
 
 
-def _jump(k: int, run: Run, chain: ChainPilot) -> ChainedJump:
-    """Jump ``k`` of a chain that has been run."""
-    plans = tuple(chain.plans[k]) if k < len(chain.plans) else ()
-    begun, said = k < len(chain.began), dict(mode="position", reaim=True, disturbance=None)
-    landing, solves = (chain.pilots[k].ahead.to_json(), chain.pilots[k].solves) if begun else (None, (0, 0))
-    result = run.result(k, solves, landing=landing, **said)
-    return ChainedJump(k, chain.began[k] * STEP_S if k else 0.0, chain.used[k] if begun else None, plans, result)
+def _jumps(run: Run, chain: ChainPilot) -> tuple[ChainedJump, ...]:
+    """The jumps of a chain that has been run; the last may not have begun."""
+    jumps = []
+    for k in range(len(run.recorders)):
+        plans, begun = tuple(chain.plans[k]) if k < len(chain.plans) else (), k < len(chain.began)
+        landing, solves = (chain.pilots[k].ahead.to_json(), chain.pilots[k].solves) if begun else (None, (0, 0))
+        log = run.result(k, solves, landing=landing, mode="position", reaim=True, disturbance=None)
+        start_s, used = (chain.began[k] * STEP_S if k else 0.0), (chain.used[k] if begun else None)
+        jumps.append(ChainedJump(k, start_s, used, plans, log))
+    return tuple(jumps)
 
 
-def _check(course, robot, perturbation, landing, method) -> None:
+def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s) -> None:
     require_type(course, Course, "the course")
     require_type(robot, Robot, "the robot")
     if perturbation is not None:
@@ -108,8 +109,6 @@ def _check(course, robot, perturbation, landing, method) -> None:
         if not isinstance(value, str) or value not in known:
             raise InputError(f"{name} {quoted(value)}: choose one of {', '.join(known)}")
 
-
-def _check_times(solve_s, look_s, revise_s) -> None:
     solve_s, revise_s = (0.0 if x is None else x for x in (solve_s, revise_s))
     rows = ("solve_s", solve_s, 0.0, 60.0), ("look_s", look_s, EARLIEST_LOOK_S, 2.0), ("revise_s", revise_s, 0.0, 2.0)
     for name, value, low, high in rows:
