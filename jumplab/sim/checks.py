@@ -27,13 +27,7 @@ FRICTION_USE = 1.01  # 1.0001 was seen where feet slide
 
 
 def check(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
-    """All findings about ``result``.
-
-    Parameters
-    ----------
-    result : of :func:`jumplab.sim.simulate_jump`.
-    robot : the simulated robot as stated: the planned one with the stated perturbation.
-    """
+    """All findings about ``result`` of ``robot``: the planned one with the stated perturbation."""
     return tuple(f for part in (_mechanics, _limits, _feet, _engine, _landing) for f in part(result, robot))
 
 
@@ -79,10 +73,9 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
 
 
 def _accelerations(result: SimulationResult, robot: Robot) -> np.ndarray:
-    """Accelerations (N - 1, nv) of the engine's steps.
+    """Accelerations (N - 1, nv) of the engine's steps, which step the velocity of the base's CoM in world axes.
 
-    The engine steps the velocity of the base's CoM in world axes. Differences of the base twist in its own axes, which
-    turn within the step, would be off by 17 N in a flip.
+    Differences of the base twist in its own axes, which turn within the step, would be off by 17 N in a flip.
     """
     arm = robot.model.inertias[1].lever  # from the base's origin to its CoM, base axes
     turn = np.array([rotation(quaternion) for quaternion in result.q[:, 3:7]])

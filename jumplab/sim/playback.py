@@ -124,14 +124,8 @@ GAINS = PdGains()
 class Playback:
     """The tape on the 1 ms grid of the simulation, as commands. After its end the last posture is held.
 
-    Parameters
-    ----------
-    mode : "position" (servo with the planned rate fed forward) or "pd" (planned torque plus PD in torque mode).
-
-    Raises
-    ------
-    InputError
-        If the mode is unknown or the tape belongs to another robot.
+    In ``mode`` "position" a servo follows it, the planned rate fed forward; in "pd" the planned torque is commanded,
+    plus PD. Raises :class:`InputError` if the mode is unknown or the tape belongs to another robot.
     """
 
     def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):

@@ -17,18 +17,11 @@ THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
 
 @dataclass(frozen=True)
 class Contacts:
-    """What touched in one step.
+    """What touched in one step."""
 
-    Attributes
-    ----------
-    wrench : (2, 6) force and moment on each foot from the ground, world axes, at the origin of the foot link [N, N m].
-    touching : names of the robot's links that press on the ground.
-    colliding : pairs of the robot's links that press on each other.
-    """
-
-    wrench: np.ndarray
-    touching: frozenset[str]
-    colliding: frozenset[tuple[str, str]]
+    wrench: np.ndarray  # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
+    touching: frozenset[str]  # the robot's links that press on the ground
+    colliding: frozenset[tuple[str, str]]  # pairs of the robot's links that press on each other
 
 
 @dataclass(frozen=True)

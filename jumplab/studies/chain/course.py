@@ -58,17 +58,9 @@ class Course:
 
     @classmethod
     def of(cls, distances_m: Iterable[Any], height_m: Any, platforms_m: Iterable[Any] | None = None) -> Course:
-        """A course from what somebody typed.
+        """A course from what somebody typed: one height for all jumps or one per jump; level ground without platforms.
 
-        Parameters
-        ----------
-        height_m : one number for all jumps, or one per jump.
-        platforms_m : one per jump; level ground if None.
-
-        Raises
-        ------
-        InputError
-            If there is no jump, if the lists differ in length, or if a number cannot be meant.
+        Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number cannot be meant.
         """
         distances = _numbers("distances", distances_m)
         count = len(distances)
@@ -106,22 +98,14 @@ class Course:
 
     def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
         """(x, height) where the ground changes its height, x from the toes' first place [m]."""
-        found = []
-        for k in range(self.count):
-            task, before = self.task(k), (0.0, *self.goals_m)[k]
-            if task.platform_m:
-                found.append((before + platform_edge_m(task, robot), self.platforms_m[k]))
-        return tuple(found)
+        jumps = zip(map(self.task, range(self.count)), (0.0, *self.goals_m), self.platforms_m, strict=False)
+        return tuple((x + platform_edge_m(task, robot), top) for task, x, top in jumps if task.platform_m)
 
     def check(self, robot: Robot, reach: Reach) -> None:
-        """Refuse what no solve could mend, before any: platforms under a sole, jumps beyond the robot's reach.
+        """Refuse what no solve could mend, before any.
 
-        Raises
-        ------
-        InputError
-            If platforms overlap with a place where the robot stands.
-        InfeasibleError
-            If a jump is beyond the robot's reach, by closed forms.
+        Raises :class:`InputError` if platforms overlap with a place where the robot stands, :class:`InfeasibleError` if
+        a jump is beyond the robot's reach, by closed forms.
         """
         self._check_platforms(robot)
         for k in range(self.count):

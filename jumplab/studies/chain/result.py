@@ -60,6 +60,15 @@ class ChainedJump:
         return row
 
 
+def _joined(name: str, doc: str) -> property:
+    """The logs ``name`` of all jumps of a chain, one after the other."""
+
+    def join(self: ChainResult) -> np.ndarray:
+        return np.concatenate([getattr(j.simulation, name) for j in self.jumps])
+
+    return property(join, doc=doc)
+
+
 @dataclass(frozen=True)
 class ChainResult:
     """A finished chain."""
@@ -133,38 +142,16 @@ class ChainResult:
         """How long the robot, still enough, waited for a plan before each jump but the first [s]."""
         return tuple(j.ahead.began_s - j.ahead.needed_s for j in self.jumps[1:] if j.ahead is not None)
 
-    def _joined(self, name: str) -> np.ndarray:
-        return np.concatenate([getattr(j.simulation, name) for j in self.jumps])
-
     @property
     def t(self) -> np.ndarray:
         """(N,) time since the chain began [s]."""
         return np.arange(sum(len(j.simulation.t) for j in self.jumps)) * STEP_S
 
-    @property
-    def q(self) -> np.ndarray:
-        """(N, nq) true configurations."""
-        return self._joined("q")
-
-    @property
-    def v(self) -> np.ndarray:
-        """(N, nv) true velocities."""
-        return self._joined("v")
-
-    @property
-    def tau(self) -> np.ndarray:
-        """(N, nv - 6) torques that the motors gave [N m]."""
-        return self._joined("tau")
-
-    @property
-    def phase(self) -> np.ndarray:
-        """(N,) "launch", "flight" or "landing"."""
-        return self._joined("phase")
-
-    @property
-    def com(self) -> np.ndarray:
-        """(N, 3) CoM of the simulated robot [m]."""
-        return self._joined("com")
+    q = _joined("q", "(N, nq) true configurations.")
+    v = _joined("v", "(N, nv) true velocities.")
+    tau = _joined("tau", "(N, nv - 6) torques that the motors gave [N m].")
+    phase = _joined("phase", '(N,) "launch", "flight" or "landing".')
+    com = _joined("com", "(N, 3) CoM of the simulated robot [m].")
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The log under the names of ``chain.npz``."""
@@ -193,18 +180,10 @@ def write_chain(
     *,
     series: Mapping | None = None,
 ) -> tuple[AuditReport, ...]:
-    """Write a chain, whole or not at all; what an older chain left there goes.
+    """Write a chain, whole or not at all, in the place of an older one; returns the audits of its plans.
 
-    ``jumps/1``, ``jumps/2`` and so on are folders of plans like any other, which ``jumplab audit`` and others read.
-
-    Parameters
-    ----------
-    further : names and texts of further files (the 3-D page).
-    series : a report on many robots, becomes the entry ``series`` of ``chain.json``.
-
-    Returns
-    -------
-    The audits of the plans, in the order of the jumps; they lie beside the plans as ``passport.json``.
+    ``jumps/1``, ``jumps/2`` and so on are folders of plans like any other, each with its audit. ``further`` are names
+    and texts of further files (the 3-D page); ``series``, a report on many robots, becomes an entry of ``chain.json``.
     """
     audits = []
     with transaction(folder) as staging:
