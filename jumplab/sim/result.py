@@ -14,8 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, SolverError
-from jumplab.io.files import write_file
-from jumplab.io.folder import read_json
+from jumplab.io.folder import read_json, write_file
 from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
