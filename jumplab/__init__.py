@@ -15,17 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ loads what is asked for
     from jumplab import errors as errors
-    from jumplab import show as plots
-    from jumplab.api import audit, load, plan, save, simulate, view
-    from jumplab.ocp import Term
-    from jumplab.robot import Robot
-    from jumplab.sim import Perturbation, Scene
-    from jumplab.stages.plan import JumpPlan
-    from jumplab.stages.planner import Planner
-    from jumplab.studies.chain import run_chain
-    from jumplab.studies.envelope import envelope
-    from jumplab.studies.trials import run_trials
-    from jumplab.task import JumpTask
+    from jumplab import show as plots  # noqa: F401
+    from jumplab.api import audit as audit
+    from jumplab.api import load as load
+    from jumplab.api import plan as plan
+    from jumplab.api import save as save
+    from jumplab.api import simulate as simulate
+    from jumplab.api import view as view
+    from jumplab.ocp import Term as Term
+    from jumplab.robot import Robot as Robot
+    from jumplab.sim import Perturbation as Perturbation
+    from jumplab.sim import Scene as Scene
+    from jumplab.stages.plan import JumpPlan as JumpPlan
+    from jumplab.stages.planner import Planner as Planner
+    from jumplab.studies.chain import run_chain as run_chain
+    from jumplab.studies.envelope import envelope as envelope
+    from jumplab.studies.trials import run_trials as run_trials
+    from jumplab.task import JumpTask as JumpTask
 
 _PLACES = {
     "JumpTask": "task",

@@ -7,10 +7,11 @@ from fixtures_chains import planner, rehearsal, waiting
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_angles
+from jumplab.sim.kinematics import Gauge
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
-from jumplab.studies.chain.course import CROUCH, Gauge
-from jumplab.studies.chain.foresight import Ahead, Foresight
+from jumplab.studies.chain.course import CROUCH
+from jumplab.studies.chain.pilot import Ahead, Foresight, posture
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses
@@ -136,16 +137,16 @@ def test_crouch_is_a_stance_of_the_same_robot(bhr):
 
 
 def test_robot_that_cannot_crouch_keeps_its_stance(bhr, monkeypatch):
-    from jumplab.studies.chain import course as posture
+    from jumplab.studies.chain import course
 
-    monkeypatch.setattr(posture, "CROUCH", {"knee_rad": 3.0, "trunk_pitch_rad": 0.2})
+    monkeypatch.setattr(course, "CROUCH", {"knee_rad": 3.0, "trunk_pitch_rad": 0.2})
     assert crouched(bhr) is bhr
 
 
 def test_gauge_reads_what_a_configuration_was_made_of(bhr):
     gauge, angles = Gauge(bhr), stance_angles(bhr) + np.array([0.0, 0.1, -0.2, 0.15, 0.3])
     q = configuration(bhr, angles, toe=(0.7, 0.2))
-    assert gauge.posture(q) == pytest.approx(angles, abs=1e-12)
+    assert posture(bhr, q) == pytest.approx(angles, abs=1e-12)
     assert gauge.toe(q)[[0, 2]] == pytest.approx([0.7, 0.2], abs=1e-12)
     v = np.zeros(bhr.model.nv)
     v[0] = 2.0  # in the base's axes, which are pitched
@@ -160,7 +161,7 @@ def test_a_plan_begins_in_the_posture_it_is_given(bhr):
     task = JumpTask(0.6, 0.3)
     for plan in (planner().plan(task, start=start), planner().replan(rehearsal().plans[0], task, start=start),
                  planner().plan(task, "direct", start=start)):  # fmt: skip
-        assert Gauge(waiting()).posture(plan.tape.q[0]) == pytest.approx(start, abs=1e-6), plan.method
+        assert posture(waiting(), plan.tape.q[0]) == pytest.approx(start, abs=1e-6), plan.method
         assert np.abs(plan.tape.v[0]).max() < 1e-6
         assert plan.planned_distance_m == pytest.approx(0.6, abs=1e-4)
     with pytest.raises(InputError, match="a flip begins in the stance"):

@@ -17,8 +17,8 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.show import studies
 from jumplab.show.style import MIN_FONT_PT, PAGE_IN
 from jumplab.sim import SLIGHT, Perturbation
+from jumplab.sim.kinematics import Gauge
 from jumplab.studies.chain import ChainReport, ChainTrial, Course, run_chain, write_chain
-from jumplab.studies.chain.course import Gauge
 
 # ------------------------------------------------------------------------------------------ in the simulation
 
@@ -45,7 +45,7 @@ def test_a_chain_stands_and_hits():
 def test_nothing_is_reset_between_jumps():
     """The log goes on from jump to jump as the engine's own step has it, and every part passes the honesty checks."""
     result = chain()
-    assert all(j.simulation.honest for j in result.jumps)
+    assert all(j.simulation.checks_passed for j in result.jumps)
     assert np.all(np.diff(result.t) > 0) and result.t[1] == pytest.approx(0.001)
     seam = len(result.jumps[0].simulation.t)
     assert result.jumps[1].start_s == pytest.approx(result.t[seam])

@@ -93,7 +93,7 @@ def test_a_run_that_is_not_honest_is_a_failure(folder, monkeypatch, honesty):
     """However well it stands; the log says which check it failed."""
     real = single.simulate_jump
     monkeypatch.setattr(
-        single, "simulate_jump", lambda *args, **options: replace(real(*args, **options), honesty=honesty)
+        single, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=honesty)
     )
     trial = run_trials(folder, 1, jobs=1).trials[0]
     assert trial.metrics.landed and not trial.landed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -61,20 +62,9 @@ class Motion:
     @classmethod
     def of_simulation_file(cls, folder: str | Path, robot: Robot) -> Motion:
         """Read ``simulation.npz`` from a result folder; raises :class:`InputError` if it is missing or damaged."""
-        path = Path(folder) / SIMULATION_NAME
-        if not path.is_file():
+        if not (Path(folder) / SIMULATION_NAME).is_file():
             raise InputError(f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first")
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                data = {k: file[k] for k in ("schema", "t", "q", "v", "tau", "phase", "joint_names")}
-        except _DAMAGE as e:
-            raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
-        schema, names = str(data.pop("schema")), tuple(str(n) for n in data.pop("joint_names"))
-        n, nq, nv = len(data["t"]), robot.model.nq, robot.model.nv
-        shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,))
-        fits = all(data[k].shape == shape for k, shape in shapes.items())
-        if schema != SIMULATION_SCHEMA or names != robot.joint_names or not fits:
-            raise InputError(f"{path}: not a simulation of this folder's robot; simulate the plan again")
+        data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase"))
         return cls(**data, source="simulation")
 
     @property
@@ -116,6 +106,26 @@ class Motion:
             raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
         count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
         return self.at(np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1]))
+
+
+def read_simulation(folder: str | Path, robot: Robot, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays ``names`` (t, q, v, tau, phase among them) of the ``simulation.npz`` in ``folder``.
+
+    Raises :class:`InputError` if the file is damaged or not one of ``robot``.
+    """
+    path = Path(folder) / SIMULATION_NAME
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {k: file[k] for k in names}
+            schema, joints = str(file["schema"]), tuple(str(n) for n in file["joint_names"])
+    except _DAMAGE as e:
+        raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
+    n, nq, nv = data["t"].size, robot.model.nq, robot.model.nv
+    shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,))
+    fits = all(data[k].shape == shape for k, shape in shapes.items())
+    if schema != SIMULATION_SCHEMA or joints != robot.joint_names or not fits:
+        raise InputError(f"{path}: not a simulation of this folder's robot; simulate the plan again")
+    return data
 
 
 def _between_attitudes(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:

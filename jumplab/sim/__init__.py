@@ -1,33 +1,28 @@
-"""Simulation in PyBullet: playback of a tape, landing, and what came of it. Start at :func:`simulate_jump`."""
+"""Simulation: in come a tape and a robot, out comes a :class:`SimulationResult`. Start at :func:`simulate_jump`.
 
-from jumplab.sim.checks import Finding
-from jumplab.sim.estimator import Estimator
-from jumplab.sim.landing import LandingController, LandingGains
-from jumplab.sim.loop import Disturbance, simulate_jump, simulate_landing
-from jumplab.sim.perturbation import SLIGHT, Perturbation, Ranges, SensorNoise
-from jumplab.sim.reference import LandingReference
-from jumplab.sim.result import Metrics, SimulationResult
-from jumplab.sim.scene import Block, Scene
-from jumplab.sim.world import World, base_from_bullet, base_to_bullet
+Names are loaded when they are first used: a scene or a perturbation needs no engine.
+"""
 
-__all__ = [
-    "SLIGHT",
-    "Block",
-    "Disturbance",
-    "Estimator",
-    "Finding",
-    "LandingController",
-    "LandingGains",
-    "LandingReference",
-    "Metrics",
-    "Perturbation",
-    "Ranges",
-    "Scene",
-    "SensorNoise",
-    "SimulationResult",
-    "World",
-    "base_from_bullet",
-    "base_to_bullet",
-    "simulate_jump",
-    "simulate_landing",
-]
+from importlib import import_module
+from typing import Any
+
+STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
+
+_PLACES = {
+    "estimator": "Estimator",
+    "landing": "LandingController LandingGains",
+    "loop": "Disturbance simulate_jump simulate_landing",
+    "perturbation": "SLIGHT Perturbation Ranges SensorNoise",
+    "reference": "LandingReference",
+    "result": "Finding Metrics SimulationResult",
+    "scene": "Block Scene",
+    "world": "World base_from_bullet base_to_bullet",
+}
+_MODULE_OF = {name: module for module, names in _PLACES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    return value

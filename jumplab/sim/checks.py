@@ -1,71 +1,34 @@
 """Is a simulated jump what it claims to be? Every finding is made from the logs, or read back from the engine.
 
-The strongest of them asks mechanics: the logged motion, torques and foot forces must obey the robot's equations of
-motion, which leaves no room for a hand that holds the base, a motor that gives more than it says, or a velocity set
-from outside.
+The strongest one asks mechanics: the logged motion, torques and foot forces must obey the robot's equations of motion.
+They leave no room for a hand that holds the base, a motor that gives more than it says, or a velocity set.
 """
 
 from __future__ import annotations
-
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.robot import Robot
-from jumplab.sim.actuation import Actuators
-from jumplab.sim.world import STEP_S
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import rotation
+from jumplab.sim.playback import Actuators
+from jumplab.sim.result import STAND_S, Finding, SimulationResult
 
-if TYPE_CHECKING:
-    from jumplab.sim.result import SimulationResult
-
-STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
-WINDOW = 100  # [steps] our choice: 0.1 s; a push shorter than that counts by its mean
-# our choice: honest jumps and flips leave 1e-10 N and 0.02 N m; in the joints up to 1 N m, the mean of two steps at an
-# impact in which the engine's servo reports another torque than it gave. What can hide below is 0.3 % of the weight
-UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 1.0, 0.5, 3.0
-NUMERIC = 1e-6  # [N m] rounding
-JUMP_M = 1e-4  # [m, rad] our choice: the engine's own step is kept to 1e-5
-STOP_RAD = 0.02  # our choice: this close to its stop, a joint may lean on it
-LOADED_N = 50.0  # our choice: below it, CoP and friction ratio are rounding
-SOLE_M = 0.001  # our choice: contact points of honest feet lie within the sole to 1e-7 m
+WINDOW = 100  # [steps] 0.1 s; a push shorter than that counts by its mean
+# Sound jumps and flips leave 1e-10 N, 0.02 N m, and in the joints up to 1 N m at an impact.
+UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 1.0, 0.5, 3.0  # [N], [N m], [N m]
+NUMERIC = 1e-6  # rounding
+JUMP_M = 1e-4  # [m, rad] the engine's own step is kept to 1e-5
+STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
+LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
+SOLE_M = 0.001  # contact points of sound feet lie within the sole to 1e-7 m
 FRICTION_USE = 1.01  # 1.0001 was seen where feet slide
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One question, answered: ``value`` may not exceed ``limit`` [unit]."""
-
-    name: str
-    value: float
-    limit: float
-    unit: str
-    catches: str
-
-    @property
-    def passed(self) -> bool:
-        """True if the value is within its limit."""
-        return bool(self.value <= self.limit)
-
-    def to_json(self) -> dict:
-        """Plain data."""
-        return {**asdict(self), "value": float(self.value), "passed": self.passed}
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.value:.4g} {self.unit}".rstrip() + f" (at most {self.limit:.4g}; {self.catches})"
-
-
 def check(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
-    """All findings about ``result``.
-
-    Parameters
-    ----------
-    result : of :func:`jumplab.sim.simulate_jump`.
-    robot : the simulated robot as stated: the planned one with the stated perturbation.
-    """
-    return (*_mechanics(result, robot), *_limits(result, robot), *_feet(result, robot), *_engine(result, robot),
-            _landing(result, robot))  # fmt: skip
+    """All findings about ``result`` of ``robot``: the planned one with the stated perturbation."""
+    return tuple(f for part in (_mechanics, _limits, _feet, _engine, _landing) for f in part(result, robot))
 
 
 def _mechanics(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
@@ -110,13 +73,12 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
 
 
 def _accelerations(result: SimulationResult, robot: Robot) -> np.ndarray:
-    """Accelerations (N - 1, nv) of the engine's steps.
+    """Accelerations (N - 1, nv) of the engine's steps, which step the velocity of the base's CoM in world axes.
 
-    The engine steps the velocity of the base's CoM in world axes. Differences of the base twist in its own axes, which
-    turn within the step, would be off by 17 N in a flip.
+    Differences of the base twist in its own axes, which turn within the step, would be off by 17 N in a flip.
     """
     arm = robot.model.inertias[1].lever  # from the base's origin to its CoM, base axes
-    turn = np.array([pin.Quaternion(w, x, y, z).toRotationMatrix() for x, y, z, w in result.q[:, 3:7]])
+    turn = np.array([rotation(quaternion) for quaternion in result.q[:, 3:7]])
     spin, speed = result.v[:, 3:6], result.v[:, :3]
 
     def stepped(vectors: np.ndarray) -> np.ndarray:
@@ -168,17 +130,16 @@ def _engine(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     """What the engine said at the end of the run, against what was stated."""
     engine, stated = result.settings["engine"], result.settings["perturbation"]["friction"]
     miss = max(abs(friction - stated) for friction in engine["friction"])
+    through, lost = float(not engine["self_collision"]), abs(engine["mass_kg"] - robot.total_mass)
     return (
         Finding("friction read back, less the stated", miss, NUMERIC, "", "friction that never reached the feet"),
         Finding("contact points outside the sole", engine["beyond_sole_m"], SOLE_M, "m", "oversized feet"),
-        Finding("links that pass through each other", float(not engine["self_collision"]), 0.0, "",
-                "self-collision switched off"),
-        Finding("mass read back, less the stated", abs(engine["mass_kg"] - robot.total_mass), 1e-3, "kg",
-                "a lighter robot"),
-    )  # fmt: skip
+        Finding("links that pass through each other", through, 0.0, "", "self-collision switched off"),
+        Finding("mass read back, less the stated", lost, 1e-3, "kg", "a lighter robot"),
+    )
 
 
-def _landing(result: SimulationResult, robot: Robot) -> Finding:
+def _landing(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     """Seconds that a claimed landing falls short of standing on the feet alone, from touchdown on."""
     down = np.flatnonzero(result.phase == "landing")
     feet = np.isin(result.link_names, robot.foot.frames)
@@ -187,4 +148,4 @@ def _landing(result: SimulationResult, robot: Robot) -> Finding:
         stray = np.flatnonzero(result.touching[down[0] :, ~feet].any(axis=1))
         stood = STEP_S * (stray[0] if len(stray) else len(result.t) - down[0])
     short = max(0.0, STAND_S - stood) if result.metrics.landed else 0.0
-    return Finding("claimed landing, short of 3 s by", short, NUMERIC, "s", "a landing shorter than 3 s")
+    return (Finding("claimed landing, short of 3 s by", short, NUMERIC, "s", "a landing shorter than 3 s"),)

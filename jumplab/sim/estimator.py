@@ -1,9 +1,8 @@
 """Where the robot is and how it moves, from its own sensors: an error-state Kalman filter, inertial unit and legs.
 
-Attitude, velocity and place of the trunk are integrated from gyro and accelerometer, which is all there is in flight.
-While a foot carries weight, the point it stands on does not move: the legs' angles then tell where the trunk is, and
-through gravity also how it is tilted. That feet are part of the state is an idea of Bloesch et al., "State estimation
-for legged robots" (2012).
+The trunk is integrated from gyro and accelerometer. While a foot carries weight, the point it stands on does not move:
+the legs' angles then tell where the trunk is, and through gravity also how it is tilted. That feet are part of the
+state is an idea of Bloesch et al., "State estimation for legged robots" (2012).
 """
 
 from __future__ import annotations
@@ -14,36 +13,27 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.perturbation import SensorNoise
-from jumplab.sim.world import STEP_S
 from jumplab.task import GRAVITY
 
-# sensors ------------------------------------------------------------------------------------------
 GRAVITY_VECTOR = np.array([0.0, 0.0, -GRAVITY])
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One sample of all sensors.
+    """One sample of all sensors; ``gyro`` and ``specific_force`` in the trunk's axes."""
 
-    Attributes
-    ----------
-    joints, rates : (nv - 6,) encoders [rad, rad/s].
-    gyro : (3,) angular velocity of the trunk in its own axes [rad/s].
-    specific_force : (3,) mean over the last step of acceleration minus gravity at the base frame's origin, in the
-        trunk's axes [m/s^2].
-    foot_force : (2,) vertical force under each foot [N].
-    """
-
-    joints: np.ndarray
-    rates: np.ndarray
-    gyro: np.ndarray
-    specific_force: np.ndarray
-    foot_force: np.ndarray
+    joints: np.ndarray  # (nv - 6,) encoders [rad]
+    rates: np.ndarray  # (nv - 6,) [rad/s]
+    gyro: np.ndarray  # (3,) angular velocity of the trunk [rad/s]
+    specific_force: np.ndarray  # (3,) acceleration of the base's origin minus gravity, mean of the last step [m/s^2]
+    foot_force: np.ndarray  # (2,) vertical force under each foot [N]
 
 
 class Sensors:
-    """Readings of the true state; exact if every deviation in ``noise`` is zero.
+    """Readings of the true state, exact if every deviation in ``noise`` is zero.
 
     Biases are drawn once. Foot forces are those of the contact itself, as if the sensor's reading were corrected for
     the foot's own weight and inertia; the accelerometer has no end of its range.
@@ -55,23 +45,15 @@ class Sensors:
         self._accel_bias = noise.accel_bias * self._rng.standard_normal(3)
         self._last_velocity: np.ndarray | None = None
 
-    @property
-    def exact(self) -> bool:
-        """True if nothing is noisy, and the true state may stand for its estimate."""
-        return self.noise == SensorNoise()
-
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: roll and pitch a little off."""
         error = self.noise.tilt_rad * self._rng.standard_normal(2)
-        turn = pin.Quaternion(pin.exp3(np.array([*error, 0.0])))
-        start = q.copy()
-        start[3:7] = (turn * pin.Quaternion(q[6], q[3], q[4], q[5])).coeffs()
-        return start
+        return turned(q, pin.exp3(np.array([*error, 0.0])))
 
     def read(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Reading:
         """Measure the true state (q, v) and the true wrenches (2, 6) under the feet; call it once per step."""
         n, draw = self.noise, self._rng.standard_normal
-        attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
+        attitude = rotation(q[3:7])
         velocity = attitude @ v[:3]
         gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
         self._last_velocity = velocity
@@ -88,13 +70,12 @@ class Sensors:
         )
 
 
-# estimator ------------------------------------------------------------------------------------------
-LOADED_N = 30.0  # our choice: a foot with less may be sliding off the ground; ten times the sensor's noise
-TIPPED_M = 0.003  # our choice: the foot stands on the lower end of its sole, once the other is higher by this much
-FOOT_WALK = 0.01  # [m/s / sqrt(Hz)] our choice: a standing foot creeps 10 mm within a second
-SETTLE_S = 0.02  # our choice: for so long after it met the ground a foot ...
-SETTLE_WALK = 0.3  # ... is free to settle by a few centimetres: contacts slip and rebound
-LEG_M = 0.7  # [m] turns an encoder's error into one of the foot
+# The papers print none of these numbers.
+LOADED_N = 30.0  # a foot with less may be sliding off the ground; ten times the sensor's noise
+TIPPED_M = 0.003  # the foot stands on the lower end of its sole, once the other is higher by this much
+FOOT_WALK = 0.01  # [m/s / sqrt(Hz)] a standing foot creeps 10 mm within a second
+SETTLE_S, SETTLE_WALK = 0.02, 0.3  # for so long after it met the ground a foot is free to settle by centimetres
+LEG_M = 0.7  # turns an encoder's error into one of the foot
 FLOOR = SensorNoise(joint_rad=3e-4, gyro=1e-3, accel=0.05, gyro_bias=1e-5, accel_bias=1e-4, tilt_rad=1e-4)
 
 # parts of the error: attitude (world axes), velocity, place, gyro bias, accelerometer bias, left foot, right foot
@@ -105,19 +86,14 @@ SIZE = 21
 class Estimator:
     """State of the full robot, from one :class:`Reading` per millisecond.
 
-    Parameters
-    ----------
-    robot : as planned; only its geometry is used.
-    q, v : (nq,), (nv,) where it starts; known but for ``noise.tilt_rad``.
-    noise : what the sensors are known to be worth.
+    Of ``robot``, as planned, only the geometry is used; it starts in ``q`` (nq,), ``v`` (nv,), known but for
+    ``noise.tilt_rad``. ``noise`` is what the sensors are known to be worth.
     """
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise):
-        self._model, self._data = robot.model, robot.model.createData()
-        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        foot = robot.foot
+        self._gauge, foot = Gauge(robot), robot.foot
         self._ends = [np.array([x, foot.center[1], foot.sole_z]) for x in (foot.toe, foot.heel)]
-        self._attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
+        self._attitude = rotation(q[3:7])
         self._place, self._velocity = q[:3].copy(), self._attitude @ v[:3]
         self._gyro_bias, self._accel_bias = np.zeros(3), np.zeros(3)
         self._foot, self._end, self._standing = np.zeros((2, 3)), [0, 0], [0, 0]  # toe or heel; for how many steps
@@ -125,8 +101,7 @@ class Estimator:
         n = self._noise
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)
-        self._step = np.eye(SIZE)
-        self._drive = np.zeros(SIZE)
+        self._step, self._drive = np.eye(SIZE), np.zeros(SIZE)
 
     def update(self, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
         """Estimated configuration (nq,) and velocity (nv,) at the time of ``reading``."""
@@ -160,8 +135,9 @@ class Estimator:
     def _sole_ends(self, joints: np.ndarray) -> np.ndarray:
         """Toe and heel (2, 2, 3) of both feet in the trunk's frame."""
         q = np.concatenate([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], joints])
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return np.array([[self._data.oMf[frame].act(end) for end in self._ends] for frame in self._frames])
+        data = self._gauge.data
+        pin.framesForwardKinematics(self._gauge.model, data, q)
+        return np.array([[data.oMf[frame].act(end) for end in self._ends] for frame in self._gauge.frames])
 
     def _stand(self, side: int, ends: np.ndarray, loaded: bool) -> None:
         """Let a loaded foot correct the estimate; a foot that has just met the ground stands where it is."""
@@ -208,19 +184,12 @@ def _foot(side: int) -> slice:
 
 
 class Perception:
-    """What the controllers are told: the truth if no sensor errs, otherwise the estimate.
-
-    Parameters
-    ----------
-    robot, q, v, noise : see :class:`Estimator`; ``seed`` of the sensors' errors.
-    """
+    """What the controllers are told: the truth if no sensor errs, otherwise the estimate, see :class:`Estimator`."""
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
-        self._sensors = Sensors(noise, seed)
-        self._estimator = None
-        if not self._sensors.exact:
-            self._estimator = Estimator(robot, self._sensors.initial(q), v, noise)
-        self._tilt, self._speed = 0.0, 0.0
+        self._sensors, self._tilt, self._speed = Sensors(noise, seed), 0.0, 0.0
+        exact = noise == SensorNoise()  # then the true state stands for its estimate
+        self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
     def __call__(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Configuration (nq,), velocity (nv,) and vertical foot forces (2,) as far as the robot knows them."""
@@ -243,6 +212,6 @@ def estimation_error(
     q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
 ) -> tuple[float, float]:
     """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
-    true, believed = (pin.Quaternion(x[6], x[3], x[4], x[5]).toRotationMatrix() for x in (q, believed_q))
+    true, believed = (rotation(x[3:7]) for x in (q, believed_q))
     tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))  # between the two ideas of up, in the trunk's axes
     return float(tilt), float(np.linalg.norm(believed @ believed_v[:3] - true @ v[:3]))

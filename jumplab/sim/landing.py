@@ -1,9 +1,8 @@
 """Landing controller: a whole-body QP in torque mode, entered at touchdown.
 
-The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not repeat it; this one is
-ours. Every 2 ms it chooses joint accelerations and two foot wrenches that obey the base dynamics, friction, the soles'
-edges and the torques that the motors have, and that come closest to a list of wishes: CoM, angular momentum, trunk,
-feet flat and still, posture.
+The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not repeat it. Here, every
+2 ms, joint accelerations and foot wrenches are chosen that obey the base dynamics, friction, the soles' edges and the
+motors' torques, and come closest to a list of wishes: CoM, angular momentum, trunk, feet flat and still, posture.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from proxsuite import proxqp
 
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim.actuation import Actuators
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.playback import Actuators
 from jumplab.sim.reference import Reference
 
 
-# body_terms ------------------------------------------------------------------------------------------
 class BodyTerms:
     """Quantities at one state (``update``); unknowns are x = (accelerations, wrench left, wrench right).
 
@@ -39,19 +38,13 @@ class BodyTerms:
     """
 
     def __init__(self, robot: Robot, wrench_scale: float):
-        self._model, self._data, self._scale = robot.model, robot.model.createData(), wrench_scale
-        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        self._center = robot.foot.center
-        self.nv = self._model.nv
-        self.nx = self.nv + 12
-        self.mass = robot.total_mass
-        self.gravity = self._model.gravity.linear.copy()
+        self._gauge, self._scale = Gauge(robot), wrench_scale
+        self.nv = nv = robot.model.nv
+        self.nx = nx = nv + 12
+        self.mass, self.gravity = robot.total_mass, robot.model.gravity.linear.copy()
         rest = stance_configuration(robot)
-        self.posture_rest = rest[7:].copy()
-        self.pitch_rest = float(robot.stance["trunk_pitch_rad"])
-        pin.centerOfMass(self._model, self._data, rest)
-        self.standing_height = float(self._data.com[0][2])
-        nv, nx = self.nv, self.nx
+        self.posture_rest, self.pitch_rest = rest[7:].copy(), float(robot.stance["trunk_pitch_rad"])
+        self.standing_height = float(self._gauge.com(rest)[2])
         self.soles, self.attitudes, self.twists = np.zeros((2, 3)), np.zeros((2, 3, 3)), np.zeros((2, 6))
         self.sole_rows, self.sole_drift = np.zeros((2, 6, nx)), np.zeros((2, 6))
         self.force_rows, self.momentum_rows = np.zeros((3, nx)), np.zeros((3, nx))
@@ -59,16 +52,15 @@ class BodyTerms:
 
     def update(self, q: np.ndarray, v: np.ndarray) -> None:
         """Evaluate everything at (q, v), before :meth:`set_contact`."""
-        model, data = self._model, self._data
+        model, data = self._gauge.model, self._gauge.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, self._zero)
         self.com, self.com_velocity = data.com[0].copy(), data.vcom[0].copy()
-        self.momentum = data.hg.angular.copy()
-        self.trunk = data.oMi[1].rotation.copy()
+        self.momentum, self.trunk = data.hg.angular.copy(), data.oMi[1].rotation.copy()
         self._dynamics[:, : self.nv] = data.M
         self.base_rows, self.torque_rows = self._dynamics[:6], self._dynamics[6:]
         self.base_offset, self.torque_offset = data.nle[:6], data.nle[6:]
-        for side, frame in enumerate(self._frames):
+        for side, frame in enumerate(self._gauge.frames):
             self._sole(side, frame)
 
     def set_contact(self, contact: np.ndarray) -> None:
@@ -82,9 +74,9 @@ class BodyTerms:
 
     def _sole(self, side: int, frame: int) -> None:
         """Kinematics of one sole's middle, world axes."""
-        model, data, axes = self._model, self._data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        model, data, axes = self._gauge.model, self._gauge.data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         place = pin.updateFramePlacement(model, data, frame)
-        arm = place.rotation @ self._center
+        arm = place.rotation @ self._gauge.robot.foot.center
         jacobian = pin.getFrameJacobian(model, data, frame, axes)
         jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
         velocity = pin.getFrameVelocity(model, data, frame, axes)
@@ -109,37 +101,32 @@ class BodyTerms:
         return self.torque(x)
 
 
-# landing ------------------------------------------------------------------------------------------
-PERIOD_STEPS = 2  # our choice: 500 Hz
+# The paper prints none of these numbers.
+PERIOD_STEPS = 2  # 500 Hz
 WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
-CONTACT_FORCE_N = 10.0  # our choice: a foot stands if it carries more than 2.5 % of the weight ...
+CONTACT_FORCE_N = 10.0  # a foot stands if it carries more than 2.5 % of the weight ...
 CONTACT_HOLD_S = 0.008  # ... and for so long after it last did; flicker of the flag makes robots fall
-NEAR_GROUND_M = 0.02  # our choice: a foot that bounced less than this is pressed down again, not swung
-# our choice: share of the sole's length and width for the wished CoP. All of the length, for the disturbed landings;
-# half of the width: two feet far apart need no more, and 0.95 lets perturbed robots roll onto an edge (7 % fell)
-SOLE_SHARE = 0.95, 0.5
-PLANNED_FRICTION = 0.45  # our choice: below the lowest floor friction of the perturbed trials, 0.5
-NOMINAL_INERTIA = 5.0  # [kg m^2] our choice: pitch inertia of the landed robot, turns a momentum rate into rad/s^2
-STOP_MARGIN_RAD = 0.05  # our choice: a stop is respected this far before it
-STOP_HORIZON_S = 0.05  # our choice: a joint that would reach it within this time is turned back
-SPIN_FRICTION = 0.04  # [m] our choice: friction coefficient times the mean lever of the sole, about 0.07 m
-MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] our choice: an impact must not make wishes that drown all others
+NEAR_GROUND_M = 0.02  # a foot that bounced less than this is pressed down again, not swung
+SOLE_SHARE = 0.95, 0.5  # of the sole's length and width for the wished CoP; more width lets robots roll onto an edge
+PLANNED_FRICTION = 0.45  # below the lowest floor friction of the perturbed trials, 0.5
+NOMINAL_INERTIA = 5.0  # [kg m^2] pitch inertia of the landed robot, turns a momentum rate into rad/s^2
+STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
+STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back
+SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
+MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 UNBOUNDED = 1e20  # ProxQP's infinity
-TOLERANCE = 1e-6  # our choice: of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
-MAX_ITERATIONS = 300  # our choice: ten times what the hardest recorded QP took
-# our choice: 0.1 mN m, no motor resolves it. ProxQP's last digits depend on where its memory lies; without rounding the
-# same landing would differ from run to run
-TORQUE_DIGITS = 4
-FALLBACK_DAMPING = 3.0  # [N m s/rad] our choice: stable at 500 Hz on the lightest joint
+TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
+MAX_ITERATIONS = 300  # ten times what the hardest recorded QP took
+TORQUE_DIGITS = 4  # [0.1 mN m] ProxQP's last digits depend on where its memory lies; rounded, runs are the same
+FALLBACK_DAMPING = 3.0  # [N m s/rad] stable at 500 Hz on the lightest joint
 UNEVEN = np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(6))  # (12, 12), squared difference of the two wrenches
 
 
 @dataclass(frozen=True)
 class LandingGains:
-    """Natural frequencies [rad/s] of critically damped wishes, and their weights.
+    """Natural frequencies [rad/s] of critically damped wishes, and their weights; the paper prints none.
 
-    All values are our choice, found by landing from states around the plan's touchdown. Weights are
-    [1 / (m/s^2)^2] or [1 / (rad/s^2)^2].
+    Weights are [1 / (m/s^2)^2] or [1 / (rad/s^2)^2], found by landing from states around the plan's touchdown.
     """
 
     com_rate_xy: float = 4.0  # the pendulum's own sqrt(g/z) = 4: faster would ask for a longer sole
@@ -165,39 +152,31 @@ class LandingGains:
 class LandingController:
     """Torques that catch and hold the robot; see the module's docstring.
 
-    Parameters
-    ----------
-    robot : the robot as it was planned; the controller knows nothing of perturbations.
-    reference : followed if given; otherwise spring-dampers lead to the middle of the feet at standing height.
-
-    Attributes
-    ----------
-    solves, failures : counts of QPs posed, and of those without a solution.
+    ``robot`` is as planned: the controller knows no perturbation. ``reference`` is followed if given; otherwise
+    spring-dampers lead to the middle of the feet at standing height. ``solves`` and ``failures`` count the QPs posed,
+    and those without a solution.
     """
 
     def __init__(self, robot: Robot, *, reference: Reference | None = None, gains: LandingGains | None = None):
         self.reference, self.gains = reference, gains or LandingGains()
         self.solves = self.failures = 0
-        self._terms = BodyTerms(robot, WRENCH_SCALE)
-        self._actuators = Actuators(robot)
-        self._posture_weight = self._posture_weights(robot)
-        self._corners = _corner_rows(robot)
+        self._terms, self._actuators = BodyTerms(robot, WRENCH_SCALE), Actuators(robot)
+        self._posture_weight, self._corners = self._posture_weights(robot), _corner_rows(robot)
         self._last_contact = np.full(2, -np.inf)
-        self._solver = _new_solver(self._terms.nx, len(self._actuators.effort) + len(self._corners))
+        self._solver = proxqp.dense.QP(self._terms.nx, 6, len(self._actuators.effort) + len(self._corners))
+        self._solver.settings.eps_abs, self._solver.settings.max_iter = TOLERANCE, MAX_ITERATIONS
 
     def _posture_weights(self, robot: Robot) -> np.ndarray:
-        g, weights = self.gains, {}
-        for role, pair in robot.joints.items():
-            weight = g.arm_posture_weight if role == "shoulder_pitch" else g.leg_posture_weight
-            weights.update(dict.fromkeys(pair, weight))
-        return np.array([weights.get(name, g.lateral_posture_weight) for name in robot.joint_names])
+        arms, pitch = robot.joints["shoulder_pitch"], {name for pair in robot.joints.values() for name in pair}
+        g, names = self.gains, robot.joint_names
+        legs = [g.leg_posture_weight if name in pitch else g.lateral_posture_weight for name in names]
+        return np.where(np.isin(names, arms), g.arm_posture_weight, legs)
 
     def torque(self, time: float, q: np.ndarray, v: np.ndarray, foot_force: np.ndarray) -> np.ndarray:
         """Joint torques (nv - 6,) [N m], ``time`` after touchdown, from measured state and vertical foot forces."""
         body = self._terms
         body.update(q, v)
-        contact = self._contact(time, np.asarray(foot_force))
-        body.set_contact(contact)
+        body.set_contact(contact := self._contact(time, np.asarray(foot_force)))
         x = self._solve(*self._wishes(time, q, v, contact), v)
         tau = -FALLBACK_DAMPING * v[6:] + body.gravity_torque(contact) if x is None else body.torque(x)
         return np.clip(np.round(tau, TORQUE_DIGITS), *self._actuators.range(v[6:]))
@@ -211,8 +190,6 @@ class LandingController:
         height = self._terms.soles[:, 2]
         return loaded | (height - height[loaded].min() < NEAR_GROUND_M)
 
-    # wishes ----------------------------------------------------------------------------------------------------
-
     def _wishes(self, time, q, v, contact):
         """Least-squares rows (k, nx), targets (k,), weights (k,); wishes on joint accelerations and their weights."""
         g, body = self.gains, self._terms
@@ -222,9 +199,8 @@ class LandingController:
         trunk_rows[:, 3:6] = np.eye(3)
         rows = [body.force_rows, body.momentum_rows / NOMINAL_INERTIA, trunk_rows]
         targets = [com_wish - body.gravity, momentum_wish / NOMINAL_INERTIA, self._trunk_wish(v)]
-        weights = [np.array(g.com_weight), np.full(3, g.momentum_weight), np.full(3, g.trunk_weight)]
-        if not contact.any():  # in the air neither CoM nor momentum can be asked for
-            weights[0], weights[1] = np.zeros(3), np.zeros(3)
+        on = float(contact.any())  # in the air neither CoM nor momentum can be asked for
+        weights = [on * np.array(g.com_weight), np.full(3, on * g.momentum_weight), np.full(3, g.trunk_weight)]
         for side in (0, 1):
             rows.append(body.sole_rows[side])
             targets.append(self._foot_wish(side, contact[side], ground[:, 2].min()) - body.sole_drift[side])
@@ -235,8 +211,8 @@ class LandingController:
         """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
         g, body = self.gains, self._terms
         rate = np.array([g.com_rate_xy, g.com_rate_xy, g.com_rate_z])
-        goal, speed, momentum = foot_middle + np.array([0.0, 0.0, body.standing_height]), np.zeros(3), np.zeros(3)
-        push, twist = np.zeros(3), np.zeros(3)
+        goal = foot_middle + np.array([0.0, 0.0, body.standing_height])
+        speed, momentum, push, twist = np.zeros((4, 3))
         if self.reference is not None:
             com, com_rate, momentum[1] = self.reference.at(time)
             goal[[0, 2]], speed[[0, 2]] = foot_middle[[0, 2]] + com, com_rate
@@ -275,14 +251,11 @@ class LandingController:
             wish[near], weight[near] = np.clip(needed[near], -MAX_TURN, MAX_TURN), g.stop_weight
         return wish, weight
 
-    # the QP ----------------------------------------------------------------------------------------------------
-
     def _solve(self, rows, targets, weights, joint_wish, joint_weight, v):
         """Unknowns x (nx,) of the QP, or None if the solver does not report success."""
         g, body, nv = self.gains, self._terms, self._terms.nv
         weighted = rows * weights[:, None]  # (k, nx)
-        hessian = weighted.T @ rows
-        linear = -weighted.T @ targets
+        hessian, linear = weighted.T @ rows, -weighted.T @ targets
         diagonal = np.concatenate([np.full(nv, g.acceleration_weight), np.full(12, g.wrench_weight)])
         diagonal[6:nv] += joint_weight
         linear[6:nv] -= joint_weight * joint_wish
@@ -290,28 +263,17 @@ class LandingController:
         hessian[nv:, nv:] += g.uneven_weight * UNEVEN
         low, high = self._actuators.range(v[6:])
         matrix = np.vstack([body.torque_rows, self._corners])
-        rest = np.zeros(len(self._corners))
-        lower = np.concatenate([low - body.torque_offset, rest])
-        upper = np.concatenate([high - body.torque_offset, rest + UNBOUNDED])
+        lower = np.concatenate([low - body.torque_offset, np.zeros(len(self._corners))])
+        upper = np.concatenate([high - body.torque_offset, np.full(len(self._corners), UNBOUNDED)])
         equations = (body.base_rows, -body.base_offset)
+        pose = self._solver.update if self.solves else self._solver.init
+        pose(hessian, linear, *equations, matrix, lower, upper)
         self.solves += 1
-        if self.solves == 1:
-            self._solver.init(hessian, linear, *equations, matrix, lower, upper)
-        else:
-            self._solver.update(hessian, linear, *equations, matrix, lower, upper)
         self._solver.solve()
         if self._solver.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
             self.failures += 1
             return None
         return self._solver.results.x
-
-
-def _new_solver(unknowns: int, inequalities: int):
-    """ProxQP: on 2,600 recorded landing QPs it solved all, in 26 us in the middle (quadprog 35 us, PIQP 93 us)."""
-    solver = proxqp.dense.QP(unknowns, 6, inequalities)
-    solver.settings.eps_abs = TOLERANCE
-    solver.settings.max_iter = MAX_ITERATIONS
-    return solver
 
 
 def _corner_rows(robot: Robot) -> np.ndarray:
@@ -324,8 +286,6 @@ def _corner_rows(robot: Robot) -> np.ndarray:
             row = np.zeros(6)
             row[2], row[column] = reach, sign
             one.append(row)
-    nv = robot.model.nv
-    rows = np.zeros((20, nv + 12))
-    rows[:10, nv : nv + 6] = one
-    rows[10:, nv + 6 :] = one
+    rows = np.zeros((20, robot.model.nv + 12))
+    rows[:10, -12:-6] = rows[10:, -6:] = one
     return rows

@@ -1,8 +1,9 @@
-"""One simulated jump: the tape in the air, the landing controller on the ground, everything logged, nothing reset."""
+"""The one loop of the simulation: a pilot commands, the engine steps, everything is logged, nothing is reset."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -10,36 +11,76 @@ import pinocchio as pin
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import checks as honesty
-from jumplab.sim.actuation import Delay
+from jumplab.sim import STEP_S
+from jumplab.sim.checks import check
 from jumplab.sim.estimator import Perception
+from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import Perturbation
 from jumplab.sim.pilot import Pilot
-from jumplab.sim.playback import Motors
-from jumplab.sim.recorder import STAND_S, Recorder
+from jumplab.sim.playback import Command, Delay, Motors
 from jumplab.sim.reference import LandingSource
-from jumplab.sim.result import SimulationResult
+from jumplab.sim.result import STAND_S, Recorder, SimulationResult
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S, World
+from jumplab.sim.world import World
 
-EXTRA_S = 0.05  # our choice: simulated beyond it, so that the last step is not decided by rounding
-AFTER_FALL_S = 0.5  # our choice: a fall is shown for this long
+
+class Commander(Protocol):
+    """Who commands a run. Its log has parts, each of which shall end on the height of a goal."""
+
+    part: int  # that the last command belongs to, from 0
+    goal: np.ndarray  # (nq,) of this part
+
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
+        """Command at ``step`` from measured state and vertical foot forces (2,)."""
+
+    def over(self, step: int, fallen_s: float) -> bool:
+        """Whether ``step`` is beyond the end; the robot has lain on the ground for ``fallen_s`` [s]."""
+
+
+class Run:
+    """One run: ``robot`` as planned, perturbed as it really is (``real``), on a ground."""
+
+    def __init__(self, robot: Robot, perturbation: Perturbation | None = None, scene: Scene | None = None):
+        self.robot, self.perturbation = robot, perturbation or Perturbation()
+        self.scene, self.real = scene or Scene.flat(), self.perturbation.robot(robot)
+
+    def play(self, pilot: Commander, q: np.ndarray, v: np.ndarray, step: int = 0) -> None:
+        """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
+        how = self.perturbation
+        perceive = Perception(self.robot, q, v, how.noise, how.seed)
+        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
+        self.recorders: list[Recorder] = []
+        with World(self.real, q, v, scene=self.scene, friction=how.friction) as world:
+            contacts, fallen_s = world.contacts(), 0.0
+            while not pilot.over(step, fallen_s):
+                q, v = world.state()
+                told = delay(pilot.command(step, *perceive(q, v, contacts.wrench)))
+                if pilot.part == len(self.recorders):
+                    self.recorders.append(Recorder(self.real, pilot.goal, world.links))
+                tau = motors.apply(world, told, v[6:])
+                world.step()
+                contacts = world.contacts()
+                self.recorders[-1].add(q, v, world.servo_torque() if tau is None else tau, contacts)
+                fallen_s = self.recorders[-1].fallen_steps * STEP_S
+                step += 1
+            self.engine, self.perception = world.read_back(), perceive.to_json()
+
+    def result(self, part: int, solves: tuple[int, int], **settings: Any) -> SimulationResult:
+        """The checked record of one part of the run; ``solves`` are the QPs posed and failed in it."""
+        settings |= dict(scene=self.scene.name, robot=self.robot.name, robot_hash=self.robot.hash, step_s=STEP_S)
+        settings |= dict(perturbation=self.perturbation.to_json(), perception=self.perception)
+        settings |= dict(engine=self.engine, friction_read_back=min(self.engine["friction"]))
+        result = self.recorders[part].result(solves, settings)
+        return replace(result, checks=check(result, self.real))
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A wrong state at the apex of the flight.
+    """A wrong state at the apex of the flight."""
 
-    Attributes
-    ----------
-    speed_factor : on the horizontal velocity of the whole robot [1].
-    pitch_rad : turn of the whole robot about its CoM [rad].
-    height_m : shift of the whole robot upward [m].
-    """
-
-    speed_factor: float = 1.0
-    pitch_rad: float = 0.0
-    height_m: float = 0.0
+    speed_factor: float = 1.0  # on the horizontal velocity of the whole robot [1]
+    pitch_rad: float = 0.0  # turn of the whole robot about its CoM
+    height_m: float = 0.0  # shift of the whole robot upward
 
     def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
         """Step of the tape's apex, and the disturbed configuration (nq,) and velocity (nv,) there."""
@@ -50,7 +91,7 @@ class Disturbance:
                 break
         q, v, com, speed = tape.q[row].copy(), tape.v[row].copy(), data.com[0].copy(), data.vcom[0].copy()
         turn = pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0)
-        attitude = turn @ pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
+        attitude = turn @ rotation(q[3:7])
         q[:3] = com + turn @ (q[:3] - com) + np.array([0.0, 0.0, self.height_m])
         q[3:7] = pin.Quaternion(attitude).coeffs()
         # the base twist is written in base axes and so has turned with the robot; the flight of its CoM must not
@@ -69,6 +110,7 @@ def simulate_jump(
     landing: str = "planned",
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
+    disturbance: Disturbance | None = None,
 ) -> SimulationResult:
     """Play ``tape`` on a simulated robot, catch it, and watch it stand.
 
@@ -86,6 +128,7 @@ def simulate_jump(
     reference : overrides ``landing``: a landing to follow, or a function that plans one from the measured state (q, v)
         at touchdown (None: it found none).
     stand_s : how long to watch after touchdown [s]; less than the default is never called a landing.
+    disturbance : begin at the apex of the flight, in a state that differs so; time, distance and rise count from there.
 
     Returns
     -------
@@ -97,27 +140,18 @@ def simulate_jump(
     InputError
         If the tape is not this robot's, or ``mode`` or ``stand_s`` make no sense.
     """
-    return _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s)
+    _check(tape, robot, perturbation, scene, reference, stand_s)
+    run = Run(robot, perturbation, scene)
+    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s)
+    step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
+    run.play(pilot, q, v, step)
+    said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
+    return run.result(0, pilot.solves, landing=pilot.landing_said(), **said)
 
 
-def simulate_landing(
-    tape: Tape,
-    robot: Robot,
-    disturbance: Disturbance,
-    *,
-    mode: str = "position",
-    perturbation: Perturbation | None = None,
-    scene: Scene | None = None,
-    reaim: bool = False,
-    landing: str = "planned",
-    reference: LandingSource | None = None,
-    stand_s: float = STAND_S,
-) -> SimulationResult:
-    """Like :func:`simulate_jump`, but from a disturbed state at the apex of the flight: one point of the landing basin.
-
-    Time, distance and rise of the result count from the apex.
-    """
-    return _run(tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance)
+def simulate_landing(tape: Tape, robot: Robot, disturbance: Disturbance, **options: Any) -> SimulationResult:
+    """One point of the landing basin: :func:`simulate_jump` from a disturbed apex, with the other options of that."""
+    return simulate_jump(tape, robot, disturbance=disturbance, **options)
 
 
 def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
@@ -135,43 +169,3 @@ def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
             raise InputError(f"the tape's {name} has entries that are no number; plan the jump again")
     if not np.any(tape.phase == "flight") or not np.any(tape.phase == "launch"):
         raise InputError("the tape must have a launch and a flight; plan the jump again")
-
-
-def _run(
-    tape, robot, mode, perturbation, scene, reaim, landing, reference, stand_s, disturbance=None
-) -> SimulationResult:
-    _check(tape, robot, perturbation, scene, reference, stand_s)
-    perturbation, scene = perturbation or Perturbation(), scene or Scene.flat()
-    real = perturbation.robot(robot)
-    pilot = Pilot(tape, robot, mode, scene, landing, reference, reaim)
-    motors, delay = Motors(robot, perturbation.motor_gain), Delay(round(perturbation.delay_s / STEP_S))
-    step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
-    perceive = Perception(robot, q, v, perturbation.noise, perturbation.seed)
-    with World(real, q, v, scene=scene, friction=perturbation.friction) as world:
-        recorder = Recorder(real, tape.q[-1], world.links)
-        contacts, end = world.contacts(), pilot.last_step
-        while step < end:
-            q, v = world.state()
-            was_flying = pilot.touchdown is None
-            told = delay(pilot.command(step, *perceive(q, v, contacts.wrench)))
-            if was_flying and pilot.touchdown is not None:
-                end = step + round((stand_s + EXTRA_S) / STEP_S)
-            tau = motors.apply(world, told, v[6:])
-            world.step()
-            contacts = world.contacts()
-            recorder.add(q, v, world.servo_torque() if tau is None else tau, contacts)
-            if pilot.touchdown is not None and recorder.fallen_steps * STEP_S > AFTER_FALL_S:
-                break
-            step += 1
-        engine = world.read_back()
-    settings = {
-        "mode": mode, "scene": scene.name, "reaim": reaim,
-        "landing": pilot.ahead.to_json() | {"again": pilot.replanned},
-        "perception": perceive.to_json(), "stand_s": stand_s, "step_s": STEP_S,
-        "robot": robot.name, "robot_hash": robot.hash,
-        "friction_read_back": min(engine["friction"]), "engine": engine,
-        "perturbation": perturbation.to_json(),
-        "disturbance": None if disturbance is None else asdict(disturbance),
-    }  # fmt: skip
-    result = recorder.result(pilot.solves, settings)
-    return replace(result, honesty=honesty.check(result, real))

@@ -10,7 +10,7 @@ import numpy as np
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 
-FRICTION = 0.8  # our choice: rubber sole on dry floor; the ground has 1, and Bullet multiplies the two
+FRICTION = 0.8  # rubber sole on dry floor; the ground has 1, and the engine multiplies the two
 LIGHT_KG = 0.01  # links below this are the massless dummies of multi-axis joints and are left alone
 
 
@@ -23,10 +23,10 @@ class Ranges:
     inertia: float = 0.10  # [1], relative
     friction: tuple[float, float] = (0.5, 1.0)  # [1], from ... to
     delay_s: tuple[float, float] = (0.0, 0.004)  # [s], from ... to
-    motor_gain: float = 0.05  # [1], relative error of every torque; our choice: typical of current-controlled drives
+    motor_gain: float = 0.05  # [1], relative error of every torque, typical of current-controlled drives
 
 
-# our choice: a "slight" difference, about a fifth of a workshop's uncertainty
+# a "slight" difference: about a fifth of a workshop's uncertainty
 SLIGHT = Ranges(0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01)
 
 
@@ -49,35 +49,22 @@ class SensorNoise:
 
     @classmethod
     def typical(cls) -> SensorNoise:
-        """Our choice: 16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
-        return cls(
-            joint_rad=5e-4, joint_rate=0.05, encoder_step_rad=1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3,
-            accel=0.2, accel_bias=0.05, force=3.0)  # fmt: skip
+        """16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
+        return cls(5e-4, 0.05, 1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3, accel=0.2, accel_bias=0.05, force=3.0)
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One robot of the population: factors and shifts by link or joint name; what is not named is as planned.
+    """One robot of the population: factors and shifts by link or joint name; what is not named is as planned."""
 
-    Attributes
-    ----------
-    seed : of the draw, also seeds the sensor noise.
-    mass, inertia : link -> factor [1].
-    com : link -> (x, y, z) shift in the link frame [m].
-    friction : lateral friction coefficient of the whole robot against ground of 1 [1].
-    delay_s : age of a command when it reaches the motors [s], rounded to milliseconds.
-    motor_gain : joint -> torque delivered per torque commanded [1].
-    noise : on measurements.
-    """
-
-    seed: int = 0
-    mass: dict[str, float] = field(default_factory=dict)
-    inertia: dict[str, float] = field(default_factory=dict)
-    com: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    friction: float = FRICTION
-    delay_s: float = 0.0
-    motor_gain: dict[str, float] = field(default_factory=dict)
-    noise: SensorNoise = SensorNoise()
+    seed: int = 0  # of the draw, also seeds the sensor noise
+    mass: dict[str, float] = field(default_factory=dict)  # link -> factor [1]
+    inertia: dict[str, float] = field(default_factory=dict)  # link -> factor [1]
+    com: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # link -> shift in its frame [m]
+    friction: float = FRICTION  # lateral coefficient of the whole robot against ground of 1 [1]
+    delay_s: float = 0.0  # age of a command when it reaches the motors, rounded to milliseconds
+    motor_gain: dict[str, float] = field(default_factory=dict)  # joint -> torque delivered per torque commanded [1]
+    noise: SensorNoise = SensorNoise()  # on measurements
 
     def __post_init__(self):
         if not 0 < self.friction <= 2:
@@ -91,7 +78,8 @@ class Perturbation:
     ) -> Perturbation:
         """Draw every number uniformly and independently from ``ranges``; the same seed gives the same robot."""
         rng = np.random.default_rng(seed)
-        names = [link.get("name") for link in ET.fromstring(robot.urdf).iter("link") if _mass(link) > LIGHT_KG]
+        masses = ((link.get("name"), link.find("inertial/mass")) for link in ET.fromstring(robot.urdf).iter("link"))
+        names = [name for name, mass in masses if mass is not None and float(mass.get("value")) > LIGHT_KG]
 
         def around(half_width, size=None):
             return rng.uniform(-half_width, half_width, size)
@@ -129,11 +117,6 @@ class Perturbation:
     def to_json(self) -> dict:
         """All numbers as plain data."""
         return asdict(self)
-
-
-def _mass(link: ET.Element) -> float:
-    mass = link.find("inertial/mass")
-    return 0.0 if mass is None else float(mass.get("value"))
 
 
 def _scale(element: ET.Element, attributes: tuple[str, ...], factor: float) -> None:

@@ -9,60 +9,75 @@ import numpy as np
 from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
 from jumplab.sim.playback import Command, Playback
-from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip, pitch_of
+from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
 from jumplab.sim.reference import LEAD_S, Forecast, LandingAhead, LandingSource, Replan, landing_planner
+from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
 
 LANDINGS = ("planned", "spring")
-WAIT_S = 0.5  # our choice: how long the robot may hang in the air after the tape's end before the run is given up
-TOUCHDOWN_FORCE_N = 30.0  # our choice: sum of both feet; 7 % of the weight, ten times the sensor noise
-EARLIEST_TOUCHDOWN = 0.5  # our choice: share of the planned flight before which a graze of the ground is no landing
-YIELD_S = 0.03  # our choice: before the ground is due, the position servos get less torque ...
-# our choice: a flip's legs are still being stopped then; with 30 ms hips at 18 rad/s ran on by up to 0.28 rad
-FLIP_YIELD_S = 0.008
-YIELD_SHARE = 0.2  # ... this share of the limit: enough for the last posture, too little to fight the impact
+# The paper prints none of these numbers.
+WAIT_S = 0.5  # how long the robot may hang in the air after the tape's end before the run is given up
+TOUCHDOWN_FORCE_N = 30.0  # sum of both feet; 7 % of the weight, ten times the sensor noise
+EARLIEST_TOUCHDOWN = 0.5  # share of the planned flight before which a graze of the ground is no landing
+YIELD_S, FLIP_YIELD_S = (
+    0.03,
+    0.008,
+)  # so long before the ground is due (a flip's legs still have to be stopped then) ...
+YIELD_SHARE = 0.2  # ... servos get this share of the torque: enough for the posture, too little to fight the impact
+EXTRA_S = 0.05  # simulated beyond the time to stand, so that the last step is not decided by rounding
+AFTER_FALL_S = 0.5  # a fall is shown for this long
 
 
 class Pilot:
     """Decides the command of each step: playback until touchdown, landing controller afterwards.
 
-    Parameters
-    ----------
-    tape, robot, scene : as planned.
-    mode : how the tape is played, see :class:`Playback`.
-    landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
-    reference : overrides ``landing`` if given.
-    reaim : correct the legs in the air.
+    Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
+    :func:`jumplab.sim.simulate_jump`.
 
     Attributes
     ----------
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
+    last_step : at which a robot that is still in the air is given up.
     """
 
-    def __init__(self, tape: Tape, robot: Robot, mode: str, scene: Scene, landing: str,
-                 reference: LandingSource | None, reaim: bool):  # fmt: skip
+    part = 0
+
+    def __init__(
+        self,
+        tape: Tape,
+        robot: Robot,
+        scene: Scene,
+        mode: str,
+        landing: str,
+        reference: LandingSource | None = None,
+        reaim: bool = True,
+        stand_s: float = STAND_S,
+    ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
-        self._robot, self._playback, self._forecast = robot, Playback(tape, robot, mode), Forecast(robot, tape, scene)
+        self._robot, self._playback, self.forecast = robot, Playback(tape, robot, mode), Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         self._landing = LandingController(robot, reference=None if callable(reference) else reference)
         self.ahead = LandingAhead(landing if reference is None else "given")
         if self.ahead.source == "planned":
             self._prepare()
+        flip, flight = is_flip(tape), tape.t[-1] - tape.takeoff_time
         self._reaim = Reaim(robot, tape, scene) if reaim else None
-        self._tuck = Tuck(robot, tape) if reaim and is_flip(tape) else None
-        flight = tape.t[-1] - tape.takeoff_time
-        self._tucked = round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S)
-        self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
-        self._yield_s = FLIP_YIELD_S if is_flip(tape) else YIELD_S
+        self._tuck = Tuck(robot, tape) if reaim and flip else None
         # other jumps land flat, within a centimetre or two of what was planned for them
-        self._replan = Replan(robot) if is_flip(tape) else None
-        self._none = np.zeros(len(robot.joint_names))
-        self._tau = self._none
+        self._replan = Replan(robot) if flip else None
+        self._yield_s = FLIP_YIELD_S if flip else YIELD_S
+        self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
+        self._tape_until = self._earliest
+        if self._tuck is not None:
+            self._tape_until = min(self._earliest, round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S))
+        self._none = self._tau = np.zeros(len(robot.joint_names))
+        self.goal, self._stand_s = tape.q[-1], stand_s
         self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
         self.touchdown: int | None = None
 
@@ -78,15 +93,20 @@ class Pilot:
         """QPs posed by the landing controller, and how many of them failed."""
         return self._landing.solves, self._landing.failures
 
-    @property
-    def replanned(self) -> dict | None:
-        """How often the landing of a flip was planned anew, see :meth:`Replan.to_json`."""
-        return None if self._replan is None else self._replan.to_json()
+    def landing_said(self) -> dict:
+        """What the settings of a result say about the landing, and how often that of a flip was planned anew."""
+        return self.ahead.to_json() | {"again": self._replan and self._replan.to_json()}
+
+    def over(self, step: int, fallen_s: float) -> bool:
+        """Whether the robot has stood or lain for long enough, or will never come down."""
+        if self.touchdown is None:
+            return step >= self.last_step
+        return step >= self.touchdown + round((self._stand_s + EXTRA_S) / STEP_S) or fallen_s > AFTER_FALL_S
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` from measured state and vertical foot forces."""
         if self.touchdown is None:
-            if step < (self._earliest if self._tuck is None else min(self._earliest, self._tucked)):
+            if step < self._tape_until:
                 return self._playback.command(step, q, v, self._none)
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, q, v)
@@ -99,16 +119,16 @@ class Pilot:
         return Command(tau=self._tau)
 
     def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
-        left, shift = self._forecast.time_left(q, v), None
-        if self._tuck is not None:
-            shift = self._tuck.shift(step, q, v, left)
+        left, aimed = self.forecast.time_left(q, v), self._none
+        shift = None if self._tuck is None else self._tuck.shift(step, q, v, left)
         if left <= LEAD_S:
             self._look_ahead(step, q, v, left)
-        aimed = self._none
         if self._reaim is not None:
             aimed = self._reaim.correction(q, v, self._error(step, q), None if self._tuck is None else left)
-        command = (self._playback.command(step, q, v, aimed) if shift is None
-                   else self._playback.shifted(step, *shift, q, v, aimed))  # fmt: skip
+        if shift is None:
+            command = self._playback.command(step, q, v, aimed)
+        else:
+            command = self._playback.shifted(step, *shift, q, v, aimed)
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
 
     def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
@@ -119,7 +139,7 @@ class Pilot:
         if left > 0:
             error = self._error(step, q)
             correction = None if self._reaim is None else self._reaim.wish(q, v, error)
-            there = self._forecast.state(q, v, error, correction)
+            there = self.forecast.state(q, v, error, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 
     def _error(self, step: int, q: np.ndarray) -> float:

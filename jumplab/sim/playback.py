@@ -1,8 +1,13 @@
-"""Launch and flight as the paper plays them: the tape goes to the joints, and nothing else does (Sec. VI-B)."""
+"""Launch and flight as the paper plays them: the tape goes to the joints, and nothing else does (Sec. VI-B).
+
+What the motors are told, how late, and what they can give stands here too.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -10,26 +15,40 @@ import pinocchio as pin
 from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim.actuation import Actuators
-from jumplab.sim.world import STEP_S, World
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import planned_pitch
+
+if TYPE_CHECKING:
+    from jumplab.sim.world import World
 
 MODES = ("position", "pd")
+POSITION_GAIN = 0.1  # [1] an error decays in 10 ms, ten control cycles; the torque limit decides the rest
+VELOCITY_GAIN = 1.0  # [1] the wished rate is met within a cycle, as by the inner loop of a drive
 
-# position mode: Bullet's servo asks for the rate  v + POSITION_GAIN * error / step  at the end of each step
-POSITION_GAIN = 0.1  # our choice: an error decays in 10 ms, ten control cycles; the torque limit decides the rest
-VELOCITY_GAIN = 1.0  # our choice: the wished rate is met within a cycle, as the inner loop of a drive does
 
-# pd mode: tau = planned + KP * error + KD * rate error; explicit at 1 kHz, so the damping is bounded by the joint's
-# reflected inertia over the age of a command. On the ground the body's weight makes that inertia large:
-PITCH_KP, PITCH_KD = 800.0, 10.0  # [N m/rad], [N m s/rad] our choice
-ANKLE_KP, ANKLE_KD = 300.0, 3.0  # our choice
-SIDE_KP, SIDE_KD = 300.0, 2.0  # our choice: yaw and roll joints, which only hold
-ARM_KP, ARM_KD = 200.0, 3.0  # our choice: the arm is light
-# In the air the foot alone hangs on the ankle (0.005 kg m^2, 0.002 in roll), and with these gains a delay of 1 to 4 ms
-# makes it swing at 30 rad/s until touchdown. There the errors ask for accelerations, and the inertia of the whole free
-# body turns them into torques: coupled joints then share one bandwidth
-FLIGHT_BANDWIDTH = 100.0  # [rad/s] our choice: 0.55 rad of phase are lost to 4 ms of delay and 1.5 ms of sampling
-FLIGHT_CORNER = 25.0  # [rad/s] stiffness over damping, our choice: a quarter of the bandwidth; 0.78 rad are left
+class Actuators:
+    """Torque limits of all joints at a given speed.
+
+    Full torque up to the corner speed, then a line to zero at the speed limit; against the motion the full torque
+    remains, as in any electric drive.
+    """
+
+    def __init__(self, robot: Robot):
+        rows = [robot.actuators[name] for name in robot.joint_names]
+        self.effort, self.speed, corner, self.lower, self.upper = (
+            np.array([row[key] for row in rows]) for key in ("effort", "speed", "corner_speed", "lower", "upper")
+        )
+        self._slope = 1 / (self.speed - corner)
+
+    def range(self, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest torque (nv - 6,) [N m] at the joint rates ``rate`` [rad/s]."""
+        lower = -self.effort * np.clip((self.speed + rate) * self._slope, 0.0, 1.0)
+        upper = self.effort * np.clip((self.speed - rate) * self._slope, 0.0, 1.0)
+        return lower, upper
+
+    def either_way(self, rate: np.ndarray) -> np.ndarray:
+        """Torque (nv - 6,) [N m] that is available in both directions: the limit given to position servos."""
+        return self.effort * np.clip((self.speed - np.abs(rate)) * self._slope, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -42,84 +61,19 @@ class Command:
     share: float = 1.0  # of the torque limit, for the servo
 
 
-class Playback:
-    """The tape on the 1 ms grid of the simulation, as commands. After its end the last posture is held.
+class Delay:
+    """A line of ``steps`` commands between the controller and the motors; the first command fills it."""
 
-    Parameters
-    ----------
-    mode : "position" (servo with the planned rate fed forward) or "pd" (planned torque plus PD in torque mode).
+    def __init__(self, steps: int):
+        self._line: deque = deque(maxlen=steps + 1)
 
-    Raises
-    ------
-    InputError
-        If the mode is unknown or the tape belongs to another robot.
-    """
-
-    def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):
-        if not isinstance(mode, str) or mode not in MODES:
-            raise InputError(f"mode {quoted(mode)}: must be one of {', '.join(MODES)}")
-        names = tuple(str(n) for n in tape.joint_names)
-        if names != robot.joint_names:
-            raise InputError(f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}")
-        self.mode = mode
-        self.steps = round(float(tape.t[-1]) / STEP_S)
-        grid = np.arange(self.steps + 1) * STEP_S
-        # Bullet's steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
-        self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
-        self._q, self._rate, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v[:, 6:], tape.tau))
-        self._pitch = _resample(grid, tape.t, np.unwrap(_pitch(tape.q))[:, None])[:, 0]
-        self._rest = np.zeros(len(names))
-        self._kp, self._kd = _gains(robot)
-        self._model, self._data = robot.model, robot.model.createData()
-        self._takeoff = round(tape.takeoff_time / STEP_S)
-        self._corrected = self._rest
-
-    def shifted(
-        self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction: np.ndarray
-    ) -> Command:
-        """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
-        at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
-        if at >= self.steps:
-            return self.command(self.steps, q, v, correction)
-        ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
-        rate = (1 + pace) * rate
-        if self.mode == "position":
-            return Command(q=ahead + correction, rate=rate)
-        change, self._corrected = (correction - self._corrected) / STEP_S, correction
-        wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * (angles + correction - q[7:]) + rate + change - v[6:])
-        return Command(tau=tau + self._inertia(q) @ wish)
-
-    def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
-        """Command for one step; the measured state is read in "pd" mode only, ``correction`` is added to the angles."""
-        now = min(step, self.steps)
-        holding = step >= self.steps
-        if self.mode == "position":
-            # the servo steers to the rate that is due at the end of the step
-            rate = self._rest if holding else self._rate[min(step + 1, self.steps)]
-            return Command(q=self._ahead[now] + correction, rate=rate)
-        rate = self._rest if holding else self._rate[now]
-        rate = rate + (correction - self._corrected) / STEP_S
-        self._corrected = correction
-        error, rate_error = self._q[now] + correction - q[7:], rate - v[6:]
-        if step < self._takeoff:
-            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error)
-        wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * error + rate_error)
-        return Command(tau=self._tau[now] + self._inertia(q) @ wish)
-
-    def _inertia(self, q: np.ndarray) -> np.ndarray:
-        """Torques per joint acceleration (nv - 6, nv - 6) of the free body [kg m^2]."""
-        upper = pin.crba(self._model, self._data, q)
-        whole = np.triu(upper) + np.triu(upper, 1).T
-        lever = whole[:6, 6:]
-        return whole[6:, 6:] - lever.T @ np.linalg.solve(whole[:6, :6], lever)
-
-    def trunk_pitch(self, step: int) -> float:
-        """Planned trunk pitch [rad], continuous through full turns."""
-        return float(self._pitch[min(step, self.steps)])
+    def __call__(self, command: Command) -> Command:
+        self._line.extend([command] * (1 if self._line else self._line.maxlen))
+        return self._line[0]
 
 
 class Motors:
-    """Turns commands into torques within the limits, and remembers what was really applied."""
+    """Turns commands into torques within the limits; ``gain`` is joint -> torque delivered per torque commanded."""
 
     def __init__(self, robot: Robot, gain: dict[str, float]):
         self.actuators = Actuators(robot)
@@ -141,6 +95,101 @@ class Motors:
         return tau
 
 
+@dataclass(frozen=True)
+class PdGains:
+    """Gains of the "pd" mode; the paper prints none.
+
+    On the ground tau = planned + kp * error + kd * rate error, explicit at 1 kHz: the damping is bounded by the joint's
+    reflected inertia over the age of a command. In the air the foot alone hangs on the ankle, and such gains would make
+    it swing; there the errors ask for accelerations, which the inertia of the free body turns into torques.
+    """
+
+    pitch: tuple[float, float] = (800.0, 10.0)  # kp, kd [N m/rad, N m s/rad]
+    ankle: tuple[float, float] = (300.0, 3.0)
+    side: tuple[float, float] = (300.0, 2.0)  # yaw and roll joints, which only hold
+    arm: tuple[float, float] = (200.0, 3.0)  # the arm is light
+    flight_bandwidth: float = 100.0  # [rad/s] 4 ms of delay and 1.5 ms of sampling cost 0.55 rad of phase
+    flight_corner: float = 25.0  # [rad/s] stiffness over damping; 0.78 rad of phase are left
+
+    def of(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """kp and kd of every joint (nv - 6,)."""
+        role = {name: role for role, pair in robot.joints.items() for name in pair}
+        special = {"ankle_pitch": self.ankle, "shoulder_pitch": self.arm, None: self.side}
+        return tuple(np.array([special.get(role.get(n), self.pitch) for n in robot.joint_names]).T)
+
+
+GAINS = PdGains()
+
+
+class Playback:
+    """The tape on the 1 ms grid of the simulation, as commands. After its end the last posture is held.
+
+    In ``mode`` "position" a servo follows it, the planned rate fed forward; in "pd" the planned torque is commanded,
+    plus PD. Raises :class:`InputError` if the mode is unknown or the tape belongs to another robot.
+    """
+
+    def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):
+        if not isinstance(mode, str) or mode not in MODES:
+            raise InputError(f"mode {quoted(mode)}: must be one of {', '.join(MODES)}")
+        names = tuple(str(n) for n in tape.joint_names)
+        if names != robot.joint_names:
+            raise InputError(f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}")
+        self.mode = mode
+        self.steps = round(float(tape.t[-1]) / STEP_S)
+        grid = np.arange(self.steps + 1) * STEP_S
+        # the engine's steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
+        self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
+        self._q, self._rate, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v[:, 6:], tape.tau))
+        self._pitch = np.interp(grid, tape.t, planned_pitch(tape.q))
+        self._rest = self._corrected = np.zeros(len(names))
+        self._kp, self._kd = GAINS.of(robot)
+        self._model, self._data = robot.model, robot.model.createData()
+        self._takeoff = round(tape.takeoff_time / STEP_S)
+
+    def shifted(
+        self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction: np.ndarray
+    ) -> Command:
+        """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
+        at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
+        if at >= self.steps:
+            return self.command(self.steps, q, v, correction)
+        ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
+        rate = (1 + pace) * rate
+        if self.mode == "position":
+            return Command(q=ahead + correction, rate=rate)
+        wish = GAINS.flight_corner * (angles + correction - q[7:]) + rate + self._correction_rate(correction) - v[6:]
+        return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish))
+
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
+        """Command for one step; the measured state is read in "pd" mode only, ``correction`` is added to the angles."""
+        now, holding = min(step, self.steps), step >= self.steps
+        if self.mode == "position":
+            # the servo steers to the rate that is due at the end of the step
+            rate = self._rest if holding else self._rate[min(step + 1, self.steps)]
+            return Command(q=self._ahead[now] + correction, rate=rate)
+        rate = self._rest if holding else self._rate[now]
+        error, rate_error = self._q[now] + correction - q[7:], rate + self._correction_rate(correction) - v[6:]
+        if step < self._takeoff:
+            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error)
+        wish = GAINS.flight_bandwidth * (GAINS.flight_corner * error + rate_error)
+        return Command(tau=self._tau[now] + self._inertia(q) @ wish)
+
+    def _correction_rate(self, correction: np.ndarray) -> np.ndarray:
+        change, self._corrected = (correction - self._corrected) / STEP_S, correction
+        return change
+
+    def _inertia(self, q: np.ndarray) -> np.ndarray:
+        """Torques per joint acceleration (nv - 6, nv - 6) of the free body [kg m^2]."""
+        upper = pin.crba(self._model, self._data, q)
+        whole = np.triu(upper) + np.triu(upper, 1).T
+        lever = whole[:6, 6:]
+        return whole[6:, 6:] - lever.T @ np.linalg.solve(whole[:6, :6], lever)
+
+    def trunk_pitch(self, step: int) -> float:
+        """Planned trunk pitch [rad], continuous through full turns."""
+        return float(self._pitch[min(step, self.steps)])
+
+
 def _resample(grid: np.ndarray, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(grid, t, c) for c in columns.T], axis=1)
 
@@ -149,15 +198,3 @@ def _between(rows: np.ndarray, at: float) -> np.ndarray:
     """The row (k,) at a place between two."""
     low = min(int(at), len(rows) - 2)
     return rows[low] + (at - low) * (rows[low + 1] - rows[low])
-
-
-def _pitch(q: np.ndarray) -> np.ndarray:
-    """Pitch (N,) of a base that turns about y only [rad]."""
-    return 2 * np.arctan2(q[:, 4], q[:, 6])
-
-
-def _gains(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    role = {name: role for role, pair in robot.joints.items() for name in pair}
-    special = {"ankle_pitch": (ANKLE_KP, ANKLE_KD), "shoulder_pitch": (ARM_KP, ARM_KD), None: (SIDE_KP, SIDE_KD)}
-    kp, kd = zip(*(special.get(role.get(n), (PITCH_KP, PITCH_KD)) for n in robot.joint_names), strict=True)
-    return np.array(kp), np.array(kd)

@@ -1,9 +1,7 @@
-"""A landing planned anew while it goes on: the impact of a flip leaves the robot elsewhere than its plan expected.
+"""The landing to follow: planned in flight for the touchdown that is forecast, and in a flip again while it goes on.
 
-The soles of a backflip tilt up, the ankles meet their stop, and for a tenth of a second the ground pushes at the toes
-only. What stage 1 planned for flat soles is then off by 5 cm and more, and a controller that still follows it pushes
-CoM and trunk towards places that this robot cannot hold. From the measured state the rest is planned as the landing
-was: it takes its time too, so the robot follows the older plan until the newer one is there.
+The impact of a flip leaves the robot elsewhere than its plan expected. From the measured state the rest is planned as
+the landing was; that takes its time too, so the robot follows the older plan until the newer one is there.
 """
 
 from __future__ import annotations
@@ -11,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import thread_time
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -19,51 +16,35 @@ import pinocchio as pin
 from jumplab.errors import JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge, pitched, rotation
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
 from jumplab.task import GRAVITY
 
-# reference ------------------------------------------------------------------------------------------
-LEAD_S = 0.15  # our choice: three times what the solve takes on one core of a laptop
-KEPT_PLANNERS = 4  # our choice: robots of one session; a planner holds a few megabytes
-
-
-class Reference(Protocol):
-    """A planned landing: anything that knows its CoM and momentum at a time, as :class:`LandingReference` does."""
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,) from the middle of the soles, its velocity (2,), and L about the pitch axis."""
-
-    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
-        """CoM acceleration (2,) [m/s^2] and rate of L [N m]."""
+# The paper prints none of these numbers.
+LEAD_S = 0.15  # before touchdown a landing is planned: three times what the solve takes on one core of a laptop
+KEPT_PLANNERS = 4  # robots of one session; a planner holds a few megabytes
+FIRST_S = 0.15  # after touchdown it is planned again; before, the soles of flips are tilted, and a plan knows flat ones
+EVERY_S = 0.10  # twice what a solve takes
+UNTIL_S = 1.2  # the longest landing that is planned; afterwards the controller leads to the stance
+LATENCY_S = 0.05  # before a new plan is followed, about what its solve takes
+OFF_M = 0.03  # of the capture point; less is what the controller's own feedback mends
+LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot is still told
 
 
 @dataclass(frozen=True)
 class LandingReference:
-    """A landing to follow, sampled: CoM from the middle between the soles.
+    """A landing to follow, sampled: CoM from the middle between the soles; what is None is not fed forward."""
 
-    Attributes
-    ----------
-    t : (N,) time since touchdown [s]; the last sample holds for ever.
-    com, com_velocity : (N, 2) x and z [m, m/s].
-    L : (N,) angular momentum about the pitch axis [kg m^2/s].
-    com_acceleration, L_rate : (N, 2), (N,) what is fed forward [m/s^2, N m]; nothing is if None.
-    """
+    t: np.ndarray  # (N,) time since touchdown [s]; the last sample holds for ever
+    com: np.ndarray  # (N, 2) x and z [m]
+    com_velocity: np.ndarray  # (N, 2) [m/s]
+    L: np.ndarray  # (N,) angular momentum about the pitch axis [kg m^2/s]
+    com_acceleration: np.ndarray | None = None  # (N, 2) [m/s^2]
+    L_rate: np.ndarray | None = None  # (N,) [N m]
 
-    t: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    L: np.ndarray
-    com_acceleration: np.ndarray | None = None
-    L_rate: np.ndarray | None = None
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,), its velocity (2,) and momentum at ``time`` since touchdown."""
-        x, z, dx, dz, momentum = (
-            np.interp(time, self.t, column) for column in (*self.com.T, *self.com_velocity.T, self.L)
-        )
-        return np.array([x, z]), np.array([dx, dz]), float(momentum)
+    at = LandingPlan.at
 
     def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
         """CoM acceleration (2,) and rate of L at ``time`` since touchdown, zero after the last sample."""
@@ -75,8 +56,24 @@ class LandingReference:
         return push, twist
 
 
-LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
+@dataclass(frozen=True)
+class Rest:
+    """The rest of a landing."""
 
+    plan: Reference
+    began: float  # the plan's time zero, since touchdown [s]
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
+        return self.plan.at(max(time - self.began, 0.0))
+
+    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
+        """CoM acceleration (2,) and rate of L at ``time`` since touchdown."""
+        return self.plan.feed_forward(max(time - self.began, 0.0))
+
+
+Reference = LandingReference | LandingPlan | Rest  # or whatever knows ``at`` and ``feed_forward``
+LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
 _planners: dict[str, LandingPlanner] = {}
 
 
@@ -90,30 +87,19 @@ def landing_planner(robot: Robot) -> LandingPlanner:
 
 
 class Forecast:
-    """The touchdown that a measured flight leads to.
-
-    Parameters
-    ----------
-    robot, tape : as planned; the tape's last row is the posture to land in.
-    scene : ground.
-    """
+    """The touchdown that a measured flight leads to; the last row of the planned ``tape`` is the posture to land in."""
 
     def __init__(self, robot: Robot, tape: Tape, scene: Scene):
-        self._robot, self._model, self._data, self._scene = robot, robot.model, robot.model.createData(), scene
-        self._frames = [self._model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+        self._gauge, self._scene = Gauge(robot), scene
         self._q, self._v = tape.q[-1].copy(), tape.v[-1].copy()
-        com, soles = self._com_and_soles(self._q)
+        com, soles = self._gauge.com(self._q), self._gauge.soles(self._q)
         self._above, self._ahead = float(com[2] - soles[2]), float(soles[0] - com[0])
-
-    def _com_and_soles(self, q) -> tuple[np.ndarray, np.ndarray]:
-        com = pin.centerOfMass(self._model, self._data, q, False).copy()
-        pin.framesForwardKinematics(self._model, self._data, q)
-        return com, np.mean([self._data.oMf[f].act(self._robot.foot.center) for f in self._frames], axis=0)
 
     def time_left(self, q: np.ndarray, v: np.ndarray) -> float:
         """Time until the soles meet the ground [s], from a measured state in flight; inf if they never do."""
-        pin.centerOfMass(self._model, self._data, q, v)
-        (x, _, z), (vx, _, vz) = self._data.com[0], self._data.vcom[0]
+        data = self._gauge.data
+        pin.centerOfMass(self._gauge.model, data, q, v)
+        (x, _, z), (vx, _, vz) = data.com[0], data.vcom[0]
         left = 0.0
         for _ in range(2):  # the ground's height depends on where, and so on when
             drop = z - self._above - self._scene.top_at(x + vx * left + self._ahead)
@@ -128,22 +114,17 @@ class Forecast:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured state in flight.
 
-        Parameters
-        ----------
-        pitch_error : of the trunk, now [rad]; it stays.
-        correction : (nv - 6,) angles that will have been added to the tape by then.
+        The trunk's ``pitch_error`` [rad] stays; ``correction`` (nv - 6,) will have been added to the tape by then.
         """
-        model, data = self._model, self._data
+        model, data = self._gauge.model, self._gauge.data
         pin.ccrba(model, data, q, v)
         speed, momentum = data.vcom[0].copy(), data.hg.angular[1]
         speed[2] -= GRAVITY * self.time_left(q, v)
-        end, rates = self._q.copy(), self._v.copy()
-        turn = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch_error, 0.0))
-        end[3:7] = (turn * pin.Quaternion(end[6], end[3], end[4], end[5])).coeffs()
+        end, rates = pitched(self._q, pitch_error), self._v.copy()
         if correction is not None:
             end[7:] += correction
         # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM flies on
-        attitude = pin.Quaternion(end[6], end[3], end[4], end[5]).toRotationMatrix()
+        attitude = rotation(end[3:7])
         pin.ccrba(model, data, end, rates)
         spin = np.array([0.0, (momentum - data.hg.angular[1]) / data.Ig.inertia[1, 1], 0.0])
         rates[3:6] += attitude.T @ spin
@@ -154,16 +135,10 @@ class Forecast:
 
 @dataclass
 class LandingAhead:
-    """Where the landing controller's reference comes from, and what became of it.
+    """Where the landing controller's reference comes from, and what became of it."""
 
-    Attributes
-    ----------
-    source : "planned" in flight by stage 1, "spring" (spring-dampers to the stance) or "given" by the caller.
-    followed : what was really followed, once decided; "spring" also if the planner found no landing.
-    """
-
-    source: str
-    followed: str | None = None
+    source: str  # "planned" in flight by stage 1, "spring" (spring-dampers to the stance) or "given" by the caller
+    followed: str | None = None  # really, once decided; "spring" also if the planner found no landing
     planned_s: float | None = None
     time_left_s: float | None = None
     solve_s: float | None = None
@@ -185,58 +160,20 @@ class LandingAhead:
     def to_json(self) -> dict:
         """What the settings of a result say."""
         in_time = None if self.solve_s is None else self.solve_s <= max(0.0, self.time_left_s)
-        return {
-            "asked": self.source, "followed": self.followed or self.source, "planned_at_s": self.planned_s,
-            "time_left_s": self.time_left_s, "solve_s": self.solve_s, "in_time": in_time, "reason": self.reason,
-        }  # fmt: skip
-
-
-# replan ------------------------------------------------------------------------------------------
-FIRST_S = 0.15  # our choice: after touchdown; before, the soles of flips are still tilted, and a plan knows flat ones
-EVERY_S = 0.10  # our choice: twice what a solve takes
-UNTIL_S = 1.2  # our choice: the longest landing that is planned; afterwards the controller leads to the stance
-LATENCY_S = 0.05  # our choice: before a new plan is followed, about what its solve takes
-OFF_M = 0.03  # our choice: of the capture point; less is what the controller's own feedback mends
-LEAST_HEIGHT_M = 0.3  # our choice: of the CoM, where the capture point of a squatting robot is still told
-
-
-@dataclass(frozen=True)
-class Rest:
-    """The rest of a landing.
-
-    Attributes
-    ----------
-    plan : its time begins with zero.
-    began : its time zero, since touchdown [s].
-    """
-
-    plan: Reference
-    began: float
-
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """CoM (2,), its velocity (2,) and L at ``time`` since touchdown."""
-        return self.plan.at(max(time - self.began, 0.0))
-
-    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
-        """CoM acceleration (2,) and rate of L at ``time`` since touchdown."""
-        return self.plan.feed_forward(max(time - self.began, 0.0))
+        times = dict(planned_at_s=self.planned_s, time_left_s=self.time_left_s, solve_s=self.solve_s, in_time=in_time)
+        return dict(asked=self.source, followed=self.followed or self.source, **times, reason=self.reason)
 
 
 class Replan:
     """Hands out the landing to follow: the one from before the touchdown, or the latest one planned after it.
 
-    Attributes
-    ----------
-    made, refused : counts of plans, and of states from which stage 1 found none.
-    slowest_s : the longest solve [s] of processor time.
+    ``made`` counts plans, ``refused`` states from which stage 1 found none; ``slowest_s`` is the longest solve [s].
     """
 
     def __init__(self, robot: Robot):
-        self._robot = robot
+        self._robot, self._due = robot, FIRST_S
         self._next: Rest | None = None
-        self._due = FIRST_S
-        self.made = self.refused = 0
-        self.slowest_s = 0.0
+        self.made, self.refused, self.slowest_s = 0, 0, 0.0
 
     def follow(self, time: float, q: np.ndarray, v: np.ndarray, reference: Reference) -> Reference:
         """What to follow at ``time`` since touchdown [s] from the measured state; ``reference`` is followed so far."""

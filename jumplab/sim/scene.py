@@ -1,4 +1,4 @@
-"""What the robot stands and lands on: boxes with flat tops and real edges."""
+"""What the robot stands and lands on, boxes with flat tops and real edges; and what it touches."""
 
 from __future__ import annotations
 
@@ -6,11 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 
-REACH_M = 20.0  # our choice: half-size of "endless" ground, far beyond any jump
-THICKNESS_M = 1.0  # our choice: deeper than any contact can push a foot in one step
+REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
+THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What touched in one step."""
+
+    wrench: np.ndarray  # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
+    touching: frozenset[str]  # the robot's links that press on the ground
+    colliding: frozenset[tuple[str, str]]  # pairs of the robot's links that press on each other
 
 
 @dataclass(frozen=True)

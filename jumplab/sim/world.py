@@ -1,7 +1,6 @@
-"""The PyBullet world: ground with edges, the robot from its own URDF, honest contact, honest actuators.
+"""The PyBullet world: ground with edges, the robot from its own URDF, contact and actuators as stated.
 
-The step is 1 ms, the paper's control cycle, without substeps. Everything outside this file speaks Pinocchio: ``q`` and
-``v`` of the base *link* frame and the joints in Pinocchio's order.
+Everything outside this file speaks Pinocchio: ``q`` and ``v`` of the base *link* frame, joints in Pinocchio's order.
 """
 
 from __future__ import annotations
@@ -10,38 +9,62 @@ import contextlib
 import os
 import tempfile
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import JumplabError, RobotError
 from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import FRICTION
-from jumplab.sim.scene import REACH_M, Scene
+from jumplab.sim.scene import REACH_M, Block, Contacts, Scene
 from jumplab.task import GRAVITY
 
 
-# engine ------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class EngineSettings:
+    """What the engine is told; the paper prints none of these numbers."""
+
+    solver_iterations: int = 1000  # with 200, what is left unsolved tips the robot sideways by 2.5 mrad
+    contact_erp: float = 0.1  # [1] a deep penetration fades in 10 ms; with the default 0.2, feet bounce off an impact
+    contact_slop_m: float = 1e-4  # boxes rest this deep; at zero, rounding breaks the contact of a light toe
+    ground_friction: float = 1.0  # friction combines as a product: the robot's coefficient is the effective one
+    tangles: int = 20  # postures tried until links are in each other; for a humanoid the first one does
+    fastest: float = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
+
+
+SETTINGS = EngineSettings()
+
+
 def _import_quietly() -> ModuleType:
     """Import pybullet with file descriptor 2, to which its C code greets, muted for the moment."""
-    try:
-        keep, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    except OSError:  # no standard error to protect
-        import pybullet
-
-        return pybullet
-    try:
-        os.dup2(nowhere, 2)
-        import pybullet
-    finally:
-        os.dup2(keep, 2)
-        os.close(keep)
-        os.close(nowhere)
-    return pybullet
+    with contextlib.ExitStack() as undo:
+        with contextlib.suppress(OSError):  # no standard error to protect
+            keep, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+            undo.callback(os.close, keep)
+            undo.callback(os.close, nowhere)
+            os.dup2(nowhere, 2)
+            undo.callback(os.dup2, keep, 2)
+        return import_module("pybullet")
 
 
 bullet = _import_quietly()
+
+
+class _Client:
+    """The functions and constants of PyBullet, each function for one of its worlds."""
+
+    def __init__(self, number: int):
+        self._number = number
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(bullet, name)
+        return partial(value, physicsClientId=self._number) if callable(value) else value
 
 
 def load_urdf(urdf: str, name: str, client: int, flags: int = 0) -> int:
@@ -61,60 +84,27 @@ def load_urdf(urdf: str, name: str, client: int, flags: int = 0) -> int:
             os.remove(path)
 
 
-# world ------------------------------------------------------------------------------------------
-STEP_S = 0.001  # paper, Sec. VI-A: control cycle 1 ms
-SOLVER_ITERATIONS = 1000  # our choice: with 200, what is left unsolved tips the robot sideways by 2.5 mrad
-CONTACT_ERP = 0.1  # our choice: a deep penetration fades in 10 ms; the default 0.2 makes feet bounce off an impact
-CONTACT_SLOP_M = 1e-4  # our choice: boxes rest this deep; at zero, rounding would break the contact of a light toe
-GROUND_FRICTION = 1.0  # friction combines as a product, so the robot's own coefficient is the effective one
-TANGLES = 20  # our choice: postures tried until links are in each other; for a humanoid the first one does
-UNLIMITED_RATE = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """What touched in the last step.
-
-    Attributes
-    ----------
-    wrench : (2, 6) force and moment on each foot from the ground, world axes, at the origin of the foot link [N, N m].
-    touching : names of the robot's links that press on the ground.
-    colliding : pairs of the robot's links that press on each other.
-    """
-
-    wrench: np.ndarray
-    touching: frozenset[str]
-    colliding: frozenset[tuple[str, str]]
-
-
 def base_to_bullet(
     q: np.ndarray, v: np.ndarray, lever: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pinocchio base state to Bullet's: position and orientation of the base's CoM, world velocity of it, world rate.
+    """Pinocchio base state to Bullet's: position [m], orientation x y z w, velocity [m/s] and rate [rad/s] of its CoM.
 
-    Parameters
-    ----------
-    q, v : configuration and velocity, of which the first 7 and 6 entries are read (link frame, twist in its own axes).
-    lever : (3,) CoM of the base link in its link frame [m].
-
-    Returns
-    -------
-    (3,) position [m], (4,) quaternion x y z w, (3,) velocity [m/s], (3,) angular velocity [rad/s], all in the world.
+    ``q`` (7,), ``v`` (6,) : pose of the link frame and twist in its own axes, further entries unread; ``lever`` (3,) :
+    CoM of the base link in its link frame [m]. What is returned is in world axes.
     """
-    rotation = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
-    velocity = rotation @ (v[:3] + pin.skew(v[3:6]) @ lever)
-    return q[:3] + rotation @ lever, q[3:7].copy(), velocity, rotation @ v[3:6]
+    attitude = rotation(q[3:7])
+    velocity = attitude @ (v[:3] + pin.skew(v[3:6]) @ lever)
+    return q[:3] + attitude @ lever, q[3:7].copy(), velocity, attitude @ v[3:6]
 
 
 def base_from_bullet(
     position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray, rate: np.ndarray, lever: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of :func:`base_to_bullet`: base part of Pinocchio's ``q`` (7,) and ``v`` (6,)."""
-    x, y, z, w = quaternion
-    rotation = pin.Quaternion(w, x, y, z).toRotationMatrix()
-    local_rate = rotation.T @ rate
-    local_velocity = rotation.T @ velocity - pin.skew(local_rate) @ lever
-    return np.concatenate([position - rotation @ lever, quaternion]), np.concatenate([local_velocity, local_rate])
+    attitude = rotation(quaternion)
+    local_rate = attitude.T @ rate
+    local_velocity = attitude.T @ velocity - pin.skew(local_rate) @ lever
+    return np.concatenate([position - attitude @ lever, quaternion]), np.concatenate([local_velocity, local_rate])
 
 
 class World:
@@ -122,7 +112,7 @@ class World:
 
     Parameters
     ----------
-    robot : the robot as it really is (perturbed, if at all).
+    robot : the robot as it really is (perturbed, if at all). The names of its links are ``links``, the base first.
     q, v : initial configuration (nq,) and velocity (nv,), rest if ``v`` is None. Set once; nothing is ever reset.
     friction : effective coefficient between robot and ground.
 
@@ -135,13 +125,14 @@ class World:
     def __init__(self, robot: Robot, q: np.ndarray, v=None, *, scene: Scene | None = None, friction: float = FRICTION):
         self.robot, self.scene, self._beyond_sole = robot, scene or Scene.flat(), 0.0
         self._client = bullet.connect(bullet.DIRECT)
+        self._bullet = _Client(self._client)
         try:
-            self._engine_settings()
+            self._set_engine()
             self._ground = [self._add_block(b) for b in self.scene.blocks]
             self._body = self._load(robot.urdf)
             self._index_links()
             self._set_dynamics(friction)
-            self._motors_off()
+            self.release()
             self._solid = self._feels_itself()
             self._place(np.asarray(q, float), np.zeros(robot.model.nv) if v is None else np.asarray(v, float))
         except BaseException:
@@ -157,146 +148,132 @@ class World:
     def close(self) -> None:
         """Free the engine."""
         if self._client is not None:
-            bullet.disconnect(physicsClientId=self._client)
+            self._bullet.disconnect()
             self._client = None
 
-    # building --------------------------------------------------------------------------------------------------
+    def _set_engine(self) -> None:
+        s = SETTINGS
+        contact = dict(contactERP=s.contact_erp, contactSlop=s.contact_slop_m, deterministicOverlappingPairs=1)
+        steps = dict(fixedTimeStep=STEP_S, numSubSteps=0, numSolverIterations=s.solver_iterations)
+        self._bullet.setGravity(0, 0, -GRAVITY)
+        self._bullet.setPhysicsEngineParameter(**steps, **contact)
 
-    def _engine_settings(self) -> None:
-        bullet.setGravity(0, 0, -GRAVITY, physicsClientId=self._client)
-        bullet.setPhysicsEngineParameter(
-            fixedTimeStep=STEP_S, numSubSteps=0, numSolverIterations=SOLVER_ITERATIONS, contactERP=CONTACT_ERP,
-            contactSlop=CONTACT_SLOP_M, deterministicOverlappingPairs=1, physicsClientId=self._client)  # fmt: skip
-
-    def _add_block(self, block) -> int:
+    def _add_block(self, block: Block) -> int:
         half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
-        shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=self._client)
+        shape = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
         centre = [(block.x_from + block.x_to) / 2, 0, block.top - block.thickness / 2]
-        body = bullet.createMultiBody(0, shape, basePosition=centre, physicsClientId=self._client)
-        bullet.changeDynamics(body, -1, lateralFriction=GROUND_FRICTION, physicsClientId=self._client)
-        bullet.changeDynamics(body, -1, restitution=0.0, physicsClientId=self._client)
+        body = self._bullet.createMultiBody(0, shape, basePosition=centre)
+        self._bullet.changeDynamics(body, -1, lateralFriction=SETTINGS.ground_friction)
+        self._bullet.changeDynamics(body, -1, restitution=0.0)
         return body
 
     def _load(self, urdf: str) -> int:
         return load_urdf(urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
 
     def _index_links(self) -> None:
-        count = bullet.getNumJoints(self._body, physicsClientId=self._client)
-        info = [bullet.getJointInfo(self._body, i, physicsClientId=self._client) for i in range(count)]
+        info = [self._bullet.getJointInfo(self._body, i) for i in range(self._bullet.getNumJoints(self._body))]
         by_joint = {row[1].decode(): i for i, row in enumerate(info)}
-        base = bullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
+        base = self._bullet.getBodyInfo(self._body)[0].decode()
         self.links = (base, *(row[12].decode() for row in info))  # Bullet's link i is links[i + 1]
         self._joints = [by_joint[name] for name in self.robot.joint_names]
         self._feet = {self.links.index(name) - 1: side for side, name in enumerate(self.robot.foot.frames)}
-        dynamics = bullet.getDynamicsInfo(self._body, -1, physicsClientId=self._client)
+        dynamics = self._bullet.getDynamicsInfo(self._body, -1)
         self._lever, tilt = np.array(dynamics[3]), dynamics[4]
         if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(f"robot {self.robot.name}: the inertial frame of {base} is turned; align it with its link")
 
+    def _dynamics(self) -> list[tuple]:
+        """What the engine has about each link: mass [kg], friction, and more."""
+        return [self._bullet.getDynamicsInfo(self._body, i - 1) for i in range(len(self.links))]
+
     def _set_dynamics(self, friction: float) -> None:
-        client, links = {"physicsClientId": self._client}, range(-1, len(self.links) - 1)
-        for link in links:
-            bullet.changeDynamics(
-                self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0,
-                maxJointVelocity=UNLIMITED_RATE, restitution=0.0, **client)  # fmt: skip
-            bullet.changeDynamics(self._body, link, lateralFriction=friction, **client)  # ignored if in the call above
-        total = 0.0
-        for link in links:
-            dynamics = bullet.getDynamicsInfo(self._body, link, **client)
-            total += dynamics[0]
-            if abs(dynamics[1] - friction) > 1e-9:
-                name = self.links[link + 1]
-                raise JumplabError(f"PyBullet kept friction {dynamics[1]:g} on {name} where {friction:g} was set")
+        change = partial(self._bullet.changeDynamics, self._body)
+        for link in range(-1, len(self.links) - 1):
+            still = dict(linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, restitution=0.0)
+            change(link, maxJointVelocity=SETTINGS.fastest, **still)
+            change(link, lateralFriction=friction)  # ignored if in the call above
+        for name, found in self.friction.items():
+            if abs(found - friction) > 1e-9:
+                raise JumplabError(f"PyBullet kept friction {found:g} on {name} where {friction:g} was set")
+        total = sum(row[0] for row in self._dynamics())
         if abs(total - self.robot.total_mass) > 1e-6:
             raise JumplabError(f"PyBullet's robot weighs {total:.4f} kg, Pinocchio's {self.robot.total_mass:.4f} kg")
 
-    def _motors_off(self) -> None:
-        zero = [0.0] * len(self._joints)
-        bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.VELOCITY_CONTROL, targetVelocities=zero, forces=zero,
-            physicsClientId=self._client)  # fmt: skip
-
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
-        client = {"physicsClientId": self._client}
         position, quaternion, velocity, rate = base_to_bullet(q, v, self._lever)
-        bullet.resetBasePositionAndOrientation(self._body, position, quaternion, **client)
-        bullet.resetBaseVelocity(self._body, velocity, rate, **client)
+        self._bullet.resetBasePositionAndOrientation(self._body, position, quaternion)
+        self._bullet.resetBaseVelocity(self._body, velocity, rate)
         for joint, angle, speed in zip(self._joints, q[7:], v[6:], strict=True):
-            bullet.resetJointState(self._body, joint, float(angle), float(speed), **client)
+            self._bullet.resetJointState(self._body, joint, float(angle), float(speed))
 
     def _feels_itself(self) -> bool:
         """Whether the engine notices links in each other: tangles the robot, before it is placed for the run."""
-        client, rng = {"physicsClientId": self._client}, np.random.default_rng(0)
-        bullet.resetBasePositionAndOrientation(self._body, [0.0, 0.0, REACH_M], [0.0, 0.0, 0.0, 1.0], **client)
-        for _ in range(TANGLES):
+        rng = np.random.default_rng(0)
+        self._bullet.resetBasePositionAndOrientation(self._body, [0.0, 0.0, REACH_M], [0.0, 0.0, 0.0, 1.0])
+        for _ in range(SETTINGS.tangles):
             for joint, angle in zip(self._joints, rng.uniform(-np.pi, np.pi, len(self._joints)), strict=True):
-                bullet.resetJointState(self._body, joint, angle, **client)
-            bullet.performCollisionDetection(**client)
-            if bullet.getContactPoints(bodyA=self._body, bodyB=self._body, **client):
+                self._bullet.resetJointState(self._body, joint, angle)
+            self._bullet.performCollisionDetection()
+            if self._bullet.getContactPoints(bodyA=self._body, bodyB=self._body):
                 return True
         return False
-
-    # running ---------------------------------------------------------------------------------------------------
 
     @property
     def friction(self) -> dict[str, float]:
         """Friction coefficient of every link as the engine has it."""
-        rows = (bullet.getDynamicsInfo(self._body, i - 1, physicsClientId=self._client) for i in range(len(self.links)))
-        return {name: row[1] for name, row in zip(self.links, rows, strict=True)}
+        return {name: row[1] for name, row in zip(self.links, self._dynamics(), strict=True)}
 
     def read_back(self) -> dict:
         """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg],
         whether links collide with each other, and how far beyond the stated sole a foot ever touched [m]."""
-        client = {"physicsClientId": self._client}
-        ground = [bullet.getDynamicsInfo(block, -1, **client)[1] for block in self._ground]
-        feet = [bullet.getDynamicsInfo(self._body, link, **client)[1] for link in self._feet]
-        masses = (bullet.getDynamicsInfo(self._body, i - 1, **client)[0] for i in range(len(self.links)))
-        friction = sorted({foot * block for foot in feet for block in ground})
-        return {"friction": friction, "mass_kg": sum(masses), "self_collision": self._solid,
-                "beyond_sole_m": self._beyond_sole}  # fmt: skip
+        ground = [self._bullet.getDynamicsInfo(block, -1)[1] for block in self._ground]
+        friction = sorted({self.friction[foot] * block for foot in self.robot.foot.frames for block in ground})
+        mass = sum(row[0] for row in self._dynamics())
+        return dict(friction=friction, mass_kg=mass, self_collision=self._solid, beyond_sole_m=self._beyond_sole)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
-        client = {"physicsClientId": self._client}
-        pose = bullet.getBasePositionAndOrientation(self._body, **client)
-        twist = bullet.getBaseVelocity(self._body, **client)
+        pose = self._bullet.getBasePositionAndOrientation(self._body)
+        twist = self._bullet.getBaseVelocity(self._body)
         base_q, base_v = base_from_bullet(*(np.array(x) for x in (*pose, *twist)), self._lever)
-        joints = np.array([row[:2] for row in bullet.getJointStates(self._body, self._joints, **client)])
+        joints = np.array([row[:2] for row in self._bullet.getJointStates(self._body, self._joints)])
         return np.concatenate([base_q, joints[:, 0]]), np.concatenate([base_v, joints[:, 1]])
+
+    def _command(self, control: int, **targets) -> None:
+        self._bullet.setJointMotorControlArray(self._body, self._joints, control, **targets)
 
     def command_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]; the caller clips."""
-        bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau.tolist(),
-                                         physicsClientId=self._client)  # fmt: skip
+        self._command(bullet.TORQUE_CONTROL, forces=tau.tolist())
 
     def command_position(
         self, q: np.ndarray, rate: np.ndarray, limit: np.ndarray, position_gain: float, velocity_gain: float
     ) -> None:
-        """Position servo of every joint for the next steps: target angle, its rate, largest torque (each (nv - 6,))."""
-        n = len(self._joints)
-        bullet.setJointMotorControlArray(
-            self._body, self._joints, bullet.POSITION_CONTROL, targetPositions=q.tolist(),
-            targetVelocities=rate.tolist(), forces=limit.tolist(), positionGains=[position_gain] * n,
-            velocityGains=[velocity_gain] * n, physicsClientId=self._client)  # fmt: skip
+        """Position servo of every joint for the next steps: target angle, its rate, largest torque (each (nv - 6,)).
+
+        At the end of each step the servo asks for the rate ``velocity_gain * rate + position_gain * error / step``.
+        """
+        gains = dict(positionGains=[position_gain] * len(q), velocityGains=[velocity_gain] * len(q))
+        targets = dict(targetPositions=q.tolist(), targetVelocities=rate.tolist(), forces=limit.tolist())
+        self._command(bullet.POSITION_CONTROL, **targets, **gains)
 
     def release(self) -> None:
         """Switch the position servos off, before torques are commanded."""
-        self._motors_off()
+        zero = [0.0] * len(self._joints)
+        self._command(bullet.VELOCITY_CONTROL, targetVelocities=zero, forces=zero)
 
     def step(self) -> None:
-        """Advance by :data:`STEP_S`."""
-        bullet.stepSimulation(physicsClientId=self._client)
+        """Advance by :data:`jumplab.sim.STEP_S`."""
+        self._bullet.stepSimulation()
 
     def servo_torque(self) -> np.ndarray:
         """Torque (nv - 6,) that the position servos gave in the last step [N m]."""
-        rows = bullet.getJointStates(self._body, self._joints, physicsClientId=self._client)
-        return np.array([row[3] for row in rows])
+        return np.array([row[3] for row in self._bullet.getJointStates(self._body, self._joints)])
 
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
-        client = {"physicsClientId": self._client}
         wrench, touching, colliding, points = np.zeros((2, 6)), set(), set(), ([], [])
-        for row in bullet.getContactPoints(bodyA=self._body, **client):
+        for row in self._bullet.getContactPoints(bodyA=self._body):
             body_b, link_a, link_b, normal_force = row[2], row[3], row[4], row[9]
             if normal_force <= 0:
                 continue
@@ -312,16 +289,15 @@ class World:
                 points[side].append(row[5])
         for link, side in self._feet.items():
             if points[side]:
-                state = bullet.getLinkState(self._body, link, **client)
+                state = self._bullet.getLinkState(self._body, link)
                 origin = np.array(state[4])
                 wrench[side, 3:] -= pin.skew(origin) @ wrench[side, :3]
-                self._note_sole(np.array(points[side]) - origin, state[5])
+                self._note_sole((np.array(points[side]) - origin) @ rotation(state[5]))
         return Contacts(wrench, frozenset(touching), frozenset(colliding))
 
-    def _note_sole(self, points: np.ndarray, quaternion) -> None:
-        """Remember how far contact points (k, 3), from the foot's origin in world axes, lay beyond the stated sole."""
-        x, y, z, w = quaternion
-        foot, local = self.robot.foot, points @ pin.Quaternion(w, x, y, z).toRotationMatrix()
-        side = np.abs(local[:, 1] - foot.center[1]) - foot.half_width
-        beyond = max((foot.heel - local[:, 0]).max(), (local[:, 0] - foot.toe).max(), side.max())
+    def _note_sole(self, points: np.ndarray) -> None:
+        """Remember how far contact points (k, 3) in the foot's frame lay beyond the stated sole."""
+        foot = self.robot.foot
+        side = np.abs(points[:, 1] - foot.center[1]) - foot.half_width
+        beyond = max((foot.heel - points[:, 0]).max(), (points[:, 0] - foot.toe).max(), side.max())
         self._beyond_sole = max(self._beyond_sole, float(beyond))

@@ -35,7 +35,7 @@ from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
 from jumplab.sim.playback import MODES
-from jumplab.sim.recorder import STAND_S
+from jumplab.sim.result import STAND_S
 from jumplab.task import JumpTask
 
 
@@ -164,8 +164,8 @@ def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics
         result = simulate()
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
         return False, str(e), None
-    doubts = [str(finding) for finding in result.honesty if not finding.passed]
-    if result.honest:
+    doubts = [str(finding) for finding in result.checks if not finding.passed]
+    if result.checks_passed:
         return result.landed, result.reason, result.metrics
     doubts = "; ".join(doubts) or "nothing was checked"
     return False, f"not honest: {doubts}; the run's own verdict: {result.reason}", result.metrics

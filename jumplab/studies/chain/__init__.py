@@ -1,22 +1,12 @@
 """Chained jumps, each planned from what is measured while the robot flies or lands. Start at :func:`run_chain`."""
 
-from jumplab.studies.chain.course import Course, crouched
-from jumplab.studies.chain.foresight import Ahead, Rehearsal
-from jumplab.studies.chain.result import ChainedJump, ChainResult, write_chain
-from jumplab.studies.chain.simulation import run_chain
-from jumplab.studies.chain.trials import RANGES, ChainReport, ChainTrial, run_chains
-
-__all__ = [
-    "RANGES",
-    "Ahead",
-    "ChainReport",
-    "ChainResult",
-    "ChainTrial",
-    "ChainedJump",
-    "Course",
-    "Rehearsal",
-    "crouched",
-    "run_chain",
-    "run_chains",
-    "write_chain",
-]
+from jumplab.studies.chain.course import Course as Course
+from jumplab.studies.chain.course import crouched as crouched
+from jumplab.studies.chain.pilot import Rehearsal as Rehearsal
+from jumplab.studies.chain.result import ChainResult as ChainResult
+from jumplab.studies.chain.result import write_chain as write_chain
+from jumplab.studies.chain.run import RANGES as RANGES
+from jumplab.studies.chain.run import ChainReport as ChainReport
+from jumplab.studies.chain.run import ChainTrial as ChainTrial
+from jumplab.studies.chain.run import run_chain as run_chain
+from jumplab.studies.chain.run import run_chains as run_chains

@@ -9,18 +9,16 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.errors import InfeasibleError, InputError, RobotError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.robot.stance import check_stance
 from jumplab.sim.scene import REACH_M, Block, Scene
-from jumplab.stages.planner import to_link_angles
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.stages.whole_body.settings import Limits
-from jumplab.task import GRAVITY, JumpTask
+from jumplab.task import JumpTask
 
 # posture ------------------------------------------------------------------------------------------
 # our choice: half-way between the stance and the bottom of a landing; a jump from there needs 0.70 s instead of 0.86 s,
@@ -41,78 +39,22 @@ def crouched(robot: Robot) -> Robot:
     return other
 
 
-class Gauge:
-    """Reads from a state of the full robot what a plan needs: where the toes are, and the sagittal posture."""
-
-    def __init__(self, robot: Robot):
-        self.robot, self._data = robot, robot.model.createData()
-        self._frames = [robot.model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
-        self._toe = np.array([robot.foot.toe, 0.0, robot.foot.sole_z])
-
-    def toe(self, q: np.ndarray) -> np.ndarray:
-        """Middle between the toes (3,) [m]."""
-        pin.framesForwardKinematics(self.robot.model, self._data, q)
-        return np.mean([self._data.oMf[f].act(self._toe) for f in self._frames], axis=0)
-
-    def heading(self, q: np.ndarray) -> float:
-        """Yaw of the feet, mean of both [rad]."""
-        pin.framesForwardKinematics(self.robot.model, self._data, q)
-        return float(np.mean([np.arctan2(*self._data.oMf[f].rotation[[1, 0], 0]) for f in self._frames]))
-
-    def posture(self, q: np.ndarray) -> np.ndarray:
-        """Absolute link angles (5,) with the feet taken as flat, mean of left and right [rad]."""
-        zero = np.zeros((1, self.robot.model.nv))
-        angles = to_link_angles(self.robot, q[None], zero, zero)[0][0]
-        angles[0] = 0.0
-        return angles
-
-    def com(self, q: np.ndarray) -> np.ndarray:
-        """CoM (3,) [m]."""
-        return pin.centerOfMass(self.robot.model, self._data, q, False).copy()
-
-    def com_velocity(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Velocity of the CoM (3,) [m/s]."""
-        pin.centerOfMass(self.robot.model, self._data, q, v, False)
-        return self._data.vcom[0].copy()
-
-    def com_ahead(self, q: np.ndarray, v: np.ndarray, left_s: float) -> np.ndarray:
-        """CoM (3,) in ``left_s`` of free flight [m]."""
-        speed = self.com_velocity(q, v)
-        return self.com(q) + speed * left_s - np.array([0.0, 0.0, GRAVITY * left_s**2 / 2])
-
-
-# course ------------------------------------------------------------------------------------------
-MOST_JUMPS = 50  # our choice: two minutes of simulated time; more is surely a typo
+MOST_JUMPS = 50  # two minutes of simulated time; more is surely a typo
 
 
 @dataclass(frozen=True)
 class Course:
-    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers.
+    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers."""
 
-    Attributes
-    ----------
-    distances_m : travel of the feet in each jump, toe to toe [m].
-    heights_m : rise of the CoM in each flight [m].
-    platforms_m : height of each landing surface above the ground that the chain begins on [m].
-    """
-
-    distances_m: tuple[float, ...]
-    heights_m: tuple[float, ...]
-    platforms_m: tuple[float, ...]
+    distances_m: tuple[float, ...]  # travel of the feet in each jump, toe to toe
+    heights_m: tuple[float, ...]  # rise of the CoM in each flight
+    platforms_m: tuple[float, ...]  # height of each landing surface above the ground that the chain begins on
 
     @classmethod
     def of(cls, distances_m: Iterable[Any], height_m: Any, platforms_m: Iterable[Any] | None = None) -> Course:
-        """A course from what somebody typed.
+        """A course from what somebody typed: one height for all jumps or one per jump; level ground without platforms.
 
-        Parameters
-        ----------
-        height_m : one number for all jumps, or one per jump.
-        platforms_m : one per jump; level ground if None.
-
-        Raises
-        ------
-        InputError
-            If there is no jump, if the lists differ in length, or if a number cannot be meant.
+        Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number cannot be meant.
         """
         distances = _numbers("distances", distances_m)
         count = len(distances)
@@ -142,33 +84,22 @@ class Course:
         """Where the toes should be after each jump, from where they stand at first [m]."""
         return tuple(float(x) for x in np.cumsum(self.distances_m))
 
-    def level(self, k: int) -> float:
-        """Height of the surface that jump ``k`` (counted from 0) starts from [m]."""
-        return self.platforms_m[k - 1] if k else 0.0
-
     def task(self, k: int, distance_m: float | None = None) -> JumpTask:
         """Target of jump ``k`` (counted from 0), with another distance if given."""
         distance = self.distances_m[k] if distance_m is None else distance_m
-        return JumpTask(distance, self.heights_m[k], round(self.platforms_m[k] - self.level(k), 9))
+        rise = self.platforms_m[k] - (0.0, *self.platforms_m)[k]  # above the surface that it starts from
+        return JumpTask(distance, self.heights_m[k], round(rise, 9))
 
     def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
         """(x, height) where the ground changes its height, x from the toes' first place [m]."""
-        found = []
-        for k in range(self.count):
-            task, before = self.task(k), (0.0, *self.goals_m)[k]
-            if task.platform_m:
-                found.append((before + platform_edge_m(task, robot), self.platforms_m[k]))
-        return tuple(found)
+        jumps = zip(map(self.task, range(self.count)), (0.0, *self.goals_m), self.platforms_m, strict=False)
+        return tuple((x + platform_edge_m(task, robot), top) for task, x, top in jumps if task.platform_m)
 
     def check(self, robot: Robot, reach: Reach) -> None:
-        """Refuse what no solve could mend, before any: platforms under a sole, jumps beyond the robot's reach.
+        """Refuse what no solve could mend, before any.
 
-        Raises
-        ------
-        InputError
-            If platforms overlap with a place where the robot stands.
-        InfeasibleError
-            If a jump is beyond the robot's reach, by closed forms.
+        Raises :class:`InputError` if platforms overlap with a place where the robot stands, :class:`InfeasibleError` if
+        a jump is beyond the robot's reach, by closed forms.
         """
         self._check_platforms(robot)
         for k in range(self.count):
@@ -181,8 +112,10 @@ class Course:
         """Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`."""
         if any(self.platforms_m) and min(self.distances_m) < 0:
             k = int(np.argmin(self.distances_m))
-            raise InputError(f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
-                             f"chains with platforms go forward, backward jumps stay on the level")  # fmt: skip
+            raise InputError(
+                f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
+                f"chains with platforms go forward, backward jumps stay on the level"
+            )
         least = 2 * Limits().edge_before_heel_m - robot.sagittal.heel[0]
         for k in range(self.count):
             rise, distance = self.task(k).platform_m, self.distances_m[k]

@@ -1,65 +1,190 @@
-"""Who commands in a chain: the standing controller between jumps, and one jump's pilot after the other."""
+"""Who commands in a chain: the standing controller between jumps, one jump's pilot after the other, and between them
+the plan of the next jump, made from what is measured while the robot flies or lands."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jumplab.errors import InfeasibleError, JumplabError, SolverError
 from jumplab.robot import Robot
+from jumplab.robot.stance import configuration, stance_configuration
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge, pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
-from jumplab.sim.pilot import Pilot
+from jumplab.sim.pilot import AFTER_FALL_S, EXTRA_S, Pilot
 from jumplab.sim.playback import Command
-from jumplab.sim.reaim import pitch_of
-from jumplab.sim.reference import Forecast
+from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
-from jumplab.studies.chain.course import Gauge
-from jumplab.studies.chain.foresight import Ahead, Foresight
+from jumplab.stages.planner import JumpPlan, Planner, to_link_angles
+from jumplab.studies.chain.course import Course
 
-FIRST_STAND_S = (
-    0.5  # our choice: the first plan, too, is made from a measured posture, once a push of the start is gone
-)
-# our choice: still enough to begin, found by measuring: the tape begins at rest, and what is left fades within BLEND_S
+FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
+# still enough to begin: the tape begins at rest, and what is left fades within BLEND_S
 STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25
 STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
-BLEND_S = 0.25  # our choice: a third of the launch, over before the push begins
-PATIENCE_S = 3.0  # our choice: who is not still this long after touchdown will not be
+BLEND_S = 0.25  # a third of the launch, over before the push begins
+PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
+LARGEST_BIAS_M = 0.10  # a robot that misses by more than this has another problem than a wrong model
+LARGEST_OFFSET_RAD = 0.10  # a posture that is farther off the crouch is not the robot standing still
+
+
+def posture(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Absolute link angles (5,) of ``q`` with the feet taken as flat, mean of left and right [rad]."""
+    zero = np.zeros((1, robot.model.nv))
+    angles = to_link_angles(robot, q[None], zero, zero)[0][0]
+    angles[0] = 0.0
+    return angles
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """Plans of the whole course from the crouch at rest, made before it begins: where re-plans begin."""
+
+    plans: tuple[JumpPlan, ...]  # one per jump; jumps with equal targets share one
+
+    @classmethod
+    def of(cls, course: Course, planner: Planner, method: str = "three-step") -> Rehearsal:
+        """Plan every jump of the course; raises what the planner raises, with the number of the jump."""
+        known: dict = {}
+        for k in range(course.count):
+            task = course.task(k)
+            try:
+                known[task] = known[task] if task in known else planner.plan(task, method)
+            except (InfeasibleError, SolverError) as e:
+                raise InfeasibleError(f"jump {k + 1} of {course.count}: {e}") from e
+        return cls(tuple(known[course.task(k)] for k in range(course.count)))
+
+
+@dataclass
+class Ahead:
+    """One plan of a chain, from the measurement it is made of to the instant at which the robot begins it.
+
+    All times are simulated [s], since the chain began; places count from where the toes stood then.
+    """
+
+    number: int  # of the jump, from 0
+    looked_s: float  # when the state was measured
+    air: bool  # whether the robot was in the air then
+    foretold_m: float  # where the toes stood, or were going to stand, by that measurement
+    place_m: float  # the same, less what such forecasts were wrong by in this chain
+    start: np.ndarray  # (5,) link angles in which the plan begins [rad]
+    joints: np.ndarray  # (nv - 6,) the same as joint angles [rad]
+    bias_m: float  # what was added to the distance because earlier jumps of this chain missed by it
+    solve_s: float  # what planning was charged: its wall clock, in whole steps, unless another number was given
+    cpu_s: float  # processor time of the same, which an idle core would need
+    plan: JumpPlan | None
+    failure: str = ""  # why there is no plan
+    needed_s: float | None = None  # when the robot was first still enough to begin
+    began_s: float | None = None  # when it began the jump
+
+    @property
+    def ready_s(self) -> float:
+        """When the plan was there: measured, plus what planning took."""
+        return self.looked_s + self.solve_s
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the plan was there when the robot was ready for it."""
+        return self.plan is not None and self.needed_s is not None and self.ready_s <= self.needed_s
+
+
+class Foresight:
+    """Plans the next jump of a course from measurements, and remembers what the robot's jumps taught.
+
+    Each plan is charged ``solve_s`` [s]; its own wall clock if None.
+    """
+
+    def __init__(
+        self,
+        course: Course,
+        robot: Robot,
+        planner: Planner,
+        rehearsal: Rehearsal | None,
+        solve_s: float | None = None,
+        method: str = "three-step",
+    ):
+        self.course, self.robot, self.planner, self.rehearsal = course, robot, planner, rehearsal
+        self._solve_s, self._method, self._offset = solve_s, method, np.zeros(5)
+        self._missed: dict[int, float] = {}  # jump: by how much it fell short [m]
+        self._misjudged: list[float] = []  # by how much places foretold in the air were too far ahead [m]
+        self._zero: float | None = None  # where the chain began, by its own measurement [m]
+        self._crouch = planner.stage("whole body" if method == "three-step" else "direct").stance
+
+    def learn_posture(self, q: np.ndarray) -> None:
+        """The robot stands still in ``q``: plans begin as far off the crouch as it is there.
+
+        A robot that is heavier or leans sags, and the standing controller brings it to that same posture again.
+        """
+        self._offset = np.clip(posture(self.robot, q) - self._crouch, -LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD)
+
+    def learn_place(self, last: Ahead, began_x: float, plans: list[Ahead], toe: np.ndarray) -> None:
+        """Jump ``last`` began with the toes at ``began_x`` of the world and has brought them to ``toe``.
+
+        ``plans`` are those of the next jump: what they foretold in the air can now be compared.
+        """
+        self._missed[last.number] = last.plan.task.distance_m - (float(toe[0]) - began_x)
+        self._misjudged += [p.foretold_m - (float(toe[0]) - self._zero) for p in plans if p.air]
+
+    @property
+    def bias_m(self) -> float:
+        """Mean of what the jumps so far fell short by [m]."""
+        return float(np.clip(np.mean([*self._missed.values()] or [0.0]), -LARGEST_BIAS_M, LARGEST_BIAS_M))
+
+    def look(
+        self, number: int, time_s: float, toe: np.ndarray, air: bool = False, last: tuple[Ahead, float] | None = None
+    ) -> Ahead:
+        """Plan jump ``number`` for toes that stand, or in the ``air`` will stand, at ``toe`` (3,) of the world.
+
+        ``last`` is the plan of the jump before, and the place from where it began.
+        """
+        began, cpu, plan, failure = time.perf_counter(), time.process_time(), None, ""
+        if self._zero is None:
+            self._zero = float(toe[0])
+        foretold = float(toe[0]) - self._zero
+        place = foretold - (float(np.mean(self._misjudged)) if air and self._misjudged else 0.0)
+        if last is not None:
+            self._missed[last[0].number] = last[0].plan.task.distance_m - (place + self._zero - last[1])
+        start, bias = self._crouch + self._offset, self.bias_m
+        try:
+            task = self.course.task(number, self.course.goals_m[number] - place + bias)
+            if self.rehearsal is None:
+                plan = self.planner.plan(task, self._method, start=start)
+            else:
+                plan = self.planner.replan(self.rehearsal.plans[number], task, start=start)
+        except JumplabError as e:
+            failure = str(e)
+        took, cpu = time.perf_counter() - began, time.process_time() - cpu
+        charged = math.ceil((took if self._solve_s is None else self._solve_s) / STEP_S - 1e-9) * STEP_S
+        joints = configuration(self.robot, start)[7:]
+        return Ahead(number, time_s, air, foretold, place, start, joints, bias, charged, cpu, plan, failure)
 
 
 class ChainPilot:
-    """Commands of a whole chain.
-
-    Parameters
-    ----------
-    foresight : makes the plans.
-    robot : as planned, crouching.
-    scene : ground of the course.
-    landing : "planned" or "spring", as for a single jump.
-    look_s : when the next jump is planned, from touchdown on [s]; negative: so long before it is due.
-    revise_s : when it is planned again if it was planned in the air, from touchdown on [s]; never if None.
+    """Commands of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` and ``revise_s`` are those
+    of :func:`jumplab.studies.chain.run_chain`.
 
     Attributes
     ----------
     plans : plans made for each jump, in the order in which they were made.
-    used : the plan with which each jump began.
-    began : step at which each jump began.
-    over : why the chain goes on no more; empty while it does.
+    used, pilots, began : plan, pilot and first step of each jump that began.
+    reason : why the chain goes on no more; empty while it does.
     """
 
-    def __init__(self, foresight: Foresight, robot: Robot, scene: Scene, landing: str, look_s: float,
-                 revise_s: float | None):  # fmt: skip
-        self._foresight, self._robot, self._scene, self._landing = foresight, robot, scene, landing
-        self._look_s, self._revise_s, self._gauge = look_s, revise_s, Gauge(robot)
-        self._stand, self._tau = LandingController(robot), np.zeros(len(robot.joint_names))
-        self._not_arms = ~np.isin(robot.joint_names, robot.joints["shoulder_pitch"])
+    def __init__(self, foresight: Foresight, scene: Scene, landing: str, look_s: float, revise_s: float | None):
+        self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
+        self._landing, self._look_s, self._revise_s = landing, look_s, revise_s
+        self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
+        self._tau = np.zeros(len(self._robot.joint_names))
+        self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
         self.plans: list[list[Ahead]] = []
         self.used: list[Ahead] = []
-        self.began: list[int] = []
-        self.over = ""
-        self.pilot: Pilot | None = None
         self.pilots: list[Pilot] = []
-        self._offset = None
+        self.began: list[int] = []
+        self.reason = ""
 
     @property
     def current(self) -> int:
@@ -67,35 +192,52 @@ class ChainPilot:
         return len(self.began) - 1
 
     @property
+    def part(self) -> int:
+        """The part of the log that this is: one per jump; the stand before the first jump belongs to it."""
+        return max(self.current, 0)
+
+    @property
+    def goal(self) -> np.ndarray:
+        """Crouch (nq,) on the surface that the present jump shall land on."""
+        end = stance_configuration(self._robot)
+        end[2] += self._foresight.course.platforms_m[self.part]
+        return end
+
+    @property
     def landed(self) -> bool:
         """Whether the robot stands: before the first jump, or after a touchdown."""
-        return self.pilot is None or self.pilot.touchdown is not None
+        return not self.pilots or self.pilots[-1].touchdown is not None
 
     def since_touchdown(self, step: int) -> float:
         """Time since the last touchdown, or since the chain began [s]; negative in the air."""
-        if self.pilot is None:
+        if not self.pilots:
             return step * STEP_S
-        return -1.0 if self.pilot.touchdown is None else (step - self.began[-1] - self.pilot.touchdown) * STEP_S
+        return (step - self.began[-1] - self.pilots[-1].touchdown) * STEP_S if self.landed else -1.0
+
+    def over(self, step: int, fallen_s: float) -> bool:
+        """Whether something has ended the chain, or its last landing has been watched."""
+        if fallen_s > AFTER_FALL_S:
+            self.reason = f"the robot fell in jump {self.part + 1}"
+        last = self.current + 1 == self._foresight.course.count
+        return bool(self.reason) or (last and self.since_touchdown(step) >= STAND_S + EXTRA_S)
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` of the chain from measured state and vertical foot forces."""
-        if self.current + 1 < self._foresight.course.count and not self.over:
+        if self.current + 1 < self._foresight.course.count and not self.reason:
             self._think(step, q, v)
-        if self.pilot is None:
+        if not self.pilots:
             if step % PERIOD_STEPS == 0:
                 self._tau = self._stand.torque(step * STEP_S, q, v, force)
             return Command(tau=self._tau)
-        now = step - self.began[-1]
-        command = self.pilot.command(now, q, v, force)
-        if self.pilot.touchdown is None and now > self.pilot.last_step:
-            self.over = self.over or f"jump {self.current + 1} never touched down"
+        now, pilot = step - self.began[-1], self.pilots[-1]
+        command = pilot.command(now, q, v, force)
+        if pilot.touchdown is None and now > pilot.last_step:
+            self.reason = self.reason or f"jump {self.current + 1} never touched down"
         return command if command.q is None else self._blended(command, now * STEP_S)
-
-    # deciding --------------------------------------------------------------------------------------------------
 
     def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
-        number, time = self.current + 1, step * STEP_S
+        number = self.current + 1
         if len(self.plans) == number:
             self.plans.append([])
         plans = self.plans[number]
@@ -104,48 +246,44 @@ class ChainPilot:
         seen = self._sight(step, q, v, plans)
         if seen is not None:
             last = (self.used[-1], self._from) if self.used else None
-            plans.append(self._foresight.look(number, time, *seen, last))
+            plans.append(self._foresight.look(number, step * STEP_S, *seen, last))
         elif plans and self.landed:
-            if all(p.failure for p in plans) and not self._may_revise(plans):
-                self.over = f"no plan for jump {number + 1}: {plans[-1].failure}"
+            revisable = plans[-1].air and self._revise_s is not None
+            if all(p.failure for p in plans) and not revisable:
+                self.reason = f"no plan for jump {number + 1}: {plans[-1].failure}"
             elif self.since_touchdown(step) > PATIENCE_S + sum(p.solve_s for p in plans):
-                self.over = f"the robot did not come to rest for jump {number + 1}"
+                self.reason = f"the robot did not come to rest for jump {number + 1}"
 
     def _begun(self, plans: list[Ahead], step: int, q: np.ndarray, v: np.ndarray) -> bool:
         """Begin with the latest plan that is there, if the robot is still enough; notes when it was."""
-        time, still = step * STEP_S, self._still(plans[0], q, v)
+        now, still = step * STEP_S, self._still(plans[0], q, v)
         for plan in plans:
             plan.needed_s = plans[0].needed_s
             if still and plan.needed_s is None:
-                plan.needed_s = time
-        there = [p for p in plans if p.plan is not None and time >= p.ready_s - STEP_S / 2]
+                plan.needed_s = now
+        there = [p for p in plans if p.plan is not None and now >= p.ready_s - STEP_S / 2]
         if still and there:
             self._begin(there[-1], step, q, v)
         return still and bool(there)
 
-    def _may_revise(self, plans: list[Ahead]) -> bool:
-        return plans[-1].air and self._revise_s is not None
-
     def _sight(self, step: int, q: np.ndarray, v: np.ndarray, plans: list[Ahead]) -> tuple[np.ndarray, bool] | None:
         """Where the toes (3,) stand, or will stand, and whether the robot flies; None unless it is time to plan."""
-        if self.pilot is None:
+        if not self.pilots:
             if plans or step * STEP_S < FIRST_STAND_S:
                 return None
             self._foresight.learn_posture(q)
             return self._gauge.toe(q), False
         since = self.since_touchdown(step)
         if plans:  # one core plans: a correction waits until the draft is done
-            due = self._may_revise(plans) and since >= self._revise_s and step * STEP_S >= plans[-1].ready_s
-            return (self._gauge.toe(q), False) if due else None
+            due = plans[-1].air and self._revise_s is not None and since >= self._revise_s
+            return (self._gauge.toe(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
         if since >= max(self._look_s, 0.0):
             return self._gauge.toe(q), False
-        if self.landed or self._look_s >= 0 or not self._airborne(step):
+        airborne = (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
+        if self.landed or self._look_s >= 0 or not airborne:
             return None
-        left = self._forecast.time_left(q, v)
+        left = self.pilots[-1].forecast.time_left(q, v)
         return None if left > -self._look_s else (self._gauge.toe(self._at_touchdown(step, q, v, left)), True)
-
-    def _airborne(self, step: int) -> bool:
-        return (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Configuration (nq,) of the touchdown to come: the posture of the tape, turned as far as the trunk is off its
@@ -153,29 +291,24 @@ class ChainPilot:
         tape = self.used[-1].plan.tape
         row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
         turned = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)])
-        end, _ = self._forecast.state(q, v, turned)
+        end, _ = self.pilots[-1].forecast.state(q, v, turned)
         end[:3] += self._gauge.com_ahead(q, v, left) - self._gauge.com(end)
         return end
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
         """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
-        off, legs = np.abs(q[7:] - ahead.joints), self._not_arms
-        near = off[legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
+        off = np.abs(q[7:] - ahead.joints)
+        near = off[self._legs].max() <= STILL_LEG_RAD and off.max() <= STILL_ARM_RAD
         slow = np.abs(v[6:]).max() <= STILL_RATE and np.linalg.norm(self._gauge.com_velocity(q, v)) <= STILL_COM
         return bool(near and slow)
 
     def _begin(self, ahead: Ahead, step: int, q: np.ndarray, v: np.ndarray) -> None:
-        ahead.began_s = step * STEP_S
-        toe = self._gauge.toe(q)
+        ahead.began_s, toe, tape = step * STEP_S, self._gauge.toe(q), ahead.plan.tape
         if self.used:
             self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
-        self._from = float(toe[0])
+        self._from, self._offset = float(toe[0]), (q[7:] - tape.q[0, 7:], v[6:].copy())
         self.used.append(ahead)
-        tape = ahead.plan.tape
-        self._offset = q[7:] - tape.q[0, 7:], v[6:].copy()
-        self.pilot = Pilot(tape, self._robot, "position", self._scene, self._landing, None, True)
-        self.pilots.append(self.pilot)
-        self._forecast = Forecast(self._robot, tape, self._scene)
+        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:
@@ -186,8 +319,3 @@ class ChainPilot:
         angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
         speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
         return replace(command, q=command.q + angle, rate=command.rate + speed)
-
-    @property
-    def finished(self) -> bool:
-        """Whether the last jump of the course is under way, or over."""
-        return self.current + 1 == self._foresight.course.count

@@ -1,4 +1,4 @@
-"""A chain's result folder, written whole or not at all: ``chain.json``, ``chain.npz``, and a plan's folder per jump."""
+"""A finished chain, and its folder: ``chain.json``, ``chain.npz``, and a plan's folder per jump."""
 
 from __future__ import annotations
 
@@ -12,48 +12,29 @@ import numpy as np
 
 from jumplab.auditing import AuditReport, write_audit
 from jumplab.io import folder as store
-from jumplab.io.files import transaction
+from jumplab.io.folder import transaction
 from jumplab.robot import Robot
-from jumplab.sim.recorder import LEVEL_TOLERANCE_M
-from jumplab.sim.result import SimulationResult
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.result import LEVEL_TOLERANCE_M, SimulationResult
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import STEP_S
-from jumplab.studies.chain.course import Course, Gauge
-from jumplab.studies.chain.foresight import Ahead
+from jumplab.studies.chain.course import Course
+from jumplab.studies.chain.pilot import Ahead
 
-# result ------------------------------------------------------------------------------------------
 SCHEMA = "jumplab-chain-1"
-PLAN_NAMES = (
-    "looked_s",
-    "air",
-    "foretold_m",
-    "place_m",
-    "bias_m",
-    "solve_s",
-    "cpu_s",
-    "ready_s",
-    "needed_s",
-    "began_s",
-)
+REPORT, LOG, JUMPS = "chain.json", "chain.npz", "jumps"
+PLAN_NAMES = "looked_s air foretold_m place_m bias_m solve_s cpu_s ready_s needed_s began_s".split()
 
 
 @dataclass(frozen=True)
 class ChainedJump:
-    """One jump of a chain.
+    """One jump of a chain."""
 
-    Attributes
-    ----------
-    number : from 0.
-    start_s : time of the chain at which ``simulation`` begins [s]; the stand before the first jump belongs to it.
-    ahead : the plan with which it began; None if it did not.  plans : all that were made for it.
-    simulation : log from there to the beginning of the next jump, its time counted from zero.
-    """
-
-    number: int
-    start_s: float
-    ahead: Ahead | None
-    plans: tuple[Ahead, ...]
-    simulation: SimulationResult
+    number: int  # from 0
+    start_s: float  # time of the chain at which the log begins; the stand before the first jump belongs to it
+    ahead: Ahead | None  # the plan with which it began; None if it did not
+    plans: tuple[Ahead, ...]  # all that were made for it
+    simulation: SimulationResult  # log up to the beginning of the next jump, its time counted from zero
 
     @property
     def air_s(self) -> float | None:
@@ -66,27 +47,38 @@ class ChainedJump:
         feet = np.isin(self.simulation.link_names, robot.foot.frames)
         return self.air_s is not None and not self.simulation.touching[:, ~feet].any()
 
+    def row(self, course: Course, robot: Robot, travel_m: float, error_m: float) -> dict[str, Any]:
+        """Distances, errors, and when the plan was made, ready, needed and begun, as plain data."""
+        a, first, run = self.ahead, self.plans[0] if self.plans else None, self.simulation
+        row = dict(jump=self.number + 1, asked_m=course.distances_m[self.number], travel_m=travel_m, error_m=error_m)
+        row |= dict(rise_m=run.metrics.com_rise_m, air_s=self.air_s, planned_m=a and a.plan.task.distance_m)
+        row |= {name: a and getattr(a, name) for name in PLAN_NAMES}
+        row |= dict(first_solve_s=first and first.solve_s, first_ready_s=first and first.ready_s)
+        row["in_time"] = a.in_time if self.number and a else None
+        row |= dict(on_feet=self.on_feet(robot), honest=run.checks_passed)
+        row["plans"] = [{n: getattr(p, n) for n in ("failure", *PLAN_NAMES)} for p in self.plans]
+        return row
+
+
+def _joined(name: str, doc: str) -> property:
+    """The logs ``name`` of all jumps of a chain, one after the other."""
+
+    def join(self: ChainResult) -> np.ndarray:
+        return np.concatenate([getattr(j.simulation, name) for j in self.jumps])
+
+    return property(join, doc=doc)
+
 
 @dataclass(frozen=True)
 class ChainResult:
-    """A finished chain.
-
-    Attributes
-    ----------
-    course, robot, scene : what was asked, of whom (crouching), on which ground.
-    jumps : those that began, and the stand before the first.
-    interrupted : why the chain ended before its course; empty if it did not.
-    settings : how it was run.
-    """
+    """A finished chain."""
 
     course: Course
-    robot: Robot
+    robot: Robot  # as planned, crouching
     scene: Scene
-    jumps: tuple[ChainedJump, ...]
-    interrupted: str
-    settings: dict
-
-    # places ----------------------------------------------------------------------------------------------------
+    jumps: tuple[ChainedJump, ...]  # those that began, and the stand before the first
+    interrupted: str  # why the chain ended before its course; empty if it did not
+    settings: dict  # how it was run
 
     @cached_property
     def places_m(self) -> np.ndarray:
@@ -107,12 +99,9 @@ class ChainResult:
     def errors_m(self) -> np.ndarray:
         """(K,) distance error of each jump: where the toes stand after it less where the course wants them [m].
 
-        That is its travel less the way from where it really began to its goal: a jump that makes good what the one
-        before has missed travels more or less than the course says, and is right to.
+        A jump that makes good what the one before has missed travels more or less than the course says.
         """
         return self.places_m[1:, 0] - np.array(self.course.goals_m[: len(self.jumps)])
-
-    # verdicts --------------------------------------------------------------------------------------------------
 
     @property
     def stood(self) -> bool:
@@ -132,9 +121,9 @@ class ChainResult:
             miss = height - self.course.platforms_m[j.number]
             if abs(miss) > LEVEL_TOLERANCE_M:
                 return f"jump {j.number + 1}: stands {miss:+.2f} m from the height it was meant to land on"
-            if not j.simulation.honest:
-                return f"jump {j.number + 1}: not honest: " + "; ".join(
-                    str(f) for f in j.simulation.honesty if not f.passed)  # fmt: skip
+            if not j.simulation.checks_passed:
+                failed = "; ".join(str(f) for f in j.simulation.checks if not f.passed)
+                return f"jump {j.number + 1}: not honest: {failed}"
         last = self.jumps[-1].simulation
         return "" if last.landed else f"jump {len(self.jumps)}: {last.reason}"
 
@@ -153,94 +142,48 @@ class ChainResult:
         """How long the robot, still enough, waited for a plan before each jump but the first [s]."""
         return tuple(j.ahead.began_s - j.ahead.needed_s for j in self.jumps[1:] if j.ahead is not None)
 
-    # the whole log ---------------------------------------------------------------------------------------------
-
-    def _joined(self, name: str) -> np.ndarray:
-        return np.concatenate([getattr(j.simulation, name) for j in self.jumps])
-
     @property
     def t(self) -> np.ndarray:
         """(N,) time since the chain began [s]."""
         return np.arange(sum(len(j.simulation.t) for j in self.jumps)) * STEP_S
 
-    @property
-    def q(self) -> np.ndarray:
-        """(N, nq) true configurations."""
-        return self._joined("q")
-
-    @property
-    def v(self) -> np.ndarray:
-        """(N, nv) true velocities."""
-        return self._joined("v")
-
-    @property
-    def tau(self) -> np.ndarray:
-        """(N, nv - 6) torques that the motors gave [N m]."""
-        return self._joined("tau")
-
-    @property
-    def phase(self) -> np.ndarray:
-        """(N,) "launch", "flight" or "landing"."""
-        return self._joined("phase")
-
-    @property
-    def com(self) -> np.ndarray:
-        """(N, 3) CoM of the simulated robot [m]."""
-        return self._joined("com")
+    q = _joined("q", "(N, nq) true configurations.")
+    v = _joined("v", "(N, nv) true velocities.")
+    tau = _joined("tau", "(N, nv - 6) torques that the motors gave [N m].")
+    phase = _joined("phase", '(N,) "launch", "flight" or "landing".')
+    com = _joined("com", "(N, 3) CoM of the simulated robot [m].")
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The log under the names of ``chain.npz``."""
         logs = {name: getattr(self, name) for name in ("t", "q", "v", "tau", "phase", "com")}
-        return {"schema": np.array(SCHEMA), **logs, "jump": np.concatenate(
-            [np.full(len(j.simulation.t), j.number) for j in self.jumps]),
-            "joint_names": np.asarray(self.robot.joint_names)}  # fmt: skip
+        logs["jump"] = np.concatenate([np.full(len(j.simulation.t), j.number) for j in self.jumps])
+        return {"schema": np.array(SCHEMA), **logs, "joint_names": np.asarray(self.robot.joint_names)}
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per jump: distances, errors, and when its plan was made, ready, needed and begun."""
-        out = []
-        for j, travel, error in zip(self.jumps, self.travels_m, self.errors_m, strict=True):
-            a, m = j.ahead, j.simulation.metrics
-            told = {name: None if a is None else getattr(a, name) for name in PLAN_NAMES}
-            first = j.plans[0] if j.plans else None
-            out.append({
-                "jump": j.number + 1, "asked_m": self.course.distances_m[j.number],
-                "planned_m": None if a is None else a.plan.task.distance_m, "travel_m": float(travel),
-                "error_m": float(error), "rise_m": m.com_rise_m, "air_s": j.air_s, **told,
-                "first_solve_s": first and first.solve_s, "first_ready_s": first and first.ready_s,
-                "in_time": None if not j.number or a is None else a.in_time,
-                "on_feet": j.on_feet(self.robot), "honest": j.simulation.honest,
-                "plans": [{"failure": p.failure, **{name: getattr(p, name) for name in PLAN_NAMES}} for p in j.plans],
-            })  # fmt: skip
-        return out
+        """One row per jump, see :meth:`ChainedJump.row`."""
+        told = zip(self.jumps, self.travels_m.tolist(), self.errors_m.tolist(), strict=True)
+        return [jump.row(self.course, self.robot, travel, error) for jump, travel, error in told]
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``chain.json``."""
-        return {
-            "schema": SCHEMA, "target": asdict(self.course),
-            "robot": {"name": self.robot.name, "hash": self.robot.hash}, "stood": self.stood, "reason": self.reason,
-            "replans": len(self.replans), "in_time": self.in_time, "waits_s": self.waits_s,
-            "jumps": self.rows(), "settings": self.settings,
-        }  # fmt: skip
+        robot, counts = dict(name=self.robot.name, hash=self.robot.hash), dict(replans=len(self.replans))
+        said = dict(schema=SCHEMA, target=asdict(self.course), robot=robot, stood=self.stood, reason=self.reason)
+        return (
+            said | counts | {n: getattr(self, n) for n in ("in_time", "waits_s", "settings")} | {"jumps": self.rows()}
+        )
 
 
-# folder ------------------------------------------------------------------------------------------
-REPORT, LOG, JUMPS = "chain.json", "chain.npz", "jumps"
+def write_chain(
+    folder: str | Path,
+    result: ChainResult,
+    further: Mapping[str, str] | None = None,
+    *,
+    series: Mapping | None = None,
+) -> tuple[AuditReport, ...]:
+    """Write a chain, whole or not at all, in the place of an older one; returns the audits of its plans.
 
-
-def write_chain(folder: str | Path, result: ChainResult, further: Mapping[str, str] | None = None, *,
-                series: Mapping | None = None) -> tuple[AuditReport, ...]:  # fmt: skip
-    """Write a chain; what an older chain left there goes.
-
-    ``jumps/1``, ``jumps/2`` and so on are folders of plans like any other, which ``jumplab audit`` and others read.
-
-    Parameters
-    ----------
-    further : names and texts of further files (the 3-D page).
-    series : a report on many robots, becomes the entry ``series`` of ``chain.json``.
-
-    Returns
-    -------
-    The audits of the plans, in the order of the jumps; they lie beside the plans as ``passport.json``.
+    ``jumps/1``, ``jumps/2`` and so on are folders of plans like any other, each with its audit. ``further`` are names
+    and texts of further files (the 3-D page); ``series``, a report on many robots, becomes an entry of ``chain.json``.
     """
     audits = []
     with transaction(folder) as staging:

@@ -8,9 +8,8 @@ import pytest
 from jumplab.errors import InputError, JumplabError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import Perturbation, Scene, World, base_from_bullet, base_to_bullet
-from jumplab.sim.actuation import Actuators, Delay
-from jumplab.sim.world import STEP_S
+from jumplab.sim import STEP_S, Perturbation, Scene, World, base_from_bullet, base_to_bullet
+from jumplab.sim.playback import Actuators, Delay
 
 HOLD = dict(position_gain=0.1, velocity_gain=1.0)
 

@@ -108,7 +108,7 @@ def test_perception_is_the_truth_until_a_sensor_errs(bhr):
 def test_a_jump_lands_on_estimates(bhr, tape):
     noisy = Perturbation(seed=1, noise=SensorNoise.typical())
     run = simulate_jump(tape, bhr, perturbation=noisy, reaim=True)
-    assert run.landed and run.honest
+    assert run.landed and run.checks_passed
     said = run.settings["perception"]
     assert (
         said["state"] == "estimated" and 0 < said["worst_tilt_error_rad"] < 0.03 and said["worst_velocity_error"] < 0.1

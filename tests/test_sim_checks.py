@@ -10,8 +10,9 @@ import pytest
 from jumplab.cli.common import print_simulation
 from jumplab.sim import Disturbance, Perturbation, World, simulate_jump, simulate_landing
 from jumplab.sim import loop as jump
-from jumplab.sim.checks import STAND_S
+from jumplab.sim.checks import check
 from jumplab.sim.playback import Motors
+from jumplab.sim.result import STAND_S
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
@@ -25,8 +26,8 @@ def tape(bhr):
 
 
 def failed(result) -> set[str]:
-    assert len(result.honesty) == 13
-    return {finding.name for finding in result.honesty if not finding.passed}
+    assert len(result.checks) == 13
+    return {finding.name for finding in result.checks if not finding.passed}
 
 
 def at_step(monkeypatch, when, cheat):
@@ -52,7 +53,7 @@ LATE = Perturbation(friction=0.5, delay_s=0.003)
 @pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}])
 def test_an_honest_jump_passes(bhr, tape, options, capsys):
     result = simulate_jump(tape, bhr, **options)
-    assert result.landed and result.honest and failed(result) == set()
+    assert result.landed and result.checks_passed and failed(result) == set()
     said = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert said["honest"] and all(row["passed"] for row in said["honesty"])
     print_simulation(said)
@@ -61,7 +62,7 @@ def test_an_honest_jump_passes(bhr, tape, options, capsys):
 
 def test_a_fall_is_honest_too(bhr, tape):
     result = simulate_landing(tape, bhr, Disturbance(pitch_rad=0.6))
-    assert not result.landed and result.honest
+    assert not result.landed and result.checks_passed
 
 
 def test_quick_legs_are_honest(bhr, tape):
@@ -72,7 +73,7 @@ def test_quick_legs_are_honest(bhr, tape):
 
 def test_without_findings_nothing_is_honest(bhr, tape):
     result = simulate_jump(tape, bhr, stand_s=SHORT_S)
-    assert result.honest and not replace(result, honesty=()).honest
+    assert result.checks_passed and not replace(result, checks=()).checks_passed
 
 
 @pytest.mark.parametrize("when", [0, IN_FLIGHT])
@@ -159,7 +160,7 @@ def test_feet_that_press_beyond_their_sole(bhr, tape):
     """The same from the forces alone: wrenches of a robot with longer feet, judged by the stated ones."""
     result = simulate_jump(tape, bhr, stand_s=SHORT_S)
     small = replace(bhr, foot=replace(bhr.foot, toe=bhr.foot.toe - 0.01))
-    names = {finding.name for finding in jump.honesty.check(result, small) if not finding.passed}
+    names = {finding.name for finding in check(result, small) if not finding.passed}
     assert "CoP outside the sole" in names
 
 
@@ -209,8 +210,8 @@ def test_self_collision_switched_off(bhr, tape, monkeypatch):
 
 def test_a_landing_shorter_than_three_seconds(bhr, tape):
     result = simulate_jump(tape, bhr, stand_s=1.0)
-    assert not result.landed and result.honest
+    assert not result.landed and result.checks_passed
     claimed = replace(result, metrics=replace(result.metrics, landed=True))
-    found = {finding.name: finding for finding in jump.honesty.check(claimed, bhr)}
+    found = {finding.name: finding for finding in check(claimed, bhr)}
     short = found["claimed landing, short of 3 s by"]
     assert not short.passed and short.value == pytest.approx(STAND_S - 1.05, abs=0.002)

@@ -7,8 +7,8 @@ from scipy.optimize import brentq
 
 from jumplab.robot.stance import com_from_toe, configuration, stance_configuration
 from jumplab.sim import LandingController, LandingReference, World
-from jumplab.sim.actuation import Actuators
 from jumplab.sim.landing import PERIOD_STEPS, BodyTerms
+from jumplab.sim.playback import Actuators
 
 
 class Catch:

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import fixtures_core
@@ -12,12 +14,21 @@ import pytest
 from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import Disturbance, LandingReference, Perturbation, Scene, SensorNoise, simulate_landing
+from jumplab.sim import (
+    STEP_S,
+    Disturbance,
+    LandingReference,
+    Perturbation,
+    Scene,
+    SensorNoise,
+    SimulationResult,
+    simulate_landing,
+)
 from jumplab.sim import simulate_jump as simulate
-from jumplab.sim.actuation import Actuators
-from jumplab.sim.recorder import Recorder, _events
+from jumplab.sim.playback import Actuators
 from jumplab.sim.reference import Forecast
-from jumplab.sim.world import STEP_S, Contacts
+from jumplab.sim.result import Recorder, _events
+from jumplab.sim.scene import Contacts
 from jumplab.stages.planner import plan_jump
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
 from jumplab.task import JumpTask
@@ -107,8 +118,53 @@ def test_saved_whole(jump, odd_folder):
 
 
 def test_saving_nowhere_is_refused(jump, tmp_path):
-    with pytest.raises(InputError, match=r"simulation\.npz cannot be written: .*choose a writable folder"):
-        jump.save(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/folder' cannot be written .*choose another one"):
+        jump.save(tmp_path / "file" / "folder")
+
+
+def test_what_was_saved_is_loaded(bhr, jump, odd_folder):
+    assert SimulationResult.load(odd_folder, bhr) is None
+    jump.save(odd_folder)
+    again = SimulationResult.load(odd_folder, bhr)
+    before, after = jump.arrays(), again.arrays()
+    assert before.keys() == after.keys() and all(np.array_equal(before[name], after[name]) for name in before)
+    assert (again.metrics, again.checks, again.checks_passed) == (jump.metrics, jump.checks, True)
+    assert again.settings == json.loads(json.dumps(jump.settings)) and again.link_names == jump.link_names
+    assert not again.q.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("simulation.npz", b"PK"),
+        ("simulation.json", b"{"),
+        ("simulation.json", b"[]"),
+        ("simulation.json", b"{}"),
+        ("simulation.json", None),
+    ],
+)
+def test_damaged_simulations_are_refused(bhr, jump, tmp_path, name, content):
+    jump.save(tmp_path)
+    if content is None:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match="not a") as e:
+        SimulationResult.load(tmp_path, bhr)
+    assert str(tmp_path) in str(e.value) and "\n" not in str(e.value)
+
+
+def test_the_simulation_of_another_robot_is_not_loaded(bhr, jump, tmp_path):
+    jump.save(tmp_path)
+    texts = (text.replace("left_knee", "left_knie") for text in (bhr.urdf, bhr.config_text))
+    with pytest.raises(InputError, match="not a simulation of this folder's robot"):
+        SimulationResult.load(tmp_path, Robot.from_text(*texts))
+
+
+def test_scenes_and_perturbations_need_no_engine():
+    code = "import sys; from jumplab.sim import Scene, Perturbation; sys.exit('pybullet' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_same_seed_same_jump(bhr, tape):

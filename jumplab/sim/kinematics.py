@@ -1,0 +1,72 @@
+"""What a configuration of the full robot says: attitude and pitch of the trunk, places of CoM and soles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.robot import Robot
+from jumplab.task import GRAVITY
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of a quaternion (4,), x y z w."""
+    x, y, z, w = quaternion
+    return pin.Quaternion(w, x, y, z).toRotationMatrix()
+
+
+def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """A copy of ``q`` (nq,) with its base turned in place by ``turn`` (3, 3), world axes."""
+    out = q.copy()
+    out[3:7] = (pin.Quaternion(turn) * pin.Quaternion(q[6], q[3], q[4], q[5])).coeffs()
+    return out
+
+
+def pitched(q: np.ndarray, angle: float) -> np.ndarray:
+    """A copy of ``q`` (nq,) with its base turned in place by ``angle`` about y [rad]."""
+    return turned(q, pin.rpy.rpyToMatrix(0.0, angle, 0.0))
+
+
+def pitch_of(q: np.ndarray) -> np.ndarray:
+    """Pitch (...) of the trunk in configurations ``q`` (..., nq), within half a turn [rad]."""
+    x, y, z, w = np.moveaxis(q[..., 3:7], -1, 0)
+    return np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+
+
+def planned_pitch(q: np.ndarray) -> np.ndarray:
+    """Pitch (N,) of a base that turns about y only, as tapes have it, continuous through full turns [rad]."""
+    return np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]))
+
+
+class Gauge:
+    """Reads places and speeds from states of one robot."""
+
+    def __init__(self, robot: Robot):
+        self.robot, self.model, self.data = robot, robot.model, robot.model.createData()
+        self.frames = [robot.model.getFrameId(name) for name in robot.foot.frames]  # names checked by Robot
+
+    def soles(self, q: np.ndarray) -> np.ndarray:
+        """Mean of both soles' middles (3,) [m]."""
+        return self._on_feet(q, self.robot.foot.center)
+
+    def toe(self, q: np.ndarray) -> np.ndarray:
+        """Middle between the toes (3,) [m]."""
+        return self._on_feet(q, np.array([self.robot.foot.toe, 0.0, self.robot.foot.sole_z]))
+
+    def _on_feet(self, q: np.ndarray, point: np.ndarray) -> np.ndarray:
+        pin.framesForwardKinematics(self.model, self.data, q)
+        return np.mean([self.data.oMf[frame].act(point) for frame in self.frames], axis=0)
+
+    def com(self, q: np.ndarray) -> np.ndarray:
+        """CoM (3,) [m]."""
+        return pin.centerOfMass(self.model, self.data, q, False).copy()
+
+    def com_velocity(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Velocity of the CoM (3,) [m/s]."""
+        pin.centerOfMass(self.model, self.data, q, v, False)
+        return self.data.vcom[0].copy()
+
+    def com_ahead(self, q: np.ndarray, v: np.ndarray, left_s: float) -> np.ndarray:
+        """CoM (3,) in ``left_s`` of free flight [m]."""
+        speed = self.com_velocity(q, v)
+        return self.com(q) + speed * left_s - np.array([0.0, 0.0, GRAVITY * left_s**2 / 2])
