@@ -7,22 +7,17 @@ Every function yields sentences ``file: element: value, limit; what to do``, so 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import partial
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from jumplab.errors import RobotError
+from jumplab.robot_import.tree import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix
 from jumplab.robot_import.urdf import numbers
 
-TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-MOVING = TYPES[:3]
-TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-LIMITS = ("lower", "upper", "effort", "velocity")
-SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
-SIZES["capsule"] = SIZES["cylinder"]
+TYPES = (*MOVING, "fixed", "floating", "planar")
 
 
 @dataclass(frozen=True)
@@ -32,7 +27,6 @@ class Plausible:
     mass_kg: tuple[float, float] = (0.5, 400.0)  # hand-sized, to twice the heaviest published one
     size_m: tuple[float, float] = (0.1, 5.0)  # longest chain of joints in the neutral pose, likewise
     gyration_m: float = 1.0  # of one link; the longest published limb link has 0.2 m
-    frame_kg: float = 5e-4  # lighter links are frames, whose tensor nobody measured; it is ignored
     triangle: float = 1e-3  # relative; rounding to four digits must not refuse a robot
     effort_nm: float = 2000.0  # five times the strongest published electric humanoid joint
     speed_rad_s: float = 60.0  # twice the fastest published humanoid joint; above it, deg/s or a placeholder
@@ -48,17 +42,20 @@ def check(root: ET.Element, where: str, repair: Collection[str] = ()) -> None:
         raise RobotError(sentence)
 
 
-def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> Iterator[str]:
+def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[str]:
     """Faults of the whole file: of names and connections, else of inertials, else of units, else of shapes.
 
     ``repair`` may name "inertia" (tensors that no solid has) and "massless" (bodies without mass): these are no faults
     then.
     """
-    for group in (_structure_faults, partial(_inertial_faults, repair=repair), _unit_faults, _shape_faults):
-        found = list(group(root, where))
-        yield from found
-        if found:  # the next group reads what this one refused
-            return
+    found = _structure_faults(root, where)
+    for link in root.findall("link") if not found else ():
+        found += _inertial_faults(link, f"{where}: link {link.get('name')!r}", "inertia" not in repair)
+    if found:  # what follows reads what was refused
+        return found
+    tree = Tree(root, where, repair_inertia="inertia" in repair)
+    massless = [] if "massless" in repair else list(_massless_bodies(tree))
+    return massless or list(_unit_faults(tree)) or list(_shape_faults(root, where))
 
 
 def _origin_faults(element: ET.Element, at: str) -> Iterator[str]:
@@ -71,7 +68,7 @@ def _origin_faults(element: ET.Element, at: str) -> Iterator[str]:
 
 
 # structure ------------------------------------------------------------------------------------------------------
-def _structure_faults(root: ET.Element, where: str) -> Iterable[str]:
+def _structure_faults(root: ET.Element, where: str) -> list[str]:
     """Names, connections and joint types."""
     links, joints = root.findall("link"), root.findall("joint")
     if not links:
@@ -154,30 +151,10 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
 
 
 # inertials ------------------------------------------------------------------------------------------------------
-def link_mass(link: ET.Element) -> float:
-    """Mass of one link [kg], 0 without ``<inertial>``."""
-    mass = link.find("inertial/mass")
-    return 0.0 if mass is None else float(mass.get("value"))
-
-
-def inertia_matrix(element: ET.Element) -> np.ndarray:
-    """(3, 3) of an ``<inertia>`` [kg m^2]."""
-    xx, xy, xz, yy, yz, zz = (float(element.get(key)) for key in TENSOR)
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def _inertial_faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> Iterable[str]:
-    """Masses and inertias of every link, and bodies that weigh nothing."""
-    found = []
-    for link in root.findall("link"):
-        if (inertial := link.find("inertial")) is not None:
-            at = f"{where}: link {link.get('name')!r}"
-            found += _one_inertial(inertial, at, "inertia" not in repair)
-    return found if found or "massless" in repair else _massless_bodies(root, where)
-
-
-def _one_inertial(inertial: ET.Element, at: str, strict: bool) -> Iterator[str]:
-    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+def _inertial_faults(link: ET.Element, at: str, strict: bool) -> Iterator[str]:
+    inertial, mass, tensor = (link.find(path) for path in ("inertial", "inertial/mass", "inertial/inertia"))
+    if inertial is None:
+        return
     if mass is None:
         yield f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
         return
@@ -195,7 +172,7 @@ def _one_inertial(inertial: ET.Element, at: str, strict: bool) -> Iterator[str]:
     wrong = next((key for key in TENSOR if numbers(tensor.get(key), 1) is None), None)
     if wrong:
         yield f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2"
-    elif strict and value[0] >= MOST.frame_kg:
+    elif strict and value[0] >= FRAME_KG:
         yield from _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
 
 
@@ -217,48 +194,34 @@ def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
         )
 
 
-def _massless_bodies(root: ET.Element, where: str) -> Iterator[str]:
+def _massless_bodies(tree: Tree) -> Iterator[str]:
     """Joints that move a link without mass, and nothing fixed to it has any."""
-    links, joints = {link.get("name"): link for link in root.findall("link")}, root.findall("joint")
-    for joint in joints:
-        if joint.get("type") == "fixed":
+    for joint in tree.joints.values():
+        at, links = f"{tree.where}: link {joint.child!r}", [tree.links[name] for name in tree.fixed_to(joint.child)]
+        if joint.kind == "fixed" or sum(link.inertia.mass for link in links) > 0:
             continue
-        child = _end(joint, "child")
-        names = [child]
-        for name in names:
-            names += [_end(j, "child") for j in joints if j.get("type") == "fixed" and _end(j, "parent") == name]
-        if sum(link_mass(links[name]) for name in names) > 0:
-            continue
-        at, name = f"{where}: link {child!r}", joint.get("name")
-        if links[child].find("inertial") is None:
+        if not tree.links[joint.child].weighed:
             yield (
                 f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet 1 kg; joint "
-                f"{name!r} needs a body of more than 0 kg"
+                f"{joint.name!r} needs a body of more than 0 kg"
             )
         else:
-            yield f"{at}: mass = 0 kg, the body of joint {name!r} must weigh more than 0 kg"
+            yield f"{at}: mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
 
 
 # units and shapes -----------------------------------------------------------------------------------------------
-def _unit_faults(root: ET.Element, where: str) -> Iterator[str]:
+def _unit_faults(tree: Tree) -> Iterator[str]:
     """Total mass and size that no humanoid has in kg and m."""
-    mass, (low, high) = sum(link_mass(link) for link in root.findall("link")), MOST.mass_kg
+    mass, (low, high) = tree.mass, MOST.mass_kg
     if not low <= mass <= high:
         guess = "grams? divide by 1000" if mass > high else "tonnes, or are inertials missing?"
-        yield f"{where}: weighs {mass:g} kg, a humanoid {low:g} to {high:g}; are the masses in {guess}"
-    above = {_end(joint, "child"): joint for joint in root.findall("joint")}
-    deepest, (low, high) = 0.0, MOST.size_m
-    for link in above:
-        depth = 0.0
-        while link in above:
-            origin = above[link].find("origin")
-            depth += 0.0 if origin is None else float(np.linalg.norm(numbers(origin.get("xyz", "0 0 0"), 3)))
-            link = _end(above[link], "parent")
-        deepest = max(deepest, depth)
-    if not low <= deepest <= high:
-        guess = "millimetres? divide by 1000" if deepest > high else "kilometres, or are the origins missing?"
+        yield f"{tree.where}: weighs {mass:g} kg, a humanoid {low:g} to {high:g}; are the masses in {guess}"
+    size = max(sum(np.linalg.norm(joint.place.translation) for joint in tree.chain(link)) for link in tree.links)
+    low, high = MOST.size_m
+    if not low <= size <= high:
+        guess = "millimetres? divide by 1000" if size > high else "kilometres, or are the origins missing?"
         yield (
-            f"{where}: the longest chain of joints measures {deepest:g} m, a humanoid's {low:g} to {high:g}; are the "
+            f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} to {high:g}; are the "
             f"origins in {guess}"
         )
 

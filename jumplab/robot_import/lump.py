@@ -13,10 +13,10 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.checks import LIMITS, limit_faults
+from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.config import table
 from jumplab.robot_import.roles import LEG, robot_axes
-from jumplab.robot_import.tree import Tree
+from jumplab.robot_import.tree import LIMITS, Tree
 
 Roles = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])

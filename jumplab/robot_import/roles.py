@@ -9,9 +9,8 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.checks import MOVING
 from jumplab.robot_import.config import ROLES
-from jumplab.robot_import.tree import Joint, Tree
+from jumplab.robot_import.tree import MOVING, Joint, Tree
 
 # None of these numbers is printed by the paper.
 PARALLEL = 0.999  # cosine: axes canted by less than 2.6 deg count as pitch

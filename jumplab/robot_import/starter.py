@@ -41,13 +41,12 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     foot : link of the foot.  turn : (3, 3) from the root's axes to the robot's.
     leg_m : length from hip to ankle, from which a sole is guessed if the foot has no shape.
     """
-    pose, links, found, kinds = tree.poses(), [foot], [], set()
-    for link in links:
+    pose, found, kinds = tree.poses(), [], set()
+    for link in tree.fixed_to(foot):
         points = tree.points(link)
         if len(points):
             found.append((points @ pose[link].rotation.T + pose[link].translation - pose[foot].translation) @ turn.T)
-            kinds |= {shape.tag for shape, _ in tree.links[link].shapes}
-        links += [j.child for j in tree.below[link] if j.kind == "fixed"]
+            kinds |= {shape.tag for _, shape in tree.links[link].shapes}
     if found:
         points = np.concatenate(found)
         low = points[points[:, 2] < points[:, 2].min() + SOLE_M]
@@ -59,7 +58,7 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
 
 
 def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> tuple[str, Roles, Sole]:
-    """Text of the file, and the roles and the sole that are written into it.
+    """Text of the file, from ``starter.toml.in``, and the roles and the sole that are written into it.
 
     Parameters
     ----------
@@ -74,7 +73,25 @@ def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> t
     sole = find_sole(tree, roles.feet[0], turn, float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]])))
     knee = _inside(tree, pose, turn, roles.joints["knee"], STANCE_KNEE_RAD)
     shoulder = _inside(tree, pose, turn, roles.joints["shoulder_pitch"], 0.0)
-    return _text(roles, sole, urdf, name, repair, knee, shoulder), roles, sole
+    text = (
+        Path(__file__)
+        .with_suffix(".toml.in")
+        .read_text(encoding="utf-8")
+        .format(
+            notes="".join(f"# note: {note}\n" for note in roles.notes),
+            name=name,
+            urdf=_texts([Path(urdf).as_posix()])[1:-1],
+            roles=roles,
+            repair=_texts(repair),
+            joints="\n".join(f"{role} = {_texts(roles.joints[role])}" for role in ROLES),
+            feet=_texts(roles.feet),
+            sole=sole,
+            knee=knee,
+            trunk=STANCE_TRUNK_RAD,
+            shoulder=shoulder,
+        )
+    )
+    return text, roles, sole
 
 
 def _inside(tree: Tree, pose: dict[str, pin.SE3], turn: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
@@ -95,51 +112,3 @@ def safe_name(text: str) -> str:
 
 def _texts(values: tuple[str, ...]) -> str:
     return json.dumps(values, ensure_ascii=False)  # an array of texts is the same in JSON and in TOML
-
-
-def _pair(values: tuple[float, float]) -> str:
-    return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
-
-
-def _text(roles: Roles, sole: Sole, urdf: str, name: str, repair: tuple[str, ...], knee: float, shoulder: float) -> str:
-    notes = "".join(f"# note: {note}\n" for note in roles.notes)
-    joints = "\n".join(f"{role} = {_texts(roles.joints[role])}" for role in ROLES)
-    return f"""# Written by "jumplab robot check": correct what is wrong, then use it as --robot PATH.
-{notes}name = "{name}"
-urdf = {_texts([Path(urdf).as_posix()])[1:-1]}
-
-[source]
-trunk = "{roles.trunk}"  # link that carries both legs
-forward = "{roles.forward}"  # of its frame, in the neutral pose
-up = "{roles.up}"
-repair = {_texts(repair)}  # "symmetry", "inertia", "massless": what may be repaired
-
-[joints]  # [left, right]; found by motion; shoulder_pitch = [] holds the arms
-{joints}
-
-[locked]  # angle [rad] of joints without a role; 0, or the nearest end of the range, where nothing is said
-
-[feet]  # sole from the origin of the foot link, along the robot's axes: heel and toe, right and left edge, height
-links = {_texts(roles.feet)}
-sole_x_m = {_pair(sole.x)}  # {sole.source}
-sole_y_m = {_pair(sole.y)}
-sole_z_m = {sole.z:.4g}
-
-[stance]  # standing at rest; the rest follows from the CoM above the middle of the sole
-knee_rad = {knee:.3g}
-trunk_pitch_rad = {STANCE_TRUNK_RAD}
-shoulder_rad = {shoulder:.3g}
-
-[actuators]
-corner_speed_ratio = 0.5  # assumed: full torque up to this share of the speed limit
-
-# [limits.knee]  # replaces what the URDF says, for a role or for one joint
-# effort = 100.0    # [N m]
-# velocity = 10.0   # [rad/s]
-# lower = 0.0       # [rad]
-# upper = 2.0
-
-# [shapes]  # boxes for self-collision; left out, they follow from the leg's length
-# trunk_m = [[-0.08, 0.08, 0.10, 0.10, 0.60]]  # rear, front, half width, bottom, top, from the middle of the hips
-# thigh_thickness_m = 0.08
-"""

@@ -10,19 +10,26 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot_import.checks import LIMITS, MOST, MOVING, SIZES, inertia_matrix, link_mass
 from jumplab.robot_import.urdf import numbers
 
+MOVING = ("revolute", "continuous", "prismatic")
+LIMITS = ("lower", "upper", "effort", "velocity")
+TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
+SIZES["capsule"] = SIZES["cylinder"]
+KNOWN = (*SIZES, "mesh")
+FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is ignored
 THINNEST = 1e-3  # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 
 
 @dataclass(frozen=True)
 class Link:
-    """One link: its inertia in its own frame (zero if it has none) and its collision shapes, (element, place) each."""
+    """One link."""
 
     name: str
-    inertia: pin.Inertia
-    shapes: list[tuple[ET.Element, pin.SE3]] = field(repr=False, compare=False)
+    weighed: bool  # the URDF says something of its mass
+    inertia: pin.Inertia  # in its own frame; zero without mass
+    shapes: list[tuple[ET.Element, ET.Element]] = field(repr=False)  # (<collision>, the shape in it)
 
 
 @dataclass(frozen=True)
@@ -61,14 +68,22 @@ def _place(element: ET.Element) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
 
 
-def _inertia(link: ET.Element, repair: bool) -> pin.Inertia:
-    mass, inertial = link_mass(link), link.find("inertial")
-    if mass <= 0:
-        return pin.Inertia.Zero()
-    place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
-    if repair or mass < MOST.frame_kg:
-        matrix = repaired(matrix)
-    return pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
+def inertia_matrix(element: ET.Element) -> np.ndarray:
+    """(3, 3) of an ``<inertia>`` [kg m^2]."""
+    xx, xy, xz, yy, yz, zz = (float(element.get(key)) for key in TENSOR)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _link(e: ET.Element, repair: bool) -> Link:
+    inertial, total = e.find("inertial"), pin.Inertia.Zero()
+    mass = 0.0 if inertial is None else float(inertial.find("mass").get("value"))
+    if mass > 0:
+        place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
+        if repair or mass < FRAME_KG:
+            matrix = repaired(matrix)
+        total = pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
+    shapes = [(c, s) for c in e.findall("collision") for s in c.findall("geometry/*") if s.tag in KNOWN]
+    return Link(e.get("name"), inertial is not None, total, shapes)
 
 
 def repaired(matrix: np.ndarray) -> np.ndarray:
@@ -78,11 +93,6 @@ def repaired(matrix: np.ndarray) -> np.ndarray:
     floor = max(THINNEST * values.max(), 1e-12)
     second = (axes * np.maximum(values, floor)) @ axes.T
     return np.trace(second) * np.eye(3) - second
-
-
-def _shapes(link: ET.Element) -> list[tuple[ET.Element, pin.SE3]]:
-    known = [(e, [s for s in e.findall("geometry/*") if s.tag in (*SIZES, "mesh")]) for e in link.findall("collision")]
-    return [(shapes[0], _place(e)) for e, shapes in known if shapes]
 
 
 def _joint(e: ET.Element) -> Joint:
@@ -99,7 +109,7 @@ def _joint(e: ET.Element) -> Joint:
 
 
 class Tree:
-    """Links and joints of a URDF that :func:`jumplab.robot_import.checks.check` has passed.
+    """Links and joints of a URDF whose names, connections and inertials have passed the checks.
 
     Parameters
     ----------
@@ -111,8 +121,7 @@ class Tree:
 
     def __init__(self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False):
         self.where, self.path = where, path
-        links = [Link(e.get("name"), _inertia(e, repair_inertia), _shapes(e)) for e in root.findall("link")]
-        self.links = {link.name: link for link in links}
+        self.links = {e.get("name"): _link(e, repair_inertia) for e in root.findall("link")}
         self.joints = {e.get("name"): _joint(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}
         self.root = next(name for name in self.links if name not in self.above)
@@ -133,6 +142,13 @@ class Tree:
                 todo.append(joint.child)
         return out
 
+    def fixed_to(self, link: str) -> list[str]:
+        """A link and all links that are fixed to it from below."""
+        out = [link]
+        for name in out:
+            out += [j.child for j in self.below[name] if j.kind == "fixed"]
+        return out
+
     def chain(self, link: str) -> list[Joint]:
         """Joints from the root to a link."""
         out = []
@@ -150,8 +166,8 @@ class Tree:
     def points(self, link: str) -> np.ndarray:
         """(n, 3) points in a link's frame whose hull holds its collision shapes; meshes count where they are found."""
         found = [np.zeros((0, 3))]
-        for shape, place in self.links[link].shapes:
-            local = self._mesh(shape) if shape.tag == "mesh" else _corners(shape)
+        for collision, shape in self.links[link].shapes:
+            place, local = _place(collision), self._mesh(shape) if shape.tag == "mesh" else _corners(shape)
             found.append(local @ place.rotation.T + place.translation)
         return np.concatenate(found)
 
