@@ -58,12 +58,10 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     return massless or list(_unit_faults(tree)) or list(_shape_faults(root, where))
 
 
-def _origin_faults(element: ET.Element, at: str) -> Iterator[str]:
-    """``at`` ends with the word "origin"."""
-    origin = element.find("origin")
-    for key in ("xyz", "rpy"):
-        text = None if origin is None else origin.get(key)
-        if text is not None and numbers(text, 3) is None:
+def _triple_faults(element: ET.Element | None, at: str, *keys: str) -> Iterator[str]:
+    """Attributes that are there, but are not three numbers."""
+    for key, text in element.items() if element is not None else ():
+        if key in keys and numbers(text, 3) is None:
             yield f"{at} {key} = {text!r} must be three finite numbers"
 
 
@@ -104,7 +102,7 @@ def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
         yield f"{at}: joins the link {ends[0]!r} to itself; correct parent or child"
     if kind not in TYPES:
         yield f"{at}: type {kind!r} is unknown; URDF has {', '.join(TYPES)}"
-    yield from _origin_faults(joint, f"{at}: origin")
+    yield from _triple_faults(joint.find("origin"), f"{at}: origin", "xyz", "rpy")
     if kind in MOVING and axis is not None:
         direction = numbers(axis.get("xyz"), 3)
         if direction is None:
@@ -135,19 +133,15 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
     if not roots:
         yield f"{where}: no link is the root: the joints form a cycle; each robot needs one link without a parent"
     elif len(roots) > 1:
-        named = ", ".join(map(repr, roots[:4]))
-        yield (
-            f"{where}: {len(roots)} links have no parent ({named}), Pinocchio keeps one tree and drops the rest; "
-            f"connect them"
-        )
+        said = f"{where}: {len(roots)} links have no parent ({', '.join(map(repr, roots[:4]))})"
+        yield f"{said}, Pinocchio keeps one tree and drops the rest; connect them"
     else:
         seen, new = set(), {*roots}
         while new:
             seen |= new
             new = {link for link, above in parent.items() if above in new}
         if lost := sorted(names - seen):
-            named = ", ".join(map(repr, lost[:4]))
-            yield f"{where}: the links {named} form a cycle apart from the root {roots[0]!r}"
+            yield f"{where}: the links {', '.join(map(repr, lost[:4]))} form a cycle apart from the root {roots[0]!r}"
 
 
 # inertials ------------------------------------------------------------------------------------------------------
@@ -165,7 +159,7 @@ def _inertial_faults(link: ET.Element, at: str, strict: bool) -> Iterator[str]:
     if value[0] < 0:
         yield f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"
         return
-    yield from _origin_faults(inertial, f"{at}: inertial origin")
+    yield from _triple_faults(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")
     if tensor is None:
         yield f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"
         return
@@ -183,15 +177,11 @@ def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
     if low <= 0:
         yield f"{at}: principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
     elif high > (low + middle) * (1 + MOST.triangle):
-        yield (
-            f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2: the largest must not exceed the sum "
-            f"of the others, no solid has this; {remedy}"
-        )
+        said = f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2"
+        yield f"{said}: the largest must not exceed the sum of the others, no solid has this; {remedy}"
     elif gyration > MOST.gyration_m:
-        yield (
-            f"{at}: moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of {gyration:.3g} m, at "
-            f"most {MOST.gyration_m:g} is likely; is it in g mm^2 or kg cm^2?"
-        )
+        said = f"{at}: moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of {gyration:.3g} m"
+        yield f"{said}, at most {MOST.gyration_m:g} is likely; is it in g mm^2 or kg cm^2?"
 
 
 def _massless_bodies(tree: Tree) -> Iterator[str]:
@@ -201,10 +191,8 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
         if joint.kind == "fixed" or sum(link.inertia.mass for link in links) > 0:
             continue
         if not tree.links[joint.child].weighed:
-            yield (
-                f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet 1 kg; joint "
-                f"{joint.name!r} needs a body of more than 0 kg"
-            )
+            read = f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet 1 kg"
+            yield f"{read}; joint {joint.name!r} needs a body of more than 0 kg"
         else:
             yield f"{at}: mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
 
@@ -220,10 +208,8 @@ def _unit_faults(tree: Tree) -> Iterator[str]:
     low, high = MOST.size_m
     if not low <= size <= high:
         guess = "millimetres? divide by 1000" if size > high else "kilometres, or are the origins missing?"
-        yield (
-            f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} to {high:g}; are the "
-            f"origins in {guess}"
-        )
+        said = f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} to {high:g}"
+        yield f"{said}; are the origins in {guess}"
 
 
 def _shape_faults(root: ET.Element, where: str) -> Iterator[str]:
@@ -231,7 +217,7 @@ def _shape_faults(root: ET.Element, where: str) -> Iterator[str]:
     for link in root.findall("link"):
         at = f"{where}: link {link.get('name')!r}"
         for collision in link.findall("collision"):
-            yield from _origin_faults(collision, f"{at}: collision origin")
+            yield from _triple_faults(collision.find("origin"), f"{at}: collision origin", "xyz", "rpy")
             for shape in collision.findall("geometry/*"):
                 yield from _size_faults(shape, at)
 
@@ -245,8 +231,7 @@ def _size_faults(shape: ET.Element, at: str) -> Iterator[str]:
     if shape.tag == "mesh":
         if not shape.get("filename"):
             yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
-        if shape.get("scale") is not None and numbers(shape.get("scale"), 3) is None:
-            yield f"{at}: mesh scale = {shape.get('scale')!r} must be three finite numbers"
+        yield from _triple_faults(shape, f"{at}: mesh", "scale")
 
 
 # limits ---------------------------------------------------------------------------------------------------------

@@ -38,14 +38,7 @@ Boxes = list[tuple[np.ndarray, np.ndarray]]  # (centre, size) in the frame of a 
 
 @dataclass(frozen=True)
 class Jumper:
-    """A robot that every stage can read, and what was done to get it.
-
-    Attributes
-    ----------
-    urdf, config_text : the two texts.
-    lumped : the bodies.
-    tree : the URDF as it was.
-    """
+    """A robot that every stage can read, as two texts; its bodies; and the URDF as it was."""
 
     urdf: str
     config_text: str
@@ -260,18 +253,15 @@ def _limb(body: Body, start: np.ndarray, end: np.ndarray, width: float) -> Boxes
 
 
 def _trunk_boxes(config: dict, leg: float, hip: np.ndarray) -> Boxes:
-    rows = table(config, "shapes").get("trunk_m", [[leg * share for share in TRUNK_BOX]])
+    rows, boxes = table(config, "shapes").get("trunk_m", [[leg * share for share in TRUNK_BOX]]), []
     if not (isinstance(rows, list) and rows and all(map(_is_box, rows))):
         raise RobotError(
             f"robot configuration: 'shapes.trunk_m' = {rows!r} must be a list of [rear, front, half width, bottom, top]"
         )
-    return [
-        (
-            np.array([hip[0] + (rear + front) / 2, 0.0, hip[2] + (bottom + top) / 2]),
-            np.array([front - rear, 2 * half, top - bottom]),
-        )
-        for rear, front, half, bottom, top in rows
-    ]
+    for rear, front, half, bottom, top in rows:
+        low, high = np.array([rear, -half, bottom]), np.array([front, half, top])
+        boxes.append((hip + (low + high) / 2, high - low))
+    return boxes
 
 
 def _is_box(row: object) -> bool:

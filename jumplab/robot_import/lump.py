@@ -38,43 +38,25 @@ TOLERANCES = Tolerances()
 
 @dataclass(frozen=True)
 class Body:
-    """Links that move as one, about a joint that moves them ("" for the trunk).
-
-    Attributes
-    ----------
-    name, parent : names of this body and of the one that carries it.
-    joint : the joint of the URDF that moves it.
-    place : (3,) origin in the robot's axes [m], on the joint's axis; the trunk's is in the plane of symmetry.
-    axis : (3,) of the joint, in the robot's axes.
-    limits : lower, upper [rad], effort [N m], velocity [rad/s].
-    inertia : about ``place``, in the robot's axes.
-    """
+    """Links that move as one, about a joint that moves them ("" for the trunk)."""
 
     name: str
-    parent: str
-    joint: str
-    place: np.ndarray
-    axis: np.ndarray
-    limits: dict[str, float]
-    inertia: pin.Inertia
+    parent: str  # name of the body that carries it
+    joint: str  # of the URDF
+    place: np.ndarray  # (3,) origin in the robot's axes [m], on the joint's axis; the trunk's in the plane of symmetry
+    axis: np.ndarray  # (3,) of the joint, in the robot's axes
+    limits: dict[str, float]  # lower, upper [rad], effort [N m], velocity [rad/s]
+    inertia: pin.Inertia  # about ``place``, in the robot's axes
 
 
 @dataclass(frozen=True)
 class Lumped:
-    """The jumper.
+    """The jumper."""
 
-    Attributes
-    ----------
-    bodies : trunk first, each after the one that carries it.
-    foot_offset : (3,) from the foot body's origin to the origin of the told foot link [m].
-    changed : what symmetry and repairs changed: name -> (amount, unit).
-    held : joint -> angle [rad] of the joints that no longer move.
-    """
-
-    bodies: tuple[Body, ...]
-    foot_offset: np.ndarray
-    changed: dict[str, tuple[float, str]]
-    held: dict[str, float]
+    bodies: tuple[Body, ...]  # trunk first, each after the one that carries it
+    foot_offset: np.ndarray  # (3,) from the foot body's origin to the origin of the told foot link [m]
+    changed: dict[str, tuple[float, str]]  # what symmetry and repairs changed: name -> (amount, unit)
+    held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
 
     def body(self, joint: str) -> Body:
         """The body that a joint moves."""
@@ -98,7 +80,7 @@ def lump(tree: Tree, config: dict, roles: Roles, source: dict, feet: tuple[str, 
         if link not in tree.links:
             raise RobotError(f"{tree.where}: the configuration names the link {link!r}, which the URDF lacks")
     moving = _moving_joints(tree, roles, source["trunk"], feet)
-    held = {name: angle for name, angle in _held_angles(tree, config).items() if name not in moving}
+    held = {name: angle for name, angle in _held_angles(tree, config).items() if angle and name not in moving}
     pose = tree.poses(held)
     turn = robot_axes(pose[source["trunk"]].rotation, source["forward"], source["up"])
     hips = [turn @ pose[tree.joints[n].child].translation for n in roles["hip_pitch"]]
@@ -155,7 +137,7 @@ def _check_number(value: float, where: str) -> None:
 
 
 def _held_angles(tree: Tree, config: dict) -> dict[str, float]:
-    """Angles of [locked], else 0 or the nearest end of the range, where they are not 0."""
+    """Joint -> angle of [locked], else 0 or the nearest end of the range."""
     told, out = table(config, "locked"), {}
     for name, value in told.items():
         if name not in tree.joints:
@@ -170,7 +152,7 @@ def _held_angles(tree: Tree, config: dict) -> dict[str, float]:
         if joint.mimic and joint.name not in told:
             leader, factor, offset = joint.mimic
             out[joint.name] = factor * out.get(leader, 0.0) + offset
-    return {name: angle for name, angle in out.items() if angle}
+    return out
 
 
 def _limits(tree: Tree, config: dict, roles: Roles, moving: list[str]) -> dict[str, dict[str, float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -24,23 +24,14 @@ LEG = ROLES[:3]
 
 @dataclass(frozen=True)
 class Roles:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    trunk : link that carries both legs.
-    forward, up : axes of the trunk's frame in the neutral pose, such as "+x", "+z".
-    joints : role -> (left, right); shoulder_pitch is () where the arms are held.
-    feet : (left, right) links moved by the last joints of the legs.
-    notes : what a person should know, one sentence each.
-    """
-
-    trunk: str
-    forward: str
+    trunk: str  # link that carries both legs
+    forward: str  # axis of the trunk's frame in the neutral pose, such as "+x"
     up: str
-    joints: dict[str, tuple[str, ...]]
-    feet: tuple[str, str]
-    notes: tuple[str, ...]
+    joints: dict[str, tuple[str, ...]]  # role -> (left, right); shoulder_pitch is () where the arms are held
+    feet: tuple[str, str]  # (left, right) links moved by the last joints of the legs
+    notes: tuple[str, ...]  # what a person should know, one sentence each
 
 
 def robot_axes(frame: np.ndarray, forward: str, up: str) -> np.ndarray:
@@ -58,13 +49,7 @@ def _signed(vector: np.ndarray) -> str:
 
 
 Chain = list[Joint]
-
-
-class _Limb(NamedTuple):
-    """Two mirrored chains of joints, on the negative and on the positive side of the lateral axis."""
-
-    chains: tuple[Chain, Chain]
-    branch: str
+Limb = tuple[Chain, Chain]  # mirror images, on the negative and on the positive side of the lateral axis
 
 
 class _Finder:
@@ -86,7 +71,7 @@ class _Finder:
         chains = [self.moving(link, every_kind) for link in self.tree.links if not self.tree.below[link]]
         return [chain for chain in chains if chain]
 
-    def limbs(self, lateral: np.ndarray, every_kind: bool = False) -> list[_Limb]:
+    def limbs(self, lateral: np.ndarray, every_kind: bool = False) -> list[Limb]:
         """Pairs of chains whose tips mirror each other across the plane between the hips."""
         unique = {c[-1].name: c for c in self.tips(every_kind)}
         chains = [c for c in unique.values() if not any(c[-1] in o[:-1] for o in unique.values())]
@@ -97,10 +82,8 @@ class _Finder:
             if len(a) != len(b) or abs(side) < SAME_M or np.linalg.norm(gap - side * lateral) > SAME_M:
                 continue
             shared = sum(x is y for x, y in zip(a, b, strict=True))
-            whole, above = self.tree.path_between(a[-1].child, b[-1].child), self.tree.chain(b[-1].child)
-            pair = (a[shared:], b[shared:]) if side > 0 else (b[shared:], a[shared:])
-            if pair[0]:
-                out.append(_Limb(pair, next(j for j in whole if j in above).parent))
+            if shared < len(a):
+                out.append((a[shared:], b[shared:]) if side > 0 else (b[shared:], a[shared:]))
         return out
 
     def pitch(self, chain: Chain, lateral: np.ndarray) -> Chain:
@@ -127,7 +110,7 @@ class _Finder:
         for l_axis, u_axis in ("yz", "xz", "zy", "xy", "yx", "zx"):
             lateral, found = AXES[l_axis], []
             for limb in self.limbs(lateral, every_kind):
-                threes = [self.triple(chain, lateral) for chain in limb.chains]
+                threes = [self.triple(chain, lateral) for chain in limb]
                 if None in threes:
                     continue
                 hip, ankle = self.at[threes[0][0].name], self.at[threes[0][2].name]
@@ -153,14 +136,15 @@ def find_roles(tree: Tree) -> Roles:
     forward = np.cross(left, up)
     order = (1, 0) if left @ lateral > 0 else (0, 1)
     joints = {role: tuple(threes[i][k].name for i in order) for k, role in enumerate(LEG)}
-    feet = tuple(_foot(finder, threes[i], limb.chains[i], lateral) for i in order)
+    feet = tuple(_foot(finder, threes[i], limb[i], lateral) for i in order)
     notes = []
     joints["shoulder_pitch"] = _shoulders(finder, lateral, limb, order, notes)
     ahead = max(_ahead(finder, foot, ankle, forward) for foot, ankle in zip(feet, joints["ankle_pitch"], strict=True))
     if ahead < -BACKWARD_M:
         notes.append(f"the feet point backwards ({ahead:.3f} m) for a robot whose knees bend backwards; check forward")
-    frame = finder.pose[limb.branch].rotation.T
-    return Roles(limb.branch, _signed(frame @ forward), _signed(frame @ up), joints, feet, tuple(notes))
+    trunk = tree.joining(*feet)
+    frame = finder.pose[trunk].rotation.T
+    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, tuple(notes))
 
 
 def _foot(finder: _Finder, three: tuple, chain: Chain, lateral: np.ndarray) -> str:
@@ -181,17 +165,17 @@ def _ahead(finder: _Finder, foot: str, ankle: str, forward: np.ndarray) -> float
 
 
 def _shoulders(
-    finder: _Finder, lateral: np.ndarray, legs: _Limb, order: tuple[int, int], notes: list[str]
+    finder: _Finder, lateral: np.ndarray, legs: Limb, order: tuple[int, int], notes: list[str]
 ) -> tuple[str, ...]:
     """The first pitch joints of the heaviest mirrored pair of limbs that are no legs, or () with a note."""
-    firsts = {c[0].name for c in legs.chains}
-    arms = [x for x in finder.limbs(lateral) if not firsts & {c[0].name for c in x.chains}]
+    firsts = {c[0].name for c in legs}
+    arms = [x for x in finder.limbs(lateral) if not firsts & {c[0].name for c in x}]
     if not arms:
         notes.append("no arms were found: the shoulder is left out")
         return ()
-    limb = max(arms, key=lambda x: finder.mass(x.chains[0][0].child))
-    first = limb.chains[0][0]
-    for pair in zip(*limb.chains, strict=True):
+    limb = max(arms, key=lambda x: finder.mass(x[0][0].child))
+    first = limb[0][0]
+    for pair in zip(*limb, strict=True):
         heavy = finder.mass(pair[0].child) >= ARM_SHARE * finder.mass(first.child)
         if heavy and len(finder.pitch(pair, lateral)) == 2:
             return tuple(pair[i].name for i in order)

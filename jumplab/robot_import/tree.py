@@ -159,9 +159,13 @@ class Tree:
 
     def path_between(self, start: str, end: str) -> list[Joint]:
         """Joints on the way from one link to another, in order."""
-        a, b = self.chain(start), self.chain(end)
-        shared = sum(x is y for x, y in zip(a, b, strict=False))
-        return a[shared:][::-1] + b[shared:]
+        shared = len(self.chain(self.joining(start, end)))
+        return self.chain(start)[shared:][::-1] + self.chain(end)[shared:]
+
+    def joining(self, a: str, b: str) -> str:
+        """The last link that the ways from the root to two links share."""
+        shared = [x.child for x, y in zip(self.chain(a), self.chain(b), strict=False) if x is y]
+        return [self.root, *shared][-1]
 
     def points(self, link: str) -> np.ndarray:
         """(n, 3) points in a link's frame whose hull holds its collision shapes; meshes count where they are found."""
