@@ -92,10 +92,8 @@ def _sole(config: dict, lumped: Lumped, where: str) -> dict[str, float]:
     z = entry(config, "feet", "sole_z_m") + lumped.foot_offset[2]
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
-        raise RobotError(
-            f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, must lie below it and "
-            f"reach to both sides of it; correct [feet]"
-        )
+        said = f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle"
+        raise RobotError(f"{said}, must lie below it and reach to both sides of it; correct [feet]")
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
 
 
@@ -107,15 +105,15 @@ def _cut_hips(lumped: Lumped, roles: Roles, urdf: str) -> Lumped:
     cut = max(abs(low - left.limits["lower"]), abs(high - left.limits["upper"]))
     if cut == 0.0:
         return lumped
-    free = {left.name: (low, high), right.name: (low, high) if left.axis @ right.axis > 0 else (-high, -low)}
-    bodies = list(lumped.bodies)
-    for i, b in enumerate(bodies):
-        if b.name in free:
-            low, high = free[b.name]
-            cuts = {"lower": max(b.limits["lower"], low), "upper": min(b.limits["upper"], high)}
-            bodies[i] = replace(b, limits=b.limits | cuts)
+    mirrored = (low, high) if left.axis @ right.axis > 0 else (-high, -low)
+    new = {left.name: _within(left, low, high), right.name: _within(right, *mirrored)}
     changed = lumped.changed | {"hip range cut, thigh meets trunk": (cut, "rad")}
-    return replace(lumped, bodies=tuple(bodies), changed=changed)
+    return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
+
+
+def _within(body: Body, low: float, high: float) -> Body:
+    limits = {"lower": max(body.limits["lower"], low), "upper": min(body.limits["upper"], high)}
+    return replace(body, limits=body.limits | limits)
 
 
 def _free_range(lumped: Lumped, roles: Roles, urdf: str) -> tuple[float, float]:
@@ -151,11 +149,10 @@ def _free_range(lumped: Lumped, roles: Roles, urdf: str) -> tuple[float, float]:
 # the URDF -------------------------------------------------------------------------------------------------------
 def _add(parent: ET.Element, tag: str, **attributes: str | float | np.ndarray) -> ET.Element:
     """An element below ``parent``; numbers are written with twelve digits."""
-    said = {
-        k: v if isinstance(v, str) else " ".join(f"{x:.12g}" for x in 0.0 + np.atleast_1d(v))
-        for k, v in attributes.items()
-    }
-    return ET.SubElement(parent, tag, said)
+    for key, value in attributes.items():
+        if not isinstance(value, str):
+            attributes[key] = " ".join(f"{x:.12g}" for x in 0.0 + np.atleast_1d(value))
+    return ET.SubElement(parent, tag, attributes)
 
 
 def _urdf(config: dict, roles: Roles, lumped: Lumped, sole: dict[str, float]) -> str:
@@ -255,9 +252,8 @@ def _limb(body: Body, start: np.ndarray, end: np.ndarray, width: float) -> Boxes
 def _trunk_boxes(config: dict, leg: float, hip: np.ndarray) -> Boxes:
     rows, boxes = table(config, "shapes").get("trunk_m", [[leg * share for share in TRUNK_BOX]]), []
     if not (isinstance(rows, list) and rows and all(map(_is_box, rows))):
-        raise RobotError(
-            f"robot configuration: 'shapes.trunk_m' = {rows!r} must be a list of [rear, front, half width, bottom, top]"
-        )
+        said = f"robot configuration: 'shapes.trunk_m' = {rows!r}"
+        raise RobotError(f"{said} must be a list of [rear, front, half width, bottom, top]")
     for rear, front, half, bottom, top in rows:
         low, high = np.array([rear, -half, bottom]), np.array([front, half, top])
         boxes.append((hip + (low + high) / 2, high - low))

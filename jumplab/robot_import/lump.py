@@ -104,10 +104,8 @@ def _moving_joints(tree: Tree, roles: Roles, trunk: str, feet: Sequence[str]) ->
             raise RobotError(f"{tree.where}: a role names the joint {name!r}, which the URDF lacks")
         joint = tree.joints[name]
         if not joint.driven:
-            kind = "a mimic" if joint.mimic else joint.kind
-            raise RobotError(
-                f"{tree.where}: joint {name!r} has a role, but is {kind}; it must be revolute with a motor of its own"
-            )
+            said = f"{tree.where}: joint {name!r} has a role, but is {'a mimic' if joint.mimic else joint.kind}"
+            raise RobotError(f"{said}; it must be revolute with a motor of its own")
     for side, foot in enumerate(feet):
         path = tree.path_between(trunk, foot)
         _check_order(tree.where, [j.name for j in path], [roles[role][side] for role in LEG], trunk, foot)
@@ -119,16 +117,12 @@ def _check_order(where: str, path: list[str], leg: list[str], trunk: str, foot: 
     """Hip, knee and ankle must follow each other between trunk and foot."""
     missing = next((name for name in leg if name not in path), None)
     if missing:
-        raise RobotError(
-            f"{where}: the role joint {missing!r} is not between {trunk!r} and the foot {foot!r}; correct [joints], "
-            f"[feet] links or their order left, right"
-        )
+        said = f"{where}: the role joint {missing!r} is not between {trunk!r} and the foot {foot!r}"
+        raise RobotError(f"{said}; correct [joints], [feet] links or their order left, right")
     found = sorted(leg, key=path.index)
     if found != leg or len(set(leg)) < 3:
-        raise RobotError(
-            f"{where}: between {trunk!r} and {foot!r} come {', '.join(found)}; hip, knee and ankle must follow in this "
-            f"order; correct [joints]"
-        )
+        said = f"{where}: between {trunk!r} and {foot!r} come {', '.join(found)}"
+        raise RobotError(f"{said}; hip, knee and ankle must follow in this order; correct [joints]")
 
 
 def _check_number(value: float, where: str) -> None:
@@ -211,10 +205,8 @@ def _bodies(
             lost -= set(away)
     missing = tree.mass - sum(b.inertia.mass for b in bodies)
     if abs(missing) > 1e-9 * tree.mass:
-        raise RobotError(
-            f"{tree.where}: {missing:.3f} kg do not hang on the trunk ({', '.join(map(repr, sorted(lost)[:4]))}); "
-            f"they are joined to it by no joint of a robot"
-        )
+        said = f"{tree.where}: {missing:.3f} kg do not hang on the trunk ({', '.join(map(repr, sorted(lost)[:4]))})"
+        raise RobotError(f"{said}; they are joined to it by no joint of a robot")
     return bodies
 
 
@@ -287,22 +279,19 @@ def _same_axis(left: Body, right: Body) -> np.ndarray:
 
 
 def _judge(where: str, place: tuple[float, str], mass: tuple[float, str], allowed: bool, changed: dict) -> None:
-    (gap, at), (share, heavy), most = place, mass, TOLERANCES
+    (gap, at), (share, heavy), most, said = place, mass, TOLERANCES, f"{where}: left and right differ by"
     if gap > most.most_m or share > most.most_share:
-        what = f"{100 * share:.1f} % in mass or inertia at {heavy!r}"
-        if gap > most.most_m:
-            what = f"{1e3 * gap:.1f} mm at {at!r}"
+        far = gap > most.most_m
+        what = f"{1e3 * gap:.1f} mm at {at!r}" if far else f"{100 * share:.1f} % in mass or inertia at {heavy!r}"
         raise RobotError(
-            f"{where}: left and right differ by {what}, at most {1e3 * most.most_m:g} mm and {100 * most.most_share:g} "
-            f"% can be evened out; a symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"
+            f"{said} {what}, at most {1e3 * most.most_m:g} mm and {100 * most.most_share:g} % can be evened out; a "
+            f"symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"
         )
     if max(gap, share) <= most.alike:
         return
     if not allowed:
-        raise RobotError(
-            f"{where}: left and right differ by {1e3 * gap:.3g} mm at {at!r} and {100 * share:.3g} % of mass or "
-            f'inertia at {heavy!r}; allow their mean with [source] repair = ["symmetry"]'
-        )
+        said += f" {1e3 * gap:.3g} mm at {at!r} and {100 * share:.3g} % of mass or inertia at {heavy!r}"
+        raise RobotError(f'{said}; allow their mean with [source] repair = ["symmetry"]')
     changed["left and right evened out, places"] = (1e3 * gap, "mm")
     changed["left and right evened out, masses"] = (100 * share, "%")
 

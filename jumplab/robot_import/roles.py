@@ -180,10 +180,8 @@ def _shoulders(
         if heavy and len(finder.pitch(pair, lateral)) == 2:
             return tuple(pair[i].name for i in order)
     cant = np.degrees(np.arccos(min(1.0, abs(finder.axis[first.name] @ lateral))))
-    notes.append(
-        f"the arms are held: the first joint, {first.name!r}, turns {cant:.1f} deg off the pitch axis, and none behind "
-        f"it swings half of the arm about that axis"
-    )
+    said = f"the arms are held: the first joint, {first.name!r}, turns {cant:.1f} deg off the pitch axis"
+    notes.append(f"{said}, and none behind it swings half of the arm about that axis")
     return ()
 
 
@@ -195,21 +193,15 @@ def _explain(finder: _Finder) -> NoReturn:
         for role, joint in zip(LEG, three, strict=True):
             if not joint.driven:
                 kind = f"mimics {joint.mimic[0]!r}" if joint.mimic else f"is of type {joint.kind!r}"
-                raise RobotError(
-                    f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}, which "
-                    f"must be revolute with a range and a motor of its own"
-                )
+                said = f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}"
+                raise RobotError(f"{said}, which must be revolute with a range and a motor of its own")
     tips = finder.tips()
     hanging = [c for c in tips if (three := finder.triple(c, lateral)) and finder.along(three, AXES["z"])]
     names = {c[-1].name for c in hanging}
     if len(names) == 1:
-        raise RobotError(
-            f"{where}: one leg only: the chain that ends with joint {names.pop()!r} has no mirror image among "
-            f"{len(tree.links)} links; a jumper needs two legs"
-        )
+        said = f"{where}: one leg only: the chain that ends with joint {names.pop()!r} has no mirror image"
+        raise RobotError(f"{said} among {len(tree.links)} links; a jumper needs two legs")
     best = max((finder.pitch(c, lateral) for c in tips), key=len, default=[])
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
-    raise RobotError(
-        f"{where}: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was found; the most on "
-        f"one chain about +-y are {len(best)} ({shown})"
-    )
+    said = f"{where}: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was found"
+    raise RobotError(f"{said}; the most on one chain about +-y are {len(best)} ({shown})")

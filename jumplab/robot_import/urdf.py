@@ -40,20 +40,15 @@ def locate(name: str, beside: Path) -> Path:
     package, colon, inside = name.partition(":")
     if not (colon and package == PACKAGE):
         return beside / name
-    try:
-        return Path(str(metadata.distribution(PACKAGE).locate_file(f"{PACKAGE_FOLDER}/{inside}")))
-    except metadata.PackageNotFoundError:
-        raise RobotError(
-            f"{name}: the package {PACKAGE} with the published robots is not installed; pip install 'jumplab[robots]'"
-        ) from None
+    if not have_published():
+        said = f"{name}: the package {PACKAGE} with the published robots is not installed"
+        raise RobotError(f"{said}; pip install 'jumplab[robots]'")
+    return Path(str(metadata.distribution(PACKAGE).locate_file(f"{PACKAGE_FOLDER}/{inside}")))
 
 
 def have_published() -> bool:
     """True if the package with the published robots is installed."""
-    try:
-        return bool(metadata.version(PACKAGE))
-    except metadata.PackageNotFoundError:
-        return False
+    return any(metadata.distributions(name=PACKAGE))
 
 
 def read_urdf(path: str | Path) -> str:
@@ -63,9 +58,8 @@ def read_urdf(path: str | Path) -> str:
         if path.is_dir():
             raise RobotError(f"{path}: is a folder; name the URDF file inside it")
         if (size := path.stat().st_size) > MAX_BYTES:
-            raise RobotError(
-                f"{path}: has {size / 1e6:.0f} MB, a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
-            )
+            most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
+            raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
         return decode(path.read_bytes(), str(path))
     except FileNotFoundError:
         raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
