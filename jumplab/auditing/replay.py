@@ -8,6 +8,7 @@ from itertools import product
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import cumulative_trapezoid
 
 from jumplab.auditing.limits import METHOD
 from jumplab.errors import InputError, RobotError
@@ -36,42 +37,26 @@ class Sole:
 
 @dataclass(frozen=True)
 class Replay:
-    """A tape, a robot's URDF and what follows from them; all vectors in world axes.
-
-    Attributes
-    ----------
-    tape, robot, task, edge_m : as given to the audit.
-    model, geometry : Pinocchio's, built from the URDF alone.
-    soles : one per contact frame.
-    com, com_velocity, com_acceleration : (N, 3) [m, m/s, m/s^2].
-    momentum : (N, 3) angular momentum about the CoM [kg m^2/s].
-    energy : (N,) kinetic plus potential [J].
-    base : (N, 3) origin of the base link [m].
-    base_rotation : (N, 3, 3).
-    foot : (N, K, 3) origin of each contact frame [m].
-    foot_rotation : (N, K, 3, 3).
-    base_residual : (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides.
-    tau : (N, nv - 6) joint torques that the motion and the contact wrenches need [N m].
-    """
+    """A tape, a robot's URDF and what follows from them, in N samples with K contact frames; vectors in world axes."""
 
     tape: Tape
     robot: Robot
     task: JumpTask | None
     edge_m: float | None
-    model: pin.Model
+    model: pin.Model  # built from the URDF alone, as the geometry
     geometry: pin.GeometryModel
-    soles: tuple[Sole, ...]
-    com: np.ndarray
+    soles: tuple[Sole, ...]  # one per contact frame
+    com: np.ndarray  # (N, 3) [m], its velocity [m/s] and its acceleration [m/s^2]
     com_velocity: np.ndarray
     com_acceleration: np.ndarray
-    momentum: np.ndarray
-    energy: np.ndarray
-    base: np.ndarray
-    base_rotation: np.ndarray
-    foot: np.ndarray
-    foot_rotation: np.ndarray
-    base_residual: np.ndarray
-    tau: np.ndarray
+    momentum: np.ndarray  # (N, 3) angular momentum about the CoM [kg m^2/s]
+    energy: np.ndarray  # (N,) kinetic plus potential [J]
+    base: np.ndarray  # (N, 3) origin of the base link [m]
+    base_rotation: np.ndarray  # (N, 3, 3)
+    foot: np.ndarray  # (N, K, 3) origin of each contact frame [m]
+    foot_rotation: np.ndarray  # (N, K, 3, 3)
+    base_residual: np.ndarray  # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
+    tau: np.ndarray  # (N, nv - 6) joint torques that the motion and the contact wrenches need [N m]
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -86,7 +71,7 @@ class Replay:
     @cached_property
     def mass(self) -> float:
         """Mass of the URDF [kg]."""
-        return float(sum(body.mass for body in self.model.inertias))
+        return float(pin.computeTotalMass(self.model))
 
     @property
     def weight(self) -> float:
@@ -156,10 +141,7 @@ class Replay:
 
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
-        values = np.asarray(values, float)
-        step = self.step.reshape((-1,) + (1,) * (values.ndim - 1))
-        total = np.cumsum((values[1:] + values[:-1]) / 2 * step, axis=0)
-        return np.concatenate([np.zeros_like(values[:1]), total])
+        return cumulative_trapezoid(values, self.tape.t, axis=0, initial=0.0)
 
 
 def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
@@ -218,8 +200,7 @@ def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: in
 
 def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.ndarray]:
     """The kinematic fields of :class:`Replay`, by name."""
-    data, rows = model.createData(), []
-    mass = sum(body.mass for body in model.inertias)
+    data, rows, mass = model.createData(), [], pin.computeTotalMass(model)
     for q, v, a in zip(tape.q, tape.v, tape.a, strict=True):
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         pin.updateFramePlacements(model, data)

@@ -49,11 +49,8 @@ class Jumper:
 def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -> Jumper:
     """Check, lump and rewrite; raises :class:`RobotError`.
 
-    Parameters
-    ----------
-    urdf : text of the URDF.
-    config : the configuration, with a table [source].
-    where, path : name of the URDF for messages, and the file itself, near which meshes are looked for.
+    ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the URDF in messages, and
+    meshes are looked for near its ``path``.
     """
     source = _source(config)
     root = parse(urdf, where)
@@ -163,14 +160,19 @@ def _urdf(config: dict, roles: Roles, lumped: Lumped, sole: dict[str, float]) ->
     _trunk(robot, trunk, boxes[trunk.name], np.mean(hips, axis=0) - trunk.place)
     for body in others:
         _link(robot, body.name, body.inertia, boxes.get(body.name, []))
-        joint = _add(robot, "joint", name=body.joint, type="revolute")
-        _add(joint, "parent", link=body.parent)
-        _add(joint, "child", link=body.name)
+        joint = _joint(robot, body.joint, "revolute", body.parent, body.name)
         _add(joint, "origin", xyz=body.place - by_name[body.parent].place, rpy="0 0 0")
         _add(joint, "axis", xyz=body.axis)
         _add(joint, "limit", **body.limits)
     ET.indent(robot)
     return f'<?xml version="1.0"?>\n{ET.tostring(robot, encoding="unicode")}\n'
+
+
+def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    joint = _add(robot, "joint", name=name, type=kind)
+    _add(joint, "parent", link=parent)
+    _add(joint, "child", link=child)
+    return joint
 
 
 def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes: Boxes, seen: Boxes | None = None) -> None:
@@ -204,9 +206,7 @@ def _trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> None
     rest = f"{body.name}_rest"
     _link(robot, body.name, pin.Inertia(half, lever, even), boxes, _spine(boxes, hip))
     _link(robot, rest, pin.Inertia(half, lever, matrix - even), [])
-    joint = _add(robot, "joint", name=f"{rest}_fixed", type="fixed")
-    _add(joint, "parent", link=body.name)
-    _add(joint, "child", link=rest)
+    _joint(robot, f"{rest}_fixed", "fixed", body.name, rest)
 
 
 def _spine(boxes: Boxes, hip: np.ndarray) -> Boxes:

@@ -64,17 +64,10 @@ class Lumped:
 
 
 def lump(tree: Tree, config: dict, roles: Roles, source: dict, feet: tuple[str, str]) -> Lumped:
-    """The jumper of a URDF.
+    """The jumper of a URDF; raises :class:`RobotError` for names, limits and asymmetries that cannot be meant.
 
-    Parameters
-    ----------
-    tree : the URDF.
-    config : the robot's whole configuration, of which [locked] and [limits] are read here.
-    roles : role -> (left, right) joint names.
-    source : trunk, forward, up and repair of [source].
-    feet : (left, right) links of the soles.
-
-    Raises :class:`RobotError` for names, limits and asymmetries that cannot be meant.
+    Of ``config`` the tables [locked] and [limits] are read here; ``roles`` are role -> (left, right) joint names,
+    ``source`` is trunk, forward, up and repair of [source], ``feet`` are the (left, right) links of the soles.
     """
     for link in (source["trunk"], *feet):
         if link not in tree.links:
@@ -301,8 +294,7 @@ def _pairs(where: str, bodies: list[Body], roles: Roles) -> list[tuple[Body, Bod
     above, out = {b.name: b for b in bodies}, []
     for role in ("ankle_pitch", "shoulder_pitch"):
         limbs = []
-        for name in roles[role]:
-            body = next(b for b in bodies if b.joint == name)
+        for body in (b for name in roles[role] for b in bodies if b.joint == name):
             limb = [body, *beyond(bodies, body)]
             while limb[0].parent != bodies[0].name:
                 limb.insert(0, above[limb[0].parent])

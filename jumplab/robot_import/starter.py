@@ -36,10 +36,8 @@ class Sole:
 def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that are at hand.
 
-    Parameters
-    ----------
-    foot : link of the foot.  turn : (3, 3) from the root's axes to the robot's.
-    leg_m : length from hip to ankle, from which a sole is guessed if the foot has no shape.
+    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip to ankle, a sole is
+    guessed if the link ``foot`` has no shape.
     """
     pose, found, kinds = tree.poses(), [], set()
     for link in tree.fixed_to(foot):
@@ -60,12 +58,8 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
 def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> tuple[str, Roles, Sole]:
     """Text of the file, from ``starter.toml.in``, and the roles and the sole that are written into it.
 
-    Parameters
-    ----------
-    tree : the URDF.  urdf : its path as the file shall name it.  name : of the robot.
-    repair : what the person allows to be repaired.
-
-    Raises :class:`jumplab.errors.RobotError` if the URDF has no two legs.
+    ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person allows to be
+    repaired. Raises :class:`jumplab.errors.RobotError` if the URDF has no two legs.
     """
     roles, pose = find_roles(tree), tree.poses()
     turn = robot_axes(pose[roles.trunk].rotation, roles.forward, roles.up)

@@ -111,12 +111,8 @@ def _joint(e: ET.Element) -> Joint:
 class Tree:
     """Links and joints of a URDF whose names, connections and inertials have passed the checks.
 
-    Parameters
-    ----------
-    root : the root element.
-    where : name of the file, for messages.
-    path : the file itself, near which meshes are looked for.
-    repair_inertia : replace inertias that no solid has by the nearest possible ones.
+    ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are looked for;
+    ``repair_inertia`` replaces inertias that no solid has by the nearest possible ones.
     """
 
     def __init__(self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False):
