@@ -33,7 +33,7 @@ class Plausible:
     angle_rad: float = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
 
 
-MOST = Plausible()
+PLAUSIBLE = Plausible()
 
 
 def check(root: ET.Element, where: str, repair: Collection[str] = ()) -> None:
@@ -176,12 +176,12 @@ def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
     gyration = np.sqrt(abs(high) / mass)
     if low <= 0:
         yield f"{at}: principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
-    elif high > (low + middle) * (1 + MOST.triangle):
+    elif high > (low + middle) * (1 + PLAUSIBLE.triangle):
         said = f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2"
         yield f"{said}: the largest must not exceed the sum of the others, no solid has this; {remedy}"
-    elif gyration > MOST.gyration_m:
+    elif gyration > PLAUSIBLE.gyration_m:
         said = f"{at}: moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of {gyration:.3g} m"
-        yield f"{said}, at most {MOST.gyration_m:g} is likely; is it in g mm^2 or kg cm^2?"
+        yield f"{said}, at most {PLAUSIBLE.gyration_m:g} is likely; is it in g mm^2 or kg cm^2?"
 
 
 def _massless_bodies(tree: Tree) -> Iterator[str]:
@@ -200,12 +200,12 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
 # units and shapes -----------------------------------------------------------------------------------------------
 def _unit_faults(tree: Tree) -> Iterator[str]:
     """Total mass and size that no humanoid has in kg and m."""
-    mass, (low, high) = tree.mass, MOST.mass_kg
+    mass, (low, high) = tree.mass, PLAUSIBLE.mass_kg
     if not low <= mass <= high:
         guess = "grams? divide by 1000" if mass > high else "tonnes, or are inertials missing?"
         yield f"{tree.where}: weighs {mass:g} kg, a humanoid {low:g} to {high:g}; are the masses in {guess}"
     size = max(sum(np.linalg.norm(joint.place.translation) for joint in tree.chain(link)) for link in tree.links)
-    low, high = MOST.size_m
+    low, high = PLAUSIBLE.size_m
     if not low <= size <= high:
         guess = "millimetres? divide by 1000" if size > high else "kilometres, or are the origins missing?"
         said = f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} to {high:g}"
@@ -253,18 +253,18 @@ def limit_faults(joint: ET.Element, where: str, told: dict[str, float] | None = 
         values[key] = float(value[0])
     low, high, effort, speed = (values[key] for key in LIMITS)
     span = f"{at}: range {low:g} ... {high:g} rad is"
-    if max(abs(low), abs(high)) > MOST.angle_rad:
-        yield f"{span} beyond {MOST.angle_rad:.1f}: degrees or a placeholder; give the real range in rad"
+    if max(abs(low), abs(high)) > PLAUSIBLE.angle_rad:
+        yield f"{span} beyond {PLAUSIBLE.angle_rad:.1f}: degrees or a placeholder; give the real range in rad"
     elif low > high:
         yield f"{at}: lower = {low:g} rad is above upper = {high:g} rad; swap them"
     elif low == high:
         yield f"{span} empty; give the real range"
     if effort <= 0:
         yield f"{at}: effort = {effort:g} N m must be positive; give the peak torque"
-    elif effort > MOST.effort_nm:
-        yield f"{at}: effort = {effort:g} N m is above {MOST.effort_nm:g}: a placeholder; give the peak torque"
+    elif effort > PLAUSIBLE.effort_nm:
+        yield f"{at}: effort = {effort:g} N m is above {PLAUSIBLE.effort_nm:g}: a placeholder; give the peak torque"
     told_speed = f"{at}: velocity = {speed:g} rad/s"
     if speed <= 0:
         yield f"{told_speed} must be positive; give the speed limit"
-    elif speed > MOST.speed_rad_s:
-        yield f"{told_speed} is above {MOST.speed_rad_s:g}: deg/s or a placeholder; give the speed limit in rad/s"
+    elif speed > PLAUSIBLE.speed_rad_s:
+        yield f"{told_speed} is above {PLAUSIBLE.speed_rad_s:g}: deg/s or a placeholder; give the speed limit in rad/s"
