@@ -18,7 +18,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, roles_table, table
-from jumplab.robot_import.lump import Body, Lumped, Roles, beyond, lump
+from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
 from jumplab.robot_import.tree import Tree
 from jumplab.robot_import.urdf import parse
 
@@ -95,7 +95,7 @@ def _sole(config: dict, lumped: Lumped, where: str) -> dict[str, float]:
 
 
 # the range of the hips ------------------------------------------------------------------------------------------
-def _cut_hips(lumped: Lumped, roles: Roles, urdf: str) -> Lumped:
+def _cut_hips(lumped: Lumped, roles: RoleJoints, urdf: str) -> Lumped:
     """Hip ranges cut to where the boxes of thigh and trunk meet."""
     left, right = (lumped.body(name) for name in roles["hip_pitch"])
     low, high = _free_range(lumped, roles, urdf)
@@ -113,7 +113,7 @@ def _within(body: Body, low: float, high: float) -> Body:
     return replace(body, limits=body.limits | limits)
 
 
-def _free_range(lumped: Lumped, roles: Roles, urdf: str) -> tuple[float, float]:
+def _free_range(lumped: Lumped, roles: RoleJoints, urdf: str) -> tuple[float, float]:
     """(lower, upper) of the left hip's own angle [rad] around 0 within which neither thigh touches the trunk.
 
     Both hips are turned together, by mirrored angles, every other joint at 0.
@@ -152,7 +152,7 @@ def _add(parent: ET.Element, tag: str, **attributes: str | float | np.ndarray) -
     return ET.SubElement(parent, tag, attributes)
 
 
-def _urdf(config: dict, roles: Roles, lumped: Lumped, sole: dict[str, float]) -> str:
+def _urdf(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]) -> str:
     robot = ET.Element("robot", name=entry(config, "name", kind=str))
     boxes, by_name = _boxes(config, roles, lumped, sole), {b.name: b for b in lumped.bodies}
     trunk, *others = lumped.bodies
@@ -218,7 +218,7 @@ def _spine(boxes: Boxes, hip: np.ndarray) -> Boxes:
     return [(np.array([hip[0], 0.0, (bottom + hip[2]) / 2]), np.array([size[0] / 2, size[1] / 2, bottom - hip[2]]))]
 
 
-def _boxes(config: dict, roles: Roles, lumped: Lumped, sole: dict[str, float]) -> dict[str, Boxes]:
+def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
     by_name = {b.name: b for b in lumped.bodies}
     hips, knees, ankles, arms = ([lumped.body(name) for name in pair] for pair in roles.values())
@@ -270,28 +270,19 @@ def _list(values: Sequence[str | float]) -> str:
     return "[" + ", ".join(f'"{v}"' if isinstance(v, str) else f"{v:.12g}" for v in values) + "]"
 
 
-def _toml(config: dict, roles: Roles, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped) -> str:
-    name, corner = entry(config, "name", kind=str), entry(config, "actuators", "corner_speed_ratio")
-    held = ", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0"
-    joints = "\n".join(f"{role} = {_list(pair)}" for role, pair in roles.items())
-    stance = "\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE)
-    return f"""# {name}, lumped by jumplab from a URDF with the SHA-256
-# {hashlib.sha256(urdf.encode()).hexdigest()}; held joints: {held}
-name = "{name}"
-urdf = "robot.urdf"
-
-[joints]
-{joints}
-
-[feet]
-links = {_list(feet)}
-sole_x_m = {_list([sole["heel"], sole["toe"]])}
-sole_y_m = {_list([-sole["half"], sole["half"]])}
-sole_z_m = {sole["z"]:.12g}
-
-[stance]
-{stance}
-
-[actuators]
-corner_speed_ratio = {corner:.12g}
-"""
+def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped) -> str:
+    return (
+        Path(__file__)
+        .with_suffix(".toml.in")
+        .read_text(encoding="utf-8")
+        .format(
+            name=entry(config, "name", kind=str),
+            sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+            held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
+            joints="\n".join(f"{role} = {_list(pair)}" for role, pair in roles.items()),
+            links=_list(feet),
+            sole=sole,
+            stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
+            corner=entry(config, "actuators", "corner_speed_ratio"),
+        )
+    )

@@ -14,11 +14,11 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.checks import limit_faults
-from jumplab.robot_import.config import table
+from jumplab.robot_import.config import entry, table
 from jumplab.robot_import.roles import LEG, robot_axes
 from jumplab.robot_import.tree import LIMITS, Tree
 
-Roles = dict[str, tuple[str, ...]]
+RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])
 DUMMY = pin.Inertia(1e-3, np.zeros(3), 1e-6 * np.eye(3))  # as in the default robot; MuJoCo refuses zero
 
@@ -63,7 +63,7 @@ class Lumped:
         return next(b for b in self.bodies if b.joint == joint)
 
 
-def lump(tree: Tree, config: dict, roles: Roles, source: dict, feet: tuple[str, str]) -> Lumped:
+def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[str, str]) -> Lumped:
     """The jumper of a URDF; raises :class:`RobotError` for names, limits and asymmetries that cannot be meant.
 
     Of ``config`` the tables [locked] and [limits] are read here; ``roles`` are role -> (left, right) joint names,
@@ -89,7 +89,7 @@ def lump(tree: Tree, config: dict, roles: Roles, source: dict, feet: tuple[str, 
 
 
 # what moves, and how far ----------------------------------------------------------------------------------------
-def _moving_joints(tree: Tree, roles: Roles, trunk: str, feet: Sequence[str]) -> list[str]:
+def _moving_joints(tree: Tree, roles: RoleJoints, trunk: str, feet: Sequence[str]) -> list[str]:
     """Names of the joints that jump: those of the roles, and every revolute joint between trunk and feet."""
     moving = [name for pair in roles.values() for name in pair]
     for name in moving:
@@ -118,23 +118,17 @@ def _check_order(where: str, path: list[str], leg: list[str], trunk: str, foot: 
         raise RobotError(f"{said}; hip, knee and ankle must follow in this order; correct [joints]")
 
 
-def _check_number(value: float, where: str) -> None:
-    if not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise RobotError(f"robot configuration: {where!r} = {value!r}, must be a finite number")
-
-
 def _held_angles(tree: Tree, config: dict) -> dict[str, float]:
     """Joint -> angle of [locked], else 0 or the nearest end of the range."""
-    told, out = table(config, "locked"), {}
-    for name, value in told.items():
+    told, out = {}, {}
+    for name in table(config, "locked"):
         if name not in tree.joints:
             raise RobotError(f"{tree.where}: [locked] names the joint {name!r}, which the URDF lacks")
-        _check_number(value, f"locked.{name}")
+        told[name] = entry(config, "locked", name)
     for joint in tree.joints.values():
         if joint.kind in ("revolute", "prismatic") and {"lower", "upper"} <= set(joint.limits):
             out[joint.name] = float(np.clip(0.0, *sorted((joint.limits["lower"], joint.limits["upper"]))))
-        if joint.name in told:
-            out[joint.name] = float(told[joint.name])
+    out |= told
     for joint in tree.joints.values():  # a follower goes where its leader is held
         if joint.mimic and joint.name not in told:
             leader, factor, offset = joint.mimic
@@ -142,20 +136,19 @@ def _held_angles(tree: Tree, config: dict) -> dict[str, float]:
     return out
 
 
-def _limits(tree: Tree, config: dict, roles: Roles, moving: list[str]) -> dict[str, dict[str, float]]:
+def _limits(tree: Tree, config: dict, roles: RoleJoints, moving: list[str]) -> dict[str, dict[str, float]]:
     """Joint -> limits, those of the configuration first; a table of [limits] names a joint or a role."""
-    told = table(config, "limits")
-    for name, values in told.items():
+    told = {}
+    for name, values in table(config, "limits").items():
         if name not in tree.joints and name not in roles:
             raise RobotError(f"{tree.where}: [limits.{name}] names neither a joint of the URDF nor a role")
         if not isinstance(values, dict) or not set(values) <= set(LIMITS):
             raise RobotError(f"robot configuration: 'limits.{name}' may hold {', '.join(LIMITS)}, got {values!r}")
-        for key, value in values.items():
-            _check_number(value, f"limits.{name}.{key}")
+        told[name] = {key: entry(config, "limits", name, key) for key in values}
     out = {}
     for name in moving:
         role = next((r for r, pair in roles.items() if name in pair), "")
-        values = {k: float(v) for k, v in (told.get(role, {}) | told.get(name, {})).items()}
+        values = told.get(role, {}) | told.get(name, {})
         for sentence in limit_faults(tree.joints[name].element, tree.where, values):
             raise RobotError(f"{sentence}, or tell it in [limits.{role or name}] of the configuration")
         out[name] = {key: values.get(key, tree.joints[name].limits.get(key)) for key in LIMITS}
@@ -229,7 +222,7 @@ def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
 
 
 # left and right -------------------------------------------------------------------------------------------------
-def _mirrored(where: str, bodies: list[Body], roles: Roles, allowed: bool, changed: dict) -> list[Body]:
+def _mirrored(where: str, bodies: list[Body], roles: RoleJoints, allowed: bool, changed: dict) -> list[Body]:
     """Left and right as exact mirror images: their means, where they are alike or that is ``allowed``."""
     trunk, out = bodies[0], {}
     place, mass = (0.0, trunk.name), (0.0, trunk.name)  # largest difference [m], and share, with the body's name
@@ -289,7 +282,7 @@ def _judge(where: str, place: tuple[float, str], mass: tuple[float, str], allowe
     changed["left and right evened out, masses"] = (100 * share, "%")
 
 
-def _pairs(where: str, bodies: list[Body], roles: Roles) -> list[tuple[Body, Body]]:
+def _pairs(where: str, bodies: list[Body], roles: RoleJoints) -> list[tuple[Body, Body]]:
     """(left, right) bodies that correspond, counted along legs and arms from the trunk."""
     above, out = {b.name: b for b in bodies}, []
     for role in ("ankle_pitch", "shoulder_pitch"):
