@@ -10,8 +10,7 @@ from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 from jumplab.errors import RobotError
 from jumplab.robot.checkup import check, draft
 from jumplab.robot_import.roles import find_roles
-from jumplab.robot_import.soles import find_sole
-from jumplab.robot_import.starter import starter
+from jumplab.robot_import.starter import find_sole, starter
 from jumplab.robot_import.tree import Tree, repaired
 
 LEGS = {

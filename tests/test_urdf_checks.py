@@ -3,7 +3,6 @@
 import re
 from xml.etree import ElementTree as ET
 
-import pinocchio as pin
 import pytest
 from paper import bhr_table as table
 
@@ -252,17 +251,6 @@ def test_a_good_robot_has_no_fault():
 def test_all_faults_are_listed():
     text = changed('value="3"', 'value="-3"', SHANK).replace('value="5"', 'value="nan"')
     assert len(list(urdf_checks.faults(parse(text, FILE), FILE))) == 3
-
-
-def test_mass_is_recounted():
-    root = parse(GOOD, FILE)
-    model = pin.buildModelFromXML(GOOD, pin.JointModelFreeFlyer())
-    urdf_checks.recount(root, sum(i.mass for i in model.inertias), FILE)
-    with pytest.raises(RobotError) as e:
-        urdf_checks.recount(root, 41.0, FILE)
-    assert str(e.value) == (
-        "my.urdf: the links weigh 42.0000 kg in the XML and 41.0000 kg in Pinocchio; a part was dropped"
-    )
 
 
 def test_paths_that_hold_no_file(tmp_path):

@@ -1,46 +1,38 @@
-"""The audit itself: replay the tape, then ask every group of checks."""
+"""The audit itself: replay a tape, ask every group of checks, and leave the report in a result folder."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import platform
-from importlib import metadata
+from pathlib import Path
 
-from jumplab.auditing import collision, contact, description, dynamics, joints, kinematics, target
+from jumplab.auditing import contact, dynamics, joints, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import AuditReport
-from jumplab.errors import InputError, quoted, require_type
+from jumplab.errors import InputError, as_path, quoted, require_type
+from jumplab.io.files import CONFIG, PLAN, SUMMARY, URDF, write_file
+from jumplab.io.folder import read_json, sha256, versions
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
 
-PACKAGES = ("jumplab", "pin", "coal", "casadi", "numpy")
-GROUPS = (kinematics, dynamics, contact, joints, target, collision, description)
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _manifest(tape: Tape, robot: Robot, task: JumpTask | None) -> dict:
-    return {
-        "robot": robot.name,
-        "robot_hash": robot.hash,
-        "target": dataclasses.asdict(task) if task else None,
-        "samples": len(tape.t),
-        "versions": {"python": platform.python_version(), **{p: _version(p) for p in PACKAGES}},
-    }
+REPORT = "passport.json"
+GROUPS = (
+    motion.checks,
+    dynamics.checks,
+    contact.checks,
+    joints.checks,
+    motion.target,
+    contact.collisions,
+    joints.description,
+)
 
 
 def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None) -> AuditReport:
     """Audit a finished plan with nothing but its tape and the robot's URDF.
 
     Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid. A tape with numbers that are not finite,
-    or with phases out of order, gets a passport with these two checks alone.
+    or with phases out of order, gets a report with these two checks alone.
 
     Parameters
     ----------
@@ -64,8 +56,62 @@ def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: flo
     if edge_m is not None and not (number and math.isfinite(edge_m)):
         raise InputError(f"edge_m must be a finite number of metres, got {quoted(edge_m)}")
     open_tape(tape, robot, task)
-    checks = kinematics.form(tape)
+    checks = motion.form(tape)
     if all(c.passed for c in checks):
         r = replay(tape, robot, task, edge_m)
-        checks += [c for group in GROUPS for c in group.checks(r)]
-    return AuditReport(tuple(checks), _manifest(tape, robot, task))
+        checks += [c for group in GROUPS for c in group(r)]
+    manifest = {
+        "robot": robot.name,
+        "robot_hash": robot.hash,
+        "target": dataclasses.asdict(task) if task else None,
+        "samples": len(tape.t),
+        "versions": versions(),
+    }
+    return AuditReport(tuple(checks), manifest)
+
+
+def write_audit(folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None) -> AuditReport:
+    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another folder).
+
+    Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest, ``summary.json`` if it is
+    there; takes no lock, since the folder may be one that is being written.
+
+    Parameters
+    ----------
+    folder : result folder of a plan.
+    task : what was asked; by default the target in ``summary.json``.
+    into : where the file goes; the folder itself if None.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, or the folder cannot be written to.
+    """
+    folder = as_path(folder, "a result folder")
+    tape = Tape.load(folder / PLAN)
+    humanoid = Robot.from_text(_text(folder / URDF), _text(folder / CONFIG))
+    summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
+    edge = None
+    if task is None:
+        task, edge = _task_of(summary), summary.get("platform_edge_m")
+    report = audit(tape, humanoid, task, edge_m=edge)
+    manifest = {**report.manifest, "plan_sha256": sha256(folder / PLAN), "planner": summary}
+    report = dataclasses.replace(report, manifest=manifest)
+    write_file((folder if into is None else as_path(into, "the passport's folder")) / REPORT, report.to_json().encode())
+    return report
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: cannot be read ({type(e).__name__}); plan the jump again into this folder") from e
+
+
+def _task_of(summary: dict) -> JumpTask | None:
+    """The target that a summary names under ``target``; None if it names none."""
+    target = summary.get("target")
+    if not isinstance(target, dict) or not {"distance_m", "height_m"} <= set(target):
+        return None
+    known = {f.name for f in dataclasses.fields(JumpTask)}
+    return JumpTask(**{k: v for k, v in target.items() if k in known})

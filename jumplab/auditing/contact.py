@@ -1,48 +1,44 @@
-"""Feet and ground: slip, penetration, clearance, centre of pressure, friction, unilaterality."""
+"""Feet and ground: slip, penetration, clearance, centre of pressure, friction; and what else may collide (coal)."""
 
 from __future__ import annotations
 
+from itertools import combinations
+
+import coal
 import numpy as np
+import pinocchio as pin
 
-from jumplab.auditing import limits as lim
+from jumplab.auditing.limits import LIMITS, METHOD
 from jumplab.auditing.replay import Replay
-from jumplab.auditing.report import Check, worst
-
-GROUP = "contact"
+from jumplab.auditing.report import Check
 
 
 def checks(r: Replay) -> list[Check]:
-    """All checks of this group."""
+    """All checks of the group "contact"."""
     return [*_geometry(r), *_pressure(r), *_force(r)]
 
 
 def _geometry(r: Replay) -> list[Check]:
     t, s, feet = r.tape.t, r.launch, r.tape.contact_frames
-    toe = r.toe_corners[s]  # (n, K, 2, 3)
+    toe, points = r.toe_corners[s], r.sole_points  # (n, K, 2, 3), (N, K, P, 3)
     slip = np.linalg.norm((toe - toe[0])[..., :2], axis=-1).max(axis=-1)
     hover = np.abs(toe[..., 2]).max(axis=-1)
-    points = r.sole_points
     above = 1e3 * (points[..., 2] - r.surface(points[..., 0])).min(axis=-1)  # (N, K)
     flying = t[r.flight]
     share = (t - flying[0]) / (flying[-1] - flying[0])
-    middle = (share >= lim.MID_FLIGHT[0]) & (share <= lim.MID_FLIGHT[1])
+    middle = (share >= METHOD.mid_flight[0]) & (share <= METHOD.mid_flight[1])
     return [
-        worst(GROUP, "toe slip", 1e3 * slip, t[s], lim.SLIP_MM, "mm",
-              "horizontal travel of the toe edge since the start, over the launch", labels=feet),
-        worst(GROUP, "toe on the ground", 1e3 * hover, t[s], lim.HOVER_MM, "mm",
-              "height of the toe edge over the ground, or depth under it, over the launch", labels=feet),
-        worst(GROUP, "penetration", -above, t, lim.PENETRATION_MM, "mm",
-              "depth of the sole's points under ground or platform, whole jump", labels=feet),
-        worst(GROUP, "foot clearance", above[middle], t[middle], lim.CLEARANCE_MM, "mm",
-              f"lowest sole point over the surface, {lim.MID_FLIGHT[0]:.0%} to {lim.MID_FLIGHT[1]:.0%} of the flight",
-              at_least=True, labels=feet),
-    ]  # fmt: skip
+        LIMITS["toe slip"].worst(1e3 * slip, t[s], feet),
+        LIMITS["toe on the ground"].worst(1e3 * hover, t[s], feet),
+        LIMITS["penetration"].worst(-above, t, feet),
+        LIMITS["foot clearance"].worst(above[middle], t[middle], feet),
+    ]
 
 
 def _pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
     """CoP on the ground (N, K, 2) [m], nan without load, and torsion about it (N, K) [N m]."""
     force, moment = r.tape.f[..., :3], r.tape.f[..., 3:]
-    up = np.where(force[..., 2] > lim.COP_MIN_FORCE_N, force[..., 2], np.nan)
+    up = np.where(force[..., 2] > METHOD.cop_force_n, force[..., 2], np.nan)
     down = -r.foot[..., 2]  # from the frame's origin to the ground
     dx = (down * force[..., 0] - moment[..., 1]) / up
     dy = (down * force[..., 1] + moment[..., 0]) / up
@@ -51,7 +47,7 @@ def _pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pressure(r: Replay) -> list[Check]:
-    t, feet = r.tape.t, r.tape.contact_frames
+    t, feet, load, friction = r.tape.t, r.tape.contact_frames, r.tape.f[..., 2], LIMITS["friction used"].limit
     cop, torsion = _pressure_points(r)
     heading = r.foot_rotation[..., :2, 0]
     heading = heading / np.maximum(np.linalg.norm(heading, axis=-1, keepdims=True), 1e-9)  # (N, K, 2) heel to toe
@@ -61,31 +57,63 @@ def _pressure(r: Replay) -> list[Check]:
     length = ((toe - heel) * heading).sum(-1)  # of the sole, seen from above
     aside = np.abs(((cop - toe) * side).sum(-1)) - np.array([(s.left - s.right) / 2 for s in r.soles])
     outside = np.maximum.reduce([ahead, -ahead - length, aside])
-    raised = 1e3 * r.heel_corners[..., 2].min(axis=-1) > lim.HEEL_UP_MM
-    loaded = r.tape.f[..., 2] > lim.COP_MIN_FORCE_N
+    raised = 1e3 * r.heel_corners[..., 2].min(axis=-1) > METHOD.heel_up_mm
+    loaded = load > METHOD.cop_force_n
     some = loaded.any(axis=1)  # rows with something to check
-    twist = np.abs(torsion) / (lim.FRICTION * lim.TORSION_ARM_M * np.where(loaded, r.tape.f[..., 2], 1.0))
-    beyond = np.where(loaded, outside, -np.inf)
-    load = f"wherever a foot carries over {lim.COP_MIN_FORCE_N:g} N"
+    beyond, tipped = np.where(loaded, outside, -np.inf), np.where(loaded & raised, np.abs(ahead), 0.0)
+    twist = np.abs(torsion) / (friction * METHOD.torsion_arm_m * np.where(loaded, load, 1.0))
     return [
-        worst(GROUP, "CoP in the sole", 1e3 * beyond[some], t[some], lim.COP_OUTSIDE_MM, "mm",
-              f"distance of the centre of pressure beyond the sole's edges (negative: inside), {load}", labels=feet),
-        worst(GROUP, "CoP at the toe", 1e3 * np.where(loaded & raised, np.abs(ahead), 0.0), t, lim.TOE_COP_MM, "mm",
-              f"distance from toe edge to centre of pressure while the heel is over {lim.HEEL_UP_MM:g} mm up, {load}",
-              labels=feet),
-        worst(GROUP, "torsional friction", 100 * np.where(loaded, twist, 0.0), t, lim.SHARE_PERCENT, "%",
-              f"moment about the vertical through the CoP as a share of friction {lim.FRICTION:g} on "
-              f"{lim.TORSION_ARM_M:g} m, {load}", labels=feet),
-    ]  # fmt: skip
+        LIMITS["CoP in the sole"].worst(1e3 * beyond[some], t[some], feet),
+        LIMITS["CoP at the toe"].worst(1e3 * tipped, t, feet),
+        LIMITS["torsional friction"].worst(100 * np.where(loaded, twist, 0.0), t, feet, friction=friction),
+    ]
 
 
 def _force(r: Replay) -> list[Check]:
     t, feet, force = r.tape.t, r.tape.contact_frames, r.tape.f
-    along = np.linalg.norm(force[..., :2], axis=-1)
-    used = along / np.maximum(force[..., 2], lim.FRICTION_MIN_FORCE_N)
+    used = np.linalg.norm(force[..., :2], axis=-1) / np.maximum(force[..., 2], METHOD.friction_force_n)
+    return [LIMITS["friction used"].worst(used, t, feet), LIMITS["ground only pushes"].worst(-force[..., 2], t, feet)]
+
+
+def collisions(r: Replay) -> list[Check]:
+    """All checks of the group "collision": links that are no neighbours, and the body and its surroundings."""
+    geometry = r.geometry.copy()
+    _add_self_pairs(r, geometry)
+    n_self = len(geometry.collisionPairs)
+    _add_surroundings(r, geometry)
+    rows = np.unique([*range(0, len(r.tape.t), METHOD.collision_step), len(r.tape.t) - 1])
+    data, shapes, gap = r.model.createData(), geometry.createData(), []
+    for q in r.tape.q[rows]:
+        pin.computeDistances(r.model, data, geometry, shapes, q)
+        gap.append([1e3 * d.min_distance for d in shapes.distanceResults])
+    gap, name = np.array(gap), [shape.name for shape in geometry.geometryObjects]
+    pairs = [f"{name[p.first]} - {name[p.second]}" for p in geometry.collisionPairs]
     return [
-        worst(GROUP, "friction used", used, t, lim.FRICTION, "1",
-              f"tangential over normal force (at least {lim.FRICTION_MIN_FORCE_N:g} N) of each foot", labels=feet),
-        worst(GROUP, "ground only pushes", -force[..., 2], t, lim.PULL_N, "N",
-              "downward pull of the ground on a foot (negative: it pushes all the time)", labels=feet),
-    ]  # fmt: skip
+        LIMITS["self-collision"].worst(gap[:, :n_self], r.tape.t[rows], pairs[:n_self]),
+        LIMITS["body clearance"].worst(gap[:, n_self:], r.tape.t[rows], pairs[n_self:]),
+    ]
+
+
+def _add_self_pairs(r: Replay, geometry: pin.GeometryModel) -> None:
+    """Pairs of different links, neither of which is the other's parent joint."""
+    joint, parents = [shape.parentJoint for shape in geometry.geometryObjects], r.model.parents
+    for (i, a), (k, b) in combinations(enumerate(joint), 2):
+        if a != b and parents[a] != b and parents[b] != a:
+            geometry.addCollisionPair(pin.CollisionPair(i, k))
+
+
+def _add_surroundings(r: Replay, geometry: pin.GeometryModel) -> None:
+    """The lower surface as a half space, the higher one as a block; pairs with every link but the feet."""
+    feet = {r.model.frames[r.model.getFrameId(str(n))].parentJoint for n in r.tape.contact_frames}
+    bodies = [i for i, s in enumerate(geometry.geometryObjects) if s.parentJoint not in feet]
+    low, high = sorted((0.0, r.platform))
+    below = coal.Halfspace(np.array([0.0, 0.0, 1.0]), low)
+    blocks = [pin.GeometryObject("ground", 0, 0, pin.SE3.Identity(), below)]
+    if high - low > 1e-6:
+        towards, size = r.heading if r.platform > 0 else -r.heading, METHOD.block_m
+        centre = np.array([r.edge + towards * size / 2, 0.0, high - size / 2])
+        blocks.append(pin.GeometryObject("platform", 0, 0, pin.SE3(np.eye(3), centre), coal.Box(size, size, size)))
+    for block in blocks:
+        index = geometry.addGeometryObject(block)
+        for i in bodies:
+            geometry.addCollisionPair(pin.CollisionPair(i, index))

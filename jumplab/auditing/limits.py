@@ -1,61 +1,69 @@
-"""Limits of the audit. Each is our choice, with its reason; the paper prints none."""
+"""How the audit looks at a tape, and what it allows: the limits of all checks stand in ``limits.toml``."""
 
-# dynamics ---------------------------------------------------------------------------------------------------------
-RESIDUAL_PERCENT = 0.5  # of m g (force) and m g * 1 m (moment): well below what landing control absorbs
-TORQUE_PERCENT = 0.5  # of each joint's peak torque: as accurate as the floating base
-IMPULSE_PERCENT = 0.5  # of the take-off momentum: 0.5 % of the speed is 1 % of the rise
-ANGULAR_IMPULSE = 0.05  # [kg m^2/s] about 1 % of L at take-off in a forward jump
-FLIGHT_COM_MM = 1.0  # from the parabola: a tenth of a percent of the jump length
-FLIGHT_GRAVITY_PERCENT = 0.1  # of g, fitted to the flight: tells 9.8 from 9.81
-FLIGHT_L = 0.01  # [kg m^2/s] drift of the angular momentum in flight: 1 mrad of rotation at rho = 6, 0.6 s
-TAKEOFF_PERCENT = 0.5  # of m g and m g * 1 m, left over in the contact wrench at take-off
-TAKEOFF_ACCELERATION_PERCENT = 0.5  # of g, between the CoM's acceleration at take-off and free fall
-FLIGHT_FORCE_N = 0.1  # contact force claimed in the air: nothing but rounding
-ENERGY_PERCENT = 0.5  # of the range of the mechanical energy
-MASS_PERCENT = 0.5  # of the URDF's mass, against the mass that the ground force moves
+from __future__ import annotations
 
-# the tape itself --------------------------------------------------------------------------------------------------
-STEP_MS = 1.05 + 1e-6  # the control cycle is 1 ms; touchdown falls between two, and a sliver joins the last step
-QUATERNION = 1e-6  # deviation from unit length that integration cannot have caused
-STEP_RATE = 0.01  # [m/s, rad/s] positions against rates, step by step: 0.1 % of the fastest joint
-STEP_ACCELERATION = 4.0  # [m/s^2, rad/s^2] rates against accelerations: a jerk step of 32,000 rad/s^3 inside one step
-DRIFT_POSITION = 1.0  # [mm, mrad] after re-integrating a whole phase
-DRIFT_RATE = 0.01  # [m/s, rad/s] after re-integrating a whole phase
-SWITCH_POSITION = 0.1  # [mm, mrad] jump between the two samples of take-off: a tenth of the slip allowed
-SWITCH_RATE = 0.01  # [m/s, rad/s] likewise
-SWITCH_ACCELERATION = 1.0  # [m/s^2, rad/s^2] about 1 % of the peak
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
-# contact ----------------------------------------------------------------------------------------------------------
-SLIP_MM = 1.0  # of the toe edge over the whole launch
-HOVER_MM = 1.0  # of the toe edge above or below the ground while it is said to push
-PENETRATION_MM = 1.0  # of any sole point below the surface under it
-CLEARANCE_MM = 20.0  # of the sole in mid-flight: rough floor and tracking error of the playback
-MID_FLIGHT = (0.3, 0.7)  # share of the flight: outside, the sole is on its way from or to a surface
-BODY_CLEARANCE_MM = 10.0  # of everything but the feet above ground and platform
-COP_MIN_FORCE_N = 50.0  # per foot (100 N in all): below, the CoP is a quotient of two small numbers
-COP_OUTSIDE_MM = 10.0  # beyond the sole's edge between the planner's nodes
-HEEL_UP_MM = 5.0  # heel height from which the foot counts as tipped
-TOE_COP_MM = 10.0  # from CoP to toe edge while the heel is up
-FRICTION = 0.5  # lowest friction that the simulations use
-FRICTION_MIN_FORCE_N = 10.0  # per foot: below, the ratio is taken to this force instead
-TORSION_ARM_M = 0.05  # half width of a sole: lever of the friction that resists turning on the spot
-PULL_N = 1.0  # the ground cannot pull: rounding only
+import numpy as np
 
-# joints -----------------------------------------------------------------------------------------------------------
-RANGE_MRAD = 1.0  # beyond a joint's range: overshoot between nodes at most
-SHARE_PERCENT = 100.0  # of a speed or torque limit
-TORQUE_FLOOR = 0.01  # of the peak torque: what counts as available at the speed limit, so that shares stay finite
-SYMMETRY_MRAD = 0.1  # between left and right, and of roll and yaw [mrad], of lateral shift [mm]
-SYMMETRY_TORQUE_PERCENT = 0.1  # of peak torque and of body weight, between left and right
+from jumplab.auditing.report import Check
 
-# target -----------------------------------------------------------------------------------------------------------
-DISTANCE_MM = 5.0  # a tenth of what the simulated jump may miss
-RISE_MM = 5.0  # a sixth of what the simulated jump may miss
-FLAT_MRAD = 10.0  # sole against the surface at touchdown: 2.4 mm over its length
-TOUCHDOWN_MM = 1.0  # sole corners from the surface at touchdown, as for penetration
-ROTATION_MRAD = 20.0  # of the feet over the whole jump, from the asked turns: flatness at both ends
-START_RATE = 0.01  # [m/s, rad/s] of anything at t = 0: the jump starts from standing
 
-# collision --------------------------------------------------------------------------------------------------------
-SELF_DISTANCE_MM = 1.0  # between links that are not neighbours: the contact margin of physics engines
-SOLE_MM = 0.1  # between the sole in the URDF and the one in the robot's configuration
+@dataclass(frozen=True)
+class Method:
+    """Numbers of the audit that are no limits; the paper prints none of them."""
+
+    min_samples: int = 10  # per phase: fewer are no motion
+    mid_flight: tuple[float, float] = (0.3, 0.7)  # share of the flight: outside, the sole is near a surface
+    cop_force_n: float = 50.0  # per foot: below, the CoP is a quotient of two small numbers
+    heel_up_mm: float = 5.0  # heel height from which the foot counts as tipped
+    friction_force_n: float = 10.0  # per foot: below, the ratio is taken to this force instead
+    torsion_arm_m: float = 0.05  # half width of a sole: lever of the friction that resists turning on the spot
+    torque_floor: float = 0.01  # of the peak torque: left at the speed limit, so that shares stay finite
+    sole_points: int = 7  # along each edge of the sole: a platform's edge cannot pass between two of them
+    same_level_m: float = 1e-3  # corners this close to the lowest one belong to the sole
+    edge_room_m: float = 0.05  # from a sole to the edge of what it stands on: a playback that falls short still lands
+    collision_step: int = 2  # samples: the fastest hand moves 2 cm meanwhile, and contact between links lasts longer
+    block_m: float = 20.0  # size of the platform's block, larger than any jump
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a check allows: ``limit`` in ``unit``; ``note`` says what is measured, with braces for what is found."""
+
+    group: str
+    name: str
+    limit: float
+    unit: str
+    note: str
+    at_least: bool = False
+
+    def check(self, value: float, time: float | None = None, **found) -> Check:
+        """Check of one value, which occurs at a time [s]."""
+        note = self.note.format(**asdict(METHOD), **found)
+        return Check(self.group, self.name, value, self.limit, self.unit, time, note, self.at_least)
+
+    def worst(self, values: np.ndarray, t: np.ndarray, labels: Sequence[str] | None = None, **found) -> Check:
+        """Check of the worst entry of ``values`` (N,) or (N, M) over the times ``t`` (N,) [s].
+
+        ``labels`` (M,) name the columns; the worst one's is added to the note. Not a number counts as worst; no rows at
+        all give the limit itself, with no time, since nothing was there to break it.
+        """
+        values = np.asarray(values, float)
+        if values.size == 0:
+            value, time, where = self.limit, None, " (nothing to check)"
+        else:
+            ranked = np.where(np.isnan(values), np.inf, -values if self.at_least else values)
+            at = np.unravel_index(int(np.argmax(ranked)), values.shape)
+            value, time = float(values[at]) + 0.0, float(t[at[0]])  # no minus zero
+            where = "" if labels is None else f"; worst: {labels[at[1]]}"
+        note = self.note.format(**asdict(METHOD), **found) + where
+        return Check(self.group, self.name, value, self.limit, self.unit, time, note, self.at_least)
+
+
+METHOD = Method()
+_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+LIMITS = {name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()}

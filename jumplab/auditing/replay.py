@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import cumulative_trapezoid
 
+from jumplab.auditing.limits import METHOD
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import GRAVITY, JumpTask
 
-SOLE_POINTS = 7  # along each edge of the sole, so that the edge of a platform cannot pass between two of them
-EDGE_ROOM_M = 0.05  # between a sole and the edge of what it stands on: a playback that falls short still lands
-SAME_LEVEL_M = 1e-3  # corners this close to the lowest one belong to the sole
+BASE = ("base x", "base y", "base z", "base roll", "base pitch", "base yaw")
 
 
 @dataclass(frozen=True)
@@ -28,77 +29,39 @@ class Sole:
     left: float
     z: float
 
-    def points(self, n: int = SOLE_POINTS) -> np.ndarray:
+    def points(self) -> np.ndarray:
         """(2 n, 3) points on right and left edge: index 0 is the heel, n - 1 the toe, then the left edge likewise."""
-        x = np.linspace(self.heel, self.toe, n)
+        x = np.linspace(self.heel, self.toe, METHOD.sole_points)
         return np.array([[xi, y, self.z] for y in (self.right, self.left) for xi in x])
-
-
-def build_geometry(model: pin.Model, robot: Robot) -> pin.GeometryModel:
-    """Collision shapes of the URDF, without pairs."""
-    try:
-        return pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
-    except (ValueError, RuntimeError) as e:
-        raise RobotError(f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}") from e
-
-
-def sole_of(geometry: pin.GeometryModel, model: pin.Model, frame_name: str) -> Sole | None:
-    """Lowest face of the boxes of a foot link, in the link's frame; None if it has no box."""
-    frame_id = model.getFrameId(frame_name)
-    frame = model.frames[frame_id]
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    corners = []
-    for shape in geometry.geometryObjects:
-        half = getattr(shape.geometry, "halfSide", None)
-        if half is not None and shape.parentFrame == frame_id:
-            place = frame.placement.actInv(shape.placement)
-            corners += [place.act(s * half) for s in signs]
-    if not corners:
-        return None
-    corners = np.array(corners)
-    low = corners[corners[:, 2] < corners[:, 2].min() + SAME_LEVEL_M]
-    return Sole(low[:, 0].min(), low[:, 0].max(), low[:, 1].min(), low[:, 1].max(), low[:, 2].min())
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A tape, a robot's URDF and what follows from them; all vectors in world axes.
-
-    Attributes
-    ----------
-    tape, robot, task, edge_m : as given to the audit.
-    model, geometry : Pinocchio's, built from the URDF alone.
-    soles : one per contact frame.
-    com, com_velocity, com_acceleration : (N, 3) [m, m/s, m/s^2].
-    momentum, momentum_rate : (N, 3) angular momentum about the CoM and its derivative [kg m^2/s, N m].
-    energy : (N,) kinetic plus potential [J].
-    base : (N, 3) origin of the base link [m].
-    base_rotation : (N, 3, 3).
-    foot : (N, K, 3) origin of each contact frame [m].
-    foot_rotation : (N, K, 3, 3).
-    base_residual : (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides.
-    tau : (N, nv - 6) joint torques that the motion and the contact wrenches need [N m].
-    """
+    """A tape, a robot's URDF and what follows from them, in N samples with K contact frames; vectors in world axes."""
 
     tape: Tape
     robot: Robot
     task: JumpTask | None
     edge_m: float | None
-    model: pin.Model
+    model: pin.Model  # built from the URDF alone, as the geometry
     geometry: pin.GeometryModel
-    soles: tuple[Sole, ...]
-    com: np.ndarray
+    soles: tuple[Sole, ...]  # one per contact frame
+    com: np.ndarray  # (N, 3) [m], its velocity [m/s] and its acceleration [m/s^2]
     com_velocity: np.ndarray
     com_acceleration: np.ndarray
-    momentum: np.ndarray
-    momentum_rate: np.ndarray
-    energy: np.ndarray
-    base: np.ndarray
-    base_rotation: np.ndarray
-    foot: np.ndarray
-    foot_rotation: np.ndarray
-    base_residual: np.ndarray
-    tau: np.ndarray
+    momentum: np.ndarray  # (N, 3) angular momentum about the CoM [kg m^2/s]
+    energy: np.ndarray  # (N,) kinetic plus potential [J]
+    base: np.ndarray  # (N, 3) origin of the base link [m]
+    base_rotation: np.ndarray  # (N, 3, 3)
+    foot: np.ndarray  # (N, K, 3) origin of each contact frame [m]
+    foot_rotation: np.ndarray  # (N, K, 3, 3)
+    base_residual: np.ndarray  # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
+    tau: np.ndarray  # (N, nv - 6) joint torques that the motion and the contact wrenches need [N m]
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """(nv,) names of the columns of v."""
+        return (*BASE, *map(str, self.tape.joint_names))
 
     @property
     def gravity(self) -> float:
@@ -108,7 +71,7 @@ class Replay:
     @cached_property
     def mass(self) -> float:
         """Mass of the URDF [kg]."""
-        return float(sum(body.mass for body in self.model.inertias))
+        return float(pin.computeTotalMass(self.model))
 
     @property
     def weight(self) -> float:
@@ -132,19 +95,19 @@ class Replay:
 
     @cached_property
     def sole_points(self) -> np.ndarray:
-        """(N, K, 2 SOLE_POINTS, 3) points of the soles in the world [m]."""
+        """(N, K, 2 n, 3) points of the soles in the world [m], in the order of :meth:`Sole.points`."""
         local = np.array([s.points() for s in self.soles])  # (K, P, 3)
         return self.foot[:, :, None] + np.einsum("nkij,kpj->nkpi", self.foot_rotation, local)
 
     @property
     def toe_corners(self) -> np.ndarray:
         """(N, K, 2, 3) ends of the toe edges [m]."""
-        return self.sole_points[:, :, [SOLE_POINTS - 1, 2 * SOLE_POINTS - 1]]
+        return self.sole_points[:, :, [METHOD.sole_points - 1, -1]]
 
     @property
     def heel_corners(self) -> np.ndarray:
         """(N, K, 2, 3) ends of the heel edges [m]."""
-        return self.sole_points[:, :, [0, SOLE_POINTS]]
+        return self.sole_points[:, :, [0, METHOD.sole_points]]
 
     @cached_property
     def platform(self) -> float:
@@ -167,8 +130,8 @@ class Replay:
             return float(self.toe_corners[0, ..., 0].mean()) + self.edge_m
         ahead = self.heading * self.sole_points[[0, -1], ..., 0]
         launched, landed = float(ahead[0].max()), float(ahead[1].min())
-        up = min(max(landed - EDGE_ROOM_M, launched), landed)
-        return self.heading * (up if self.platform > 0 else launched + EDGE_ROOM_M)
+        up = min(max(landed - METHOD.edge_room_m, launched), landed)
+        return self.heading * (up if self.platform > 0 else launched + METHOD.edge_room_m)
 
     def surface(self, x: np.ndarray) -> np.ndarray:
         """Height of the surface under ``x`` [m]."""
@@ -178,31 +141,7 @@ class Replay:
 
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
-        values = np.asarray(values, float)
-        step = self.step.reshape((-1,) + (1,) * (values.ndim - 1))
-        total = np.cumsum((values[1:] + values[:-1]) / 2 * step, axis=0)
-        return np.concatenate([np.zeros_like(values[:1]), total])
-
-
-def _check_names(tape: Tape, model: pin.Model, robot: Robot) -> list[int]:
-    names = tuple(model.names[2:])
-    if tuple(str(n) for n in tape.joint_names) != names:
-        raise InputError(f"tape: its joints are not those of the robot {robot.name!r} in the same order; plan the jump "
-                         f"again with this robot")  # fmt: skip
-    n, k = len(tape.t), len(tape.contact_frames)
-    shapes = {"q": (n, model.nq), "v": (n, model.nv), "a": (n, model.nv), "tau": (n, model.nv - 6), "f": (n, k, 6)}
-    for name, shape in shapes.items():
-        if getattr(tape, name).shape != shape:
-            found = getattr(tape, name).shape
-            raise InputError(f"tape: {name} has shape {found}, the robot {robot.name!r} needs {shape}")
-    frames = []
-    for name in tape.contact_frames:
-        if not model.existFrame(str(name)):
-            raise InputError(f"tape: the contact frame {str(name)!r} is not a link of the robot {robot.name!r}")
-        frames.append(model.getFrameId(str(name)))
-    if k == 0:
-        raise InputError("tape: it names no contact frame; a jump needs at least one foot")
-    return frames
+        return cumulative_trapezoid(values, self.tape.t, axis=0, initial=0.0)
 
 
 def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
@@ -212,64 +151,88 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
     except ValueError as e:
         raise RobotError(f"robot {robot.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}") from e
     model.gravity.linear = np.array([0.0, 0.0, -(task.gravity if task else GRAVITY)])
-    return model, _check_names(tape, model, robot)
+    if tuple(map(str, tape.joint_names)) != tuple(model.names[2:]):
+        raise InputError(
+            f"tape: its joints are not those of the robot {robot.name!r} in the same order; plan the jump again with "
+            f"this robot"
+        )
+    n, k = len(tape.t), len(tape.contact_frames)
+    shapes = {"q": (n, model.nq), "v": (n, model.nv), "a": (n, model.nv), "tau": (n, model.nv - 6), "f": (n, k, 6)}
+    for name, shape in shapes.items():
+        if (found := getattr(tape, name).shape) != shape:
+            raise InputError(f"tape: {name} has shape {found}, the robot {robot.name!r} needs {shape}")
+    for name in tape.contact_frames:
+        if not model.existFrame(str(name)):
+            raise InputError(f"tape: the contact frame {str(name)!r} is not a link of the robot {robot.name!r}")
+    if k == 0:
+        raise InputError("tape: it names no contact frame; a jump needs at least one foot")
+    return model, [model.getFrameId(str(name)) for name in tape.contact_frames]
 
 
 def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None = None) -> Replay:
     """Recompute motion and forces of a whole tape (finite numbers only; see :func:`open_tape`)."""
     model, frames = open_tape(tape, robot, task)
-    geometry = build_geometry(model, robot)
-    soles = []
-    for name in tape.contact_frames:
-        sole = sole_of(geometry, model, str(name))
-        if sole is None:  # a foot without boxes: what the robot's configuration says
-            f = robot.foot
-            sole = Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
-        soles.append(sole)
+    try:
+        geometry = pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
+    except (ValueError, RuntimeError) as e:
+        raise RobotError(f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}") from e
+    soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
     motion = _motion(tape, model, frames)
     residual, tau = _inverse_dynamics(tape, model, frames, motion)
-    return Replay(tape, robot, task, edge_m, model, geometry, tuple(soles), base_residual=residual, tau=tau, **motion)
+    return Replay(tape, robot, task, edge_m, model, geometry, soles, base_residual=residual, tau=tau, **motion)
 
 
-def _motion(tape, model, frames) -> dict:
-    n, k, data = len(tape.t), len(frames), model.createData()
-    shapes = {"com": (3,), "com_velocity": (3,), "com_acceleration": (3,), "momentum": (3,), "momentum_rate": (3,),
-              "energy": (), "base": (3,), "base_rotation": (3, 3), "foot": (k, 3),
-              "foot_rotation": (k, 3, 3)}  # fmt: skip
-    out = {name: np.empty((n, *shape)) for name, shape in shapes.items()}
-    mass = sum(body.mass for body in model.inertias)
-    for i in range(n):
-        q, v, a = tape.q[i], tape.v[i], tape.a[i]
+def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: int) -> Sole:
+    """Lowest face of the boxes of a foot link; without any, what the robot's configuration says."""
+    corners = []
+    for shape in geometry.geometryObjects:
+        half = getattr(shape.geometry, "halfSide", None)
+        if half is not None and shape.parentFrame == frame:
+            place = model.frames[frame].placement.actInv(shape.placement)
+            corners += [place.act(half * signs) for signs in product((-1, 1), repeat=3)]
+    if not corners:
+        f = robot.foot
+        return Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
+    corners = np.array(corners)
+    low = corners[corners[:, 2] < corners[:, 2].min() + METHOD.same_level_m]
+    return Sole(low[:, 0].min(), low[:, 0].max(), low[:, 1].min(), low[:, 1].max(), low[:, 2].min())
+
+
+def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.ndarray]:
+    """The kinematic fields of :class:`Replay`, by name."""
+    data, rows, mass = model.createData(), [], pin.computeTotalMass(model)
+    for q, v, a in zip(tape.q, tape.v, tape.a, strict=True):
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         pin.updateFramePlacements(model, data)
-        out["energy"][i] = pin.computeMechanicalEnergy(model, data, q, v)
-        out["com"][i] = data.com[0]
-        out["com_velocity"][i], out["momentum"][i] = data.hg.linear / mass, data.hg.angular
-        out["com_acceleration"][i], out["momentum_rate"][i] = data.dhg.linear / mass, data.dhg.angular
-        out["base"][i], out["base_rotation"][i] = data.oMi[1].translation, data.oMi[1].rotation
-        for j, frame in enumerate(frames):
-            out["foot"][i, j], out["foot_rotation"][i, j] = data.oMf[frame].translation, data.oMf[frame].rotation
-    return out
+        energy, base, feet = pin.computeMechanicalEnergy(model, data, q, v), data.oMi[1], [data.oMf[i] for i in frames]
+        row = {
+            "com": data.com[0],
+            "com_velocity": data.hg.linear / mass,
+            "com_acceleration": data.dhg.linear / mass,
+            "momentum": data.hg.angular,
+            "energy": energy,
+            "base": base.translation,
+            "base_rotation": base.rotation,
+            "foot": [foot.translation for foot in feet],
+            "foot_rotation": [foot.rotation for foot in feet],
+        }
+        rows.append({name: np.array(value) for name, value in row.items()})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def _inverse_dynamics(tape, model, frames, motion):
+def _inverse_dynamics(tape: Tape, model: pin.Model, frames: list[int], motion: dict) -> tuple[np.ndarray, np.ndarray]:
     """Base residual (force, moment about the CoM; world axes) and joint torques."""
-    data, n = model.createData(), len(tape.t)
-    local = np.empty_like(tape.f)  # wrench at the contact frame's origin, in its axes
-    local[..., :3] = np.einsum("nkji,nkj->nki", motion["foot_rotation"], tape.f[..., :3])
-    local[..., 3:] = np.einsum("nkji,nkj->nki", motion["foot_rotation"], tape.f[..., 3:])
-    external = pin.StdVec_Force()
-    external.extend([pin.Force.Zero() for _ in range(model.njoints)])
-    joints = [model.frames[i].parentJoint for i in frames]
-    places = [model.frames[i].placement for i in frames]
-    need = np.empty((n, model.nv))
-    for i in range(n):
-        for j in set(joints):
-            external[j] = pin.Force.Zero()
-        for k, j in enumerate(joints):
-            external[j] = external[j] + places[k].act(pin.Force(local[i, k]))
+    data = model.createData()
+    # (N, K, 2, 3) force and moment at the contact frame's origin, in its axes
+    local = np.einsum("nkji,nkcj->nkci", motion["foot_rotation"], tape.f.reshape(*tape.f.shape[:2], 2, 3))
+    contacts = [(model.frames[i].parentJoint, model.frames[i].placement) for i in frames]
+    need = np.empty_like(tape.v)
+    for i in range(len(tape.t)):
+        external = pin.StdVec_Force()
+        external.extend([pin.Force.Zero() for _ in range(model.njoints)])
+        for (joint, place), wrench in zip(contacts, local[i], strict=True):
+            external[joint] = external[joint] + place.act(pin.Force(*wrench))
         need[i] = pin.rnea(model, data, tape.q[i], tape.v[i], tape.a[i], external)
-    force = np.einsum("nij,nj->ni", motion["base_rotation"], need[:, :3])
-    moment = np.einsum("nij,nj->ni", motion["base_rotation"], need[:, 3:6])
+    force, moment = (np.einsum("nij,nj->ni", motion["base_rotation"], need[:, k : k + 3]) for k in (0, 3))
     moment -= np.cross(motion["com"] - motion["base"], force)
     return np.concatenate([force, moment], axis=1), need[:, 6:]

@@ -16,8 +16,7 @@ from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper, make_jumper
 from jumplab.robot_import.roles import Roles
-from jumplab.robot_import.soles import Sole
-from jumplab.robot_import.starter import safe_name, starter
+from jumplab.robot_import.starter import Sole, safe_name, starter
 from jumplab.robot_import.tree import Tree, moving_count
 from jumplab.robot_import.urdf import parse, read_urdf
 

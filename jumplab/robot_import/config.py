@@ -10,7 +10,7 @@ import numpy as np
 from jumplab.errors import RobotError
 
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
-MAY_BE_HELD = ("shoulder_pitch",)  # an empty list: the arms are held, and belong to the trunk
+_REQUIRED = object()
 
 
 def read_toml(text: str, where: str) -> dict:
@@ -21,34 +21,28 @@ def read_toml(text: str, where: str) -> dict:
         raise RobotError(f"{where}: not a TOML file: {e}") from e
 
 
-def entry(config: dict, *path: str, kind: type = float, count: int | None = None) -> Any:
-    """One checked entry of the configuration: a finite number or a text, or ``count`` of them."""
+def entry(
+    config: dict, *path: str, kind: type = float, count: int | None = None, default: Any = _REQUIRED
+) -> float | str | list:
+    """One checked entry of the configuration: a finite number or a text, or ``count`` of them.
+
+    Raises :class:`RobotError` if it is of another kind, or missing without a ``default``.
+    """
     where, value = ".".join(path), config
     for key in path:
         if not isinstance(value, dict) or key not in value:
+            if default is not _REQUIRED:
+                return default
             raise RobotError(f"robot configuration: the entry {where!r} is missing")
         value = value[key]
-    items = value if count else [value]
-    numbers = kind is float
+    items, numbers = value if count else [value], kind is float
     good = isinstance(items, list) and len(items) == (count or 1)
     good = good and all(isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items)
     if not good or (numbers and not np.all(np.isfinite(items))):
-        wanted = "a finite number" if numbers else "a text"
-        raise RobotError(
-            f"robot configuration: {where!r} = {value!r}, must be {f'{count} of ' if count else ''}{wanted}"
-        )
-    clean = [float(x) if numbers else x for x in items]
+        many, wanted = f"{count} of " if count else "", "a finite number" if numbers else "a text"
+        raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
+    clean = [kind(x) for x in items]
     return clean if count else clean[0]
-
-
-def optional(config: dict, default: Any, *path: str, kind: type = float, count: int | None = None) -> Any:
-    """As :func:`entry`, or ``default`` where the entry is missing."""
-    value = config
-    for key in path:
-        if not isinstance(value, dict) or key not in value:
-            return default
-        value = value[key]
-    return entry(config, *path, kind=kind, count=count)
 
 
 def table(config: dict, name: str) -> dict:
@@ -60,11 +54,9 @@ def table(config: dict, name: str) -> dict:
 
 
 def roles_table(config: dict) -> dict[str, tuple[str, ...]]:
-    """role -> (left, right) joint names; () for arms that are held."""
+    """role -> (left, right) joint names; an empty list for the shoulder holds the arms, which is told as ()."""
     joints = {}
     for role in ROLES:
-        if role in MAY_BE_HELD and table(config, "joints").get(role) == []:
-            joints[role] = ()
-        else:
-            joints[role] = tuple(entry(config, "joints", role, kind=str, count=2))
+        held = role == "shoulder_pitch" and table(config, "joints").get(role) == []
+        joints[role] = () if held else tuple(entry(config, "joints", role, kind=str, count=2))
     return joints

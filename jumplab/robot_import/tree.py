@@ -3,49 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.robot_import.checks import FRAME_KG, inertia_matrix, link_mass
 from jumplab.robot_import.urdf import numbers
 
 MOVING = ("revolute", "continuous", "prismatic")
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A collision shape: ``kind`` box, cylinder, sphere, capsule or mesh; ``place`` in its link."""
-
-    kind: str
-    size: tuple[float, ...]
-    place: pin.SE3
-    mesh: str = ""
-
-    def corners(self, vertices: np.ndarray | None = None) -> np.ndarray:
-        """(n, 3) points in the link frame whose hull holds the shape; a mesh needs its ``vertices`` (m, 3)."""
-        if self.kind == "mesh":
-            local = np.asarray(vertices) * self.size
-        else:
-            half = {
-                "box": lambda s: np.array(s) / 2,
-                "sphere": lambda s: np.full(3, s[0]),
-                "cylinder": lambda s: np.array([s[0], s[0], s[1] / 2]),
-                "capsule": lambda s: np.array([s[0], s[0], s[1] / 2 + s[0]]),
-            }[self.kind](self.size)
-            local = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        return local @ self.place.rotation.T + self.place.translation
+LIMITS = ("lower", "upper", "effort", "velocity")
+TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
+SIZES["capsule"] = SIZES["cylinder"]
+KNOWN = (*SIZES, "mesh")
+FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is ignored
+THINNEST = 1e-3  # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 
 
 @dataclass(frozen=True)
 class Link:
-    """One link: its inertia in its own frame (zero if it has none) and its collision shapes."""
+    """One link."""
 
     name: str
-    inertia: pin.Inertia
-    shapes: tuple[Shape, ...]
+    weighed: bool  # the URDF says something of its mass
+    inertia: pin.Inertia  # in its own frame; zero without mass
+    shapes: list[tuple[ET.Element, ET.Element]] = field(repr=False)  # (<collision>, the shape in it)
 
 
 @dataclass(frozen=True)
@@ -58,88 +42,91 @@ class Joint:
     child: str
     place: pin.SE3
     axis: np.ndarray
-    limits: dict
+    limits: dict[str, float]
     mimic: tuple[str, float, float] | None
     element: ET.Element = field(repr=False, compare=False)
+
+    @property
+    def driven(self) -> bool:
+        """True if it turns between two stops by a motor of its own."""
+        return self.kind == "revolute" and self.mimic is None
 
     def turned(self, angle: float) -> pin.SE3:
         """Place of the child in the parent at an angle [rad] or a displacement [m]."""
         if self.kind == "prismatic":
             return self.place * pin.SE3(np.eye(3), self.axis * angle)
-        if self.kind in ("revolute", "continuous") and angle:
+        if self.kind in MOVING and angle:
             return self.place * pin.SE3(pin.exp3(self.axis * angle), np.zeros(3))
         return self.place
 
 
-def _place(element: ET.Element | None) -> pin.SE3:
-    origin = None if element is None else element.find("origin")
+def _place(element: ET.Element) -> pin.SE3:
+    origin = element.find("origin")
     if origin is None:
         return pin.SE3.Identity()
     xyz, rpy = (numbers(origin.get(k, "0 0 0"), 3) for k in ("xyz", "rpy"))
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
 
 
-def _inertia(link: ET.Element, repair: bool) -> pin.Inertia:
-    mass = link_mass(link)
-    if mass <= 0:
-        return pin.Inertia.Zero()
-    inertial = link.find("inertial")
-    place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
-    if repair or mass < FRAME_KG:
-        matrix = repaired(matrix)
-    return pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
+def inertia_matrix(element: ET.Element) -> np.ndarray:
+    """(3, 3) of an ``<inertia>`` [kg m^2]."""
+    xx, xy, xz, yy, yz, zz = (float(element.get(key)) for key in TENSOR)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _link(e: ET.Element, repair: bool) -> Link:
+    inertial, total = e.find("inertial"), pin.Inertia.Zero()
+    mass = 0.0 if inertial is None else float(inertial.find("mass").get("value"))
+    if mass > 0:
+        place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
+        if repair or mass < FRAME_KG:
+            matrix = repaired(matrix)
+        total = pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
+    shapes = [(c, s) for c in e.findall("collision") for s in c.findall("geometry/*") if s.tag in KNOWN]
+    return Link(e.get("name"), inertial is not None, total, shapes)
 
 
 def repaired(matrix: np.ndarray) -> np.ndarray:
     """The nearest inertia that a solid can have: its second moments of mass, none of them negative."""
     second = np.trace(matrix) / 2 * np.eye(3) - matrix  # integral of x x^T dm
     values, axes = np.linalg.eigh(second)
-    floor = max(1e-3 * values.max(), 1e-12)  # our choice: a plate a thirtieth as thick as wide
+    floor = max(THINNEST * values.max(), 1e-12)
     second = (axes * np.maximum(values, floor)) @ axes.T
     return np.trace(second) * np.eye(3) - second
 
 
-def _shape(element: ET.Element) -> Shape | None:
-    place, geometry = _place(element), element.find("geometry")
-    for found in () if geometry is None else geometry:
-        get = found.get
-        if found.tag == "box":
-            return Shape("box", tuple(float(x) for x in get("size").split()), place)
-        if found.tag == "sphere":
-            return Shape("sphere", (float(get("radius")),), place)
-        if found.tag in ("cylinder", "capsule"):
-            return Shape(found.tag, (float(get("radius")), float(get("length"))), place)
-        if found.tag == "mesh":
-            scale = tuple(float(x) for x in get("scale", "1 1 1").split())
-            return Shape("mesh", scale, place, get("filename", ""))
-    return None
+def _joint(e: ET.Element) -> Joint:
+    name, kind, parent, child = e.get("name"), e.get("type"), e.find("parent").get("link"), e.find("child").get("link")
+    axis, limit, mimic = (e.find(tag) for tag in ("axis", "limit", "mimic"))
+    direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
+    told = {key: None if limit is None else numbers(limit.get(key), 1) for key in LIMITS}
+    limits = {key: float(value[0]) for key, value in told.items() if value is not None}
+    follows = None
+    if mimic is not None:
+        follows = mimic.get("joint"), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+    unit = direction / max(np.linalg.norm(direction), 1e-12)
+    return Joint(name, kind, parent, child, _place(e), unit, limits, follows, e)
 
 
 class Tree:
-    """Links and joints of a URDF that :func:`jumplab.robot_import.checks.check` has passed.
+    """Links and joints of a URDF whose names, connections and inertials have passed the checks.
 
-    Parameters
-    ----------
-    root : the root element.
-    where : name of the file, for messages.
-    path : the file itself, near which meshes are looked for.
-    repair_inertia : replace inertias that no solid has by the nearest possible ones.
+    ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are looked for;
+    ``repair_inertia`` replaces inertias that no solid has by the nearest possible ones.
     """
 
     def __init__(self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False):
         self.where, self.path = where, path
-        self.links = {
-            e.get("name"): Link(
-                e.get("name"), _inertia(e, repair_inertia),
-                tuple(s for s in map(_shape, e.findall("collision")) if s is not None))
-            for e in root.findall("link")
-        }  # fmt: skip
+        self.links = {e.get("name"): _link(e, repair_inertia) for e in root.findall("link")}
         self.joints = {e.get("name"): _joint(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}
         self.root = next(name for name in self.links if name not in self.above)
-        self.below: dict[str, list[Joint]] = {name: [] for name in self.links}
-        for joint in self.joints.values():
-            self.below[joint.parent].append(joint)
+        self.below = {name: [j for j in self.joints.values() if j.parent == name] for name in self.links}
+
+    @property
+    def mass(self) -> float:
+        """Mass of all links [kg]."""
+        return float(sum(link.inertia.mass for link in self.links.values()))
 
     def poses(self, angles: dict[str, float] | None = None) -> dict[str, pin.SE3]:
         """Place of every link in the root's frame; joints not named in ``angles`` are at 0."""
@@ -149,6 +136,13 @@ class Tree:
             for joint in self.below[name]:
                 out[joint.child] = out[name] * joint.turned(angles.get(joint.name, 0.0))
                 todo.append(joint.child)
+        return out
+
+    def fixed_to(self, link: str) -> list[str]:
+        """A link and all links that are fixed to it from below."""
+        out = [link]
+        for name in out:
+            out += [j.child for j in self.below[name] if j.kind == "fixed"]
         return out
 
     def chain(self, link: str) -> list[Joint]:
@@ -161,60 +155,46 @@ class Tree:
 
     def path_between(self, start: str, end: str) -> list[Joint]:
         """Joints on the way from one link to another, in order."""
-        a, b = self.chain(start), self.chain(end)
-        shared = 0
-        while shared < min(len(a), len(b)) and a[shared] is b[shared]:
-            shared += 1
-        return a[shared:][::-1] + b[shared:]
+        shared = len(self.chain(self.joining(start, end)))
+        return self.chain(start)[shared:][::-1] + self.chain(end)[shared:]
 
-    @property
-    def mass(self) -> float:
-        """Mass of all links [kg]."""
-        return float(sum(link.inertia.mass for link in self.links.values()))
-
-    def mesh_file(self, name: str) -> Path | None:
-        """A mesh of the URDF on this machine: beside the file, or in a folder above it; None if it is not there."""
-        if self.path is None:
-            return None
-        inside = name.split("://", 1)[-1].lstrip("/")
-        rest = inside.split("/", 1)[-1]
-        for folder in self.path.resolve().parents:
-            for part in (inside, rest):
-                if (folder / part).is_file():
-                    return folder / part
-        return None
+    def joining(self, a: str, b: str) -> str:
+        """The last link that the ways from the root to two links share."""
+        shared = [x.child for x, y in zip(self.chain(a), self.chain(b), strict=False) if x is y]
+        return [self.root, *shared][-1]
 
     def points(self, link: str) -> np.ndarray:
         """(n, 3) points in a link's frame whose hull holds its collision shapes; meshes count where they are found."""
         found = [np.zeros((0, 3))]
-        for shape in self.links[link].shapes:
-            if shape.kind != "mesh":
-                found.append(shape.corners())
-            elif (file := self.mesh_file(shape.mesh)) is not None:
-                found.append(shape.corners(_vertices(str(file))))
+        for collision, shape in self.links[link].shapes:
+            place, local = _place(collision), self._mesh(shape) if shape.tag == "mesh" else _corners(shape)
+            found.append(local @ place.rotation.T + place.translation)
         return np.concatenate(found)
 
+    def _mesh(self, shape: ET.Element) -> np.ndarray:
+        """(n, 3) vertices of a mesh: from beside the URDF, or from a folder above it; none if it is not there."""
+        inside = shape.get("filename").split("://", 1)[-1].lstrip("/")
+        folders = self.path.resolve().parents if self.path else ()
+        places = (folder / part for folder in folders for part in (inside, inside.split("/", 1)[-1]))
+        file = next((place for place in places if place.is_file()), None)
+        if file is None:
+            return np.zeros((0, 3))
+        import coal
 
-def _vertices(path: str) -> np.ndarray:
-    import coal
-
-    return np.array(coal.MeshLoader(coal.BV_AABB).load(path, np.ones(3)).vertices())
+        mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), np.ones(3))
+        return np.array(mesh.vertices()) * numbers(shape.get("scale", "1 1 1"), 3)
 
 
-def _joint(e: ET.Element) -> Joint:
-    axis = e.find("axis")
-    direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
-    limit, mimic = e.find("limit"), e.find("mimic")
-    limits = {}
-    for key in ("lower", "upper", "effort", "velocity"):
-        value = None if limit is None else numbers(limit.get(key), 1)
-        if value is not None:
-            limits[key] = float(value[0])
-    follows = None
-    if mimic is not None:
-        follows = mimic.get("joint"), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
-    return Joint(e.get("name"), e.get("type"), e.find("parent").get("link"), e.find("child").get("link"),
-                 _place(e), direction / max(np.linalg.norm(direction), 1e-12), limits, follows, e)  # fmt: skip
+def _corners(shape: ET.Element) -> np.ndarray:
+    """(8, 3) corners of the box around a shape, in its own frame [m]."""
+    size = np.concatenate([numbers(shape.get(key), count) for key, count in SIZES[shape.tag].items()])
+    if shape.tag == "box":
+        half = size / 2
+    elif shape.tag == "sphere":
+        half = size.repeat(3)
+    else:
+        half = np.array([size[0], size[0], size[1] / 2 + (size[0] if shape.tag == "capsule" else 0.0)])
+    return half * np.array([*product((-1, 1), repeat=3)])
 
 
 def moving_count(tree: Tree) -> int:

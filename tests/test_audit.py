@@ -10,8 +10,7 @@ import sys
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import jump
-from fixtures_passport import (
+from fixtures_audit import (
     FLYING,
     HIP,
     KNEE,
@@ -32,6 +31,7 @@ from fixtures_passport import (
     shifted,
     strong_at_speed,
 )
+from fixtures_core import jump
 
 from jumplab.auditing import AuditReport, audit
 from jumplab.errors import InputError
@@ -240,7 +240,7 @@ def test_another_robots_tape_is_refused(good):
 def test_audit_shares_no_code_with_the_planner():
     code = """
 import sys, jumplab.auditing
-ours = {"errors", "task", "trajectory", "robot", "passport"}
+ours = {"errors", "task", "robot_import", "robot", "io", "auditing"}
 names = [m.split(".") for m in sys.modules]
 print([n for n in names if n[0] == "casadi" or n[0] == "jumplab" and len(n) > 1 and n[1] not in ours])
 """

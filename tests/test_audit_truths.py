@@ -5,18 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_passport import KNEE, LEFT, ROBOT, edit, good_tape, robot_with, with_forces
+from fixtures_audit import KNEE, LEFT, ROBOT, edit, good_tape, robot_with, with_forces
 
-from jumplab.auditing import AuditReport, Check, audit, contact, folder, write_audit
+from jumplab.auditing import AuditReport, Check, audit, contact, write_audit
 from jumplab.auditing.joints import available_torque
-from jumplab.auditing.kinematics import mirror
+from jumplab.auditing.limits import Limit
+from jumplab.auditing.motion import foot_turn, mirror
 from jumplab.auditing.replay import open_tape, replay
-from jumplab.auditing.report import worst
-from jumplab.auditing.target import foot_turn
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot.stance import com_from_toe, stance_angles, stance_configuration
@@ -144,11 +144,11 @@ def test_step_between_two_surfaces(statue_and_top):
 
 
 def test_report_is_strict_and_readable():
-    rows = worst("tape", "x", [[1.0, np.nan], [5.0, 2.0]], [0.1, 0.2], 9.0, "m", "what", labels=["a", "b"])
+    rows = Limit("tape", "x", 9.0, "m", "what").worst([[1.0, np.nan], [5.0, 2.0]], [0.1, 0.2], ["a", "b"])
     assert math.isnan(rows.value) and not rows.passed and rows.time == 0.1 and rows.note.endswith("worst: b")
-    low = worst("tape", "low", [3.0, -1.0], [0.1, 0.2], 0.0, "m", "what", at_least=True)
+    low = Limit("tape", "low", 0.0, "m", "what", at_least=True).worst([3.0, -1.0], [0.1, 0.2])
     assert (low.value, low.time, low.passed) == (-1.0, 0.2, False)
-    assert worst("tape", "none", [], [], 2.0, "m", "what").passed
+    assert Limit("tape", "none", 2.0, "m", "what").worst([], []).passed
     passport = AuditReport((rows, low, Check("joints", "fine", 1, 2, "m", None, "ok")), {"size": np.float64(np.inf)})
     data = json.loads(passport.to_json(), parse_constant=pytest.fail)
     assert data["passed"] is False and data["failed"] == ["x", "low"] and data["manifest"]["size"] is None
@@ -190,7 +190,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(folder.os, "replace", interrupt)
+    monkeypatch.setattr(os, "replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         write_audit(tmp_path, JumpTask(0.9, 0.5))
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
@@ -204,8 +204,8 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
         ("robot.urdf", None, "cannot be read"),
         ("robot.urdf", "<robot", "the URDF is no well-formed XML"),
         ("robot.toml", "name = ", "not a TOML file"),
-        ("summary.json", "{", "not a JSON file"),
-        ("summary.json", "[]", "must hold a JSON object"),
+        ("summary.json", "{", "not a readable JSON file"),
+        ("summary.json", "[]", "not a JSON object"),
         ("summary.json", '{"target": {"distance_m": 99, "height_m": 0.5}}', "distance = 99 m is outside"),
     ],
 )

@@ -1,0 +1,165 @@
+"""The tape as a record of one motion: form, rates, switch of phases, symmetry; and that motion against the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.auditing.limits import LIMITS, METHOD
+from jumplab.auditing.replay import Replay
+from jumplab.auditing.report import Check
+from jumplab.io.tape import Tape
+from jumplab.task import JumpTask
+
+
+def form(tape: Tape) -> list[Check]:
+    """Finite numbers, order of phases and times: without these nothing else can be computed."""
+    arrays = (tape.t, tape.q, tape.v, tape.a, tape.tau, tape.f)
+    broken = sum(int((~np.isfinite(x)).sum()) for x in arrays)
+    phase = np.asarray(tape.phase)
+    flying = phase == "flight"
+    faults = int((~flying & (phase != "launch")).sum())
+    faults += sum(int(np.sum(flying == x) < METHOD.min_samples) for x in (False, True))
+    faults += abs(int(np.sum(flying[1:] != flying[:-1])) - 1) + int(bool(flying[:1].any()))
+    step, same = np.diff(tape.t), flying[1:] == flying[:-1]
+    faults += int((~(step[same] > 0)).sum()) + int((step[~same] != 0).sum())
+    return [LIMITS["finite numbers"].check(broken), LIMITS["order of phases"].check(faults)]
+
+
+def checks(r: Replay) -> list[Check]:
+    """All checks of the group "tape" beyond :func:`form`."""
+    norm = np.abs(np.linalg.norm(r.tape.q[:, 3:7], axis=1) - 1)
+    return [
+        LIMITS["time step"].worst(1e3 * r.step, r.tape.t[1:]),
+        LIMITS["unit quaternion"].worst(norm, r.tape.t),
+        *_steps(r),
+        *_reintegration(r),
+        *_switch(r),
+        *_symmetry(r),
+    ]
+
+
+def _mean_rates(r: Replay) -> np.ndarray:
+    """(N - 1, nv) mean of v over each step: the trapezoid, corrected by the accelerations (fourth order)."""
+    v, a = r.tape.v, r.tape.a
+    return (v[1:] + v[:-1]) / 2 + (a[:-1] - a[1:]) * r.step[:, None] / 12
+
+
+def _steps(r: Replay) -> list[Check]:
+    tape, inside = r.tape, r.step > 0
+    t, h = tape.t[1:][inside], r.step[inside][:, None]
+    moved = np.array([pin.difference(r.model, a, b) for a, b in zip(tape.q[:-1], tape.q[1:], strict=True)])[inside]
+    rate_error = np.abs(moved / h - _mean_rates(r)[inside])
+    mean_acceleration = ((tape.a[1:] + tape.a[:-1]) / 2)[inside]
+    acceleration_error = np.abs(np.diff(tape.v, axis=0)[inside] / h - mean_acceleration)
+    return [
+        LIMITS["rates against positions"].worst(rate_error, t, r.coordinates),
+        LIMITS["accelerations against rates"].worst(acceleration_error, t, r.coordinates),
+    ]
+
+
+def _reintegration(r: Replay) -> list[Check]:
+    tape, rates = r.tape, _mean_rates(r)
+    position, rate = np.zeros_like(tape.v), np.zeros_like(tape.v)
+    for phase in (r.launch, r.flight):
+        q = tape.q[phase.start]
+        for i in range(phase.start + 1, phase.stop):
+            q = pin.integrate(r.model, q, rates[i - 1] * r.step[i - 1])
+            position[i] = pin.difference(r.model, tape.q[i], q)
+        gained = r.integral(tape.a)[phase]
+        rate[phase] = tape.v[phase.start] + gained - gained[0] - tape.v[phase]
+    return [
+        LIMITS["re-integrated positions"].worst(1e3 * np.abs(position), tape.t, r.coordinates),
+        LIMITS["re-integrated rates"].worst(np.abs(rate), tape.t, r.coordinates),
+    ]
+
+
+def _switch(r: Replay) -> list[Check]:
+    tape, i = r.tape, r.tape.takeoff_index
+    jumps = {
+        "position": 1e3 * pin.difference(r.model, tape.q[i - 1], tape.q[i]),
+        "rate": tape.v[i] - tape.v[i - 1],
+        "acceleration": tape.a[i] - tape.a[i - 1],
+    }
+    t, names = tape.t[i : i + 1], r.coordinates
+    return [LIMITS[f"{kind} at the switch"].worst(np.abs(jump)[None], t, names) for kind, jump in jumps.items()]
+
+
+def mirror(model: pin.Model) -> list[tuple[int, int, float]] | None:
+    """Joints that mirror each other in the x-z plane: (left index, right index, sign of the angle), indices into v[6:].
+
+    Found from the geometry in the neutral pose, not from names. None if a joint has no counterpart.
+    """
+    data = model.createData()
+    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
+    flip, joints, pairs = np.array([1.0, -1.0, 1.0]), range(2, model.njoints), []
+    place = {j: data.oMi[j].translation for j in joints}
+    axis = {j: jacobian[3:, model.idx_vs[j]] for j in joints}  # world axes, since the base is neutral
+    for j in joints:
+        turned = -flip * axis[j]  # an axial vector mirrors with the opposite sign
+        for k in joints:
+            along = float(turned @ axis[k])
+            if np.allclose(flip * place[j], place[k], atol=1e-6) and abs(along) > 1 - 1e-6:
+                pairs.append((model.idx_vs[j] - 6, model.idx_vs[k] - 6, float(np.sign(along))))
+                break
+        else:
+            return None
+    return pairs
+
+
+def _symmetry(r: Replay) -> list[Check]:
+    tape, pairs = r.tape, mirror(r.model)
+    if pairs is None:
+        note = "a joint has no mirrored counterpart: a symmetric jump is not defined for this robot"
+        return [replace(LIMITS["left/right posture"], note=note).check(np.nan)]
+    left, right, sign = (np.array(x) for x in zip(*pairs, strict=True))
+    names = [str(n) for n in tape.joint_names[left]]
+    joints, peak = tape.q[:, 7:], r.model.upperEffortLimit[6:]
+    out_of_plane = np.stack([tape.q[:, 1] - tape.q[0, 1], 2 * tape.q[:, 3], 2 * tape.q[:, 5]], axis=1)
+    posture = np.concatenate([joints[:, right] - sign * joints[:, left], out_of_plane], axis=1)
+    torque = (tape.tau[:, right] - sign * tape.tau[:, left]) / peak[right]
+    sideways = tape.f[..., 1].sum(axis=1, keepdims=True) / r.weight
+    load = np.ptp(tape.f[..., 2], axis=1)[:, None] / r.weight
+    effort = 100 * np.abs(np.concatenate([torque, sideways, load], axis=1))
+    base = ["lateral shift", "roll", "yaw"]
+    return [
+        LIMITS["left/right posture"].worst(1e3 * np.abs(posture), tape.t, [*names, *base]),
+        LIMITS["left/right effort"].worst(effort, tape.t, [*names, "lateral force", "foot load"]),
+    ]
+
+
+def target(r: Replay) -> list[Check]:
+    """All checks of the group "target": touchdown always; start, distance, rise and turns if there is a task."""
+    t, feet = r.tape.t[-1:], r.tape.contact_frames
+    off = np.abs(r.sole_points[-1:, ..., 2] - r.platform).max(axis=-1)  # (1, K)
+    tilt = np.arccos(np.clip(r.foot_rotation[-1:, :, 2, 2], -1, 1))
+    touchdown = [
+        LIMITS["sole on the surface"].worst(1e3 * off, t, feet, height=r.platform),
+        LIMITS["sole flat at touchdown"].worst(1e3 * tilt, t, feet),
+    ]
+    return touchdown + (_asked(r, r.task) if r.task else [])
+
+
+def foot_turn(r: Replay) -> np.ndarray:
+    """(K,) rotation of each foot about +y from the first to the last sample [rad], whole turns counted."""
+    x_axis = r.foot_rotation[..., :, 0]  # (N, K, 3)
+    return np.diff(np.unwrap(np.arctan2(-x_axis[..., 2], x_axis[..., 0]), axis=0)[[0, -1]], axis=0)[0]
+
+
+def _asked(r: Replay, task: JumpTask) -> list[Check]:
+    tape, i = r.tape, r.tape.takeoff_index
+    t, feet = tape.t, tape.contact_frames
+    travel = (r.toe_corners[-1] - r.toe_corners[0]).mean(axis=1)[:, :2]  # (K, 2)
+    miss = 1e3 * np.linalg.norm(travel - np.array([task.distance_m, 0.0]), axis=-1)
+    highest = int(np.argmax(r.com[i:, 2])) + i
+    rise, turn = float(r.com[highest, 2] - r.com[i, 2]), foot_turn(r)
+    wrong, degrees = 1e3 * np.abs(turn - task.rotation_rad), np.degrees([turn.mean(), task.rotation_rad])
+    names = [*("base",) * 6, *map(str, tape.joint_names)]
+    return [
+        LIMITS["start at rest"].worst(np.abs(tape.v[:1]), t[:1], names),
+        LIMITS["distance"].worst(miss[None], t[-1:], feet, found=travel[:, 0].mean(), asked=task.distance_m),
+        LIMITS["rise"].check(1e3 * abs(rise - task.height_m), float(t[highest]), found=rise, asked=task.height_m),
+        LIMITS["rotation"].worst(wrong[None], t[-1:], feet, found=degrees[0], asked=degrees[1]),
+    ]
