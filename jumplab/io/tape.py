@@ -16,7 +16,7 @@ SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
 _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
 # what reading a cut, altered or foreign file may raise
-_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Tape:
                 raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in file.files}
-        except _DAMAGE as e:
+        except DAMAGE as e:
             raise InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated") from e
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:

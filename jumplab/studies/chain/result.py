@@ -12,7 +12,7 @@ import numpy as np
 
 from jumplab.auditing import AuditReport, write_audit
 from jumplab.io import folder as store
-from jumplab.io.files import transaction
+from jumplab.io.folder import transaction
 from jumplab.robot import Robot
 from jumplab.sim.recorder import LEVEL_TOLERANCE_M
 from jumplab.sim.result import SimulationResult
