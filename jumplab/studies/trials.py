@@ -11,7 +11,6 @@ import json
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from collections import Counter
@@ -336,7 +335,7 @@ def run_series(
         done = {key: log.done[key] for key in work if key in log.done}
         resumed = len(done)
         missing = [task for key, task in work.items() if key not in done]
-        hide = not (sys.stderr.isatty() if progress is None else progress)
+        hide = None if progress is None else not progress
         with tqdm(total=len(work), initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
             for trial in in_parallel(missing, jobs):
                 log.add(trial.to_json())
