@@ -49,18 +49,18 @@ class Tape:
     extra: dict = field(default_factory=dict)
 
     def __post_init__(self):
+        own = {name: getattr(self, name) for name in _DIMENSIONS}
         for name, count in _DIMENSIONS.items():
-            if np.ndim(getattr(self, name)) != count:
-                raise InputError(f"tape: {name} has {np.ndim(getattr(self, name))} dimensions, needs {count}")
-        n = len(self.t)
+            if np.ndim(own[name]) != count:
+                raise InputError(f"tape: {name} has {np.ndim(own[name])} dimensions, needs {count}")
         for name in ("q", "v", "a", "tau", "phase", "f"):
-            if len(getattr(self, name)) != n:
-                raise InputError(f"tape: {name} has {len(getattr(self, name))} rows, t has {n}")
+            if len(own[name]) != len(self.t):
+                raise InputError(f"tape: {name} has {len(own[name])} rows, t has {len(self.t)}")
         for name in ("t", "q", "v", "a", "tau", "f"):
-            kind = np.asarray(getattr(self, name)).dtype.kind
+            kind = np.asarray(own[name]).dtype.kind
             if kind not in "fiu":
                 raise InputError(f"tape: {name} holds no real numbers (kind {kind!r})")
-        for x in (*(getattr(self, name) for name in _DIMENSIONS), *self.extra.values()):
+        for x in (*own.values(), *self.extra.values()):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
@@ -97,9 +97,9 @@ class Tape:
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:
             raise InputError(f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again")
-        names = [f.name for f in dataclasses.fields(cls) if f.name != "extra"]
-        missing = [n for n in names if n not in data]
-        if missing:
-            raise InputError(f"{path}: the array {missing[0]!r} is missing")
-        own = {n: data.pop(n) for n in names}
+        own = {}
+        for name in (f.name for f in dataclasses.fields(cls) if f.name != "extra"):
+            if name not in data:
+                raise InputError(f"{path}: the array {name!r} is missing")
+            own[name] = data.pop(name)
         return cls(**own, extra=data)

@@ -104,7 +104,7 @@ def landing_basin(
         raise InputError(f"n = {count} is too large; the basin has {len(states)} states")
     tape, robot, summary = store.read_plan(folder)
     scene, plan = Scene.of_plan(summary, robot), series.plan_hash(summary)
-    keys = _keys(states[:count], settings, plan)
+    keys = state_keys(states[:count], settings, plan)
     work = {key: joblib.delayed(drop)(tape, robot, scene, settings, key, state) for key, state in keys.items()}
     trials, resumed = series.run_series(folder, work, jobs, progress)
     report = BasinReport(trials, 0, settings, plan, dict(summary["target"]), resumed, grid)
@@ -112,20 +112,7 @@ def landing_basin(
     return report
 
 
-def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), grid: BasinGrid = BasinGrid()) -> int:
-    """How many states of ``grid`` the plan in ``folder`` has been dropped from; :func:`landing_basin` runs the others.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no whole plan, or its log cannot be read.
-    """
-    plan = series.plan_hash(store.read_plan(folder)[2])
-    with series.trial_log(folder) as log:
-        return sum(key in log.done for key in _keys(grid.states, settings, plan))
-
-
-def _keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
+def state_keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
     """Each state's name in the log; whatever the grid, equal states are equal trials."""
     code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
     names = [short_hash(["basin", code, asdict(state)]) for state in states]

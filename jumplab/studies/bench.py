@@ -52,33 +52,26 @@ PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "numpy")
 
 
 def report(
-    head: Mapping[str, Any],
-    cpu: dict[str, list[float]],
-    wall: dict[str, list[float]],
-    audits: Mapping[str, list[bool]],
-    iterations: dict[str, dict[str, int]],
-    functions: dict[str, float],
-    growth: dict[str, Any],
-    peaks: list[float],
+    head: Mapping[str, Any], watch: Stopwatch, audits: Mapping[str, list[bool]], growth: Mapping, peaks: list[float]
 ) -> dict[str, Any]:
     """Put a benchmark's numbers together.
 
     Returns
     -------
-    dict of plain types: the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
+    dict of plain types: ``head``; the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
     ``cold_over_direct``, but the new process found its functions on file), ``tape_over_direct`` (as
     ``warm_over_direct``, with the plan's 1 kHz tape, of which the direct solve has none), ``warm_over_approached`` (as
     ``warm_over_direct``, but the direct NLP is begun with Gauss-Newton steps too), ``goals`` (name -> value, limit,
     aim, reached), ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s`` and
-    ``raw_s`` (name -> CPU and wall times), ``iterations``, ``functions_s`` (CPU time of function evaluations in the
-    solve on the fine mesh), ``where`` (stage -> share of the three steps' time), ``growth``, ``machine``.
+    ``raw_s`` (name -> CPU and wall times), ``where`` (stage -> share of the three steps' time), ``growth``,
+    ``machine`` (what it ran on, and with which packages).
     """
+    cpu, known = watch.cpu, versions()
     peer = min(DIRECT, key=lambda name: np.median(cpu[name]))
     steps = np.sum([times for name, times in cpu.items() if name.startswith("plan: ") and name != TAPE], axis=0)
     whole = np.add(cpu["direct, build"], cpu[peer])
-    medians = {
-        kind: {n: float(np.median(x)) for n, x in times.items()} for kind, times in (("cpu", cpu), ("wall", wall))
-    }
+    raw = {"cpu": cpu, "wall": watch.wall}
+    medians = {kind: {n: float(np.median(x)) for n, x in times.items()} for kind, times in raw.items()}
     stages = {name: t for name, t in medians["cpu"].items() if name.startswith("plan: ")}
     numbers = {
         "warm_over_direct": _ratio(steps, cpu[peer]),
@@ -102,11 +95,16 @@ def report(
         **head,
         "median_s": medians,
         "where": {name: t / sum(stages.values()) for name, t in stages.items()},
-        "iterations": iterations,
-        "functions_s": functions,
         "growth": growth,
-        "raw_s": {"cpu": cpu, "wall": wall},
-        "machine": machine(),
+        "raw_s": raw,
+        "machine": {
+            "processor": platform.machine(),
+            "system": platform.system(),
+            "cpus": joblib.cpu_count(),
+            "load": os.getloadavg()[0],
+            "python": known["python"],
+            "versions": {name: known[name] for name in PACKAGES},
+        },
     }
 
 
@@ -122,19 +120,6 @@ def line_error(rows: list[dict[str, float]]) -> float | None:
     n, t = (np.array([row[key] for row in rows]) for key in ("intervals", "iteration_s"))
     line = np.polyval(np.polyfit(n, t, 1, w=1 / t), n)
     return float(np.max(np.abs(t / line - 1)))
-
-
-def machine() -> dict[str, Any]:
-    """What it ran on, and with which packages."""
-    known = versions()
-    return {
-        "processor": platform.machine(),
-        "system": platform.system(),
-        "cpus": joblib.cpu_count(),
-        "load": os.getloadavg()[0],
-        "python": known["python"],
-        "versions": {name: known[name] for name in PACKAGES},
-    }
 
 
 def text(found: Mapping[str, Any]) -> str:
@@ -159,8 +144,8 @@ def text(found: Mapping[str, Any]) -> str:
         lines.append(f"  {name}: " + ", ".join(f"{stage} {n}" for stage, n in row.items()))
     lines += ["", "growth of stage 3 with its mesh", "  intervals  iterations   solve [s]   per iteration [ms]"]
     for r in found["growth"]["nodes"]:
-        solve = f"{r['iterations']:>12}{r['solve_s']:>12.3f}{1e3 * r['iteration_s']:>14.2f}"
-        lines.append(f"  {r['intervals']:>9}{solve}")
+        counts = f"  {r['intervals']:>9}{r['iterations']:>12}"
+        lines.append(f"{counts}{r['solve_s']:>12.3f}{1e3 * r['iteration_s']:>14.2f}")
     targets = ", ".join(f"{n}: {t:.2f} s" for n, t in found["growth"]["targets_cpu_s"].items())
     audits = "; ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items())
     lines += [f"  CPU time by number of targets: {targets}", ""]
@@ -238,7 +223,7 @@ def bench(
     cold: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Measure everything.
+    """Measure everything; returns plain types, see :func:`report`.
 
     Parameters
     ----------
@@ -248,10 +233,6 @@ def bench(
     nodes : numbers of intervals for the growth with nodes.
     spread : further targets, as shares of the target's distance and rise, planned once in both ways.
     cold : also time new processes.  say : is told what goes on.
-
-    Returns
-    -------
-    dict of plain types, see :func:`report`.
 
     Raises
     ------
@@ -284,9 +265,10 @@ def bench(
     growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
     growth["spread"] = _spread(planner, ways, task, spread)
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
-    iterations = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
-    functions = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
-    return report(head, watch.cpu, watch.wall, audits, iterations, functions, growth, peaks)
+    head["iterations"] = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
+    # CPU time of function evaluations in the solve on the fine mesh
+    head["functions_s"] = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
+    return report(head, watch, audits, growth, peaks)
 
 
 def _once(

@@ -345,22 +345,6 @@ def run_series(
     return tuple(done[key] for key in work), resumed
 
 
-def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = None) -> dict[str, SimulationResult]:
-    """Several jumps at once, on several cores.
-
-    Parameters
-    ----------
-    jumps : by name, the arguments of :func:`jumplab.sim.simulate_jump`, all named.
-    jobs : processes; one per core if None.
-
-    Returns
-    -------
-    Results by the same names, as that function gives them one by one.
-    """
-    work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
-    return dict(zip(jumps, in_parallel(work, jobs, "list"), strict=True))
-
-
 # processes ------------------------------------------------------------------------------------------
 def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_unordered") -> Iterable[Any]:
     """Results, as they come unless ``order`` says otherwise; in ``jobs`` processes, by default one per core."""
