@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from xml.etree import ElementTree
@@ -51,19 +51,19 @@ def write(
         If the format is unknown, an option cannot be meant, or the path cannot be written. Nothing is left behind.
     """
     path = Path(path)
+    if format_name not in FORMATS:
+        raise InputError(f"format {format_name!r}: must be one of {', '.join(FORMATS)}")
     if format_name == "urdf-replay":
         return _write_replay(motion, robot, path)
-    makers: Mapping[str, Callable[[], bytes]] = {
-        "csv": lambda: joint_table(motion, robot).encode(),
-        "npz": lambda: _npz(plain_arrays(motion, robot)),
-        "motion-clip": lambda: _npz(motion_clip(motion, robot, fps=fps, order=order)),
-    }
-    if format_name not in makers:
-        raise InputError(f"format {format_name!r}: must be one of {', '.join(FORMATS)}")
     ending = Path(FORMATS[format_name]).suffix
     if path.suffix.lower() != ending:
         raise InputError(f"--out must name a file that ends in {ending}, got {str(path)!r}")
-    return write_file(path, makers[format_name]())
+    if format_name == "csv":
+        return write_file(path, joint_table(motion, robot).encode())
+    clip = format_name == "motion-clip"
+    return write_file(
+        path, _npz(motion_clip(motion, robot, fps=fps, order=order) if clip else plain_arrays(motion, robot))
+    )
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -72,13 +72,13 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def joint_table(motion: Motion, robot: Robot, rate_hz: float = RATE_HZ) -> str:
+def joint_table(motion: Motion, robot: Robot) -> str:
     """Time, phase, position, velocity and torque of every joint as comma-separated text, one header line with units.
 
     One line per millisecond; take-off, which a tape holds twice, stands once. The last line is the last whole
     millisecond within the motion.
     """
-    x = motion.every(rate_hz)
+    x = motion.every(RATE_HZ)
     kinds = {"position_rad": x.q[:, 7:], "velocity_rad_s": x.v[:, 6:], "torque_N_m": x.tau}
     head = ["time_s", "phase_0_launch_1_flight_2_landing"]
     head += [f"{name}_{kind}" for kind in kinds for name in robot.joint_names]
@@ -195,11 +195,10 @@ def _write_replay(motion: Motion, robot: Robot, path: Path) -> Path:
     script, readme = ((files / name).read_text(encoding="utf-8") for name in ("replay.py.txt", "replay.md"))
     for mark, said in (("@@SCRIPT@@", script.strip()), ("@@SOURCE@@", motion.source), ("@@ROBOT@@", robot.name)):
         readme = readme.replace(mark, said)
+    arrays = {"hz": np.array(REPLAY_HZ), **plain_arrays(motion, robot, REPLAY_HZ)}
     with transaction(path) as staging:
         (staging / "robot.urdf").write_bytes(robot.urdf.encode())
-        (staging / "trajectory.npz").write_bytes(
-            _npz({"hz": np.array(REPLAY_HZ), **plain_arrays(motion, robot, REPLAY_HZ)})
-        )
+        (staging / "trajectory.npz").write_bytes(_npz(arrays))
         (staging / "replay.py").write_text(script, encoding="utf-8")
         (staging / "README.md").write_text(readme, encoding="utf-8")
     return path

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import joblib
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.io.files import append, open_log
+from jumplab.io.files import Log, append, open_log
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot.reach import Reach, reach
@@ -136,12 +136,9 @@ def envelope(
     for distance in distances:
         for height in heights:
             JumpTask(distance, height)  # refuses what no task may ask
-    path = None if folder is None else Path(folder) / CELLS
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    rows = []
-    with nullcontext() if path is None else open_log(path, "envelope", _entry) as log:
-        done = {} if log is None else _own(log.done, robot, path)
+    path, rows = None if folder is None else Path(folder) / CELLS, []
+    with nullcontext() if path is None else _opened(path, robot) as log:
+        done = {} if log is None else log.done
         run = joblib.Parallel(n_jobs=workers, return_as="generator")
         for row in run(joblib.delayed(_row)(robot, height, tuple(distances), done, path) for height in heights):
             rows.append(row)
@@ -204,17 +201,15 @@ def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> 
 
 
 # finished cells on file -----------------------------------------------------------------------------------------
-def _entry(line: Any) -> tuple[Place, tuple[str, Cell]]:
-    owner = line.pop("robot")
-    cell = Cell(**{k: math.nan if v is None else v for k, v in line.items()})
-    return (cell.distance_m, cell.height_m), (owner, cell)
-
-
-def _own(found: Mapping[Place, tuple[str, Cell]], robot: Robot, path: Path) -> dict[Place, Cell]:
-    for owner, _ in found.values():
-        if owner != robot.hash:
+def _opened(path: Path, robot: Robot) -> AbstractContextManager[Log[Place, Cell]]:
+    def entry(line: dict[str, Any]) -> tuple[Place, Cell]:
+        if (owner := line.pop("robot")) != robot.hash:
             raise InputError(f"{path}: belongs to another robot ({owner}, not {robot.hash}); choose another folder")
-    return {key: cell for key, (_, cell) in found.items()}
+        cell = Cell(**{k: math.nan if v is None else v for k, v in line.items()})
+        return (cell.distance_m, cell.height_m), cell
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return open_log(path, "envelope", entry)
 
 
 def _keep(cell: Cell, robot: Robot, path: Path | None) -> None:
