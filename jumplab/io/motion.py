@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
-from jumplab.io.tape import DAMAGE
+from jumplab.io.tape import DAMAGE as _DAMAGE
 from jumplab.robot import Robot
 
 SIMULATION_NAME, SIMULATION_SCHEMA = "simulation.npz", "jumplab-simulation-1"
@@ -64,7 +64,7 @@ class Motion:
         try:
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in ("schema", "t", "q", "v", "tau", "phase", "joint_names")}
-        except DAMAGE as e:
+        except _DAMAGE as e:
             raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
         schema, names = str(data.pop("schema")), tuple(str(n) for n in data.pop("joint_names"))
         n, nq, nv = len(data["t"]), robot.model.nq, robot.model.nv

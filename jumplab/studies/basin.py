@@ -24,20 +24,12 @@ SHUFFLE_SEED = 0  # of the grid's order, so that any first part of it is a fair 
 
 @dataclass(frozen=True)
 class BasinState:
-    """One state of the grid: how it differs from the planned apex, and the floor's friction.
+    """One state of the grid: how it differs from the planned apex, and the floor's friction."""
 
-    Attributes
-    ----------
-    speed_factor : on the horizontal velocity [1].
-    pitch_deg : turn of the whole robot [degrees].
-    height_m : shift upward [m].
-    friction : coefficient of the soles on the ground [1].
-    """
-
-    speed_factor: float
-    pitch_deg: float
-    height_m: float
-    friction: float
+    speed_factor: float  # on the horizontal velocity [1]
+    pitch_deg: float  # turn of the whole robot [degrees]
+    height_m: float  # shift upward [m]
+    friction: float  # coefficient of the soles on the ground [1]
 
 
 @dataclass(frozen=True)

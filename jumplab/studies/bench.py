@@ -44,7 +44,6 @@ AT_ONCE, OVER_COARSE, APPROACHED = "direct, at once", "direct, over a coarse mes
 DIRECT = (AT_ONCE, OVER_COARSE)  # by ipopt alone, from a cold start
 WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
 TAPE = "plan: tape"
-PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "numpy")
 
 
 def report(
@@ -77,8 +76,7 @@ def report(
         "node_growth_error": line_error(growth["nodes"]),
     }
     goals = {}
-    for name, (_, limit, aim) in GOALS.items():
-        value = numbers[name]
+    for (name, value), (_, limit, aim) in zip(numbers.items(), GOALS.values(), strict=True):
         goals[name] = dict(value=value, limit=limit, aim=aim, reached=None if value is None else bool(value <= limit))
     return {
         **numbers,
@@ -99,7 +97,7 @@ def report(
             "cpus": joblib.cpu_count(),
             "load": os.getloadavg()[0],
             "python": known["python"],
-            "versions": {name: known[name] for name in PACKAGES},
+            "versions": {name: known[name] for name in ("jumplab", "casadi", "pin", "proxsuite", "numpy")},
         },
     }
 
@@ -142,12 +140,12 @@ def text(found: Mapping[str, Any]) -> str:
         lines.append(f"  {name}: " + ", ".join(f"{stage} {n}" for stage, n in row.items()))
     lines += ["", "growth of stage 3 with its mesh", "  intervals  iterations   solve [s]   per iteration [ms]"]
     for r in found["growth"]["nodes"]:
-        counts = f"  {r['intervals']:>9}{r['iterations']:>12}"
-        lines.append(f"{counts}{r['solve_s']:>12.3f}{1e3 * r['iteration_s']:>14.2f}")
+        n, count, solve_s, each_s = (r[key] for key in ("intervals", "iterations", "solve_s", "iteration_s"))
+        lines.append(f"  {n:>9}{count:>12}{solve_s:>12.3f}{1e3 * each_s:>14.2f}")
     targets = ", ".join(f"{n}: {t:.2f} s" for n, t in found["growth"]["targets_cpu_s"].items())
     audits = "; ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items())
-    lines += [f"  CPU time by number of targets: {targets}", ""]
-    lines += [f"plans that were timed and are clean in the audit: {audits}"]
+    timed = f"plans that were timed and are clean in the audit: {audits}"
+    lines += [f"  CPU time by number of targets: {targets}", "", timed]
     if not all(goal["reached"] for goal in found["goals"].values()):
         lines += ["", "where the time of the three steps goes"]
         lines += [f"  {name.removeprefix('plan: '):<16}{share:>6.0%}" for name, share in found["where"].items()]
@@ -223,6 +221,8 @@ def bench(
 ) -> dict[str, Any]:
     """Measure everything; returns plain types, see :func:`report`.
 
+    Raises :class:`InputError` for fewer repeats than 1, another :class:`JumplabError` if the target has no plan.
+
     Parameters
     ----------
     robot_name : shipped robot, or path of a TOML file.  task : the target.
@@ -231,13 +231,6 @@ def bench(
     nodes : numbers of intervals for the growth with nodes.
     spread : further targets, as shares of the target's distance and rise, planned once in both ways.
     cold : also time new processes.  say : is told what goes on.
-
-    Raises
-    ------
-    InputError
-        For fewer repeats than 1.
-    JumplabError
-        If the target has no plan.
     """
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
@@ -290,8 +283,8 @@ def _once(
 
 def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, list[bool]], kept: str) -> float:
     """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
-    in the folder ``kept``; returns the peak memory of the first [GiB]. Python's own bytecode is on file for both, as it
-    is after any first run, whatever the settings of this process."""
+    in the folder ``kept``; returns the larger peak of memory [GiB]. Python's own bytecode is on file for both, as it is
+    after any first run."""
     peak = 0.0
     environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)

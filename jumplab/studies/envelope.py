@@ -41,26 +41,16 @@ OPEN, VERDICT, BEYOND = "no plan found", "refused before solving", "not tried, b
 
 @dataclass(frozen=True)
 class Cell:
-    """One target.
-
-    Attributes
-    ----------
-    distance_m, height_m : the target.
-    solved : True if a plan within all limits was found.
-    limiting : what is used most ("hip torque", "knee speed", "friction"), or why there is no plan.
-    share : how much of what the planner allows of it is used, 1 at the limit; nan without a plan.
-    iterations, solve_s : cost of the solve.
-    reason : the sentence of the refusal.
-    """
+    """One target, and whether a plan within all limits was found."""
 
     distance_m: float
     height_m: float
     solved: bool
-    limiting: str
-    share: float
+    limiting: str  # what is used most ("hip torque", "knee speed", "friction"), or why there is no plan
+    share: float  # how much of what the planner allows of it is used, 1 at the limit; nan without a plan
     iterations: int = 0
     solve_s: float = 0.0
-    reason: str = ""
+    reason: str = ""  # the sentence of the refusal
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import product
@@ -177,10 +177,8 @@ def _check_weights(cases: list[Case]) -> None:
 
 def _backend(cluster: str | None) -> AbstractContextManager:
     """Where joblib sends the work: processes of this machine, or a Dask cluster."""
-    if cluster is None:
-        return joblib.parallel_config("loky", inner_max_num_threads=1)
     if not cluster:
-        return nullcontext()
+        return joblib.parallel_config("loky", inner_max_num_threads=1)
     try:
         from distributed import Client
     except ImportError:
@@ -207,9 +205,8 @@ def _opened(folder: Path, cases: list[Case], hashes: Mapping[str, str]) -> Itera
         elif _HEAD not in log.done:
             raise InputError(f"{str(folder / CASES)!r} is no log of a sweep; choose another folder")
         elif log.done[_HEAD] != head:
-            raise InputError(
-                f"{str(folder)!r} holds a sweep of other targets, robots or weights; choose another folder"
-            )
+            other = "a sweep of other targets, robots or weights"
+            raise InputError(f"{str(folder)!r} holds {other}; choose another folder")
         yield log
 
 

@@ -38,7 +38,6 @@ from jumplab.sim.playback import MODES
 SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
 CONFIDENCE = 0.95
 LOOK_S = 0.5  # how often a worker looks whether its parent still lives
-LEG_ROLES = ("hip_pitch", "knee", "ankle_pitch")
 # whose versions decide a trial's outcome, and which sources of this package do: trials of others are not these trials
 SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")
 SOURCES = (
@@ -46,7 +45,6 @@ SOURCES = (
     *("studies/trials.py", "studies/basin.py"),
 )
 Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
-_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
 
 
 def short_hash(data: Any) -> str:
@@ -68,20 +66,12 @@ def plan_hash(summary: Mapping[str, Any]) -> str:
 # one trial ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class TrialSettings:
-    """How the robots of a Monte Carlo are drawn and made to jump.
+    """How the robots of a Monte Carlo are drawn and made to jump."""
 
-    Attributes
-    ----------
-    mode : "position" or "pd", how the tape is played until touchdown.
-    reaim : turn the legs in the air against the trunk's measured pitch error.
-    noise : on what the controllers are told.
-    ranges : half-widths of the draws.
-    """
-
-    mode: str = "position"
-    reaim: bool = True
-    noise: SensorNoise = field(default_factory=SensorNoise)
-    ranges: Ranges = field(default_factory=Ranges)
+    mode: str = "position"  # or "pd": how the tape is played until touchdown
+    reaim: bool = True  # turn the legs in the air against the trunk's measured pitch error
+    noise: SensorNoise = field(default_factory=SensorNoise)  # on what the controllers are told
+    ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
 
     def __post_init__(self):
         if self.mode not in MODES:
@@ -111,23 +101,14 @@ class TrialKey:
 
 @dataclass(frozen=True)
 class Trial:
-    """One finished trial.
+    """One finished trial."""
 
-    Attributes
-    ----------
-    key : what it was.
-    perturbation : every drawn number, as :meth:`jumplab.sim.Perturbation.to_json` gives them.
-    features : the drawn robot in a few numbers, see :func:`features`.
-    landed, reason : the verdict, and why; a run that fails a check of its honesty has not landed.
-    metrics : all numbers of the jump; None if the engine lost the robot.
-    """
-
-    key: TrialKey
-    perturbation: dict[str, Any]
-    features: dict[str, float]
-    landed: bool
-    reason: str
-    metrics: Metrics | None
+    key: TrialKey  # what it was
+    perturbation: dict[str, Any]  # every drawn number, as :meth:`jumplab.sim.Perturbation.to_json` gives them
+    features: dict[str, float]  # the drawn robot in a few numbers, see :func:`features`
+    landed: bool  # the verdict; a run that fails a check of its honesty has not landed
+    reason: str  # and why
+    metrics: Metrics | None  # all numbers of the jump; None if the engine lost the robot
 
     def to_json(self) -> dict[str, Any]:
         """The trial as the log keeps it."""
@@ -172,43 +153,33 @@ def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics
 def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
     """A perturbed robot in a few numbers, all relative to the planned one.
 
-    Returns
-    -------
-    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its stance),
-    leg_motors [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
+    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its stance), leg_motors
+    [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
     """
     q, real = stance_configuration(robot), drawn.robot(robot)
     here, planned = (pin.centerOfMass(r.model, r.model.createData(), q, False).copy() for r in (real, robot))
-    legs = [drawn.motor_gain.get(name, 1.0) for role in LEG_ROLES for name in robot.joints[role]]
+    legs = [name for role in ("hip_pitch", "knee", "ankle_pitch") for name in robot.joints[role]]
     return {
         "friction": drawn.friction,
         "delay_s": drawn.delay_s,
         "mass": real.total_mass / robot.total_mass - 1,
         "com_x_m": float(here[0] - planned[0]),
         "com_y_m": float(here[1] - planned[1]),
-        "leg_motors": float(np.mean(legs)) - 1,
+        "leg_motors": float(np.mean([drawn.motor_gain.get(name, 1.0) for name in legs])) - 1,
     }
 
 
 # a series of trials ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class TrialReport:
-    """All trials of one seed, settings and plan, in the order of their numbers.
+    """A series of trials, and what they share."""
 
-    Attributes
-    ----------
-    trials : finished trials.
-    seed, settings, plan : what they share; ``plan`` is the hash of the plan.
-    target : of the plan, as its summary says it.
-    resumed : how many were taken from an earlier run.
-    """
-
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  # in the order of their numbers
     seed: int
     settings: TrialSettings
-    plan: str
-    target: dict[str, float]
-    resumed: int = 0
+    plan: str  # its hash
+    target: dict[str, float]  # of the plan, as its summary says it
+    resumed: int = 0  # how many were taken from an earlier run
 
     @property
     def count(self) -> int:
@@ -233,8 +204,9 @@ class TrialReport:
     @property
     def reasons(self) -> dict[str, int]:
         """How often robots failed for which reason, the most frequent first; numbers and sides are left out."""
-        kinds = (_NUMBER.sub("...", t.reason) for t in self.trials if not t.landed)
-        return dict(Counter(k.replace("left_", "").replace("right_", "") for k in kinds).most_common())
+        numbers, sides = r"[+-]?\d+(\.\d+)?", "left_|right_"
+        kinds = (re.sub(sides, "", re.sub(numbers, "...", t.reason)) for t in self.trials if not t.landed)
+        return dict(Counter(kinds).most_common())
 
     def values(self, name: str) -> np.ndarray:
         """One metric (M,) of the trials that landed."""
@@ -242,10 +214,8 @@ class TrialReport:
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``trials.json``; depends on the trials alone, not on how or when they were run."""
-        kinds, measured = {"least": np.min, "median": np.median, "largest": np.max}, {}
-        for name in ("foot_distance_m", "com_rise_m"):
-            x = self.values(name)
-            measured[name] = {kind: float(of(x)) for kind, of in kinds.items()} if len(x) else None
+        measured = {name: self.values(name) for name in ("foot_distance_m", "com_rise_m")}
+        kinds = {"least": np.min, "median": np.median, "largest": np.max}
         return {
             "schema": SCHEMA,
             "success_rate": self.success_rate,
@@ -255,7 +225,10 @@ class TrialReport:
             "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed},
             "reasons": self.reasons,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
-            "landed_metrics": measured,
+            "landed_metrics": {
+                name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x) else None
+                for name, x in measured.items()
+            },
             "target": self.target,
             "seed": self.seed,
             "settings": {**asdict(self.settings), "hash": self.trials[0].key.settings},
@@ -281,13 +254,10 @@ def run_trials(
 ) -> TrialReport:
     """Let ``n`` perturbed robots jump the plan in ``folder``; write ``trials.jsonl`` and ``trials.json`` there.
 
-    Trials that the folder already has are not run again.
-
     Parameters
     ----------
-    folder : result folder of a plan.
-    n : number of trials; the first ones of a larger number are the same.
-    seed : of the whole series.
+    folder : result folder of a plan; trials that it already has are not run again.
+    n : number of trials; the first ones of a larger number are the same.  seed : of the whole series.
     jobs : processes; one per core if None.
     progress : a bar on stderr; only on a terminal if None.
 
@@ -326,9 +296,7 @@ def run_series(
 ) -> tuple[tuple[Trial, ...], int]:
     """Do the ``work`` that the folder's log does not have yet, and keep it there.
 
-    Returns
-    -------
-    All trials in the order of ``work``, and how many of them the log had.
+    Returns all trials in the order of ``work``, and how many of them the log had.
     """
     store.ensure_writable(folder)
     with trial_log(folder) as log:
@@ -355,11 +323,11 @@ def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_
 
 def _serve(parent: int) -> None:
     """A worker's habits: Ctrl-C is its parent's affair, and without the parent there is nothing left to do."""
+
+    def leave_with_it() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK_S)
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-
-
-def _leave_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(LOOK_S)
-    os._exit(1)
+    threading.Thread(target=leave_with_it, daemon=True).start()
