@@ -30,25 +30,17 @@ def default_name(format_name: str, source: str) -> str:
 
 
 def write(
-    format_name: str,
-    motion: Motion,
-    robot: Robot,
-    path: str | Path,
-    *,
-    fps: float = CLIP_FPS,
-    order: str = "depth-first",
+    format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float = CLIP_FPS, order: str = ORDERS[0]
 ) -> Path:
     """Write a motion in one of :data:`FORMATS`.
+
+    Raises :class:`InputError` if the format is unknown, an option cannot be meant, or the path cannot be written;
+    nothing is left behind then.
 
     Parameters
     ----------
     path : file to write, or folder with "urdf-replay".
     fps, order : of a motion clip, see :func:`motion_clip`.
-
-    Raises
-    ------
-    InputError
-        If the format is unknown, an option cannot be meant, or the path cannot be written. Nothing is left behind.
     """
     path = Path(path)
     if format_name not in FORMATS:
@@ -108,28 +100,21 @@ def plain_arrays(motion: Motion, robot: Robot, rate_hz: float = RATE_HZ) -> dict
 
 
 def motion_clip(
-    motion: Motion, robot: Robot, *, fps: float = CLIP_FPS, order: str = "depth-first"
+    motion: Motion, robot: Robot, *, fps: float = CLIP_FPS, order: str = ORDERS[0]
 ) -> dict[str, np.ndarray]:
     """F frames under the names that motion trackers read: J joints and B links, 32-bit floats, all in world axes.
 
     Base and joints are interpolated (the attitude along the arc), links follow from them by Pinocchio, so that every
     frame is a state that the robot can have.
 
-    Parameters
-    ----------
-    fps : whole frames a second.
-    order : of joints and links, one of :data:`ORDERS`.
+    ``fps`` are whole frames a second, ``order`` of joints and links is one of :data:`ORDERS`; raises
+    :class:`InputError` if they cannot be meant.
 
     Returns
     -------
     ``fps`` (1,); ``joint_pos``, ``joint_vel`` (F, J) [rad, rad/s]; ``body_pos_w`` (F, B, 3) origins of the links [m];
     ``body_quat_w`` (F, B, 4) w x y z, free of jumps in sign; ``body_lin_vel_w`` (F, B, 3) of those origins [m/s];
     ``body_ang_vel_w`` (F, B, 3) [rad/s]; ``joint_names`` (J,); ``body_names`` (B,), the base link first.
-
-    Raises
-    ------
-    InputError
-        If ``fps`` or ``order`` cannot be meant.
     """
     if fps != round(fps):
         raise InputError(f"fps = {fps:g}: clips carry whole frames per second")

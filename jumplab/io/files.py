@@ -27,10 +27,7 @@ LOCK_WAIT_S = 20.0  # a write lasts well under a second: after a longer wait som
 def made(folder: Path) -> Iterator[list[Path]]:
     """Make ``folder`` with its parents, and yield the new ones, innermost first; they go again if the block fails.
 
-    Raises
-    ------
-    InputError
-        If ``folder`` is a file, or the system refuses anything here or in the block.
+    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in the block.
     """
     new = [p for p in (folder, *folder.parents) if not os.path.exists(p)]
     try:
@@ -88,12 +85,8 @@ def write_file(path: str | Path, content: bytes) -> Path:
 def locked(folder: Path, *, shared: bool = False, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
     """Hold the lock of an existing folder; readers share it, a writer has it alone.
 
-    A file system that knows no locks grants it always: the hashes in the manifest then still tell a mix.
-
-    Raises
-    ------
-    InputError
-        If another process keeps it for longer than ``wait_s`` [s].
+    Raises :class:`InputError` if another process keeps it for longer than ``wait_s`` [s]. A file system that knows no
+    locks grants it always: the hashes in the manifest then still tell a mix.
     """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -121,10 +114,8 @@ def _try_lock(fd: int, kind: int) -> bool:
 class Log(Generic[K, V]):
     """An open log; made by :func:`open_log`.
 
-    Attributes
-    ----------
-    done : what its lines say, the last one of equal keys; damaged and foreign lines are left out.
-    empty : True if it had no line at all.
+    ``done`` is what its lines say, the last one of equal keys; damaged and foreign lines are left out. ``empty`` is
+    True if it had no line at all.
     """
 
     def __init__(self, file: BinaryIO, parse: Callable[[Any], tuple[K, V]]):
@@ -159,15 +150,9 @@ def append(file: BinaryIO, data: Mapping[str, Any]) -> None:
 def open_log(path: str | Path, command: str, parse: Callable[[Any], tuple[K, V]]) -> Iterator[Log[K, V]]:
     """The log at ``path``, for one process at a time; it is made if it is missing, and goes if nothing is added.
 
-    Parameters
-    ----------
-    command : of jumplab, that writes such logs.
-    parse : key and value of a line's data; raises ValueError, KeyError or TypeError if it is not ours.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written, or another process has it.
+    ``command`` of jumplab writes such logs; ``parse`` gives key and value of a line's data, or raises ValueError,
+    KeyError or TypeError if it is not ours. Raises :class:`InputError` if the file cannot be written, or another
+    process has it.
     """
     path = Path(path)
     try:

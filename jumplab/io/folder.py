@@ -31,6 +31,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
 T = TypeVar("T")
+Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
@@ -47,12 +48,8 @@ _STAGING, _COMMIT = ".staging", ".commit"
 def transaction(folder: str | Path) -> Iterator[Path]:
     """Yield an empty staging folder; if the block ends well, its files replace those of ``folder`` all at once.
 
-    If the block raises, or the process is killed before its end, ``folder`` is what it was before.
-
-    Raises
-    ------
-    InputError
-        If ``folder`` cannot be written.
+    If the block raises, or the process is killed before its end, ``folder`` is what it was before. Raises
+    :class:`InputError` if ``folder`` cannot be written.
     """
     folder = as_path(folder, "a result folder")
     staging = folder / _STAGING
@@ -129,22 +126,15 @@ def _sha256(path: Path) -> str:
 
 
 def write_plan(
-    folder: str | Path,
-    tape: Tape,
-    robot: Robot,
-    summary: Mapping[str, Any],
-    complete: Callable[[Path], T] | None = None,
+    folder: str | Path, tape: Tape, robot: Robot, summary: Summary, complete: Callable[[Path], T] | None = None
 ) -> T | None:
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
     Parameters
     ----------
     summary : becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the files.
-    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``).
-
-    Returns
-    -------
-    What ``complete`` returned.
+    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``); what it
+        returns is returned.
     """
     require_type(tape, Tape, "the tape to write")
     require_type(robot, Robot, "its robot")
@@ -171,13 +161,10 @@ class Simulation(Protocol):
         """Write both files; ``extra`` are further entries of the second one."""
 
 
-def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[str, Any]) -> None:
+def write_simulation(folder: str | Path, result: Simulation, summary: Summary) -> None:
     """Write ``simulation.npz`` and ``simulation.json`` beside the plan that ``summary`` was read with.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be written, or has come to hold another plan.
+    Raises :class:`InputError` if the folder cannot be written, or has come to hold another plan.
     """
     require_type(summary, Mapping, "the summary")
     if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
@@ -189,14 +176,14 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
         result.save(staging, extra=planned)
 
 
-def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any], name: str) -> None:
+def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Summary, name: str) -> None:
     """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
     with transaction(folder) as staging:
         _same_plan(Path(folder), summary)
         (staging / name).write_text(to_json(report), encoding="utf-8")
 
 
-def _same_plan(folder: Path, summary: Mapping[str, Any]) -> None:
+def _same_plan(folder: Path, summary: Summary) -> None:
     if _read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
         raise InputError(f"{str(folder)!r} has been planned again in the meantime; simulate the new plan")
 
@@ -227,10 +214,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
     """Read a plan's folder: the tape, the robot it was planned for, and the summary.
 
-    Raises
-    ------
-    InputError
-        If the folder holds no finished plan, or if a file is damaged or not the one that the summary speaks of.
+    Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the one that the
+    summary speaks of.
     """
     folder = as_path(folder, "a result folder")
     try:

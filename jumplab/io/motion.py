@@ -30,24 +30,14 @@ class Record(Protocol):
 
 @dataclass(frozen=True)
 class Motion:
-    """States and torques of a robot over time.
+    """States and torques of a robot over time."""
 
-    Attributes
-    ----------
-    t : (N,) [s], never falling; an instant may stand twice, where one phase ends and the next begins.
-    q : (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
-    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
-    tau : (N, nv - 6) joint torques [N m].
-    phase : (N,) "launch", "flight" or "landing".
-    source : "plan" or "simulation".
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    tau: np.ndarray
-    phase: np.ndarray
-    source: str
+    t: np.ndarray  # (N,) [s], never falling; an instant may stand twice, where one phase ends and the next begins
+    q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
+    v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    phase: np.ndarray  # (N,) "launch", "flight" or "landing"
+    source: str  # "plan" or "simulation"
 
     @classmethod
     def of(cls, record: Record) -> Motion:
@@ -82,12 +72,8 @@ class Motion:
     def at(self, times: np.ndarray) -> Motion:
         """The motion at ``times`` (M,) [s]: everything linear between samples, the base's attitude along the arc.
 
-        An instant that stands twice gives its later sample, so that take-off belongs to the flight.
-
-        Raises
-        ------
-        InputError
-            If a time lies outside the motion.
+        An instant that stands twice gives its later sample, so that take-off belongs to the flight. Raises
+        :class:`InputError` if a time lies outside the motion.
         """
         times = np.asarray(times, float)
         if len(times) and not (self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE):

@@ -23,30 +23,20 @@ DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedErro
 class Tape:
     """Launch and flight of the full robot at 1 kHz.
 
-    Attributes
-    ----------
-    t : (N,) time from the start of the launch [s]; the instant of take-off appears twice, once per phase.
-    q : (N, nq) Pinocchio free-flyer order: x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
-    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
-    a : (N, nv) time derivative of ``v`` [m/s^2, rad/s^2].
-    tau : (N, nv - 6) joint torques [N m].
-    phase : (N,) "launch" or "flight".
-    contact_frames : (K,) names of the foot links; where wrenches act.
-    f : (N, K, 6) force then moment on the robot, world axes, at the origin of each contact frame [N, N m].
-    joint_names : (nv - 6,) in the order of ``q[7:]``.
-    extra : further arrays under their own names (SRMP and planar solutions), for study; not needed to play the tape.
+    Configurations are in Pinocchio's free-flyer order. The instant of take-off appears twice, once per phase. ``extra``
+    (SRMP and planar solutions) is for study, and not needed to play the tape.
     """
 
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    tau: np.ndarray
-    phase: np.ndarray
-    contact_frames: np.ndarray
-    f: np.ndarray
-    joint_names: np.ndarray
-    extra: dict = field(default_factory=dict)
+    t: np.ndarray  # (N,) time from the start of the launch [s]
+    q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
+    v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    a: np.ndarray  # (N, nv) time derivative of v [m/s^2, rad/s^2]
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    phase: np.ndarray  # (N,) "launch" or "flight"
+    contact_frames: np.ndarray  # (K,) names of the foot links; where wrenches act
+    f: np.ndarray  # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]
+    joint_names: np.ndarray  # (nv - 6,) in the order of q[7:]
+    extra: dict = field(default_factory=dict)  # further arrays under their own names
 
     def __post_init__(self):
         own = {name: getattr(self, name) for name in _DIMENSIONS}

@@ -74,8 +74,8 @@ def landing_basin(
 ) -> BasinReport:
     """Drop the robot of the plan in ``folder`` from every state of ``grid``; write ``trials.jsonl`` and ``basin.json``.
 
-    The robot is as planned, but for the friction; what the engine has of that is read back. States that the folder
-    already has are not run again.
+    The robot is as planned, but for the friction. States that the folder already has are not run again.
+    Raises as :func:`jumplab.studies.trials.run_trials`, and if ``n`` is more than the grid has.
 
     Parameters
     ----------
@@ -83,11 +83,6 @@ def landing_basin(
     n : how many states of the grid, in their random order; all if None.
     settings : ``ranges`` is not used.
     jobs, progress : see :func:`jumplab.studies.trials.run_trials`.
-
-    Raises
-    ------
-    InputError
-        If ``n`` cannot be meant or is more than the grid has, or the folder holds no whole plan or cannot be written.
     """
     states = grid.states
     count = len(states) if n is None else n

@@ -109,17 +109,14 @@ def envelope(
 ) -> Envelope:
     """Solve the whole map.
 
+    Raises :class:`InputError` if the grid is empty or too large, or the folder holds cells of another robot.
+
     Parameters
     ----------
     distances, heights : of the cells [m], rising.
     folder : where finished cells are kept; cells found there are not solved again.
     workers : processes that share the rows.
     tell : called with a line per finished row.
-
-    Raises
-    ------
-    InputError
-        If the grid is empty or too large, or the folder holds cells of another robot.
     """
     if not 0 < len(distances) * len(heights) <= MAX_CELLS:
         raise InputError(f"the map has {len(distances)} x {len(heights)} cells, must be 1 to {MAX_CELLS}")

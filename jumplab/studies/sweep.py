@@ -123,21 +123,15 @@ def run(
 ) -> list[dict[str, Any]]:
     """Plan all cases that have no line in ``out`` yet, and write the table.
 
+    Returns one row per case, in their order, with the columns of :data:`COLUMNS`. Raises :class:`InputError` if a robot
+    cannot be read, the folder holds another sweep, or there is no such cluster.
+
     Parameters
     ----------
     cases : from :func:`grid`.  out : folder; made if it is not there.
     jobs : processes; -1 for as many as there are processors.
     cluster : address of a Dask scheduler that does the work instead, for instance "tcp://host:8786".
     progress : a bar; by default on a terminal only.
-
-    Returns
-    -------
-    One row per case, in their order, with the columns of :data:`COLUMNS`.
-
-    Raises
-    ------
-    InputError
-        If a robot cannot be read, the folder holds another sweep, or there is no such cluster.
     """
     _check_weights(cases)
     hashes = {name: load_robot(name).hash for name in sorted({case.robot for case in cases})}

@@ -254,17 +254,14 @@ def run_trials(
 ) -> TrialReport:
     """Let ``n`` perturbed robots jump the plan in ``folder``; write ``trials.jsonl`` and ``trials.json`` there.
 
+    Raises :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
+
     Parameters
     ----------
     folder : result folder of a plan; trials that it already has are not run again.
     n : number of trials; the first ones of a larger number are the same.  seed : of the whole series.
     jobs : processes; one per core if None.
     progress : a bar on stderr; only on a terminal if None.
-
-    Raises
-    ------
-    InputError
-        If ``n`` or ``seed`` cannot be meant, or the folder holds no whole plan or cannot be written.
     """
     check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)
