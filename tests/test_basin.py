@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from fixtures_core import jump
-from paper.experiments import states_kept
+from paper.runs import states_kept
 
 from jumplab.errors import InputError
 from jumplab.io import folder as store
