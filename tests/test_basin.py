@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 from fixtures_core import jump
+from paper.runs import states_kept
 
 from jumplab.errors import InputError
 from jumplab.io import folder as store
 from jumplab.studies import basin
-from jumplab.studies.basin import BasinGrid, landing_basin, states_kept
+from jumplab.studies.basin import BasinGrid, landing_basin
 from jumplab.studies.trials import Trial, TrialSettings
 
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))

@@ -8,7 +8,7 @@ import pytest
 from jumplab.errors import InputError
 from jumplab.stages.whole_body import Mesh
 from jumplab.studies import bench as benchmark
-from jumplab.studies.bench import line_error, report, text
+from jumplab.studies.bench import Stopwatch, line_error, report, text
 from jumplab.task import JumpTask
 
 TIMES = {"plan": [0.5, 0.6], "re-plan": [0.2, 0.2], "direct, at once": [1.0, 1.0], "direct, build": [0.5, 0.5],
@@ -21,8 +21,9 @@ def made(**other) -> dict:
     """A report of made-up times."""
     growth = {"nodes": NODES, "targets_cpu_s": {"1": 0.5},
               "spread": [dict(ratio=r, ratio_approached=2 * r, clean=True) for r in (0.4, 0.7, 0.5)]}  # fmt: skip
-    return report({"repeats": 2}, {**TIMES, **other}, TIMES, {"plan": [True, False]}, {"plan": {"1 SRMP": 9}},
-                  {"plan": 0.1}, growth, [0.4, 0.5] if "cold" in other else [])  # fmt: skip
+    head, watch = {"repeats": 2, "iterations": {"plan": {"1 SRMP": 9}}, "functions_s": {"plan": 0.1}}, Stopwatch()
+    watch.cpu, watch.wall = {**TIMES, **other}, TIMES
+    return report(head, watch, {"plan": [True, False]}, growth, [0.4, 0.5] if "cold" in other else [])
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,13 @@ from jumplab.robot import Robot
 from jumplab.show.studies import envelope_map
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.stages.whole_body.settings import Limits
-from jumplab.studies import envelope
-from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Cell, Envelope, measure, usage
+from jumplab.studies.envelope import BEYOND, CELLS, OPEN, VERDICT, Cell, Envelope, envelope, usage
 from jumplab.task import JumpTask
 
 
 def test_cells_are_plans_within_the_limits(bhr, tmp_path):
     told = []
-    found = measure(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
+    found = envelope(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
     near, far, *refused = found.cells
     assert near.solved and far.solved and all(0.3 < c.share < 1.05 for c in (near, far))
     assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "ask for" in refused[0].reason
@@ -39,39 +38,57 @@ def test_usage_is_that_of_the_plan(bhr):
 
 
 def test_an_interrupted_map_goes_on(bhr, tmp_path, monkeypatch):
-    first = measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+    first = envelope(bhr, (0.4,), (0.3,), folder=tmp_path)
 
     def never(*_, **__):
         raise AssertionError("a finished cell is not solved again")
 
     monkeypatch.setattr(WholeBodyPlanner, "plan", never)
-    again = measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+    again = envelope(bhr, (0.4,), (0.3,), folder=tmp_path)
     assert again == first
-    (file,) = (tmp_path / "cells").iterdir()
+    file = tmp_path / CELLS
     data = json.loads(file.read_text())
-    file.write_text(json.dumps(data | {"robot": "somebody"}))
+    file.write_text(json.dumps(data | {"robot": "somebody"}) + "\n")
     with pytest.raises(InputError, match="belongs to another robot"):
-        measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+        envelope(bhr, (0.4,), (0.3,), folder=tmp_path)
     file.write_text(file.read_text()[:20])  # cut short: no cell
     with pytest.raises(AssertionError):
-        measure(bhr, (0.4,), (0.3,), folder=tmp_path)
+        envelope(bhr, (0.4,), (0.3,), folder=tmp_path)
+
+
+def test_every_cell_is_kept_at_once(bhr, tmp_path, monkeypatch):
+    """A map that is stopped within a row has the cells before; a map of its own is refused meanwhile."""
+    tried = []
+
+    def stopping(robot, task, guess, *, cold):
+        tried.append(task.distance_m)
+        if len(tried) == 3:
+            with pytest.raises(InputError, match="another 'jumplab envelope' is writing it"):
+                envelope(bhr, (0.1,), (0.3,), folder=tmp_path)
+            raise KeyboardInterrupt
+        return Cell(task.distance_m, task.height_m, True, "friction", 0.5), None
+
+    monkeypatch.setattr("jumplab.studies.envelope._solve", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        envelope(bhr, (0.1, 0.2, 0.3), (0.3,), folder=tmp_path)
+    assert all(c.solved for c in envelope(bhr, (0.1, 0.2, 0.3), (0.3,), folder=tmp_path).cells)
+    assert tried == [0.1, 0.2, 0.3, 0.3]
 
 
 def test_far_cells_are_not_tried_for_ever(bhr, monkeypatch):
-    def hopeless(self, task, guess, *, cold):
+    def hopeless(robot, task, guess, *, cold):
         return Cell(task.distance_m, task.height_m, False, OPEN, math.nan), None
 
-    monkeypatch.setattr(envelope._Row, "_cell", hopeless)
-    monkeypatch.setattr(envelope, "_ROWS", {})
-    cells = measure(bhr, (0.1, 0.2, 0.3, 0.4), (0.3,)).cells
+    monkeypatch.setattr("jumplab.studies.envelope._solve", hopeless)
+    cells = envelope(bhr, (0.1, 0.2, 0.3, 0.4), (0.3,)).cells
     assert [c.limiting for c in cells] == [OPEN, OPEN, BEYOND, BEYOND]
 
 
 def test_grids_that_cannot_be_meant(bhr):
     with pytest.raises(InputError, match=r"the map has 0 x 1 cells"):
-        measure(bhr, (), (0.3,))
+        envelope(bhr, (), (0.3,))
     with pytest.raises(InputError, match=r"height = "):
-        measure(bhr, (0.3,), (-1.0,))
+        envelope(bhr, (0.3,), (-1.0,))
 
 
 @pytest.mark.parametrize("argv, sentence", [

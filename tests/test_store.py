@@ -17,6 +17,7 @@ import pytest
 
 from jumplab.errors import InputError
 from jumplab.io import folder as store
+from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -219,6 +220,27 @@ def test_unwritable_folder(bhr, tmp_path, monkeypatch, name, sentence):
 def test_ensure_writable_leaves_no_trace(tmp_path):
     store.ensure_writable(tmp_path / "a" / "b")
     assert names(tmp_path) == []
+
+
+def test_a_log_is_read_around_what_is_not_its_own(tmp_path):
+    """Of equal keys the last line counts; a line that was cut off goes, foreign ones stay, and nothing is no file."""
+
+    def parse(line):
+        return line["key"], line["value"]
+
+    path = tmp_path / "log.jsonl"
+    with open_log(path, "log", parse) as log:
+        assert log.empty and not log.done
+    assert names(tmp_path) == []
+    path.write_bytes(b'hello\n[1]\n{"key": 1, "value": 2}\n{"key": 1, "value": 3}\n{"key": 4, "val')
+    with open_log(path, "log", parse) as log:
+        assert log.done == {1: 3} and not log.empty
+        log.add({"key": 5, "value": 6})
+        with pytest.raises(InputError, match=r"another 'jumplab log' is writing it"), open_log(path, "log", parse):
+            pass
+    assert path.read_bytes().splitlines()[-2:] == [b'{"key": 1, "value": 3}', b'{"key": 5, "value": 6}']
+    with pytest.raises(InputError, match="cannot be written"), open_log(tmp_path, "log", parse):
+        pass
 
 
 def damage(folder, name, how):

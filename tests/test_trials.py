@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import grimp
 import numpy as np
 import pytest
 from fixtures_core import jump
@@ -18,10 +20,8 @@ from test_store import make_tape, names
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
 from jumplab.sim import Finding, Perturbation, Scene, SensorNoise
-from jumplab.studies import trials as experiments
 from jumplab.studies import trials as monte_carlo
-from jumplab.studies import trials as single
-from jumplab.studies.trials import Trial, TrialKey, TrialSettings, open_log, run_trials, wilson
+from jumplab.studies.trials import Trial, TrialKey, TrialSettings, run_trials, trial_log, wilson
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -39,7 +39,7 @@ def play(tape, robot, scene, settings, key):
     toss = np.random.default_rng(key.robot_seed).uniform()
     drawn = Perturbation.draw(robot, key.robot_seed)
     reason = "stood" if toss < 0.7 else f"left_arm touched the ground {toss:.2f} s after touchdown"
-    return Trial(key, {}, single.features(drawn, robot), toss < 0.7, reason, None)
+    return Trial(key, {}, monte_carlo.features(drawn, robot), toss < 0.7, reason, None)
 
 
 @pytest.fixture
@@ -58,12 +58,12 @@ def content(folder):
 def test_a_trial_is_the_simulation_it_says(folder, bhr):
     tape, robot, summary = store.read_plan(folder)
     settings = TrialSettings("pd", True, SensorNoise.typical())
-    key = TrialKey(3, 5, settings.hash, single.plan_hash(summary))
-    trial = single.run_trial(tape, robot, Scene.flat(), settings, key)
+    key = TrialKey(3, 5, settings.hash, monte_carlo.plan_hash(summary))
+    trial = monte_carlo.run_trial(tape, robot, Scene.flat(), settings, key)
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
     assert trial.perturbation == json.loads(json.dumps(drawn.to_json()))
     assert trial.metrics.landed == trial.landed and trial.metrics.com_rise_m == pytest.approx(0.3, abs=0.05)
-    assert Trial.from_line(trial.line()) == trial and trial.line().count("\n") == 1
+    assert Trial.from_json(json.loads(json.dumps(trial.to_json()))) == trial
     f = trial.features
     assert (f["friction"], f["delay_s"]) == (drawn.friction, drawn.delay_s)
     assert drawn.robot(robot).total_mass == pytest.approx(robot.total_mass * (1 + f["mass"]))
@@ -72,17 +72,17 @@ def test_a_trial_is_the_simulation_it_says(folder, bhr):
 def test_features_of_a_shift_of_every_link(bhr):
     """All links' centres of mass moved alike, nothing turned but the legs: the whole robot's moves as its trunk's."""
     links = Perturbation.draw(bhr, 0).com
-    shifted = single.features(Perturbation(com=dict.fromkeys(links, (0.0, 0.01, 0.0))), bhr)
+    shifted = monte_carlo.features(Perturbation(com=dict.fromkeys(links, (0.0, 0.01, 0.0))), bhr)
     assert shifted["com_y_m"] == pytest.approx(0.01, rel=1e-3) and shifted["mass"] == 0
     weak = Perturbation(motor_gain=dict.fromkeys(bhr.joint_names, 0.97))
-    assert single.features(weak, bhr)["leg_motors"] == pytest.approx(-0.03)
+    assert monte_carlo.features(weak, bhr)["leg_motors"] == pytest.approx(-0.03)
 
 
 def test_a_lost_robot_is_a_failure(folder, monkeypatch):
     def explode(*args, **options):
         raise SolverError("PyBullet lost the robot")
 
-    monkeypatch.setattr(single, "simulate_jump", explode)
+    monkeypatch.setattr(monte_carlo, "simulate_jump", explode)
     report = run_trials(folder, 2, jobs=1)
     assert (report.landed, report.reasons) == (0, {"PyBullet lost the robot": 2})
     assert store.read_json(folder / "trials.json")["landed_metrics"]["com_rise_m"] is None
@@ -91,9 +91,9 @@ def test_a_lost_robot_is_a_failure(folder, monkeypatch):
 @pytest.mark.parametrize("honesty", [(Finding("extra force", 20.0, 15.0, "N", "a carried base"),), ()])
 def test_a_run_that_is_not_honest_is_a_failure(folder, monkeypatch, honesty):
     """However well it stands; the log says which check it failed."""
-    real = single.simulate_jump
+    real = monte_carlo.simulate_jump
     monkeypatch.setattr(
-        single, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=honesty)
+        monte_carlo, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=honesty)
     )
     trial = run_trials(folder, 1, jobs=1).trials[0]
     assert trial.metrics.landed and not trial.landed
@@ -108,12 +108,30 @@ def test_keys_differ_in_everything_that_matters(folder, monkeypatch):
               TrialSettings(ranges=replace(base.ranges, mass=0.06))]  # fmt: skip
     assert len({s.hash for s in (base, *others)}) == 5 and TrialSettings().hash == base.hash
     known = base.hash
-    monkeypatch.setattr(single, "_code", lambda: "another controller")
+    monkeypatch.setattr(monte_carlo, "_code", lambda: "another controller")
     assert base.hash != known
     plans = [summary, summary | {"platform_edge_m": 0.3}, summary | {"target": {"platform_m": 0.1}}]
-    assert len({single.plan_hash(s) for s in plans}) == 3
+    assert len({monte_carlo.plan_hash(s) for s in plans}) == 3
     seeds = {TrialKey(s, k, "", "").robot_seed for s in range(20) for k in range(50)}
     assert len(seeds) == 1000
+
+
+def test_the_code_that_decides_a_trial_is_all_listed(tmp_path):
+    """Whatever a trial imports, at any depth, and nothing else; a changed line there is another code."""
+    graph = grimp.build_graph("jumplab", cache_dir=None)
+    used = {f"jumplab.studies.{name}" for name in ("trials", "basin")}
+    used |= set().union(*(graph.find_upstream_modules(name) for name in used))
+    listed = {"jumplab." + part.removesuffix(".py").replace("/", ".") for part in monte_carlo.SOURCES}
+    assert all(any(f"{name}.".startswith(f"{room}.") for room in listed) for name in used)
+    assert all(any(f"{name}.".startswith(f"{room}.") for name in used) for room in listed)
+    root = tmp_path / "jumplab"
+    shutil.copytree(ROOT / "jumplab", root)
+    known = monte_carlo._code(root)
+    assert known == monte_carlo._code()
+    for file, decides in (("sim/loop.py", True), ("studies/trials.py", True), ("cli/main.py", False)):
+        (root / file).write_text((root / file).read_text() + "\n")
+        assert (monte_carlo._code(root) != known) == decides, file
+        known = monte_carlo._code(root)
 
 
 def test_bad_mode():
@@ -135,7 +153,7 @@ def test_report_counts(folder, coins):
     assert said["settings"]["mode"] == "position" and said["settings"]["reaim"] and said["seed"] == 2
     assert [t.key.index for t in report.trials] == list(range(40))
     lines = (folder / "trials.jsonl").read_text().splitlines()
-    assert {Trial.from_line(line).key for line in lines} == {t.key for t in report.trials}
+    assert {Trial.from_json(json.loads(line)).key for line in lines} == {t.key for t in report.trials}
 
 
 def test_wilson_is_its_formula():
@@ -164,7 +182,7 @@ def test_a_stopped_series_goes_on_to_the_same_end(folder, coins, monkeypatch, st
         run_trials(folder, 12, jobs=1)
     assert "trials.json" not in names(folder)
     with open(folder / "trials.jsonl", "ab") as file:  # killed in the middle of a line
-        file.write(whole.trials[7].line().encode()[:100])
+        file.write(json.dumps(whole.trials[7].to_json()).encode()[:100])
     monkeypatch.setattr(monte_carlo, "run_trial", play)
     again = run_trials(folder, 12, jobs=1)
     assert again.resumed == 5 and again.trials == whole.trials and content(folder) == wanted
@@ -207,13 +225,13 @@ def test_other_settings_seeds_and_plans_do_not_mix(folder, bhr, coins):
 def test_a_log_with_junk_is_read_around(folder, coins, junk):
     (folder / "trials.jsonl").write_bytes(junk)
     run_trials(folder, 3, jobs=1)
-    with open_log(folder) as log:
-        assert len(log.trials) == 3
+    with trial_log(folder) as log:
+        assert len(log.done) == 3
     assert (folder / "trials.jsonl").read_bytes().startswith(junk)
 
 
 def test_two_runs_at_once_are_refused(folder, coins):
-    with open_log(folder), pytest.raises(InputError, match=r"trials\.jsonl: another 'jumplab trials' is writing it"):
+    with trial_log(folder), pytest.raises(InputError, match=r"trials\.jsonl: another 'jumplab trials' is writing it"):
         run_trials(folder, 3, jobs=1)
 
 
@@ -266,8 +284,8 @@ def test_damaged_plans_are_refused_in_one_sentence(folder, damage):
 
 def whole_lines(folder):
     """Lines of the log, in any order, without what the kill has torn."""
-    with open_log(folder) as log:
-        return {trial.line() for trial in log.trials.values()}
+    with trial_log(folder) as log:
+        return {json.dumps(trial.to_json()) for trial in log.done.values()}
 
 
 @pytest.mark.slow
@@ -297,7 +315,3 @@ def test_killed_in_parallel_and_resumed_equals_serial(folder, tmp_path):
     assert last.resumed >= 1
     assert last.trials == serial.trials and content(other) == content(folder)
     assert whole_lines(other) == whole_lines(folder)
-
-
-def test_package_exports():
-    assert set(experiments.__all__) <= set(dir(experiments))

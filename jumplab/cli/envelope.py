@@ -47,9 +47,9 @@ def _envelope(args: argparse.Namespace) -> None:
 
     from jumplab.show.studies import envelope_map
     from jumplab.show.style import save_figure
-    from jumplab.studies.envelope import measure
+    from jumplab.studies.envelope import envelope
 
-    found = measure(robot, distances, heights, folder=out, workers=int(workers), tell=print)
+    found = envelope(robot, distances, heights, folder=out, workers=int(workers), tell=print)
     text = json.dumps(asdict(found) | {"hash": robot.hash}, indent=1).replace("NaN", "null")
     Path(out, "envelope.json").write_text(text + "\n")
     caption = "Cells with a plan of the direct planner, coloured by the limit of which they use most."

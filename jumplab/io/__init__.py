@@ -1,1 +1,5 @@
-"""Tapes, result folders and exports: everything that is read from or written to disk."""
+"""Everything that is read from or written to disk.
+
+In come tapes, simulations and reports; out go result folders, exports and logs, each whole or not at all. Start at
+:mod:`jumplab.io.folder`; what a plan is on file is :class:`jumplab.io.tape.Tape`.
+"""

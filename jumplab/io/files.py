@@ -1,78 +1,51 @@
-"""Folders that are written whole or not at all.
+"""Files that are written whole or not at all, locks, and the resumable log: a line of JSON per finished piece of work.
 
-New files are first written into ``.staging`` inside the folder. Renaming that to ``.commit`` is the one moment at which
-the new result exists; its files then replace the old ones. Killed before that moment, the old result stands; killed
-after it, the next reader or writer moves the rest. Readers and writers take turns by a lock on the folder itself, which
-the system releases when a process dies.
+Locks are those of the system, on the folder or the log itself: readers share, a writer is alone, and a process that
+dies gives them back. (The package filelock shares only through a database, and leaves a file of its own in the folder.)
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
-import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, BinaryIO, Generic, TypeVar
 
 from jumplab.errors import InputError, as_path
 
-PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
-HASHED = (PLAN, URDF, CONFIG)
-# Statements about one plan, which a new plan makes untrue and therefore removes.
-OF_SIMULATION = ("jump.html", "simulated_joints.csv", "simulated_motion.npz", "simulated_motion_clip.npz",
-                 "simulated_replay")  # what a new simulation makes untrue  # fmt: skip
-DERIVED = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json",
-           "plan.html",
-           "joints.csv", "motion.npz", "motion_clip.npz", "replay", *OF_SIMULATION)  # fmt: skip
-LOCK_WAIT_S = 20.0  # our choice: a write lasts well under a second, so a longer wait means that something hangs
-_STAGING, _COMMIT = ".staging", ".commit"
-
-
-def ensure_writable(folder: str | Path) -> Path:
-    """Check that results can be written into ``folder``, and leave no trace.
-
-    Raises
-    ------
-    InputError
-        If ``folder`` is a file, or cannot be made, or cannot be written.
-    """
-    folder = as_path(folder, "a result folder")
-    with _explained(folder):
-        made = _make(folder)
-        try:
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        finally:
-            _unmake(made)
-    return folder
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+LOCK_WAIT_S = 20.0  # a write lasts well under a second: after a longer wait something hangs
 
 
 @contextlib.contextmanager
-def _explained(folder: Path) -> Iterator[None]:
-    """Turn what the system says about ``folder`` into one sentence."""
-    try:
-        yield
-    except OSError as e:
-        reason = e.strerror or type(e).__name__
-        raise InputError(f"the folder {str(folder)!r} cannot be written ({reason}); choose another one") from e
+def made(folder: Path) -> Iterator[list[Path]]:
+    """Make ``folder`` with its parents, and yield the new ones, innermost first; they go again if the block fails.
 
-
-def _make(folder: Path) -> list[Path]:
-    """Make ``folder`` with its parents; return those that are new, innermost first."""
-    new = [p for p in (folder, *folder.parents) if not p.exists()]
+    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in the block.
+    """
+    new = [p for p in (folder, *folder.parents) if not os.path.exists(p)]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except ValueError as e:  # a zero byte in the name
+            raise InputError(f"{str(folder)!r} cannot be the name of a folder ({e}); choose another one") from e
+        except OSError as e:
+            if os.path.exists(folder) and not os.path.isdir(folder):
+                raise InputError(f"{str(folder)!r} is a file; choose a folder") from e
+            raise
+        yield new
     except BaseException as e:
         _unmake(new)
-        if isinstance(e, ValueError):  # a zero byte in the name
-            raise InputError(f"{str(folder)!r} cannot be the name of a folder ({e}); choose another one") from e
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{str(folder)!r} is a file; choose a folder") from e
-        raise
-    return new
+        if not isinstance(e, OSError):
+            raise
+        reason = e.strerror or type(e).__name__
+        raise InputError(f"the folder {str(folder)!r} cannot be written ({reason}); choose another one") from e
 
 
 def _unmake(folders: list[Path]) -> None:
@@ -81,16 +54,39 @@ def _unmake(folders: list[Path]) -> None:
             p.rmdir()
 
 
+def ensure_writable(folder: str | Path) -> Path:
+    """Check that results can be written into ``folder``, and leave no trace; raises as :func:`made`."""
+    folder = as_path(folder, "a result folder")
+    with made(folder) as new:
+        tempfile.TemporaryFile(dir=folder).close()
+    _unmake(new)
+    return folder
+
+
+def write_file(path: str | Path, content: bytes) -> Path:
+    """Write one file, whole or not at all, and make its folder; raises :class:`InputError` if that cannot be."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{str(path)!r} is a folder; name a file")
+    with made(path.parent):
+        handle, half = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                os.fchmod(file.fileno(), 0o644)  # readable by all; temporary files are private by default
+                file.write(content)
+            os.replace(half, path)
+        except BaseException:
+            Path(half).unlink(missing_ok=True)
+            raise
+    return path
+
+
 @contextlib.contextmanager
 def locked(folder: Path, *, shared: bool = False, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
     """Hold the lock of an existing folder; readers share it, a writer has it alone.
 
-    A file system that knows no locks grants it always: the hashes in the manifest then still tell a mix.
-
-    Raises
-    ------
-    InputError
-        If another process keeps it for longer than ``wait_s`` [s].
+    Raises :class:`InputError` if another process keeps it for longer than ``wait_s`` [s]. A file system that knows no
+    locks grants it always: the hashes in the manifest then still tell a mix.
     """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -114,86 +110,63 @@ def _try_lock(fd: int, kind: int) -> bool:
     return True
 
 
-@contextlib.contextmanager
-def transaction(folder: str | Path) -> Iterator[Path]:
-    """Yield an empty staging folder; if the block ends well, its files replace those of ``folder`` all at once.
+# log ------------------------------------------------------------------------------------------
+class Log(Generic[K, V]):
+    """An open log; made by :func:`open_log`.
 
-    If the block raises, or the process is killed before its end, ``folder`` is what it was before.
-
-    Raises
-    ------
-    InputError
-        If ``folder`` cannot be written.
+    ``done`` is what its lines say, the last one of equal keys; damaged and foreign lines are left out. ``empty`` is
+    True if it had no line at all.
     """
-    folder = as_path(folder, "a result folder")
-    with _explained(folder):
-        made = _make(folder)
-        staging = folder / _STAGING
-        try:
-            with locked(folder):
-                _finish(folder)
-                shutil.rmtree(staging, ignore_errors=True)  # left by a writer that was killed
-                staging.mkdir()
-                try:
-                    yield staging
-                    _commit(folder)
-                finally:
-                    shutil.rmtree(staging, ignore_errors=True)
-        except BaseException:
-            _unmake(made)
-            raise
+
+    def __init__(self, file: BinaryIO, parse: Callable[[Any], tuple[K, V]]):
+        file.seek(0)
+        content, self._file = file.read(), file
+        whole, _, rest = content.rpartition(b"\n")
+        if rest.startswith(b"{"):  # killed in the middle of a line
+            file.truncate(len(content) - len(rest))
+            content = whole
+        elif rest:
+            file.write(b"\n")
+        lines = content.splitlines()
+        self.empty, self.done = not lines, {}
+        for line in lines:
+            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                key, value = parse(json.loads(line))
+                self.done[key] = value
+
+    def add(self, data: Mapping[str, Any]) -> None:
+        """Append one line, see :func:`append`."""
+        append(self._file, data)
 
 
-def _commit(folder: Path) -> None:
-    try:
-        (folder / _STAGING).rename(folder / _COMMIT)
-        _finish(folder)
-    except BaseException:  # Ctrl-C between the two: the new result exists, so let it be complete
-        _finish(folder)
-        raise
+def append(file: BinaryIO, data: Mapping[str, Any]) -> None:
+    """Write one line at the end of a file that is open for appending; it is on the disk when this returns."""
+    file.write(json.dumps(data, allow_nan=False).encode() + b"\n")
+    file.flush()
+    os.fsync(file.fileno())
 
 
-def _finish(folder: Path) -> None:
-    """Move what is committed to its place: the plan first, the summary last. Needs the lock; may be repeated."""
-    commit = folder / _COMMIT
-    if not commit.is_dir():
-        return
-    names = {p.name for p in commit.iterdir()}
-    stale = {n for n in names if n.endswith(".json")}
-    if PLAN in names:
-        stale |= {SUMMARY, *DERIVED}
-    if "simulation.npz" in names:
-        stale |= set(OF_SIMULATION)
-    for name in sorted(stale):
-        if (folder / name).is_dir():
-            shutil.rmtree(folder / name)
-        (folder / name).unlink(missing_ok=True)
-    for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
-        if (folder / name).is_dir() and not (folder / name).is_symlink():  # a folder takes no other's place
-            shutil.rmtree(folder / name)
-        os.replace(commit / name, folder / name)
-    commit.rmdir()
+@contextlib.contextmanager
+def open_log(path: str | Path, command: str, parse: Callable[[Any], tuple[K, V]]) -> Iterator[Log[K, V]]:
+    """The log at ``path``, for one process at a time; it is made if it is missing, and goes if nothing is added.
 
-
-def recover(folder: Path) -> None:
-    """Finish what a writer had committed when it was killed."""
-    if (folder / _COMMIT).is_dir():
-        with locked(folder):
-            _finish(folder)
-
-
-def write_file(path: str | Path, content: bytes) -> Path:
-    """Write one file, whole or not at all, and make its folder; raises :class:`InputError` if that cannot be."""
+    ``command`` of jumplab writes such logs; ``parse`` gives key and value of a line's data, or raises ValueError,
+    KeyError or TypeError if it is not ours. Raises :class:`InputError` if the file cannot be written, or another
+    process has it.
+    """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{str(path)!r} is a folder; name a file")
-    with _explained(path.parent), contextlib.ExitStack() as undo:
-        undo.callback(_unmake, _make(path.parent))
-        handle, half = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
-        undo.callback(Path(half).unlink, missing_ok=True)
-        with os.fdopen(handle, "wb") as file:
-            os.fchmod(file.fileno(), 0o644)  # readable by all; temporary files are private by default
-            file.write(content)
-        os.replace(half, path)
-        undo.pop_all()
-    return path
+    try:
+        file = open(path, "a+b")
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror}); choose a writable folder") from e
+    try:
+        with file:
+            if not _try_lock(file.fileno(), fcntl.LOCK_EX):
+                raise InputError(f"{path}: another 'jumplab {command}' is writing it; wait until that is done")
+            try:
+                yield Log(file, parse)
+            finally:
+                if os.fstat(file.fileno()).st_size == 0:
+                    path.unlink(missing_ok=True)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written ({e.strerror}); free some space, or choose another folder") from e

@@ -2,18 +2,23 @@
 
 A plan's folder holds ``plan.npz`` (the tape), ``robot.urdf`` and ``robot.toml`` (the robot it was planned for) and
 ``summary.json``, which comes last and whose ``manifest`` carries the SHA-256 of the others. What is said about that
-plan later (passport, simulation) lies beside it.
+plan later (audit, simulation, trials) lies beside it.
 
-How a folder changes all at once is told in :mod:`jumplab.transactions`.
+New files are first written into ``.staging`` inside the folder. Renaming that to ``.commit`` is the one moment at which
+the new result exists; its files then replace the old ones. Killed before that moment, the old result stands; killed
+after it, the next reader or writer moves the rest. Readers and writers take turns by a lock on the folder.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
+import os
 import platform
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -21,24 +26,83 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from jumplab.errors import InputError, as_path, require_type
-from jumplab.io.files import (
-    CONFIG,
-    HASHED,
-    PLAN,
-    SUMMARY,
-    URDF,
-    locked,
-    recover,
-    transaction,
-)
-from jumplab.io.files import ensure_writable as ensure_writable  # what commands and notebooks use with a result
-from jumplab.io.files import write_file as write_file
+from jumplab.io.files import ensure_writable, locked, made, write_file  # noqa: F401 - two of them for users of a result
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
 T = TypeVar("T")
+Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
-PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
+PACKAGES = (
+    "jumplab",
+    "casadi",
+    "pin",
+    "coal",
+    "cvxpy",
+    "clarabel",
+    "proxsuite",
+    "pybullet",
+    "numpy",
+    "scipy",
+    "matplotlib",
+)
+PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
+HASHED = (PLAN, URDF, CONFIG)
+EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")
+# what a new simulation makes untrue and therefore removes, and what a new plan does
+OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
+RESULTS = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json")
+OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *EXPORTS, *OF_SIMULATION)
+_STAGING, _COMMIT = ".staging", ".commit"
+
+
+@contextlib.contextmanager
+def transaction(folder: str | Path) -> Iterator[Path]:
+    """Yield an empty staging folder; if the block ends well, its files replace those of ``folder`` all at once.
+
+    If the block raises, or the process is killed before its end, ``folder`` is what it was before. Raises
+    :class:`InputError` if ``folder`` cannot be written.
+    """
+    folder = as_path(folder, "a result folder")
+    staging = folder / _STAGING
+    with made(folder), locked(folder):
+        _finish(folder)
+        shutil.rmtree(staging, ignore_errors=True)  # left by a writer that was killed
+        staging.mkdir()
+        try:
+            yield staging
+            staging.rename(folder / _COMMIT)
+            _finish(folder)
+        finally:
+            _finish(folder)  # Ctrl-C after the renaming: the new result exists, so let it be complete
+            shutil.rmtree(staging, ignore_errors=True)
+
+
+def _finish(folder: Path) -> None:
+    """Move what is committed to its place: the plan first, the summary last. Needs the lock; may be repeated."""
+    commit = folder / _COMMIT
+    if not commit.is_dir():
+        return
+    names = {p.name for p in commit.iterdir()}
+    stale = {n for n in names if n.endswith(".json")}
+    if PLAN in names:
+        stale |= set(OF_PLAN)
+    if "simulation.npz" in names:
+        stale |= set(OF_SIMULATION)
+    for name in sorted(stale):
+        _remove(folder / name)
+    for name in sorted(names, key=lambda n: (n != PLAN, n == SUMMARY, n.endswith(".json"), n)):
+        if (folder / name).is_dir():  # a folder takes no other's place
+            _remove(folder / name)
+        os.replace(commit / name, folder / name)
+    commit.rmdir()
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str]:
@@ -69,28 +133,20 @@ def _plain(x: Any) -> Any:
     return str(x) if isinstance(x, Path) else x
 
 
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
+def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_plan(
-    folder: str | Path,
-    tape: Tape,
-    robot: Robot,
-    summary: Mapping[str, Any],
-    complete: Callable[[Path], T] | None = None,
+    folder: str | Path, tape: Tape, robot: Robot, summary: Summary, complete: Callable[[Path], T] | None = None
 ) -> T | None:
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
     Parameters
     ----------
     summary : becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the files.
-    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``).
-
-    Returns
-    -------
-    What ``complete`` returned.
+    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``); what it
+        returns is returned.
     """
     require_type(tape, Tape, "the tape to write")
     require_type(robot, Robot, "its robot")
@@ -104,26 +160,23 @@ def write_plan(
             "schema": SCHEMA,
             "versions": versions(),
             "robot": {"name": robot.name, "hash": robot.hash},
-            "files": {name: sha256(staging / name) for name in HASHED},
+            "files": {name: _sha256(staging / name) for name in HASHED},
         }
         (staging / SUMMARY).write_text(to_json({**summary, "manifest": manifest}), encoding="utf-8")
         return complete(staging) if complete else None
 
 
 class Simulation(Protocol):
-    """What :func:`write_simulation` needs of a simulation's result."""
+    """A simulation's result, as :func:`write_simulation` needs it."""
 
     def save(self, folder: Path, extra: dict | None = None) -> None:
-        """Write both files, with further entries for the second one."""
+        """Write both files; ``extra`` are further entries of the second one."""
 
 
-def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[str, Any]) -> None:
+def write_simulation(folder: str | Path, result: Simulation, summary: Summary) -> None:
     """Write ``simulation.npz`` and ``simulation.json`` beside the plan that ``summary`` was read with.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be written, or has come to hold another plan.
+    Raises :class:`InputError` if the folder cannot be written, or has come to hold another plan.
     """
     require_type(summary, Mapping, "the summary")
     if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
@@ -135,20 +188,19 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Mapping[st
         result.save(staging, extra=planned)
 
 
-def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Mapping[str, Any], name: str) -> None:
+def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Summary, name: str) -> None:
     """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
     with transaction(folder) as staging:
         _same_plan(Path(folder), summary)
         (staging / name).write_text(to_json(report), encoding="utf-8")
 
 
-def _same_plan(folder: Path, summary: Mapping[str, Any]) -> None:
-    if read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
+def _same_plan(folder: Path, summary: Summary) -> None:
+    if _read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
         raise InputError(f"{str(folder)!r} has been planned again in the meantime; simulate the new plan")
 
 
-def read_summary(folder: Path) -> dict[str, Any]:
-    """Read and check ``summary.json``; the lock is the caller's affair."""
+def _read_summary(folder: Path) -> dict[str, Any]:
     path = folder / SUMMARY
     if not path.is_file():
         raise InputError(f"{str(folder)!r} holds no finished plan ({SUMMARY} is missing); make one with 'jumplab plan'")
@@ -174,20 +226,20 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
     """Read a plan's folder: the tape, the robot it was planned for, and the summary.
 
-    Raises
-    ------
-    InputError
-        If the folder holds no finished plan, or if a file is damaged or not the one that the summary speaks of.
+    Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the one that the
+    summary speaks of.
     """
     folder = as_path(folder, "a result folder")
     try:
         if not folder.is_dir():
             raise InputError(f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first")
-        recover(folder)
+        if (folder / _COMMIT).is_dir():  # a writer was killed
+            with locked(folder):
+                _finish(folder)
         with locked(folder, shared=True):
-            summary = read_summary(folder)
+            summary = _read_summary(folder)
             for name in HASHED:
-                if sha256(folder / name) != summary["manifest"]["files"][name]:
+                if _sha256(folder / name) != summary["manifest"]["files"][name]:
                     raise InputError(f"{folder / name}: changed or damaged since it was written; plan the jump again")
             urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
             return Tape.load(folder / PLAN), Robot.from_text(urdf, config), summary

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
+from jumplab.io.tape import DAMAGE
 from jumplab.robot import Robot
 
 SIMULATION_NAME, SIMULATION_SCHEMA = "simulation.npz", "jumplab-simulation-1"
-MAX_RATE_HZ = 10_000.0  # our choice: ten times the rate of the logs; more than that is a typing error
+MAX_RATE_HZ = 10_000.0  # ten times the rate of the logs; more is a typing error
 END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample in spite of rounding
-# what reading a cut, altered or foreign file may raise
-_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 class Record(Protocol):
@@ -34,24 +31,14 @@ class Record(Protocol):
 
 @dataclass(frozen=True)
 class Motion:
-    """States and torques of a robot over time.
+    """States and torques of a robot over time."""
 
-    Attributes
-    ----------
-    t : (N,) [s], never falling; an instant may stand twice, where one phase ends and the next begins.
-    q : (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
-    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
-    tau : (N, nv - 6) joint torques [N m].
-    phase : (N,) "launch", "flight" or "landing".
-    source : "plan" or "simulation".
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    tau: np.ndarray
-    phase: np.ndarray
-    source: str
+    t: np.ndarray  # (N,) [s], never falling; an instant may stand twice, where one phase ends and the next begins
+    q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
+    v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    phase: np.ndarray  # (N,) "launch", "flight" or "landing"
+    source: str  # "plan" or "simulation"
 
     @classmethod
     def of(cls, record: Record) -> Motion:
@@ -75,18 +62,13 @@ class Motion:
     def at(self, times: np.ndarray) -> Motion:
         """The motion at ``times`` (M,) [s]: everything linear between samples, the base's attitude along the arc.
 
-        An instant that stands twice gives its later sample, so that take-off belongs to the flight.
-
-        Raises
-        ------
-        InputError
-            If a time lies outside the motion.
+        An instant that stands twice gives its later sample, so that take-off belongs to the flight. Raises
+        :class:`InputError` if a time lies outside the motion.
         """
         times = np.asarray(times, float)
         if len(times) and not (self.t[0] <= times.min() and times.max() <= self.t[-1] + END_TOLERANCE):
-            raise InputError(
-                f"times {times.min():g} ... {times.max():g} s leave the motion, {self.t[0]:g} ... {self.t[-1]:g} s"
-            )
+            asked = f"{times.min():g} ... {times.max():g} s"
+            raise InputError(f"times {asked} leave the motion, {self.t[0]:g} ... {self.t[-1]:g} s")
         row = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
         gap = self.t[row + 1] - self.t[row]
         share = np.clip((times - self.t[row]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
@@ -118,7 +100,7 @@ def read_simulation(folder: str | Path, robot: Robot, names: Sequence[str]) -> d
         with np.load(path, allow_pickle=False) as file:
             data = {k: file[k] for k in names}
             schema, joints = str(file["schema"]), tuple(str(n) for n in file["joint_names"])
-    except _DAMAGE as e:
+    except DAMAGE as e:
         raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
     n, nq, nv = data["t"].size, robot.model.nq, robot.model.nv
     shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,))
@@ -132,7 +114,11 @@ def _between_attitudes(first: np.ndarray, second: np.ndarray, share: np.ndarray)
     """Quaternions xyzw (M, 4) at ``share`` (M,) of the arcs from ``first`` to ``second``, free of jumps in sign."""
     start = Rotation.from_quat(first)
     arc = (start.inv() * Rotation.from_quat(second)).as_rotvec()
-    quat = (start * Rotation.from_rotvec(share[:, None] * arc)).as_quat()
-    turned = np.sum(quat[1:] * quat[:-1], axis=1) < 0
-    flip = np.concatenate([[False], np.cumsum(turned) % 2 == 1])
-    return np.where(flip[:, None], -quat, quat)
+    return steady((start * Rotation.from_rotvec(share[:, None] * arc)).as_quat())
+
+
+def steady(quaternions: np.ndarray) -> np.ndarray:
+    """Quaternions (M, ..., 4) with the sign of each the nearest to the one before."""
+    turned = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True) < 0
+    flips = np.concatenate([np.zeros((1, *turned.shape[1:]), bool), np.cumsum(turned, axis=0) % 2 == 1])
+    return np.where(flips, -quaternions, quaternions)

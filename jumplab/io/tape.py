@@ -16,51 +16,41 @@ SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
 _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
 # what reading a cut, altered or foreign file may raise
-_DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
 class Tape:
     """Launch and flight of the full robot at 1 kHz.
 
-    Attributes
-    ----------
-    t : (N,) time from the start of the launch [s]; the instant of take-off appears twice, once per phase.
-    q : (N, nq) Pinocchio free-flyer order: x y z qx qy qz qw of the base link in the world, then joint angles [m, rad].
-    v : (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s].
-    a : (N, nv) time derivative of ``v`` [m/s^2, rad/s^2].
-    tau : (N, nv - 6) joint torques [N m].
-    phase : (N,) "launch" or "flight".
-    contact_frames : (K,) names of the foot links; where wrenches act.
-    f : (N, K, 6) force then moment on the robot, world axes, at the origin of each contact frame [N, N m].
-    joint_names : (nv - 6,) in the order of ``q[7:]``.
-    extra : further arrays under their own names (SRMP and planar solutions), for study; not needed to play the tape.
+    Configurations are in Pinocchio's free-flyer order. The instant of take-off appears twice, once per phase. ``extra``
+    (SRMP and planar solutions) is for study, and not needed to play the tape.
     """
 
-    t: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    tau: np.ndarray
-    phase: np.ndarray
-    contact_frames: np.ndarray
-    f: np.ndarray
-    joint_names: np.ndarray
-    extra: dict = field(default_factory=dict)
+    t: np.ndarray  # (N,) time from the start of the launch [s]
+    q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
+    v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    a: np.ndarray  # (N, nv) time derivative of v [m/s^2, rad/s^2]
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    phase: np.ndarray  # (N,) "launch" or "flight"
+    contact_frames: np.ndarray  # (K,) names of the foot links; where wrenches act
+    f: np.ndarray  # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]
+    joint_names: np.ndarray  # (nv - 6,) in the order of q[7:]
+    extra: dict = field(default_factory=dict)  # further arrays under their own names
 
     def __post_init__(self):
+        own = {name: getattr(self, name) for name in _DIMENSIONS}
         for name, count in _DIMENSIONS.items():
-            if np.ndim(getattr(self, name)) != count:
-                raise InputError(f"tape: {name} has {np.ndim(getattr(self, name))} dimensions, needs {count}")
-        n = len(self.t)
+            if np.ndim(own[name]) != count:
+                raise InputError(f"tape: {name} has {np.ndim(own[name])} dimensions, needs {count}")
         for name in ("q", "v", "a", "tau", "phase", "f"):
-            if len(getattr(self, name)) != n:
-                raise InputError(f"tape: {name} has {len(getattr(self, name))} rows, t has {n}")
+            if len(own[name]) != len(self.t):
+                raise InputError(f"tape: {name} has {len(own[name])} rows, t has {len(self.t)}")
         for name in ("t", "q", "v", "a", "tau", "f"):
-            kind = np.asarray(getattr(self, name)).dtype.kind
+            kind = np.asarray(own[name]).dtype.kind
             if kind not in "fiu":
                 raise InputError(f"tape: {name} holds no real numbers (kind {kind!r})")
-        for x in (*(getattr(self, name) for name in _DIMENSIONS), *self.extra.values()):
+        for x in (*own.values(), *self.extra.values()):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
@@ -92,14 +82,14 @@ class Tape:
                 raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in file.files}
-        except _DAMAGE as e:
+        except DAMAGE as e:
             raise InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated") from e
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:
             raise InputError(f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again")
-        names = [f.name for f in dataclasses.fields(cls) if f.name != "extra"]
-        missing = [n for n in names if n not in data]
-        if missing:
-            raise InputError(f"{path}: the array {missing[0]!r} is missing")
-        own = {n: data.pop(n) for n in names}
+        own = {}
+        for name in (f.name for f in dataclasses.fields(cls) if f.name != "extra"):
+            if name not in data:
+                raise InputError(f"{path}: the array {name!r} is missing")
+            own[name] = data.pop(name)
         return cls(**own, extra=data)

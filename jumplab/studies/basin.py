@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import product
@@ -18,38 +16,20 @@ from jumplab.io import folder as store
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import Disturbance, Perturbation, Ranges, Scene, simulate_landing
-from jumplab.studies.trials import (
-    HASH_DIGITS,
-    Trial,
-    TrialKey,
-    TrialReport,
-    TrialSettings,
-    check_numbers,
-    judged,
-    open_log,
-    plan_hash,
-    run_series,
-)
+from jumplab.studies import trials as series
+from jumplab.studies.trials import Trial, TrialKey, TrialReport, TrialSettings, short_hash
 
 SHUFFLE_SEED = 0  # of the grid's order, so that any first part of it is a fair sample
 
 
 @dataclass(frozen=True)
 class BasinState:
-    """One state of the grid: how it differs from the planned apex, and the floor's friction.
+    """One state of the grid: how it differs from the planned apex, and the floor's friction."""
 
-    Attributes
-    ----------
-    speed_factor : on the horizontal velocity [1].
-    pitch_deg : turn of the whole robot [degrees].
-    height_m : shift upward [m].
-    friction : coefficient of the soles on the ground [1].
-    """
-
-    speed_factor: float
-    pitch_deg: float
-    height_m: float
-    friction: float
+    speed_factor: float  # on the horizontal velocity [1]
+    pitch_deg: float  # turn of the whole robot [degrees]
+    height_m: float  # shift upward [m]
+    friction: float  # coefficient of the soles on the ground [1]
 
 
 @dataclass(frozen=True)
@@ -77,16 +57,10 @@ class BasinReport(TrialReport):
     def to_json(self) -> dict[str, Any]:
         """The content of ``basin.json``."""
         said = super().to_json()
-        del (
-            said["settings"]["ranges"],
-            said["seed"],
-            said["landed_metrics"],
-        )  # nothing is drawn; travel is from the apex
-        return said | {
-            "grid": asdict(self.grid),
-            "states": len(self.grid.states),
-            "failed": [t.features | {"reason": t.reason} for t in self.trials if not t.landed],
-        }
+        del said["settings"]["ranges"], said["seed"]  # nothing is drawn
+        del said["landed_metrics"]  # travel is from the apex
+        failed = [t.features | {"reason": t.reason} for t in self.trials if not t.landed]
+        return said | {"grid": asdict(self.grid), "states": len(self.grid.states), "failed": failed}
 
 
 def landing_basin(
@@ -100,8 +74,8 @@ def landing_basin(
 ) -> BasinReport:
     """Drop the robot of the plan in ``folder`` from every state of ``grid``; write ``trials.jsonl`` and ``basin.json``.
 
-    The robot is as planned, but for the friction; what the engine has of that is read back. States that the folder
-    already has are not run again.
+    The robot is as planned, but for the friction. States that the folder already has are not run again.
+    Raises as :func:`jumplab.studies.trials.run_trials`, and if ``n`` is more than the grid has.
 
     Parameters
     ----------
@@ -109,44 +83,26 @@ def landing_basin(
     n : how many states of the grid, in their random order; all if None.
     settings : ``ranges`` is not used.
     jobs, progress : see :func:`jumplab.studies.trials.run_trials`.
-
-    Raises
-    ------
-    InputError
-        If ``n`` cannot be meant or is more than the grid has, or the folder holds no whole plan or cannot be written.
     """
     states = grid.states
     count = len(states) if n is None else n
-    check_numbers(count, 0, jobs)
+    series.check_numbers(count, 0, jobs)
     if count > len(states):
         raise InputError(f"n = {count} is too large; the basin has {len(states)} states")
     tape, robot, summary = store.read_plan(folder)
-    scene, plan = Scene.of_plan(summary, robot), plan_hash(summary)
-    keys = _keys(states[:count], settings, plan)
+    scene, plan = Scene.of_plan(summary, robot), series.plan_hash(summary)
+    keys = state_keys(states[:count], settings, plan)
     work = {key: joblib.delayed(drop)(tape, robot, scene, settings, key, state) for key, state in keys.items()}
-    trials, resumed = run_series(folder, work, jobs, progress)
+    trials, resumed = series.run_series(folder, work, jobs, progress)
     report = BasinReport(trials, 0, settings, plan, dict(summary["target"]), resumed, grid)
     store.write_trials(folder, report.to_json(), summary, "basin.json")
     return report
 
 
-def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), grid: BasinGrid = BasinGrid()) -> int:
-    """How many states of ``grid`` the plan in ``folder`` has been dropped from; :func:`landing_basin` runs the others.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no whole plan, or its log cannot be read.
-    """
-    plan = plan_hash(store.read_plan(folder)[2])
-    with open_log(folder) as log:
-        return sum(key in log.trials for key in _keys(grid.states, settings, plan))
-
-
-def _keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
+def state_keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
     """Each state's name in the log; whatever the grid, equal states are equal trials."""
     code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
-    names = [_hash(["basin", code, asdict(state)]) for state in states]
+    names = [short_hash(["basin", code, asdict(state)]) for state in states]
     return {TrialKey(0, int(n[:8], 16), n, plan): state for n, state in zip(names, states, strict=True)}
 
 
@@ -154,13 +110,6 @@ def drop(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: T
     """Simulate one state from the apex on."""
     wrong = Disturbance(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
     floor = Perturbation(key.robot_seed, friction=state.friction, noise=settings.noise)
-    verdict = judged(
-        lambda: simulate_landing(
-            tape, robot, wrong, mode=settings.mode, perturbation=floor, scene=scene, reaim=settings.reaim
-        )
-    )
-    return Trial.from_line(Trial(key, floor.to_json(), asdict(state), *verdict).line())
-
-
-def _hash(data: Any) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:HASH_DIGITS]
+    how = {"mode": settings.mode, "perturbation": floor, "scene": scene, "reaim": settings.reaim}
+    verdict = series.judged(lambda: simulate_landing(tape, robot, wrong, **how))
+    return Trial(key, floor.to_json(), asdict(state), *verdict).as_kept()

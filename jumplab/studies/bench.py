@@ -15,78 +15,69 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib import metadata
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import joblib
 import numpy as np
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError, JumplabError, SolverError
+from jumplab.io.folder import versions
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, guess_from_joints, make_tape
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 from jumplab.task import JumpTask
 
-# report ------------------------------------------------------------------------------------------
-# name -> (limit, aim); ratios of CPU times
+# name -> (words, limit, aim); ratios of CPU times
 GOALS = {
-    "warm_over_direct": (0.6, 0.25),
-    "replan_over_direct": (0.3, 0.1),
-    "cold_over_direct": (1.5, None),
-    "peak_memory_gib": (1.0, None),
-    "node_growth_error": (0.2, None),
+    "warm_over_direct": ("three steps, warm / direct NLP's solve", 0.6, 0.25),
+    "replan_over_direct": ("re-plan of a neighbouring target / direct NLP's solve", 0.3, 0.1),
+    "cold_over_direct": ("new process to finished plan / direct NLP's build and solve", 1.5, None),
+    "peak_memory_gib": ("peak memory of a new process [GiB]", 1.0, None),
+    "node_growth_error": ("cost of an iteration: largest distance from a straight line over the nodes", 0.2, None),
 }
-WORDS = {
-    "warm_over_direct": "three steps, warm / direct NLP's solve",
-    "replan_over_direct": "re-plan of a neighbouring target / direct NLP's solve",
-    "cold_over_direct": "new process to finished plan / direct NLP's build and solve",
-    "peak_memory_gib": "peak memory of a new process [GiB]",
-    "node_growth_error": "cost of an iteration: largest distance from a straight line over the nodes",
-}
-FURTHER = {
-    "tape_over_direct": "three steps and the 1 kHz tape, warm / direct NLP's solve",
-    "warm_over_approached": "three steps, warm / direct NLP begun with stage 3's Gauss-Newton steps",
-}
-DIRECT = ("direct, at once", "direct, over a coarse mesh")  # by ipopt alone, from a cold start
-APPROACHED = "direct, Gauss-Newton first"  # begun as stage 3 is
+AT_ONCE, OVER_COARSE, APPROACHED = "direct, at once", "direct, over a coarse mesh", "direct, Gauss-Newton first"
+DIRECT = (AT_ONCE, OVER_COARSE)  # by ipopt alone, from a cold start
+WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
 TAPE = "plan: tape"
-PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "numpy")
 
 
-def report(head: dict, cpu: dict, wall: dict, audits: dict, iterations: dict, functions: dict, growth: dict,
-           peaks: list[float]) -> dict:  # fmt: skip
+def report(
+    head: Mapping[str, Any], watch: Stopwatch, audits: Mapping[str, list[bool]], growth: Mapping, peaks: list[float]
+) -> dict[str, Any]:
     """Put a benchmark's numbers together.
 
     Returns
     -------
-    dict of plain types: the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
+    dict of plain types: ``head``; the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
     ``cold_over_direct``, but the new process found its functions on file), ``tape_over_direct`` (as
     ``warm_over_direct``, with the plan's 1 kHz tape, of which the direct solve has none), ``warm_over_approached`` (as
     ``warm_over_direct``, but the direct NLP is begun with Gauss-Newton steps too), ``goals`` (name -> value, limit,
     aim, reached), ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s`` and
-    ``raw_s`` (name -> CPU and wall times), ``iterations``, ``functions_s`` (CPU time of function evaluations in the
-    solve on the fine mesh), ``where`` (stage -> share of the three steps' time), ``growth``, ``machine``.
+    ``raw_s`` (name -> CPU and wall times), ``where`` (stage -> share of the three steps' time), ``growth``,
+    ``machine`` (what it ran on, and with which packages).
     """
+    cpu, known = watch.cpu, versions()
     peer = min(DIRECT, key=lambda name: np.median(cpu[name]))
     steps = np.sum([times for name, times in cpu.items() if name.startswith("plan: ") and name != TAPE], axis=0)
+    whole = np.add(cpu["direct, build"], cpu[peer])
+    raw = {"cpu": cpu, "wall": watch.wall}
+    medians = {kind: {n: float(np.median(x)) for n, x in times.items()} for kind, times in raw.items()}
+    stages = {name: t for name, t in medians["cpu"].items() if name.startswith("plan: ")}
     numbers = {
         "warm_over_direct": _ratio(steps, cpu[peer]),
         "replan_over_direct": _ratio(cpu["re-plan"], cpu[peer]),
-        "cold_over_direct": None,
-        "peak_memory_gib": max(peaks) if peaks else None,
+        "cold_over_direct": _ratio(cpu["cold"], whole) if "cold" in cpu else None,
+        "peak_memory_gib": max(peaks, default=None),
         "node_growth_error": line_error(growth["nodes"]),
     }
-    whole = np.add(cpu["direct, build"], cpu[peer])
-    if "cold" in cpu:
-        numbers["cold_over_direct"] = _ratio(cpu["cold"], whole)
     goals = {}
-    for name, (limit, aim) in GOALS.items():
-        value = numbers[name]
+    for (name, value), (_, limit, aim) in zip(numbers.items(), GOALS.values(), strict=True):
         goals[name] = dict(value=value, limit=limit, aim=aim, reached=None if value is None else bool(value <= limit))
-    stages = {name: float(np.median(times)) for name, times in cpu.items() if name.startswith("plan: ")}
     return {
         **numbers,
         "goals": goals,
@@ -96,22 +87,27 @@ def report(head: dict, cpu: dict, wall: dict, audits: dict, iterations: dict, fu
         "cold_kept_over_direct": _ratio(cpu["cold, functions kept"], whole) if "cold" in cpu else None,
         "audits": {name: {"clean": sum(found), "of": len(found)} for name, found in audits.items()},
         **head,
-        "median_s": {k: {n: float(np.median(x)) for n, x in v.items()} for k, v in (("cpu", cpu), ("wall", wall))},
+        "median_s": medians,
         "where": {name: t / sum(stages.values()) for name, t in stages.items()},
-        "iterations": iterations,
-        "functions_s": functions,
         "growth": growth,
-        "raw_s": {"cpu": cpu, "wall": wall},
-        "machine": machine(),
+        "raw_s": raw,
+        "machine": {
+            "processor": platform.machine(),
+            "system": platform.system(),
+            "cpus": joblib.cpu_count(),
+            "load": os.getloadavg()[0],
+            "python": known["python"],
+            "versions": {name: known[name] for name in ("jumplab", "casadi", "pin", "proxsuite", "numpy")},
+        },
     }
 
 
-def _ratio(times, base) -> float:
+def _ratio(times: Sequence[float], base: Sequence[float]) -> float:
     """Median over the repeats of the ratio within one repeat."""
     return float(np.median(np.divide(times, base)))
 
 
-def line_error(rows: list[dict]) -> float | None:
+def line_error(rows: list[dict[str, float]]) -> float | None:
     """Largest relative distance of an iteration's cost from the straight line through all meshes; None below three."""
     if len(rows) < 3:
         return None
@@ -120,85 +116,59 @@ def line_error(rows: list[dict]) -> float | None:
     return float(np.max(np.abs(t / line - 1)))
 
 
-def machine() -> dict:
-    """What it ran on, and with which packages."""
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "(not installed)"
-    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {"processor": platform.machine(), "system": platform.system(), "cpus": cpus, "load": load,
-            "python": platform.python_version(), "versions": versions}  # fmt: skip
-
-
-def text(found: dict) -> str:
+def text(found: Mapping[str, Any]) -> str:
     """The report for people."""
-    lines = [
-        f"direct NLP, the peer: {found['peer']} (ipopt from a cold start, the faster of two ways)",
-        "",
-        "ratios and limits",
-    ]
-    for name, goal in found["goals"].items():
-        lines.append(f"  {WORDS[name]:<76} {_goal(goal)}")
-    kept = found["cold_kept_over_direct"]
-    if kept is not None:
-        lines.append(f"  {'the same with functions kept from an earlier process':<76} {kept:.3f}")
-    for key, words in FURTHER.items():
-        lines.append(f"  {words:<76} {found[key]:.3f}")
+    lines = [f"direct NLP, the peer: {found['peer']} (ipopt from a cold start, the faster of two ways)", ""]
+    ratios = [(GOALS[name][0], _goal(goal)) for name, goal in found["goals"].items()]
+    if found["cold_kept_over_direct"] is not None:
+        ratios += [("the same with functions kept from an earlier process", f"{found['cold_kept_over_direct']:.3f}")]
+    begun = "three steps, warm / direct NLP begun with stage 3's Gauss-Newton steps"
+    ratios += [("three steps and the 1 kHz tape, warm / direct NLP's solve", f"{found['tape_over_direct']:.3f}")]
+    ratios += [(begun, f"{found['warm_over_approached']:.3f}")]
     spread = found["growth"]["spread"]
-    if spread:
-        for key, peer in (("ratio", "direct NLP at once"), ("ratio_approached", APPROACHED)):
-            ratios, words = [row[key] for row in spread], f"plan / {peer}, over {len(spread)} other targets"
-            lines.append(f"  {words:<76} {np.median(ratios):.3f}  (median; {min(ratios):.2f} to {max(ratios):.2f}), "
-                         f"{sum(row['clean'] for row in spread)} clean")  # fmt: skip
+    for key, peer in (("ratio", "direct NLP at once"), ("ratio_approached", APPROACHED)) if spread else ():
+        values = [row[key] for row in spread]
+        said = f"{np.median(values):.3f}  (median; {min(values):.2f} to {max(values):.2f})"
+        clean = f"{sum(row['clean'] for row in spread)} clean"
+        ratios += [(f"plan / {peer}, over {len(spread)} other targets", f"{said}, {clean}")]
+    lines += ["ratios and limits", *(f"  {words:<76} {said}" for words, said in ratios)]
     lines += ["", f"medians of {found['repeats']} repeats [s]" + " " * 24 + "CPU      wall"]
-    cpu, wall = found["median_s"]["cpu"], found["median_s"]["wall"]
-    for name in cpu:
-        lines.append(f"  {name:<38}{cpu[name]:>10.3f}{wall[name]:>10.3f}" if name in wall
-                     else f"  {name:<38}{cpu[name]:>10.3f}")  # fmt: skip
+    wall = {name: f"{t:>10.3f}" for name, t in found["median_s"]["wall"].items()}
+    lines += [f"  {name:<38}{t:>10.3f}{wall.get(name, '')}" for name, t in found["median_s"]["cpu"].items()]
     lines += ["", "iterations"]
-    lines += [
-        f"  {name}: " + ", ".join(f"{s} {n}" for s, n in row.items()) for name, row in found["iterations"].items()
-    ]
+    for name, row in found["iterations"].items():
+        lines.append(f"  {name}: " + ", ".join(f"{stage} {n}" for stage, n in row.items()))
     lines += ["", "growth of stage 3 with its mesh", "  intervals  iterations   solve [s]   per iteration [ms]"]
-    lines += [f"  {r['intervals']:>9}{r['iterations']:>12}{r['solve_s']:>12.3f}{1e3 * r['iteration_s']:>14.2f}"
-              for r in found["growth"]["nodes"]]  # fmt: skip
+    for r in found["growth"]["nodes"]:
+        n, count, solve_s, each_s = (r[key] for key in ("intervals", "iterations", "solve_s", "iteration_s"))
+        lines.append(f"  {n:>9}{count:>12}{solve_s:>12.3f}{1e3 * each_s:>14.2f}")
     targets = ", ".join(f"{n}: {t:.2f} s" for n, t in found["growth"]["targets_cpu_s"].items())
-    lines += [f"  CPU time by number of targets: {targets}", "", _audits(found["audits"])]
+    audits = "; ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items())
+    timed = f"plans that were timed and are clean in the audit: {audits}"
+    lines += [f"  CPU time by number of targets: {targets}", "", timed]
     if not all(goal["reached"] for goal in found["goals"].values()):
         lines += ["", "where the time of the three steps goes"]
         lines += [f"  {name.removeprefix('plan: '):<16}{share:>6.0%}" for name, share in found["where"].items()]
-        lines += [f"  of the solve on the fine mesh, {found['functions_s']['plan']:.3f} s of CPU time are function "
-                  "evaluations, the rest is ipopt's and its linear solver's"]  # fmt: skip
+        own = f"{found['functions_s']['plan']:.3f} s of CPU time are function evaluations"
+        lines += [f"  of the solve on the fine mesh, {own}, the rest is ipopt's and its linear solver's"]
     return "\n".join(lines)
 
 
-def _goal(goal: dict) -> str:
+def _goal(goal: Mapping[str, Any]) -> str:
     if goal["value"] is None:
         return "not measured"
     aim = f", aim {goal['aim']:g}" if goal["aim"] else ""
-    word = "reached" if goal["reached"] else "not reached"
-    return f"{goal['value']:.3f}  (limit {goal['limit']:g}{aim}): {word}"
-
-
-def _audits(audits: dict) -> str:
-    parts = [f"{name} {x['clean']} of {x['of']}" for name, x in audits.items()]
-    return "plans that were timed and are clean in the audit: " + "; ".join(parts)
+    return f"{goal['value']:.3f}  (limit {goal['limit']:g}{aim}): {'reached' if goal['reached'] else 'not reached'}"
 
 
 # measure ------------------------------------------------------------------------------------------
-AT_ONCE, OVER_COARSE = DIRECT
-WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
 TASK, MESH = JumpTask(1.0, 0.5), Mesh()  # the paper's target, the usual mesh
-NEIGHBOUR_M = 0.05  # our choice: how much farther the re-planned target is
+NEIGHBOUR_M = 0.05  # how much farther the re-planned target is
 NODES = (20, 40, 60, 80, 100, 120)  # intervals of the three phases together
+NODE_REPEATS = 3  # the growth is a fit over many meshes
 TARGETS = (1, 2, 4, 8)
-# our choice: shares of the target's distance and rise; how many iterations one target takes is a matter of luck
+# shares of the target's distance and rise; how many iterations one target takes is a matter of luck
 SPREAD = ((0.0, 0.8), (0.2, 0.6), (0.3, 1.0), (0.4, 0.4), (0.6, 1.0), (0.8, 0.6), (1.0, 0.6), (1.1, 0.8))
-NODE_REPEATS = 3  # our choice: the growth is a fit over many meshes
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
 COLD = """
 import time
@@ -229,16 +199,29 @@ class Stopwatch:
         """Do the work, and keep what it took."""
         cpu, wall = time.process_time(), time.perf_counter()
         answer = work(*arguments, **options)
-        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-        self.cpu.setdefault(name, []).append(cpu)
-        self.wall.setdefault(name, []).append(wall)
+        self.keep(name, time.process_time() - cpu, time.perf_counter() - wall)
         return answer
 
+    def keep(self, name: str, cpu_s: float, wall_s: float | None = None) -> None:
+        """Keep what a piece of work took."""
+        self.cpu.setdefault(name, []).append(cpu_s)
+        if wall_s is not None:
+            self.wall.setdefault(name, []).append(wall_s)
 
-def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh: Mesh = MESH,
-          nodes: tuple[int, ...] = NODES, spread: tuple = SPREAD, cold: bool = True,
-          say: Callable[[str], None] = print) -> dict:  # fmt: skip
-    """Measure everything.
+
+def bench(
+    robot_name: str = "bhr",
+    task: JumpTask = TASK,
+    repeats: int = 7,
+    mesh: Mesh = MESH,
+    nodes: Sequence[int] = NODES,
+    spread: Sequence[tuple[float, float]] = SPREAD,
+    cold: bool = True,
+    say: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Measure everything; returns plain types, see :func:`report`.
+
+    Raises :class:`InputError` for fewer repeats than 1, another :class:`JumplabError` if the target has no plan.
 
     Parameters
     ----------
@@ -248,17 +231,6 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
     nodes : numbers of intervals for the growth with nodes.
     spread : further targets, as shares of the target's distance and rise, planned once in both ways.
     cold : also time new processes.  say : is told what goes on.
-
-    Returns
-    -------
-    dict of plain types, see :func:`jumplab.studies.bench.report`.
-
-    Raises
-    ------
-    InputError
-        For fewer repeats than 1.
-    JumplabError
-        If the target has no plan.
     """
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
@@ -281,18 +253,25 @@ def bench(robot_name: str = "bhr", task: JumpTask = TASK, repeats: int = 7, mesh
             if cold:
                 peaks.append(_cold(watch, robot_name, task, audits, kept))
     say("growth with nodes and targets")
-    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task),
-              "spread": _spread(planner, ways, task, spread)}  # fmt: skip
+    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
+    growth["spread"] = _spread(planner, ways, task, spread)
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
-    iterations = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
-    functions = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
-    return report(head, watch.cpu, watch.wall, audits, iterations, functions, growth, peaks)
+    head["iterations"] = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
+    # CPU time of function evaluations in the solve on the fine mesh
+    head["functions_s"] = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
+    return report(head, watch, audits, growth, peaks)
 
 
-def _once(watch: Stopwatch, planner: Planner, ways: dict, near: JumpPlan, task: JumpTask) -> dict:
+def _once(
+    watch: Stopwatch, planner: Planner, ways: Mapping[str, Callable], near: JumpPlan, task: JumpTask
+) -> dict[str, JumpPlan]:
     """Time everything once, in turn; returns the plans."""
-    robot = planner.robot
-    _stages(watch, planner, task)
+    robot, last = planner.robot, planner.stage("whole body")
+    srmp = watch("plan: 1 SRMP", planner.stage("srmp").plan, task)
+    joints = watch("plan: 2 joint map", map_to_joints, srmp, robot, STEPS_S, "direct")
+    guess = watch("plan: 2 to 3", guess_from_joints, joints, last, task, srmp.toe_s)
+    body = watch("plan: 3 whole body", last.plan, task, srmp, guess=guess)
+    watch(TAPE, make_tape, body, robot, srmp)
     bodies = {name: watch(name, way, task) for name, way in ways.items()}
     plans = {"plan": watch("plan", planner.plan, task), "re-plan": watch("re-plan", planner.replan, near, task)}
     watch("direct, build", lambda: WholeBodyPlanner(robot, planner.mesh, tracking=False, refine=False).nlp.prepare())
@@ -302,20 +281,10 @@ def _once(watch: Stopwatch, planner: Planner, ways: dict, near: JumpPlan, task: 
     return plans
 
 
-def _stages(watch: Stopwatch, planner: Planner, task: JumpTask) -> None:
-    """The three steps once more, each timed apart."""
-    robot, last = planner.robot, planner.stage("whole body")
-    srmp = watch("plan: 1 SRMP", planner.stage("srmp").plan, task)
-    joints = watch("plan: 2 joint map", map_to_joints, srmp, robot, STEPS_S, "direct")
-    guess = watch("plan: 2 to 3", guess_from_joints, joints, last, task, srmp.toe_s)
-    body = watch("plan: 3 whole body", last.plan, task, srmp, guess=guess)
-    watch("plan: tape", make_tape, body, robot, srmp)
-
-
-def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict, kept: str) -> float:
+def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, list[bool]], kept: str) -> float:
     """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
-    in the folder ``kept``; returns the peak memory of the first [GiB]. Python's own bytecode is on file for both, as it
-    is after any first run, whatever the settings of this process."""
+    in the folder ``kept``; returns the larger peak of memory [GiB]. Python's own bytecode is on file for both, as it is
+    after any first run."""
     peak = 0.0
     environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -325,46 +294,40 @@ def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict, kept:
         if done.returncode:
             raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
         said = json.loads(done.stdout)
-        for key, number in ((name, "cpu_s"), (f"{name}: imports and robot", "imports_s")):
-            watch.cpu.setdefault(key, []).append(said[number])
-        watch.wall.setdefault(name, []).append(said["wall_s"])
+        watch.keep(name, said["cpu_s"], said["wall_s"])
+        watch.keep(f"{name}: imports and robot", said["imports_s"])
         audits.setdefault(name, []).append(said["clean"])
         peak = max(peak, said["peak_kib"] / 2**20)
     return peak
 
 
-def _nodes(planner: Planner, task: JumpTask, nodes) -> list[dict]:
+def _nodes(planner: Planner, task: JumpTask, nodes: Sequence[int]) -> list[dict[str, float]]:
     """Cost of one iteration of stage 3 on ever finer meshes, all solved at once from stage 2's guess."""
     srmp = planner.stage("srmp").plan(task)
     joints = map_to_joints(srmp, planner.robot, STEPS_S, "direct")
     rows = []
     for n in nodes:
         flat, toe = max(round(n / 3), 2), max(round(4 * n / 15), 2)
-        mesh = Mesh(flat, toe, max(n - flat - toe, 2))
-        watch = Stopwatch()
+        mesh, watch = Mesh(flat, toe, max(n - flat - toe, 2)), Stopwatch()
         body = watch("build", WholeBodyPlanner, planner.robot, mesh, refine=False)
         guess = guess_from_joints(joints, body, task, srmp.toe_s)
         for _ in range(NODE_REPEATS):
             s = watch("solve", body.plan, task, srmp, guess=guess).solution.statistics
+        row = {"intervals": sum(mesh.intervals().values()), "variables": s.variables, "iterations": s.iterations}
         solve_s = float(np.median(watch.cpu["solve"]))
-        rows.append(dict(intervals=mesh.flat + mesh.toe + mesh.flight, variables=s.variables,
-                         iterations=s.iterations, build_s=watch.cpu["build"][0], solve_s=solve_s,
-                         iteration_s=solve_s / s.iterations))  # fmt: skip
+        rows.append(row | dict(build_s=watch.cpu["build"][0], solve_s=solve_s, iteration_s=solve_s / s.iterations))
     return rows
 
 
-def _spread(planner: Planner, ways: dict, task: JumpTask, spread) -> list[dict]:
+def _spread(
+    planner: Planner, ways: Mapping[str, Callable], task: JumpTask, spread: Sequence[tuple[float, float]]
+) -> list[dict[str, Any]]:
     """Other targets, each planned once by three steps and directly, by ipopt at once and begun with Gauss-Newton steps:
-    CPU times [s], and the ratios; those without a plan are left out.
-
-    The peers' times are those of their solves alone, as everywhere.
-    """
+    CPU times [s] (the peers' of their solves alone, as everywhere), and the ratios; not those without a plan."""
     rows = []
     for distance, height in spread:
-        other, watch = (
-            replace(task, distance_m=distance * task.distance_m, height_m=height * task.height_m),
-            Stopwatch(),
-        )
+        place = {"distance_m": distance * task.distance_m, "height_m": height * task.height_m}
+        other, watch = replace(task, **place), Stopwatch()
         try:
             plan = watch("plan", planner.plan, other)
             for name in (AT_ONCE, APPROACHED):
@@ -372,10 +335,9 @@ def _spread(planner: Planner, ways: dict, task: JumpTask, spread) -> list[dict]:
         except JumplabError:
             continue
         plan_s, direct_s, begun_s = (watch.cpu[name][0] for name in ("plan", AT_ONCE, APPROACHED))
-        clean = audit(plan.tape, planner.robot, other).passed
-        rows.append(dict(distance_m=other.distance_m, height_m=other.height_m, plan_s=plan_s, direct_s=direct_s,
-                         ratio=plan_s / direct_s, approached_s=begun_s, ratio_approached=plan_s / begun_s,
-                         clean=clean))  # fmt: skip
+        times = {"plan_s": plan_s, "direct_s": direct_s, "ratio": plan_s / direct_s}
+        times |= {"approached_s": begun_s, "ratio_approached": plan_s / begun_s}
+        rows.append(place | times | {"clean": audit(plan.tape, planner.robot, other).passed})
     return rows
 
 

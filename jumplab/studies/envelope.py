@@ -1,60 +1,56 @@
 """The jumps that a robot can do: a map over distance and height, each cell one solve of the direct planner.
 
-Rows of equal height are solved side by side; within a row each cell starts from its neighbour's solution, first
-from near to far, then, where that failed, from far to near. Finished cells are kept as files, so that an interrupted
-map goes on where it stopped.
+Rows of equal height are solved side by side; within a row each cell starts from its neighbour's solution, first from
+near to far, then, where that failed, from far to near. Every finished cell is a line of ``cells.jsonl``, so that an
+interrupted map goes on where it stopped.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import joblib
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.io.files import Log, append, open_log
+from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import SAGITTAL_JOINTS, Robot
-from jumplab.robot.reach import reach
+from jumplab.robot.reach import Reach, reach
 from jumplab.stages.reconstruction import planar_motion, planar_quantities
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
-MAX_ITERATIONS = 160  # our choice: solves that succeed need 20 to 110
-GIVE_UP = 2  # our choice: so many cells in a row without a plan, and the farther ones of the row are not tried
-LOADED_N = 50.0  # our choice: friction is a quotient, looked at above this force
-MAX_CELLS = 2500  # our choice: an hour or two of work
+Guess = dict[str, PhaseGuess]
+Place = tuple[float, float]  # distance and height [m]
+CELLS = "cells.jsonl"
+MAX_ITERATIONS = 160  # solves that succeed need 20 to 110
+GIVE_UP = 2  # so many cells in a row without a plan, and the farther ones of the row are not tried
+LOADED_N = 50.0  # friction is a quotient, looked at above this force
+MAX_CELLS = 2500  # an hour or two of work
 
 OPEN, VERDICT, BEYOND = "no plan found", "refused before solving", "not tried, beyond cells without a plan"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One target.
-
-    Attributes
-    ----------
-    distance_m, height_m : the target.
-    solved : True if a plan within all limits was found.
-    limiting : what is used most ("hip torque", "knee speed", "friction"), or why there is no plan.
-    share : how much of what the planner allows of it is used, 1 at the limit; nan without a plan.
-    iterations, solve_s : cost of the solve.
-    reason : the sentence of the refusal.
-    """
+    """One target, and whether a plan within all limits was found."""
 
     distance_m: float
     height_m: float
     solved: bool
-    limiting: str
-    share: float
+    limiting: str  # what is used most ("hip torque", "knee speed", "friction"), or why there is no plan
+    share: float  # how much of what the planner allows of it is used, 1 at the limit; nan without a plan
     iterations: int = 0
     solve_s: float = 0.0
-    reason: str = ""
+    reason: str = ""  # the sentence of the refusal
 
 
 @dataclass(frozen=True)
@@ -102,58 +98,18 @@ def usage(plan: WholeBodyPlan, robot: Robot) -> dict[str, float]:
     return out
 
 
-def _solved(plan: WholeBodyPlan, robot: Robot) -> Cell:
-    shares, s = usage(plan, robot), plan.solution.statistics
-    most = max(shares, key=shares.get)
-    return Cell(plan.task.distance_m, plan.task.height_m, True, most, shares[most], s.iterations, s.solve_s)
-
-
-class _Row:
-    """Cells of one height, solved from near to far."""
-
-    def __init__(self, robot: Robot):
-        self.robot, self.reach = robot, reach(robot)
-        # on the fine mesh at once: most cells begin with a neighbour's solution, which is nearer than steps would lead
-        self.planner = WholeBodyPlanner(robot, tracking=False, options={"max_iter": MAX_ITERATIONS}, refine=False)
-
-    def solve(self, height_m: float, distances: Sequence[float], folder: Path | None) -> list[Cell]:
-        cells, guesses, guess, failed = [], {}, None, 0
-        for i, distance in enumerate(distances):
-            cell = _read(folder, self.robot, distance, height_m)
-            if cell is None:
-                if failed >= GIVE_UP:
-                    cell = Cell(distance, height_m, False, BEYOND, math.nan)
-                else:
-                    cell, guess = self._cell(JumpTask(distance, height_m), guess, cold=True)
-                    guesses[i] = guess if cell.solved else None
-                _write(folder, self.robot, cell)
-            failed = 0 if cell.solved else failed + 1
-            cells.append(cell)
-        for i in reversed(range(len(cells) - 1)):  # back from far to near
-            if cells[i].limiting == OPEN and guesses.get(i + 1):
-                cells[i], guesses[i] = self._cell(JumpTask(distances[i], height_m), guesses[i + 1], cold=False)
-                _write(folder, self.robot, cells[i])
-        return cells
-
-    def _cell(self, task: JumpTask, guess, *, cold: bool):
-        """One cell from a neighbour's solution, then, if asked, from the planner's own guess."""
-        try:
-            check_reachable(task, self.reach, self.robot)
-        except InfeasibleError as e:
-            return Cell(task.distance_m, task.height_m, False, VERDICT, math.nan, reason=str(e)), guess
-        reason = ""
-        for start in [guess] * bool(guess) + [None] * cold:
-            try:
-                plan = self.planner.plan(task, guess=start)
-                return _solved(plan, self.robot), plan.solution.guess()
-            except SolverError as e:
-                reason = str(e)
-        return Cell(task.distance_m, task.height_m, False, OPEN, math.nan, reason=reason), None if not cold else guess
-
-
-def measure(robot: Robot, distances: Sequence[float], heights: Sequence[float], *, folder: str | Path | None = None,
-            workers: int = 1, tell: Callable[[str], None] | None = None) -> Envelope:  # fmt: skip
+def envelope(
+    robot: Robot,
+    distances: Sequence[float],
+    heights: Sequence[float],
+    *,
+    folder: str | Path | None = None,
+    workers: int = 1,
+    tell: Callable[[str], None] | None = None,
+) -> Envelope:
     """Solve the whole map.
+
+    Raises :class:`InputError` if the grid is empty or too large, or the folder holds cells of another robot.
 
     Parameters
     ----------
@@ -161,67 +117,91 @@ def measure(robot: Robot, distances: Sequence[float], heights: Sequence[float], 
     folder : where finished cells are kept; cells found there are not solved again.
     workers : processes that share the rows.
     tell : called with a line per finished row.
-
-    Raises
-    ------
-    InputError
-        If the grid is empty or too large, or the folder holds cells of another robot.
     """
     if not 0 < len(distances) * len(heights) <= MAX_CELLS:
         raise InputError(f"the map has {len(distances)} x {len(heights)} cells, must be 1 to {MAX_CELLS}")
     for distance in distances:
         for height in heights:
             JumpTask(distance, height)  # refuses what no task may ask
-    keep = None if folder is None else Path(folder) / "cells"
-    if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
-    from joblib import Parallel, delayed
-
-    run = Parallel(n_jobs=workers, return_as="generator")
-    rows = []
-    for row in run(delayed(_solve_row)(robot, height, tuple(distances), keep) for height in heights):
-        rows.append(row)
-        if tell is not None:
-            good = [c.distance_m for c in row if c.solved]
-            tell(f"height {row[0].height_m:.2f} m: {len(good)} of {len(row)} cells"
-                 + (f", up to {max(good):.2f} m" if good else ""))  # fmt: skip
-    cells = tuple(cell for row in rows for cell in row)
-    return Envelope(robot.name, tuple(distances), tuple(heights), cells)
+    path, rows = None if folder is None else Path(folder) / CELLS, []
+    with nullcontext() if path is None else _opened(path, robot) as log:
+        done = {} if log is None else log.done
+        run = joblib.Parallel(n_jobs=workers, return_as="generator")
+        for row in run(joblib.delayed(_row)(robot, height, tuple(distances), done, path) for height in heights):
+            rows.append(row)
+            if tell is not None:
+                good = [c.distance_m for c in row if c.solved]
+                far = f", up to {max(good):.2f} m" if good else ""
+                tell(f"height {row[0].height_m:.2f} m: {len(good)} of {len(row)} cells{far}")
+    return Envelope(robot.name, tuple(distances), tuple(heights), tuple(cell for row in rows for cell in row))
 
 
-_ROWS: dict[str, _Row] = {}  # one planner per process
+def _row(
+    robot: Robot, height_m: float, distances: Sequence[float], done: Mapping[Place, Cell], path: Path | None
+) -> list[Cell]:
+    """Cells of one height, solved from near to far, then back."""
+    cells, guesses, guess, failed = [], {}, None, 0
+    for i, distance in enumerate(distances):
+        cell = done.get((distance, height_m))
+        if cell is None:
+            if failed >= GIVE_UP:
+                cell = Cell(distance, height_m, False, BEYOND, math.nan)
+            else:
+                cell, guess = _solve(robot, JumpTask(distance, height_m), guess, cold=True)
+                guesses[i] = guess if cell.solved else None
+            _keep(cell, robot, path)
+        failed = 0 if cell.solved else failed + 1
+        cells.append(cell)
+    for i in reversed(range(len(cells) - 1)):
+        if cells[i].limiting == OPEN and guesses.get(i + 1):
+            cells[i], guesses[i] = _solve(robot, JumpTask(distances[i], height_m), guesses[i + 1], cold=False)
+            _keep(cells[i], robot, path)
+    return cells
 
 
-def _solve_row(robot: Robot, height_m: float, distances, folder: Path | None) -> list[Cell]:
-    if robot.hash not in _ROWS:
-        _ROWS[robot.hash] = _Row(robot)
-    return _ROWS[robot.hash].solve(height_m, distances, folder)
+_tools: dict[str, tuple[Reach, WholeBodyPlanner]] = {}  # of this process, by the robot's hash
+
+
+def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
+    """One cell from a neighbour's solution, then, if ``cold``, from the planner's own guess; a guess for the next."""
+    if robot.hash not in _tools:
+        # on the fine mesh at once: most cells begin with a neighbour's solution, which is nearer than steps would lead
+        options = {"max_iter": MAX_ITERATIONS}
+        _tools[robot.hash] = reach(robot), WholeBodyPlanner(robot, tracking=False, options=options, refine=False)
+    known, planner = _tools[robot.hash]
+    try:
+        check_reachable(task, known, robot)
+    except InfeasibleError as e:
+        return Cell(task.distance_m, task.height_m, False, VERDICT, math.nan, reason=str(e)), guess
+    reason = ""
+    for start in [guess] * bool(guess) + [None] * cold:
+        try:
+            plan = planner.plan(task, guess=start)
+        except SolverError as e:
+            reason = str(e)
+            continue
+        shares, s = usage(plan, robot), plan.solution.statistics
+        most = max(shares, key=shares.get)
+        cell = Cell(task.distance_m, task.height_m, True, most, shares[most], s.iterations, s.solve_s)
+        return cell, plan.solution.guess()
+    return Cell(task.distance_m, task.height_m, False, OPEN, math.nan, reason=reason), guess if cold else None
 
 
 # finished cells on file -----------------------------------------------------------------------------------------
-def _path(folder: Path, distance: float, height: float) -> Path:
-    return folder / f"l{distance:+.4f}_h{height:.4f}.json"
+def _opened(path: Path, robot: Robot) -> AbstractContextManager[Log[Place, Cell]]:
+    def entry(line: dict[str, Any]) -> tuple[Place, Cell]:
+        if (owner := line.pop("robot")) != robot.hash:
+            raise InputError(f"{path}: belongs to another robot ({owner}, not {robot.hash}); choose another folder")
+        cell = Cell(**{k: math.nan if v is None else v for k, v in line.items()})
+        return (cell.distance_m, cell.height_m), cell
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return open_log(path, "envelope", entry)
 
 
-def _read(folder: Path | None, robot: Robot, distance: float, height: float) -> Cell | None:
-    if folder is None or not (path := _path(folder, distance, height)).exists():
-        return None
-    try:
-        data = json.loads(path.read_text())
-        owner = data.pop("robot")
-        cell = Cell(**{k: math.nan if v is None else v for k, v in data.items()})
-    except (ValueError, TypeError, KeyError, AttributeError):
-        return None  # cut short: solved again
-    if owner != robot.hash:
-        raise InputError(f"{path}: belongs to another robot ({owner}, not {robot.hash}); choose another folder")
-    return cell
-
-
-def _write(folder: Path | None, robot: Robot, cell: Cell) -> None:
-    if folder is None:
-        return
-    path = _path(folder, cell.distance_m, cell.height_m)
-    data = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(cell).items()}
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps({"robot": robot.hash} | data))
-    os.replace(part, path)
+def _keep(cell: Cell, robot: Robot, path: Path | None) -> None:
+    """Add a line, from whichever process; the first one holds the log."""
+    if path is not None:
+        data = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(cell).items()}
+        with open(path, "ab") as file:
+            append(file, {"robot": robot.hash, **data})

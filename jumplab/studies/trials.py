@@ -6,18 +6,16 @@ is stopped therefore goes on where it was, and gives what it would have given un
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,56 +28,50 @@ from tqdm import tqdm
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
+from jumplab.io.files import Log, open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
 from jumplab.sim.playback import MODES
-from jumplab.sim.result import STAND_S
-from jumplab.task import JumpTask
+
+SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
+CONFIDENCE = 0.95
+LOOK_S = 0.5  # how often a worker looks whether its parent still lives
+# whose versions decide a trial's outcome, and which sources of this package do: trials of others are not these trials
+SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")
+SOURCES = (
+    *("errors.py", "task.py", "robot_import", "robot", "io", "ocp", "models", "stages", "sim"),
+    *("studies/trials.py", "studies/basin.py"),
+)
+Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
 
 
-# outcome ------------------------------------------------------------------------------------------
-def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]:
-    """One row per quantity, one column per run, and what was asked: ready for :func:`jumplab.show.table`."""
-    rows = [
-        ("travel of the feet [m]", task.distance_m, lambda r: r.metrics.foot_distance_m),
-        ("rise of the CoM in flight [m]", task.height_m, lambda r: r.metrics.com_rise_m),
-        ("CoM, end above start [m]", task.platform_m, lambda r: round(float(r.com[-1, 2] - r.com[0, 2]), 3) + 0.0),
-        ("on its feet after touchdown [s]", STAND_S, lambda r: r.metrics.standing_s),
-        ("torque / limit before touchdown", 1.0, lambda r: r.metrics.max_torque_ratio_before_touchdown),
-        ("speed / limit before touchdown", 1.0, lambda r: r.metrics.max_speed_ratio_before_touchdown),
-        ("links pressed on each other [s]", 0.0, lambda r: r.metrics.self_collision_s),
-        ("lands", True, lambda r: r.landed),
-    ]
-    return [{"quantity": text, "asked or allowed": asked} | {name: value(run) for name, run in runs.items()}
-            for text, asked, value in rows]  # fmt: skip
+def short_hash(data: Any) -> str:
+    """64 bits of a hash of JSON data, enough to tell settings apart."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-# trial ------------------------------------------------------------------------------------------
-SCHEMA = "jumplab-trials-1"
-SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")  # whose versions decide a trial's outcome
-LOOKING = ("cli", "show")  # rooms of the package that decide nothing about a jump
-HASH_DIGITS = 16  # 64 bits: enough to tell settings apart
-LEG_ROLES = ("hip_pitch", "knee", "ankle_pitch")
+def _code(root: Path = Path(__file__).parent.parent) -> str:
+    parts = [root / part for part in SOURCES]
+    files = sorted(f for part in parts for f in (part.rglob("*.py") if part.is_dir() else [part]))
+    return short_hash([[str(f.relative_to(root)), hashlib.sha256(f.read_bytes()).hexdigest()] for f in files])
 
 
+def plan_hash(summary: Mapping[str, Any]) -> str:
+    """Short hash of all that a trial takes from a plan's folder: tape, robot, ground."""
+    return short_hash([summary["manifest"]["files"], summary["target"], summary.get("platform_edge_m")])
+
+
+# one trial ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class TrialSettings:
-    """How the robots of a Monte Carlo are drawn and made to jump.
+    """How the robots of a Monte Carlo are drawn and made to jump."""
 
-    Attributes
-    ----------
-    mode : "position" or "pd", how the tape is played until touchdown.
-    reaim : turn the legs in the air against the trunk's measured pitch error.
-    noise : on what the controllers are told.
-    ranges : half-widths of the draws.
-    """
-
-    mode: str = "position"
-    reaim: bool = True
-    noise: SensorNoise = field(default_factory=SensorNoise)
-    ranges: Ranges = field(default_factory=Ranges)
+    mode: str = "position"  # or "pd": how the tape is played until touchdown
+    reaim: bool = True  # turn the legs in the air against the trunk's measured pitch error
+    noise: SensorNoise = field(default_factory=SensorNoise)  # on what the controllers are told
+    ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
 
     def __post_init__(self):
         if self.mode not in MODES:
@@ -87,9 +79,9 @@ class TrialSettings:
 
     @property
     def hash(self) -> str:
-        """Short hash of these settings, of the package's own code and of the packages that shape an outcome."""
+        """Short hash of these settings, and of the code and the packages that shape an outcome."""
         known = store.versions()
-        return _hash([SCHEMA, asdict(self), _code(), {name: known[name] for name in SHAPING}])
+        return short_hash([SCHEMA, asdict(self), _code(), {name: known[name] for name in SHAPING}])
 
 
 @dataclass(frozen=True)
@@ -109,32 +101,23 @@ class TrialKey:
 
 @dataclass(frozen=True)
 class Trial:
-    """One finished trial.
+    """One finished trial."""
 
-    Attributes
-    ----------
-    key : what it was.
-    perturbation : every drawn number, as :meth:`jumplab.sim.Perturbation.to_json` gives them.
-    features : the drawn robot in a few numbers, see :func:`features`.
-    landed, reason : the verdict, and why; a run that fails a check of its honesty has not landed.
-    metrics : all numbers of the jump; None if the engine lost the robot.
-    """
+    key: TrialKey  # what it was
+    perturbation: dict[str, Any]  # every drawn number, as :meth:`jumplab.sim.Perturbation.to_json` gives them
+    features: dict[str, float]  # the drawn robot in a few numbers, see :func:`features`
+    landed: bool  # the verdict; a run that fails a check of its honesty has not landed
+    reason: str  # and why
+    metrics: Metrics | None  # all numbers of the jump; None if the engine lost the robot
 
-    key: TrialKey
-    perturbation: dict[str, Any]
-    features: dict[str, float]
-    landed: bool
-    reason: str
-    metrics: Metrics | None
-
-    def line(self) -> str:
-        """The trial as one line of JSON, newline included."""
-        return json.dumps({"schema": SCHEMA, **asdict(self)}, allow_nan=False) + "\n"
+    def to_json(self) -> dict[str, Any]:
+        """The trial as the log keeps it."""
+        return {"schema": SCHEMA, **asdict(self)}
 
     @classmethod
-    def from_line(cls, line: str | bytes) -> Trial:
-        """Inverse of :meth:`line`; raises ValueError, KeyError or TypeError if the line is damaged or not ours."""
-        data = json.loads(line)
+    def from_json(cls, data: Mapping[str, Any]) -> Trial:
+        """Inverse of :meth:`to_json`; raises ValueError, KeyError or TypeError if the data are not ours."""
+        data = dict(data)
         if data.pop("schema") != SCHEMA:
             raise ValueError("another schema")
         metrics = data.pop("metrics")
@@ -142,20 +125,17 @@ class Trial:
             metrics = Metrics(**{k: tuple(v) if isinstance(v, list) else v for k, v in metrics.items()})
         return cls(key=TrialKey(**data.pop("key")), metrics=metrics, **data)
 
+    def as_kept(self) -> Trial:
+        """The very trial that a resumed run reads."""
+        return Trial.from_json(json.loads(json.dumps(self.to_json())))
+
 
 def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: TrialKey) -> Trial:
-    """Draw the robot of ``key`` and let it jump.
-
-    Raises
-    ------
-    InputError
-        If the tape is not this robot's.
-    """
+    """Draw the robot of ``key`` and let it jump; raises :class:`InputError` if the tape is not this robot's."""
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    verdict = judged(lambda: simulate_jump(
-        tape, robot, mode=settings.mode, perturbation=drawn, scene=scene, reaim=settings.reaim))  # fmt: skip
-    trial = Trial(key, drawn.to_json(), features(drawn, robot), *verdict)
-    return Trial.from_line(trial.line())  # the very thing that a resumed run reads
+    how = {"mode": settings.mode, "perturbation": drawn, "scene": scene, "reaim": settings.reaim}
+    verdict = judged(lambda: simulate_jump(tape, robot, **how))
+    return Trial(key, drawn.to_json(), features(drawn, robot), *verdict).as_kept()
 
 
 def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None]:
@@ -164,151 +144,42 @@ def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics
         result = simulate()
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
         return False, str(e), None
-    doubts = [str(finding) for finding in result.checks if not finding.passed]
     if result.checks_passed:
         return result.landed, result.reason, result.metrics
-    doubts = "; ".join(doubts) or "nothing was checked"
+    doubts = "; ".join(str(finding) for finding in result.checks if not finding.passed) or "nothing was checked"
     return False, f"not honest: {doubts}; the run's own verdict: {result.reason}", result.metrics
 
 
 def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
     """A perturbed robot in a few numbers, all relative to the planned one.
 
-    Returns
-    -------
-    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its stance),
-    leg_motors [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
+    friction [1], delay_s [s], mass [1] (whole robot), com_x_m and com_y_m [m] (whole robot, in its stance), leg_motors
+    [1] (mean gain of hip, knee and ankle pitch motors, minus 1).
     """
     q, real = stance_configuration(robot), drawn.robot(robot)
-    shift = _com(real, q) - _com(robot, q)
-    legs = [drawn.motor_gain.get(name, 1.0) for role in LEG_ROLES for name in robot.joints[role]]
+    here, planned = (pin.centerOfMass(r.model, r.model.createData(), q, False).copy() for r in (real, robot))
+    legs = [name for role in ("hip_pitch", "knee", "ankle_pitch") for name in robot.joints[role]]
     return {
         "friction": drawn.friction,
         "delay_s": drawn.delay_s,
         "mass": real.total_mass / robot.total_mass - 1,
-        "com_x_m": float(shift[0]),
-        "com_y_m": float(shift[1]),
-        "leg_motors": float(np.mean(legs)) - 1,
+        "com_x_m": float(here[0] - planned[0]),
+        "com_y_m": float(here[1] - planned[1]),
+        "leg_motors": float(np.mean([drawn.motor_gain.get(name, 1.0) for name in legs])) - 1,
     }
 
 
-def plan_hash(summary: Mapping[str, Any]) -> str:
-    """Short hash of all that a trial takes from a plan's folder: tape, robot, ground."""
-    return _hash([summary["manifest"]["files"], summary["target"], summary.get("platform_edge_m")])
-
-
-def _com(robot: Robot, q: np.ndarray) -> np.ndarray:
-    return pin.centerOfMass(robot.model, robot.model.createData(), q, False).copy()
-
-
-def _code() -> str:
-    """Hash of the package's source: trials of other code are not these trials."""
-    root = Path(store.__file__).parent.parent
-    files = sorted(f for f in root.rglob("*.py") if f.relative_to(root).parts[0] not in LOOKING)
-    return _hash([[str(f.relative_to(root)), hashlib.sha256(f.read_bytes()).hexdigest()] for f in files])
-
-
-def _hash(data: Any) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:HASH_DIGITS]
-
-
-# log ------------------------------------------------------------------------------------------
-NAME = "trials.jsonl"
-
-
-class TrialLog:
-    """The open log of one folder; made by :func:`open_log`.
-
-    Attributes
-    ----------
-    trials : what the log held when it was opened, by key; damaged and foreign lines are left out.
-    """
-
-    def __init__(self, descriptor: int):
-        self._descriptor = descriptor
-        os.lseek(descriptor, 0, os.SEEK_SET)
-        with os.fdopen(os.dup(descriptor), "rb") as file:
-            content = file.read()
-        self._torn = bool(content) and not content.endswith(b"\n")  # killed in the middle of a line
-        self.trials: dict[TrialKey, Trial] = {}
-        for line in content.splitlines():
-            try:
-                trial = Trial.from_line(line)
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-                continue
-            self.trials[trial.key] = trial
-
-    def add(self, trial: Trial) -> None:
-        """Append one trial: a single write of whole lines at the file's end."""
-        text = ("\n" if self._torn else "") + trial.line()
-        self._torn = True  # until the whole line is there
-        data = text.encode()
-        while data:
-            data = data[os.write(self._descriptor, data) :]
-        self._torn = False
-
-
-@contextmanager
-def open_log(folder: str | Path) -> Iterator[TrialLog]:
-    """The folder's log, for one process at a time.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written, or another process has it.
-    """
-    path = Path(folder) / NAME
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror}); choose a writable folder") from e
-    try:
-        _lock(descriptor, path)
-        try:
-            yield TrialLog(descriptor)
-        finally:
-            if os.fstat(descriptor).st_size == 0:
-                path.unlink(missing_ok=True)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror}); free some space, or choose another folder") from e
-    finally:
-        os.close(descriptor)
-
-
-def _lock(descriptor: int, path: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InputError(f"{path}: another 'jumplab trials' is writing it; wait until that is done") from None
-    except OSError:  # no locks on this file system: lines are appended whole in any case
-        pass
-
-
-# monte_carlo ------------------------------------------------------------------------------------------
-CONFIDENCE = 0.95
-LOOK_S = 0.5  # our choice: how often a worker looks whether its parent still lives
-Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
-_NUMBER = re.compile(r"[+-]?\d+(\.\d+)?")
-
-
+# a series of trials ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class TrialReport:
-    """All trials of one seed, settings and plan, in the order of their numbers.
+    """A series of trials, and what they share."""
 
-    Attributes
-    ----------
-    trials : finished trials.
-    seed, settings, plan : what they share; ``plan`` is the hash of the plan.
-    target : of the plan, as its summary says it.
-    resumed : how many were taken from an earlier run.
-    """
-
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  # in the order of their numbers
     seed: int
     settings: TrialSettings
-    plan: str
-    target: dict[str, float]
-    resumed: int = 0
+    plan: str  # its hash
+    target: dict[str, float]  # of the plan, as its summary says it
+    resumed: int = 0  # how many were taken from an earlier run
 
     @property
     def count(self) -> int:
@@ -333,7 +204,9 @@ class TrialReport:
     @property
     def reasons(self) -> dict[str, int]:
         """How often robots failed for which reason, the most frequent first; numbers and sides are left out."""
-        return dict(Counter(kind_of(t.reason) for t in self.trials if not t.landed).most_common())
+        numbers, sides = r"[+-]?\d+(\.\d+)?", "left_|right_"
+        kinds = (re.sub(sides, "", re.sub(numbers, "...", t.reason)) for t in self.trials if not t.landed)
+        return dict(Counter(kinds).most_common())
 
     def values(self, name: str) -> np.ndarray:
         """One metric (M,) of the trials that landed."""
@@ -341,6 +214,8 @@ class TrialReport:
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``trials.json``; depends on the trials alone, not on how or when they were run."""
+        measured = {name: self.values(name) for name in ("foot_distance_m", "com_rise_m")}
+        kinds = {"least": np.min, "median": np.median, "largest": np.max}
         return {
             "schema": SCHEMA,
             "success_rate": self.success_rate,
@@ -350,7 +225,10 @@ class TrialReport:
             "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed},
             "reasons": self.reasons,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
-            "landed_metrics": {name: _spread(self.values(name)) for name in ("foot_distance_m", "com_rise_m")},
+            "landed_metrics": {
+                name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x) else None
+                for name, x in measured.items()
+            },
             "target": self.target,
             "seed": self.seed,
             "settings": {**asdict(self.settings), "hash": self.trials[0].key.settings},
@@ -365,11 +243,6 @@ def wilson(landed: int, count: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def kind_of(reason: str) -> str:
-    """A reason without its numbers and sides, so that equal kinds can be counted."""
-    return _NUMBER.sub("...", reason).replace("left_", "").replace("right_", "")
-
-
 def run_trials(
     folder: str | Path,
     n: int,
@@ -381,20 +254,14 @@ def run_trials(
 ) -> TrialReport:
     """Let ``n`` perturbed robots jump the plan in ``folder``; write ``trials.jsonl`` and ``trials.json`` there.
 
-    Trials that the folder already has are not run again.
+    Raises :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
 
     Parameters
     ----------
-    folder : result folder of a plan.
-    n : number of trials; the first ones of a larger number are the same.
-    seed : of the whole series.
+    folder : result folder of a plan; trials that it already has are not run again.
+    n : number of trials; the first ones of a larger number are the same.  seed : of the whole series.
     jobs : processes; one per core if None.
     progress : a bar on stderr; only on a terminal if None.
-
-    Raises
-    ------
-    InputError
-        If ``n`` or ``seed`` cannot be meant, or the folder holds no whole plan or cannot be written.
     """
     check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)
@@ -407,65 +274,6 @@ def run_trials(
     return report
 
 
-def run_series(
-    folder: str | Path, work: Mapping[TrialKey, Task], jobs: int | None, progress: bool | None
-) -> tuple[tuple[Trial, ...], int]:
-    """Do the ``work`` that the folder's log does not have yet, and keep it there.
-
-    Returns
-    -------
-    All trials in the order of ``work``, and how many of them the log had.
-    """
-    store.ensure_writable(folder)
-    with open_log(folder) as log:
-        done = {key: log.trials[key] for key in work if key in log.trials}
-        resumed = len(done)
-        missing = [task for key, task in work.items() if key not in done]
-        hide = not (sys.stderr.isatty() if progress is None else progress)
-        with tqdm(total=len(work), initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
-            for trial in in_parallel(missing, min(jobs or joblib.cpu_count(), max(len(missing), 1))):
-                log.add(trial)
-                done[trial.key] = trial
-                bar.set_postfix_str(f"{sum(t.landed for t in done.values())} of {len(done)} landed", refresh=False)
-                bar.update()
-    return tuple(done[key] for key in work), resumed
-
-
-def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = None) -> dict[str, SimulationResult]:
-    """Several jumps at once, on several cores.
-
-    Parameters
-    ----------
-    jumps : by name, the arguments of :func:`jumplab.sim.simulate_jump`, all named.
-    jobs : processes; one per core if None.
-
-    Returns
-    -------
-    Results by the same names, as that function gives them one by one.
-    """
-    work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
-    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
-    return dict(zip(jumps, in_parallel(work, jobs, "list"), strict=True))
-
-
-def in_parallel(work: Iterable[Task], jobs: int, order: str = "generator_unordered") -> Iterable[Any]:
-    """Results, as they come unless ``order`` says otherwise."""
-    options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
-    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
-
-
-def _serve(parent: int) -> None:
-    """A worker's habits: Ctrl-C is its parent's affair, and without the parent there is nothing left to do."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
-
-
-def _leave_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(LOOK_S)
-    os._exit(1)
-
-
 def check_numbers(n: int, seed: int, jobs: int | None) -> None:
     """Raise :class:`InputError` unless these numbers can be meant."""
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("jobs", 1 if jobs is None else jobs, 1)):
@@ -475,7 +283,48 @@ def check_numbers(n: int, seed: int, jobs: int | None) -> None:
             raise InputError(f"{name} = {value} is too small; it must be at least {least}")
 
 
-def _spread(values: np.ndarray) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    return {"least": float(values.min()), "median": float(np.median(values)), "largest": float(values.max())}
+def trial_log(folder: str | Path) -> AbstractContextManager[Log[TrialKey, Trial]]:
+    """The trials that ``folder`` has, see :func:`jumplab.io.files.open_log`."""
+    return open_log(Path(folder) / NAME, "trials", lambda data: ((trial := Trial.from_json(data)).key, trial))
+
+
+def run_series(
+    folder: str | Path, work: Mapping[TrialKey, Task], jobs: int | None, progress: bool | None
+) -> tuple[tuple[Trial, ...], int]:
+    """Do the ``work`` that the folder's log does not have yet, and keep it there.
+
+    Returns all trials in the order of ``work``, and how many of them the log had.
+    """
+    store.ensure_writable(folder)
+    with trial_log(folder) as log:
+        done = {key: log.done[key] for key in work if key in log.done}
+        resumed = len(done)
+        missing = [task for key, task in work.items() if key not in done]
+        hide = None if progress is None else not progress
+        with tqdm(total=len(work), initial=resumed, disable=hide, unit="jump", dynamic_ncols=True) as bar:
+            for trial in in_parallel(missing, jobs):
+                log.add(trial.to_json())
+                done[trial.key] = trial
+                bar.set_postfix_str(f"{sum(t.landed for t in done.values())} of {len(done)} landed", refresh=False)
+                bar.update()
+    return tuple(done[key] for key in work), resumed
+
+
+# processes ------------------------------------------------------------------------------------------
+def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_unordered") -> Iterable[Any]:
+    """Results, as they come unless ``order`` says otherwise; in ``jobs`` processes, by default one per core."""
+    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
+    options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
+    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+
+
+def _serve(parent: int) -> None:
+    """A worker's habits: Ctrl-C is its parent's affair, and without the parent there is nothing left to do."""
+
+    def leave_with_it() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK_S)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=leave_with_it, daemon=True).start()
