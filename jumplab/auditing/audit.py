@@ -10,8 +10,8 @@ from jumplab.auditing import contact, dynamics, joints, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import AuditReport
 from jumplab.errors import InputError, as_path, quoted, require_type
-from jumplab.io.files import CONFIG, PLAN, SUMMARY, URDF, write_file
-from jumplab.io.folder import read_json, sha256, versions
+from jumplab.io.files import write_file
+from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import JumpTask

@@ -133,7 +133,7 @@ def _plain(x: Any) -> Any:
     return str(x) if isinstance(x, Path) else x
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -160,7 +160,7 @@ def write_plan(
             "schema": SCHEMA,
             "versions": versions(),
             "robot": {"name": robot.name, "hash": robot.hash},
-            "files": {name: _sha256(staging / name) for name in HASHED},
+            "files": {name: sha256(staging / name) for name in HASHED},
         }
         (staging / SUMMARY).write_text(to_json({**summary, "manifest": manifest}), encoding="utf-8")
         return complete(staging) if complete else None
@@ -239,7 +239,7 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
         with locked(folder, shared=True):
             summary = _read_summary(folder)
             for name in HASHED:
-                if _sha256(folder / name) != summary["manifest"]["files"][name]:
+                if sha256(folder / name) != summary["manifest"]["files"][name]:
                     raise InputError(f"{folder / name}: changed or damaged since it was written; plan the jump again")
             urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
             return Tape.load(folder / PLAN), Robot.from_text(urdf, config), summary
