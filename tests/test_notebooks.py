@@ -214,7 +214,7 @@ def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     sleeper = f"import os, pathlib, time\npathlib.Path({str(pid_file)!r}).write_text(str(os.getpid()))\ntime.sleep(300)"
     make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
     code = (
-        f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab import notebooks;"
+        f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab.cli import notebooks;"
         f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.cli.main import main;"
         f"sys.exit(main(['run', '-p', 'n=2']))"
     )

@@ -1,63 +1,133 @@
-"""What several commands share: targets and folders as they are typed, and what is printed of results."""
+"""What the commands share: how one is declared, its options and what they take, and what is printed of a result."""
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from typing import Any
 
 from jumplab.errors import InfeasibleError, InputError
-from jumplab.task import JumpTask
+
+Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
+Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
+SEVERAL = {"+": {"nargs": "+"}, "*": {"nargs": "*"}, "...": {"action": "append"}}
 
 
-def common_options() -> argparse.ArgumentParser:
-    """Options of every command."""
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks")
-    return common
+class Late:
+    """A module that is imported when it is first used: help and refusals need not wait for the heavy libraries."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(import_module(self._name), attribute)
 
 
-def robot_option() -> argparse.ArgumentParser:
-    """The option ``--robot``."""
-    robot = argparse.ArgumentParser(add_help=False)
-    robot.add_argument(
-        "--robot", default="bhr", help="shipped robot (see 'jumplab robot list') or path of a robot's TOML file"
-    )
-    return robot
+@dataclass(frozen=True)
+class Command:
+    """A command of the name of its function, whose docstring is the help. See :func:`command`."""
+
+    work: Callable[[argparse.Namespace], None]
+    options: tuple[Option, ...]
+    actions: tuple[Command, ...]
+
+    @property
+    def name(self) -> str:
+        """How it is typed."""
+        return self.work.__name__.rstrip("_")
+
+    def declare(self, parsers: argparse._SubParsersAction) -> None:
+        """Add its parser, and those of its actions below it."""
+        text = self.work.__doc__ or ""
+        parser = parsers.add_parser(self.name, help=text[:1].lower() + text[1:].rstrip("."))
+        for names, how in (DEBUG, *self.options):
+            parser.add_argument(*names, **how)
+        parser.set_defaults(work=self.work)
+        if self.actions:
+            below = parser.add_subparsers(dest="action", metavar="ACTION", parser_class=type(parser))
+            for action in self.actions:
+                action.declare(below)
 
 
-def target_options() -> argparse.ArgumentParser:
-    """``--distance-m`` and ``--height-m``."""
-    target = argparse.ArgumentParser(add_help=False)
-    target.add_argument("--distance-m", default="1.0", metavar="M", help="travel of the feet [m] (default 1.0)")
-    target.add_argument("--height-m", default="0.5", metavar="M", help="rise of the CoM in flight [m] (default 0.5)")
-    return target
+def command(*options: Option, actions: tuple[Command, ...] = ()) -> Callable[[Callable], Command]:
+    """Make a command of a function that takes these options, parsed."""
+    return partial(Command, options=options, actions=actions)
 
 
-def number(option: str, text: str) -> float:
+def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = None, **how: Any) -> Option:
+    """Declare an option, ``opt("--out DIR", "where to")``, or an argument, ``opt("DIR", "where from")``.
+
+    Parameters
+    ----------
+    usage : names, then the placeholder of the value. "DIR+" and "DIR*" take several values, "DIR..." may be repeated.
+        Without placeholder and choices it is a flag; one that has a default can also be undone with --no-.
+    text : the help.
+    default : a text is read as if it had been typed.
+    kind : what makes the value of the text, or a tuple of choices.
+    how : further arguments of ``add_argument``.
+    """
+    names = tuple(word for word in usage.split() if word.startswith("-"))
+    placeholder = usage.split()[-1]
+    for sign, meaning in SEVERAL.items():
+        if placeholder.endswith(sign):
+            how |= meaning
+            placeholder = placeholder.removesuffix(sign)
+    if isinstance(kind, tuple):
+        how["choices"] = kind
+    elif placeholder in names:
+        how["action"] = argparse.BooleanOptionalAction if isinstance(default, bool) else "store_true"
+    else:
+        how |= {"metavar": placeholder, "type": partial(kind, names[-1]) if kind else str}
+    if default is not None:
+        how["default"] = default
+    return names or (placeholder.lower(),), {"help": text, **how}
+
+
+def number(option: str, text: str, what: str = "a number") -> float:
     """The number that an option was given."""
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"{option} must be a number, got {text!r}") from None
+        raise InputError(f"{option} must be {what}, got {text!r}") from None
 
 
-def task_of(args: argparse.Namespace) -> JumpTask:
-    """The target that the options describe."""
-    return JumpTask(
-        distance_m=number("--distance-m", args.distance_m),
-        height_m=number("--height-m", args.height_m),
-        platform_m=number("--platform-m", getattr(args, "platform_m", "0")),
-        rotation_rad=math.radians(number("--rotation-deg", getattr(args, "rotation_deg", "0"))),
-    )
+def whole(allowed: Sequence[int], what: str = "") -> Kind:
+    """Kind of an option that takes these whole numbers; ``what`` says which, if they are not simply a range."""
+
+    def kind(option: str, text: str) -> int:
+        value = number(option, text, what or "a number")
+        if value not in allowed:
+            said = what or f"a whole number from {allowed[0]} to {allowed[-1]}"
+            raise InputError(f"{option} must be {said}, got {text!r}")
+        return int(value)
+
+    return kind
 
 
-def folder_of(option: str, text: str | None) -> str | None:
+def folder(option: str, text: str) -> str:
     """A folder's name, refused if it is blank."""
-    if text is not None and not text.strip():
+    if not text.strip():
         raise InputError(f"{option} must name a folder, got {text!r}")
     return text
+
+
+def out_folder(text: str, **how: Any) -> Option:
+    """The option ``--out DIR``."""
+    return opt("--out DIR", text, kind=folder, **how)
+
+
+DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
+PLAN = opt("DIR", "folder of a plan")
+MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
+METHODS = ("three-step", "direct")
+ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
+TARGET = (
+    opt("--distance-m M", "travel of the feet [m] (default 1.0)", "1.0", number),
+    opt("--height-m M", "rise of the CoM in flight [m] (default 0.5)", "0.5", number),
+)
 
 
 def judge(audit: Any, folder: str) -> None:

@@ -16,11 +16,14 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NoReturn
 
-from jumplab.cli import COMMANDS
-from jumplab.cli.common import common_options
+from jumplab.cli.common import DEBUG
+from jumplab.cli.jumps import audit, export, plan, run, simulate, view
+from jumplab.cli.robots import robot
+from jumplab.cli.studies import bench, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
+COMMANDS = (run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep, bench)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -34,6 +37,33 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; '{self.prog} --help' shows what is possible")
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
+    names, how = DEBUG
+    parser.add_argument(*names, **how)
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    for command in COMMANDS:
+        command.declare(commands)
+    return parser
+
+
+def _work(argv: Sequence[str]) -> None:
+    parser = _parser()
+    for text in argv:  # argparse would make an empty list of it
+        if re.fullmatch(r"-[^=]*=--", text):
+            parser.error(f"{text}: '--' is not a value")
+    args = parser.parse_args(argv)
+    if args.version:
+        print(f"jumplab {_version()}")
+    elif args.command is None:
+        *first, last = (command.name for command in COMMANDS)
+        parser.error(f"choose a command: {', '.join(first)} or {last}")
+    else:
+        args.work(args)
+    sys.stdout.flush()
+
+
 def _version() -> str:
     from importlib import metadata
 
@@ -41,22 +71,6 @@ def _version() -> str:
         return metadata.version("jumplab")
     except metadata.PackageNotFoundError:
         return "(not installed)"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.", parents=[common_options()]
-    )
-    parser.add_argument("--version", action="store_true", help="print the version and exit")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-    for command in COMMANDS:
-        command.add(commands)
-    return parser
-
-
-def _names() -> str:
-    *first, last = (command.__name__.rpartition(".")[2] for command in COMMANDS)
-    return f"{', '.join(first)} or {last}"
 
 
 def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
@@ -71,52 +85,38 @@ def _heed(seen: list[int]) -> dict:
     return {number: signal.signal(number, partial(_stop, seen)) for number, ours in usual.items() if ours}
 
 
-def _complain(text: str, debug: bool) -> None:
-    if debug:
-        traceback.print_exc()
-    print(f"jumplab: {' '.join(text.split())}", file=sys.stderr)
-
-
-def _interrupted(said: str, debug: bool) -> int:
-    _complain(said or "interrupted; what was there before is unchanged", debug)
-    return INTERRUPTED
+def _verdict(e: BaseException, interrupted: bool, debug: bool) -> tuple[int, str]:
+    """Exit code and sentence of what has ended a command."""
+    if isinstance(e, KeyboardInterrupt) or interrupted:
+        said = str(e) if isinstance(e, KeyboardInterrupt) else ""
+        return INTERRUPTED, said or "interrupted; what was there before is unchanged"
+    if isinstance(e, JumplabError):
+        return e.exit_code, str(e)
+    first = (str(e).strip().splitlines() or ["no message"])[0]
+    hint = "" if debug else "; run it again with --debug for the traceback"
+    return INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    debug = "--debug" in argv
     seen: list[int] = []
     before = _heed(seen)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
     try:
-        parser = _parser()
-        for text in argv:  # argparse would make an empty list of it
-            if re.fullmatch(r"-[^=]*=--", text):
-                parser.error(f"{text}: '--' is not a value")
-        args = parser.parse_args(argv)
-        if args.version:
-            print(f"jumplab {_version()}")
-        elif args.command is None:
-            parser.error(f"choose a command: {_names()}")
-        else:
-            args.work(args)
-        sys.stdout.flush()
-    except KeyboardInterrupt as e:
-        return _interrupted(str(e), debug)
+        _work(argv)
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
-    except Exception as e:
-        if seen:
-            return TERMINATED if seen[-1] == signal.SIGTERM else _interrupted("", debug)
-        if isinstance(e, JumplabError):
-            _complain(str(e), debug)
-            return e.exit_code
-        first = (str(e).strip().splitlines() or ["no message"])[0]
-        hint = "" if debug else "; run it again with --debug for the traceback"
-        _complain(f"internal failure, {type(e).__name__}: {first}{hint}", debug)
-        return INTERNAL
+    except (KeyboardInterrupt, Exception) as e:
+        if seen[-1:] == [signal.SIGTERM] and not isinstance(e, KeyboardInterrupt):
+            return TERMINATED
+        debug = "--debug" in argv
+        code, said = _verdict(e, bool(seen), debug)
+        if debug:
+            traceback.print_exc()
+        print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
+        return code
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from jumplab import errors
-from jumplab.cli.parameters import STANDARD, check_parameters, check_value, declared_kinds, declared_parameters, literal
+from jumplab.cli.parameters import STANDARD, check_value, declared_kinds, declared_parameters, literal
+from jumplab.cli.parameters import check_parameters as check_parameters  # what the notebooks call
 from jumplab.errors import InputError, JumplabError, as_path, require_type
 from jumplab.io import folder as store
 from jumplab.robot import load_robot
 from jumplab.task import JumpTask
 
-__all__ = ["STANDARD", "RunReport", "check_parameters", "declared_parameters", "find_notebooks", "run_notebooks"]
 PATTERN = "[0-9][0-9]_*.ipynb"
 _PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
 
@@ -51,9 +51,6 @@ class RunReport:
     wall_s: float
 
 
-# ---------------------------------------------------------------------------------------------- finding them
-
-
 def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
     """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
 
@@ -67,23 +64,14 @@ def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
         If there are none, since an installed package carries no notebooks; or none of a name.
     """
     places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
-    for place in places:
-        found = sorted(place.glob(PATTERN))
-        if found:
-            return _named(found, names)
-    raise InputError(
-        f"no notebooks in {' nor in '.join(repr(str(p)) for p in places)}; run this in a clone of the repository"
-    )
-
-
-def _named(found: list[Path], names: Sequence[str]) -> list[Path]:
+    found = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
+    if found is None:
+        there = " nor in ".join(repr(str(p)) for p in places)
+        raise InputError(f"no notebooks in {there}; run this in a clone of the repository")
     for name in names:
         if not any(name in (p.stem, p.stem[:2]) for p in found):
             raise InputError(f"no notebook {name!r}; there are {', '.join(p.stem for p in found)}")
     return [p for p in found if not names or {p.stem, p.stem[:2]} & set(names)]
-
-
-# ---------------------------------------------------------------------------------------------- running them
 
 
 def run_notebooks(
@@ -128,8 +116,9 @@ def run_notebooks(
     with _workshop(out) as work:
         for i, notebook in enumerate(notebooks, start=1):
             given = {k: v for k, v in values.items() if k in declared[notebook]}
-            label = f"{i}/{len(notebooks)} {notebook.stem}" if progress else None
-            _execute(notebook, given, work, label, keep_failed=out / "failed")
+            label = f"{i}/{len(notebooks)} {notebook.stem}"
+            bar = progress and {"desc": label, "disable": None}  # None: only on a terminal
+            _execute(notebook, given, work, bar, keep_failed=out / "failed")
         _publish(work, out, figures, sources=notebooks[0].parent)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
 
@@ -168,9 +157,9 @@ def _workshop(out: Path) -> Iterator[Path]:
     try:
         with store.locked(executed, wait_s=0.0):
             shutil.rmtree(work, ignore_errors=True)  # left by a chain that was killed
-            for name in ("result", "figures", "notebooks"):
-                (work / name).mkdir(parents=True)
             try:
+                for name in ("result", "figures", "notebooks"):
+                    (work / name).mkdir(parents=True)
                 yield work
             finally:
                 shutil.rmtree(work, ignore_errors=True)
@@ -180,20 +169,18 @@ def _workshop(out: Path) -> Iterator[Path]:
                 p.rmdir()
 
 
-def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | None, keep_failed: Path) -> None:
+def _execute(notebook: Path, given: dict[str, Any], work: Path, progress: dict | bool, keep_failed: Path) -> None:
     import papermill
     from nbclient.exceptions import DeadKernelError
-    from papermill.exceptions import PapermillExecutionError
 
     executed = work / "notebooks" / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
+        kernel = _kernel(Path(scratch), notebook.parent)
+        kernel_options = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": kernel}
+        files = literal(notebook), literal(executed)
         try:
-            papermill.execute_notebook(
-                literal(notebook), literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
-                progress_bar={"desc": label, "disable": None} if label else False,  # None: only on a terminal
-                kernel_manager_class=_kernel_manager(Path(scratch), notebook.parent),
-            )  # fmt: skip
-        except PapermillExecutionError as e:
+            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=progress, **kernel_options)
+        except papermill.PapermillExecutionError as e:
             keep_failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, keep_failed)
             raise _explained(notebook.name, e, place) from e
@@ -212,17 +199,16 @@ def _explained(name: str, e: Any, place: str) -> JumplabError:
     return (kind if ours else JumplabError)(f"notebook {name}, cell In [{e.exec_count}]: {text} (see {place})")
 
 
-def _kernel_manager(scratch: Path, beside: Path) -> type:
-    """Kernel manager that knows one kernel: this interpreter, with no user configuration, and the notebook's folder."""
-    from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
+def _kernel(scratch: Path, beside: Path) -> type:
+    """Kernel manager whose one kernel is this interpreter: no user configuration, the notebook's folder on its path."""
+    from jupyter_client.kernelspec import KernelSpec
     from jupyter_client.manager import AsyncKernelManager
-    from traitlets import default
+    from traitlets import Unicode
 
-    path = [str(beside), *([os.environ["PYTHONPATH"]] if os.environ.get("PYTHONPATH") else [])]
-    if (_PACKAGE_PARENT / "pyproject.toml").is_file():  # a checkout, perhaps not installed
-        path.insert(0, str(_PACKAGE_PARENT))
+    checkout = [_PACKAGE_PARENT] if (_PACKAGE_PARENT / "pyproject.toml").is_file() else []  # perhaps not installed
+    path = [*checkout, beside, *filter(None, [os.environ.get("PYTHONPATH")])]
     env = {
-        "PYTHONPATH": os.pathsep.join(path),
+        "PYTHONPATH": os.pathsep.join(map(str, path)),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
         "IPYTHONDIR": str(scratch / "ipython"),
         "JUPYTER_RUNTIME_DIR": str(scratch),
@@ -230,29 +216,20 @@ def _kernel_manager(scratch: Path, beside: Path) -> type:
         "JPY_SESSION_NAME": "",  # nobody looks, even if the runner was started from an open notebook
     }
 
-    class ThisInterpreter(KernelSpecManager):
-        def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
-            argv = [sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"]
-            escaped = {k: v.replace("$", "$$") for k, v in env.items()}
-            return KernelSpec(argv=argv, env=escaped, language="python", display_name="Python of jumplab")
-
-    class Manager(AsyncKernelManager):
-        @default("kernel_spec_manager")
-        def _kernel_spec_manager_default(self) -> KernelSpecManager:
-            return ThisInterpreter(parent=self)
-
-        @default("connection_file")
-        def _connection_file_default(self) -> str:
-            return str(scratch / "kernel.json")
+    class ThisInterpreter(AsyncKernelManager):
+        kernel_spec = KernelSpec(
+            argv=[sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"],
+            env={k: v.replace("$", "$$") for k, v in env.items()},
+            language="python",
+            display_name="Python of jumplab",
+        )
+        connection_file = Unicode(str(scratch / "kernel.json"))
 
         async def start_kernel(self, **kwargs: Any) -> None:
             # What cells print reaches the notebook another way; here would only come the kernel's own chatter.
             await super().start_kernel(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **kwargs)
 
-    return Manager
-
-
-# ---------------------------------------------------------------------------------------------- publishing
+    return ThisInterpreter
 
 
 def _publish(work: Path, out: Path, figures: Path, sources: Path) -> None:
@@ -263,19 +240,7 @@ def _publish(work: Path, out: Path, figures: Path, sources: Path) -> None:
     for old in (out / "notebooks").glob(PATTERN):
         if not (sources / old.name).exists():  # executed once, since removed or renamed
             old.unlink()
-    _place(work / "notebooks", out / "notebooks")
-    _place(work / "figures", figures)
+    for source, target in ((work / "notebooks", out / "notebooks"), (work / "figures", figures)):
+        for p in (q for q in source.rglob("*") if q.is_file()):
+            store.write_file(target / p.relative_to(source), p.read_bytes())
     shutil.rmtree(out / "failed", ignore_errors=True)
-
-
-def _place(source: Path, target: Path) -> None:
-    """Copy a tree's files, then rename all of them into their places, so that nobody finds half a file."""
-    ready = []
-    for p in sorted(q for q in source.rglob("*") if q.is_file()):
-        final = target / p.relative_to(source)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        half = final.with_name(f".{final.name}.half")
-        shutil.copyfile(p, half)
-        ready.append((half, final))
-    for half, final in ready:
-        os.replace(half, final)

@@ -35,22 +35,15 @@ def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> Non
         Naming the parameter, its value and what it should be.
     """
     known = {**STANDARD, **extra}
-    for name in _injected(namespace):
-        if name not in known:
-            raise InputError(f"unknown notebook parameter {name!r}; this notebook knows {', '.join(known)}")
+    cells = [source for source in namespace.get("In", []) if source.startswith(INJECTED)]
+    for target in (t for n in ast.walk(ast.parse("\n".join(cells))) if isinstance(n, ast.Assign) for t in n.targets):
+        if isinstance(target, ast.Name) and target.id not in known:
+            raise InputError(f"unknown notebook parameter {target.id!r}; this notebook knows {', '.join(known)}")
     for name, kind in known.items():
         if name in namespace:
             check_value(name, namespace[name], kind)
     if "distance_m" in namespace or "height_m" in namespace:
         JumpTask(namespace.get("distance_m", 0.0), namespace.get("height_m", 0.5))
-
-
-def _injected(namespace: Mapping[str, Any]) -> list[str]:
-    """Names assigned by the cell that papermill added, from IPython's list of what has been executed."""
-    cells = [source for source in namespace.get("In", []) if source.startswith(INJECTED)]
-    names = [t.id for c in cells for node in ast.walk(ast.parse(c)) if isinstance(node, ast.Assign)
-             for t in node.targets if isinstance(t, ast.Name)]  # fmt: skip
-    return list(dict.fromkeys(names))
 
 
 def check_value(name: str, value: Any, kind: type | range) -> None:
@@ -60,9 +53,8 @@ def check_value(name: str, value: Any, kind: type | range) -> None:
         if value not in kind:
             raise InputError(f"parameter {name} must be {kind.start} ... {kind.stop - 1}, got {value}")
         return
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    good = number if kind is float else isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
-    if not good:
+    wanted = int | float if kind is float else kind
+    if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
         raise InputError(f"parameter {name} must be of type {kind.__name__}, got {quoted(value)}")
     if kind is float and not math.isfinite(value):
         raise InputError(f"parameter {name} must be finite, got {value}")
@@ -85,14 +77,13 @@ def declared_kinds(notebook: Path) -> dict[str, type | range]:
 
     What cannot be read that way is left out: the notebook itself will still refuse it.
     """
-    cells = (c["source"] for c in json.loads(notebook.read_bytes())["cells"] if c["cell_type"] == "code")
     found: dict[str, type | range] = {}
-    for source in ("".join(c) for c in cells):
-        with contextlib.suppress(SyntaxError, ValueError, TypeError):  # a cell with magics, or a range of variables
-            calls = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Call)]
-            for call in (c for c in calls if getattr(c.func, "id", "") == "check_parameters"):
-                kinds = {k.arg: _kind(k.value) for k in call.keywords if k.arg}
-                found |= {name: kind for name, kind in kinds.items() if kind is not None}
+    for cell in json.loads(notebook.read_bytes())["cells"]:
+        with contextlib.suppress(SyntaxError, ValueError, TypeError):  # text, magics, a range of variables
+            for call in ast.walk(ast.parse("".join(cell["source"]))):
+                if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "check_parameters":
+                    kinds = {k.arg: _kind(k.value) for k in call.keywords if k.arg}
+                    found |= {name: kind for name, kind in kinds.items() if kind is not None}
     return found
 
 

@@ -1,0 +1,97 @@
+"""The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
+
+from __future__ import annotations
+
+import os
+from argparse import Namespace
+from pathlib import Path
+
+from jumplab.cli.common import Late, command, folder, opt, out_folder
+from jumplab.errors import InputError, JumplabError, RobotError
+
+robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
+jumper, configs, urdfs = (Late(f"jumplab.robot_import.{name}") for name in ("jumper", "config", "urdf"))
+tables, sheets, style = (Late(f"jumplab.show.{name}") for name in ("tables", "robots", "style"))
+store = Late("jumplab.io.folder")
+
+
+@command()
+def list_(args: Namespace) -> None:
+    """The shipped robots."""
+    rows = []
+    for name in describe.SHIPPED:
+        try:
+            robot = robots.load_robot(name)
+            kg, joints, note = robot.total_mass, len(robot.joint_names), ""
+            arms = "swing" if robot.joints["shoulder_pitch"] else "held"
+        except JumplabError as e:
+            kg, joints, arms, note = None, None, "", str(e).rpartition(": ")[2]
+        rows.append({"name": name, "kg": kg, "joints": joints, "arms": arms, "note": note})
+    print(tables.table(rows, digits=3))
+
+
+@command(
+    opt("URDF", "the robot's URDF, or the name of a shipped robot"),
+    opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
+    out_folder("write a starter configuration and a picture into DIR"),
+    opt("--repair WHAT...", "allow a repair: symmetry, inertia or massless; may be repeated", []),
+)
+def check(args: Namespace) -> None:
+    """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
+    for word in args.repair:
+        if word not in jumper.REPAIRS:
+            raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
+    urdf, config = _files(args.urdf, args.config)
+    if config is None:
+        config = _draft(urdf, tuple(args.repair), args.out)
+    result = checkup.check(urdf, config)
+    print(*result.lines(), sep="\n")
+    print(tables.table(result.rows()))
+    if args.out is not None:
+        caption = "Side view, moving joints from the front, and the five links of the sagittal plane, standing."
+        robot = result.robot
+        style.save_figure(sheets.robot_sheet(robot), robot.name, args.out, caption, robot=robot)
+        print(f"picture: {Path(args.out) / robot.name}.png")
+
+
+@command(actions=(check, list_))
+def robot(args: Namespace) -> None:
+    """The robots that are there, and whether a URDF can jump."""
+    raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
+
+
+def _files(urdf: str, config: str | None) -> tuple[Path, str | None]:
+    """Path of the URDF and text of the configuration; the name of a shipped robot stands for both."""
+    if config is None and urdf in describe.SHIPPED:
+        text = describe.SHIPPED[urdf].read_text()
+        if "[source]" not in text:
+            raise InputError(f"{urdf!r} is the default robot, described as jumplab wants it; there is nothing to check")
+        return urdfs.locate(configs.read_toml(text, urdf)["urdf"], describe.SHIPPED[urdf].parent), text
+    if config is None:
+        return Path(urdf), None
+    try:
+        return Path(urdf), Path(config).read_text()
+    except (OSError, ValueError) as e:
+        raise InputError(f"--config {config}: cannot be read as text ({type(e).__name__})") from e
+
+
+def _draft(urdf: Path, repair: tuple[str, ...], out: str | None) -> str:
+    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``."""
+    first, *others = checkup.all_faults(urdf, repair) or [None]
+    if first:
+        print("".join(f"{sentence}\n" for sentence in others), end="")
+        raise RobotError(first + (f" ({len(others)} further faults are printed above)" if others else ""))
+    found = checkup.draft(urdf, repair)
+    for note in found.roles.notes:
+        print(f"note: {note}")
+    print(f"sole: {found.sole.source}")
+    if out is not None:
+        path = Path(out) / f"{configs.read_toml(found.text, 'starter')['name']}.toml"
+        if os.path.exists(path):
+            raise InputError(f"{path}: is there already, perhaps with corrections; choose another --out or remove it")
+        try:
+            store.write_file(path, found.text.encode())
+        except InputError as e:
+            raise InputError(f"{path}: cannot be written ({getattr(e.__cause__, 'strerror', e)})") from e
+        print(f"starter configuration: {path}")
+    return found.text
