@@ -39,22 +39,23 @@ class Command:
         """How it is typed."""
         return self.work.__name__.rstrip("_")
 
-    def declare(self, parsers: argparse._SubParsersAction) -> None:
-        """Add its parser, and those of its actions below it."""
-        text = self.work.__doc__ or ""
-        parser = parsers.add_parser(self.name, help=text[:1].lower() + text[1:].rstrip("."))
-        for names, how in (DEBUG, *self.options):
-            parser.add_argument(*names, **how)
-        parser.set_defaults(work=self.work)
-        if self.actions:
-            below = parser.add_subparsers(dest="action", metavar="ACTION", parser_class=type(parser))
-            for action in self.actions:
-                action.declare(below)
-
 
 def command(*options: Option, actions: tuple[Command, ...] = ()) -> Callable[[Callable], Command]:
-    """Make a command of a function that takes these options, parsed."""
+    """Make a command of a function that takes these options, parsed; ``actions`` are the commands below it."""
     return partial(Command, options=options, actions=actions)
+
+
+def declare(parser: argparse.ArgumentParser, commands: Sequence[Command], dest: str = "command") -> None:
+    """Add a parser for each of these commands, and for those below them."""
+    below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
+    for command in commands:
+        text = command.work.__doc__ or ""
+        parser = below.add_parser(command.name, help=text[:1].lower() + text[1:].rstrip("."))
+        parser.set_defaults(work=command.work)
+        for names, how in (DEBUG, *command.options):
+            parser.add_argument(*names, **how)
+        if command.actions:
+            declare(parser, command.actions, "action")
 
 
 def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = None, **how: Any) -> Option:
@@ -112,11 +113,6 @@ def folder(option: str, text: str) -> str:
     if not text.strip():
         raise InputError(f"{option} must name a folder, got {text!r}")
     return text
-
-
-def out_folder(text: str, **how: Any) -> Option:
-    """The option ``--out DIR``."""
-    return opt("--out DIR", text, kind=folder, **how)
 
 
 DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND

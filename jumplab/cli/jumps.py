@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import METHODS, MODE, PLAN, ROBOT, TARGET, Late, command, folder, number, opt, out_folder
+from jumplab.cli.common import METHODS, MODE, PLAN, ROBOT, TARGET, Late, command, folder, number, opt
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 
@@ -36,7 +36,7 @@ def _pair(option: str, text: str) -> tuple[str, Any]:
     *TARGET,
     ROBOT,
     opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
-    out_folder("results and executed notebooks (default: executed/ in the checkout)"),
+    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
     opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", [], _pair),
 )
@@ -63,7 +63,7 @@ def run(args: Namespace) -> None:
 @command(
     *TARGET,
     ROBOT,
-    out_folder("folder for the plan", required=True),
+    opt("--out DIR", "folder for the plan", None, folder, required=True),
     opt("--platform-m M", "height of the landing surface [m] (default 0)", "0", number),
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
     opt("--method", "the paper's three steps, or the whole-body problem without them", METHODS[0], METHODS),

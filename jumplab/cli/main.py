@@ -7,16 +7,16 @@ limits, 4 internal failure, 130 and 143 interrupted.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import re
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
-from jumplab.cli.common import DEBUG
+from jumplab.cli.common import DEBUG, declare
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
 from jumplab.cli.studies import bench, chain, envelope, sweep, trials
@@ -42,9 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     names, how = DEBUG
     parser.add_argument(*names, **how)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-    for command in COMMANDS:
-        command.declare(commands)
+    declare(parser, COMMANDS)
     return parser
 
 
@@ -55,7 +53,10 @@ def _work(argv: Sequence[str]) -> None:
             parser.error(f"{text}: '--' is not a value")
     args = parser.parse_args(argv)
     if args.version:
-        print(f"jumplab {_version()}")
+        from importlib import metadata
+
+        found = next(metadata.Distribution.discover(name="jumplab"), None)
+        print(f"jumplab {found.version if found else '(not installed)'}")
     elif args.command is None:
         *first, last = (command.name for command in COMMANDS)
         parser.error(f"choose a command: {', '.join(first)} or {last}")
@@ -64,32 +65,36 @@ def _work(argv: Sequence[str]) -> None:
     sys.stdout.flush()
 
 
-def _version() -> str:
-    from importlib import metadata
+@contextlib.contextmanager
+def _heeded() -> Iterator[list[int]]:
+    """Let signals end what is run; yields those that came. An ignored Ctrl-C stays ignored.
 
+    They are noted, since CasADi can lose what is raised within its calls: only a failure is left.
+    """
+    seen: list[int] = []
+
+    def stop(signum: int, frame: Any) -> NoReturn:
+        seen.append(signum)
+        raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
+
+    ours = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        ours.append(signal.SIGINT)
+    before = {number: signal.signal(number, stop) for number in ours}
     try:
-        return metadata.version("jumplab")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
+        yield seen
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
-    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
-    seen.append(signum)
-    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
-
-
-def _heed(seen: list[int]) -> dict:
-    """Handle the signals that end a command; returns the handlers before. An ignored Ctrl-C stays ignored."""
-    usual = {signal.SIGTERM: True, signal.SIGINT: signal.getsignal(signal.SIGINT) is signal.default_int_handler}
-    return {number: signal.signal(number, partial(_stop, seen)) for number, ours in usual.items() if ours}
-
-
-def _verdict(e: BaseException, interrupted: bool, debug: bool) -> tuple[int, str]:
+def _verdict(e: BaseException, seen: list[int], debug: bool) -> tuple[int, str]:
     """Exit code and sentence of what has ended a command."""
-    if isinstance(e, KeyboardInterrupt) or interrupted:
+    if isinstance(e, KeyboardInterrupt) or seen[-1:] == [signal.SIGINT]:
         said = str(e) if isinstance(e, KeyboardInterrupt) else ""
         return INTERRUPTED, said or "interrupted; what was there before is unchanged"
+    if seen:
+        return TERMINATED, ""
     if isinstance(e, JumplabError):
         return e.exit_code, str(e)
     first = (str(e).strip().splitlines() or ["no message"])[0]
@@ -100,28 +105,18 @@ def _verdict(e: BaseException, interrupted: bool, debug: bool) -> tuple[int, str
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    seen: list[int] = []
-    before = _heed(seen)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
-    try:
-        _work(argv)
-    except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return INTERNAL
-    except (KeyboardInterrupt, Exception) as e:
-        if seen[-1:] == [signal.SIGTERM] and not isinstance(e, KeyboardInterrupt):
-            return TERMINATED
-        debug = "--debug" in argv
-        code, said = _verdict(e, bool(seen), debug)
-        if debug:
-            traceback.print_exc()
-        print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
-        return code
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with _heeded() as seen:
+        try:
+            _work(argv)
+        except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return INTERNAL
+        except (KeyboardInterrupt, Exception) as e:
+            code, said = _verdict(e, seen, debug="--debug" in argv)
+            if said and "--debug" in argv:
+                traceback.print_exc()
+            if said:
+                print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
+            return code
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

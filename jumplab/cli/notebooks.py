@@ -35,20 +35,12 @@ _PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
 
 @dataclass(frozen=True)
 class RunReport:
-    """Where a finished chain put its things, and how long it took.
+    """Where a finished chain of notebooks put its things, and how long it took."""
 
-    Attributes
-    ----------
-    out : result folder: plan, simulation, and the executed notebooks in ``notebooks``.
-    figures : folder of the figures.
-    notebooks : names of the notebooks, in the order in which they ran.
-    wall_s : wall time of the whole chain [s].
-    """
-
-    out: Path
+    out: Path  # result folder: plan, simulation, and the executed notebooks in ``notebooks``
     figures: Path
-    notebooks: tuple[str, ...]
-    wall_s: float
+    notebooks: tuple[str, ...]  # their names, in the order in which they ran
+    wall_s: float  # of the whole chain [s]
 
 
 def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
@@ -107,7 +99,7 @@ def run_notebooks(
     declared = {n: declared_parameters(n) for n in notebooks}
     kinds = {k: v for n in notebooks for k, v in declared_kinds(n).items()}
     values = _checked(dict(parameters or {}), set().union(*declared.values()), kinds)
-    root = notebooks[0].parent.parent.parent
+    root = notebooks[0].parent.parent
     asked = out is not None
     out = store.ensure_writable(out if asked else root / "executed").resolve()
     if figures is None and asked:

@@ -6,13 +6,16 @@ import os
 from argparse import Namespace
 from pathlib import Path
 
-from jumplab.cli.common import Late, command, folder, opt, out_folder
+from jumplab.cli.common import Late, command, folder, opt
 from jumplab.errors import InputError, JumplabError, RobotError
 
 robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
-jumper, configs, urdfs = (Late(f"jumplab.robot_import.{name}") for name in ("jumper", "config", "urdf"))
-tables, sheets, style = (Late(f"jumplab.show.{name}") for name in ("tables", "robots", "style"))
-store = Late("jumplab.io.folder")
+store, jumper, configs = (
+    Late("jumplab.io.folder"),
+    Late("jumplab.robot_import.jumper"),
+    Late("jumplab.robot_import.config"),
+)
+tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.robots"), Late("jumplab.show.style")
 
 
 @command()
@@ -33,7 +36,7 @@ def list_(args: Namespace) -> None:
 @command(
     opt("URDF", "the robot's URDF, or the name of a shipped robot"),
     opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
-    out_folder("write a starter configuration and a picture into DIR"),
+    opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
     opt("--repair WHAT...", "allow a repair: symmetry, inertia or massless; may be repeated", []),
 )
 def check(args: Namespace) -> None:
@@ -41,10 +44,15 @@ def check(args: Namespace) -> None:
     for word in args.repair:
         if word not in jumper.REPAIRS:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
-    urdf, config = _files(args.urdf, args.config)
-    if config is None:
-        config = _draft(urdf, tuple(args.repair), args.out)
-    result = checkup.check(urdf, config)
+    if args.config is not None:
+        result = checkup.check(args.urdf, _read(args.config))
+    elif args.urdf not in describe.SHIPPED:
+        result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out))
+    elif "[source]" in describe.SHIPPED[args.urdf].read_text():
+        result = checkup.examine(args.urdf)
+    else:
+        said = "is the default robot, described as jumplab wants it; there is nothing to check"
+        raise InputError(f"{args.urdf!r} {said}")
     print(*result.lines(), sep="\n")
     print(tables.table(result.rows()))
     if args.out is not None:
@@ -60,22 +68,14 @@ def robot(args: Namespace) -> None:
     raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
 
 
-def _files(urdf: str, config: str | None) -> tuple[Path, str | None]:
-    """Path of the URDF and text of the configuration; the name of a shipped robot stands for both."""
-    if config is None and urdf in describe.SHIPPED:
-        text = describe.SHIPPED[urdf].read_text()
-        if "[source]" not in text:
-            raise InputError(f"{urdf!r} is the default robot, described as jumplab wants it; there is nothing to check")
-        return urdfs.locate(configs.read_toml(text, urdf)["urdf"], describe.SHIPPED[urdf].parent), text
-    if config is None:
-        return Path(urdf), None
+def _read(config: str) -> str:
     try:
-        return Path(urdf), Path(config).read_text()
+        return Path(config).read_text()
     except (OSError, ValueError) as e:
         raise InputError(f"--config {config}: cannot be read as text ({type(e).__name__})") from e
 
 
-def _draft(urdf: Path, repair: tuple[str, ...], out: str | None) -> str:
+def _draft(urdf: str, repair: tuple[str, ...], out: str | None) -> str:
     """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``."""
     first, *others = checkup.all_faults(urdf, repair) or [None]
     if first:

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jumplab.cli.common import METHODS, MODE, ROBOT, TARGET, Kind, Late, command, number, opt, out_folder, whole
+from jumplab.cli.common import METHODS, MODE, ROBOT, TARGET, Kind, Late, command, folder, number, opt, whole
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.task import JumpTask
 
@@ -99,7 +99,7 @@ def _revision(option: str, text: str) -> float | None:
     opt("--landing", "how it lands", "spring", ("planned", "spring")),
     opt("--method", "of planning", METHODS[0], METHODS),
     opt("--jobs J", "processes for several runs (default: one per core)", None, whole(range(1, 4097))),
-    out_folder("folder for plans, log, report and 3-D page", required=True),
+    opt("--out DIR", "folder for plans, log, report and 3-D page", None, folder, required=True),
 )
 def chain(args: Namespace) -> None:
     """Several jumps in a row, each planned while the one before lands."""
@@ -161,7 +161,7 @@ def _steps(option: str, text: str) -> list[float]:
 
 @command(
     ROBOT,
-    out_folder("folder for the map; an interrupted one goes on", required=True),
+    opt("--out DIR", "folder for the map; an interrupted one goes on", None, folder, required=True),
     opt("--distances-m A:B:STEP", "of the cells [m]", "0:1.2:0.1", _steps),
     opt("--heights-m A:B:STEP", "of the cells [m]", "0.1:0.6:0.1", _steps),
     opt("--workers N", "processes side by side", str(os.cpu_count() or 1), whole(range(1, 257))),
@@ -216,7 +216,7 @@ _JOBS = whole([-1, *range(1, 4097)], "a number of processes, or -1 for all proce
     opt("--robot NAME...", "robot; may be repeated (default bhr)"),
     opt("--weight TERM=VALUES...", "weights of a term of stage 3, as TERM=A,B,...; may be repeated", []),
     opt("--method METHOD", "three-step (default) or direct", "three-step"),
-    out_folder("folder of the table; an unfinished sweep goes on", required=True),
+    opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
     opt("--jobs N", "processes (default: one per processor)", "-1", _JOBS),
     opt("--cluster ADDRESS", "Dask scheduler that does the work, tcp://HOST:PORT"),
 )
