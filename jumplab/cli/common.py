@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -13,6 +12,7 @@ from jumplab.errors import InfeasibleError, InputError
 
 Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
 Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
+Work = Callable[[argparse.Namespace], None]
 SEVERAL = {"+": {"nargs": "+"}, "*": {"nargs": "*"}, "...": {"action": "append"}}
 
 
@@ -26,36 +26,33 @@ class Late:
         return getattr(import_module(self._name), attribute)
 
 
-@dataclass(frozen=True)
-class Command:
-    """A command of the name of its function, whose docstring is the help. See :func:`command`."""
+def command(*options: Option, actions: Sequence[Work] = ()) -> Callable[[Work], Work]:
+    """Make a command of a function that takes these options, parsed: its name and docstring are the command's.
 
-    work: Callable[[argparse.Namespace], None]
-    options: tuple[Option, ...]
-    actions: tuple[Command, ...]
+    Parameters
+    ----------
+    options : what :func:`opt` declares.
+    actions : commands below this one.
+    """
 
-    @property
-    def name(self) -> str:
-        """How it is typed."""
-        return self.work.__name__.rstrip("_")
+    def mark(work: Work) -> Work:
+        work.options, work.actions = (DEBUG, *options), actions
+        return work
 
-
-def command(*options: Option, actions: tuple[Command, ...] = ()) -> Callable[[Callable], Command]:
-    """Make a command of a function that takes these options, parsed; ``actions`` are the commands below it."""
-    return partial(Command, options=options, actions=actions)
+    return mark
 
 
-def declare(parser: argparse.ArgumentParser, commands: Sequence[Command], dest: str = "command") -> None:
+def declare(parser: argparse.ArgumentParser, commands: Sequence[Work], dest: str = "command") -> None:
     """Add a parser for each of these commands, and for those below them."""
     below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
-    for command in commands:
-        text = command.work.__doc__ or ""
-        parser = below.add_parser(command.name, help=text[:1].lower() + text[1:].rstrip("."))
-        parser.set_defaults(work=command.work)
-        for names, how in (DEBUG, *command.options):
+    for work in commands:
+        text = work.__doc__ or ""
+        parser = below.add_parser(work.__name__.rstrip("_"), help=text[:1].lower() + text[1:].rstrip("."))
+        parser.set_defaults(work=work)
+        for names, how in work.options:
             parser.add_argument(*names, **how)
-        if command.actions:
-            declare(parser, command.actions, "action")
+        if work.actions:
+            declare(parser, work.actions, "action")
 
 
 def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = None, **how: Any) -> Option:
@@ -87,34 +84,33 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
     return names or (placeholder.lower(),), {"help": text, **how}
 
 
-def number(option: str, text: str, what: str = "a number") -> float:
+def number(option: str, text: str) -> float:
     """The number that an option was given."""
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"{option} must be {what}, got {text!r}") from None
+        raise InputError(f"{option} must be a number, got {text!r}") from None
 
 
-def whole(allowed: Sequence[int], what: str = "") -> Kind:
-    """Kind of an option that takes these whole numbers; ``what`` says which, if they are not simply a range."""
+def needing(what: str, fits: Callable[[Any], Any], make: Kind = lambda option, text: text) -> Kind:
+    """Kind of an option that must ``what``: refuses a value that does not fit."""
 
-    def kind(option: str, text: str) -> int:
-        value = number(option, text, what or "a number")
-        if value not in allowed:
-            said = what or f"a whole number from {allowed[0]} to {allowed[-1]}"
-            raise InputError(f"{option} must be {said}, got {text!r}")
-        return int(value)
+    def kind(option: str, text: str) -> Any:
+        value = make(option, text)
+        if not fits(value):
+            raise InputError(f"{option} must {what}, got {text!r}")
+        return value
 
     return kind
 
 
-def folder(option: str, text: str) -> str:
-    """A folder's name, refused if it is blank."""
-    if not text.strip():
-        raise InputError(f"{option} must name a folder, got {text!r}")
-    return text
+def whole(least: int, most: int) -> Kind:
+    """Kind of an option that takes a whole number from ``least`` to ``most``."""
+    check = needing(f"be a whole number from {least} to {most}", range(least, most + 1).__contains__, number)
+    return lambda option, text: int(check(option, text))
 
 
+folder = needing("name a folder", str.strip)
 DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
 PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))

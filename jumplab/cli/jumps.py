@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import METHODS, MODE, PLAN, ROBOT, TARGET, Late, command, folder, number, opt
+from jumplab.cli.common import METHODS, MODE, PLAN, ROBOT, TARGET, Late, command, folder, needing, number, opt
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 
@@ -19,6 +19,7 @@ robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.page"), Late("jumplab.cli.notebooks")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
+HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
 ORDERS = ("depth-first", "breadth-first")
 
 
@@ -102,20 +103,14 @@ def simulate(args: Namespace) -> None:
     common.print_simulation(result.to_json())
 
 
-def _html(option: str, text: str) -> Path:
-    if not text.lower().endswith(".html"):
-        raise InputError(f"{option} must name a file that ends in .html, got {text!r}")
-    return Path(text)
-
-
 @command(
     opt("DIR", "folder of a plan, simulated or not"),
-    opt("--out FILE.html", "file to write (default: DIR/jump.html)", None, _html),
+    opt("--out FILE.html", "file to write (default: DIR/jump.html)", None, HTML),
 )
 def view(args: Namespace) -> None:
     """A jump in 3-D, as one HTML file."""
     tape, robot, summary = store.read_plan(args.dir)
-    path = args.out or Path(args.dir, "jump.html")
+    path = Path(args.out or Path(args.dir, "jump.html"))
     store.ensure_writable(path.parent)
     simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
     simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None

@@ -58,7 +58,7 @@ def _work(argv: Sequence[str]) -> None:
         found = next(metadata.Distribution.discover(name="jumplab"), None)
         print(f"jumplab {found.version if found else '(not installed)'}")
     elif args.command is None:
-        *first, last = (command.name for command in COMMANDS)
+        *first, last = (work.__name__ for work in COMMANDS)
         parser.error(f"choose a command: {', '.join(first)} or {last}")
     else:
         args.work(args)

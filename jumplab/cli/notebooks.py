@@ -1,8 +1,8 @@
 """Runs the notebooks in order with papermill, under the very Python that runs this, and publishes what they made.
 
-A chain works in ``OUT/.run``: the notebooks execute there with ``out = "result"`` and ``figures = "figures"``. Only
-when the last one has passed are the results moved to OUT, the executed notebooks to ``OUT/notebooks`` and the figures
-to their folder. A chain that fails leaves all of them as they were, and the notebook that failed in ``OUT/failed``.
+A chain works in a staging folder, with ``out = "result"`` and ``figures = "figures"``. Only when the last notebook has
+passed are the results moved to OUT, the figures to their folder and the executed notebooks to ``OUT/notebooks``. A
+chain that fails leaves all of them as they were, and the notebook that failed in ``OUT/failed``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,13 +105,24 @@ def run_notebooks(
     if figures is None and asked:
         figures = out / "figures"
     figures = _figures_folder(figures, root, out)
-    with _workshop(out) as work:
+    executed = out / "notebooks"
+    if executed.is_dir():
+        with store.locked(executed, wait_s=0.0):
+            pass  # another chain is refused at once
+    with store.transaction(executed) as staging:
+        work = staging / "work"
+        for name in ("result", "figures"):
+            (work / name).mkdir(parents=True)
         for i, notebook in enumerate(notebooks, start=1):
             given = {k: v for k, v in values.items() if k in declared[notebook]}
-            label = f"{i}/{len(notebooks)} {notebook.stem}"
-            bar = progress and {"desc": label, "disable": None}  # None: only on a terminal
-            _execute(notebook, given, work, bar, keep_failed=out / "failed")
-        _publish(work, out, figures, sources=notebooks[0].parent)
+            bar = progress and {"desc": f"{i}/{len(notebooks)} {notebook.stem}", "disable": None}  # on a terminal
+            _execute(notebook, staging / notebook.name, given, work, bar, keep_failed=out / "failed")
+        for old in executed.glob(PATTERN):
+            if not (notebooks[0].parent / old.name).exists():  # executed once, since removed or renamed
+                old.unlink()
+        _publish(work, out, figures)
+        shutil.rmtree(work)
+    shutil.rmtree(out / "failed", ignore_errors=True)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
 
 
@@ -140,32 +151,12 @@ def _figures_folder(figures: str | Path | None, root: Path, out: Path) -> Path:
     return out / "figures"
 
 
-@contextlib.contextmanager
-def _workshop(out: Path) -> Iterator[Path]:
-    """An empty ``.run`` in ``out``, for one chain at a time; gone at the end, however that comes."""
-    executed, work = out / "notebooks", out / ".run"
-    new = [p for p in (executed, out, *out.parents) if not p.exists()]
-    executed.mkdir(parents=True, exist_ok=True)
-    try:
-        with store.locked(executed, wait_s=0.0):
-            shutil.rmtree(work, ignore_errors=True)  # left by a chain that was killed
-            try:
-                for name in ("result", "figures", "notebooks"):
-                    (work / name).mkdir(parents=True)
-                yield work
-            finally:
-                shutil.rmtree(work, ignore_errors=True)
-    finally:
-        for p in new:
-            with contextlib.suppress(OSError):  # only what is still empty goes
-                p.rmdir()
-
-
-def _execute(notebook: Path, given: dict[str, Any], work: Path, progress: dict | bool, keep_failed: Path) -> None:
+def _execute(
+    notebook: Path, executed: Path, given: dict[str, Any], work: Path, progress: dict | bool, keep_failed: Path
+) -> None:
     import papermill
     from nbclient.exceptions import DeadKernelError
 
-    executed = work / "notebooks" / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
         kernel = _kernel(Path(scratch), notebook.parent)
         kernel_options = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": kernel}
@@ -224,15 +215,11 @@ def _kernel(scratch: Path, beside: Path) -> type:
     return ThisInterpreter
 
 
-def _publish(work: Path, out: Path, figures: Path, sources: Path) -> None:
+def _publish(work: Path, out: Path, figures: Path) -> None:
     with store.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():
                 os.replace(p, staging / p.name)
-    for old in (out / "notebooks").glob(PATTERN):
-        if not (sources / old.name).exists():  # executed once, since removed or renamed
-            old.unlink()
-    for source, target in ((work / "notebooks", out / "notebooks"), (work / "figures", figures)):
-        for p in (q for q in source.rglob("*") if q.is_file()):
-            store.write_file(target / p.relative_to(source), p.read_bytes())
-    shutil.rmtree(out / "failed", ignore_errors=True)
+    for p in (work / "figures").rglob("*"):
+        if p.is_file():
+            store.write_file(figures / p.relative_to(work / "figures"), p.read_bytes())

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jumplab.cli.common import METHODS, MODE, ROBOT, TARGET, Kind, Late, command, folder, number, opt, whole
+from jumplab.cli.common import METHODS, MODE, ROBOT, TARGET, Kind, Late, command, folder, needing, number, opt, whole
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.task import JumpTask
 
@@ -22,7 +22,16 @@ maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studie
 pages, pictures, style = Late("jumplab.show.page"), Late("jumplab.show.envelope"), Late("jumplab.show.style")
 
 MOST = 100_000  # trials: two days of one core; more is surely a typo
-RUNS = whole(range(1, 10_001))  # chains: a day of two cores
+RUNS = whole(1, 10_000)  # chains: a day of two cores
+JOBS = needing(
+    "be a number of processes, or -1 for all processors",
+    lambda text: text == "-1" or (text.isdecimal() and 1 <= int(text) <= 4096),
+)
+REPEATS = needing("be a number from 1 to 1000", lambda text: text.isdecimal() and 1 <= int(text) <= 1000)
+FILE = needing(
+    "name a file in a folder that exists",
+    lambda text: text.strip() and not Path(text).is_dir() and Path(text).resolve().parent.is_dir(),
+)
 VALUES = "FROM:TO:COUNT or A,B,..."
 
 
@@ -90,7 +99,7 @@ def _revision(option: str, text: str) -> float | None:
     opt("--distances-m M+", "travel of the feet, per jump [m]", None, number, required=True),
     opt("--height-m M+", "rise of the CoM in flight [m], for all jumps or per jump (default 0.3)", [0.3], number),
     opt("--platforms-m M+", "height of each landing surface above the first ground [m] (default: level)", None, number),
-    opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(range(2**31))),
+    opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(0, 2**31 - 1)),
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
     opt("--ranges", "how much they differ", "slight", ("slight", "wide")),
     opt("--look-s S", "when the next jump is planned, from touchdown on [s]; negative: in the air", "-0.3", number),
@@ -98,7 +107,7 @@ def _revision(option: str, text: str) -> float | None:
     opt("--solve-s S", "charge each plan this [s] instead of its wall clock", None, number),
     opt("--landing", "how it lands", "spring", ("planned", "spring")),
     opt("--method", "of planning", METHODS[0], METHODS),
-    opt("--jobs J", "processes for several runs (default: one per core)", None, whole(range(1, 4097))),
+    opt("--jobs J", "processes for several runs (default: one per core)", None, whole(1, 4096)),
     opt("--out DIR", "folder for plans, log, report and 3-D page", None, folder, required=True),
 )
 def chain(args: Namespace) -> None:
@@ -164,7 +173,7 @@ def _steps(option: str, text: str) -> list[float]:
     opt("--out DIR", "folder for the map; an interrupted one goes on", None, folder, required=True),
     opt("--distances-m A:B:STEP", "of the cells [m]", "0:1.2:0.1", _steps),
     opt("--heights-m A:B:STEP", "of the cells [m]", "0.1:0.6:0.1", _steps),
-    opt("--workers N", "processes side by side", str(os.cpu_count() or 1), whole(range(1, 257))),
+    opt("--workers N", "processes side by side", str(os.cpu_count() or 1), whole(1, 256)),
 )
 def envelope(args: Namespace) -> None:
     """Map of the jumps that a robot can do."""
@@ -206,9 +215,6 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     return found
 
 
-_JOBS = whole([-1, *range(1, 4097)], "a number of processes, or -1 for all processors")
-
-
 @command(
     opt("--distance-m M", f"{VALUES} [m] (default 0:1.2:13)", "0:1.2:13", values_of),
     opt("--height-m M", f"{VALUES} [m] (default 0.1:0.6:11)", "0.1:0.6:11", values_of),
@@ -217,7 +223,7 @@ _JOBS = whole([-1, *range(1, 4097)], "a number of processes, or -1 for all proce
     opt("--weight TERM=VALUES...", "weights of a term of stage 3, as TERM=A,B,...; may be repeated", []),
     opt("--method METHOD", "three-step (default) or direct", "three-step"),
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
-    opt("--jobs N", "processes (default: one per processor)", "-1", _JOBS),
+    opt("--jobs N", "processes (default: one per processor)", "-1", JOBS),
     opt("--cluster ADDRESS", "Dask scheduler that does the work, tcp://HOST:PORT"),
 )
 def sweep(args: Namespace) -> None:
@@ -225,33 +231,23 @@ def sweep(args: Namespace) -> None:
     began, weights = time.perf_counter(), weights_of(args.weight)
     axes = (args.distance_m, args.height_m, args.platform_m)
     cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
-    rows = sweeps.run(cases, args.out, jobs=args.jobs, cluster=args.cluster)
+    rows = sweeps.run(cases, args.out, jobs=int(args.jobs), cluster=args.cluster)
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
     table = f"{args.out}/{sweeps.TABLE}"
     print(f"{len(rows)} cases, {planned} planned, {clean} of them clean in the audit; table in {table}")
     print(f"whole sweep: {time.perf_counter() - began:.1f} s")
 
 
-_REPEATS = whole(range(1, 1001), "a number from 1 to 1000")
-
-
-def _file(option: str, text: str) -> Path:
-    path = Path(text)
-    if not text.strip() or path.is_dir() or not path.resolve().parent.is_dir():
-        raise InputError(f"{option} must name a file in a folder that exists, got {text!r}")
-    return path
-
-
 @command(
     *TARGET,
     ROBOT,
-    opt("--repeats N", "how often everything is timed (default 7)", "7", _REPEATS),
-    opt("--json FILE", "file for ratios and all raw times", None, _file),
+    opt("--repeats N", "how often everything is timed (default 7)", "7", REPEATS),
+    opt("--json FILE", "file for ratios and all raw times", None, FILE),
 )
 def bench(args: Namespace) -> None:
     """How long planning takes, against one direct NLP."""
     task = JumpTask(args.distance_m, args.height_m)
-    found = benchmark.bench(args.robot, task, args.repeats, say=lambda word: print(word, file=sys.stderr))
+    found = benchmark.bench(args.robot, task, int(args.repeats), say=lambda word: print(word, file=sys.stderr))
     print(benchmark.text(found))
     if args.json is not None:
         store.write_file(args.json, json.dumps(found, indent=1).encode())
