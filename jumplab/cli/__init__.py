@@ -1,7 +1,7 @@
 """The command line: what is typed comes in, text, a result folder and an exit code go out. Start reading in ``main``.
 
-``common`` says how a command is declared, ``jumps``, ``studies`` and ``robots`` hold the commands; ``notebooks`` runs
-the notebooks, ``parameters`` checks what each of them was given.
+``common`` says how a command is declared; ``jumps``, ``studies`` and ``robots`` hold the commands; ``notebooks`` checks
+what a notebook was given, and runs them.
 """
 
-from jumplab.cli.parameters import check_parameters as check_parameters
+from jumplab.cli.notebooks import check_parameters as check_parameters

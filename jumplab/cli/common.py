@@ -1,7 +1,5 @@
 """What the commands share: how one is declared, its options and what they take, and what is printed of a result."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -27,13 +25,7 @@ class Late:
 
 
 def command(*options: Option, actions: Sequence[Work] = ()) -> Callable[[Work], Work]:
-    """Make a command of a function that takes these options, parsed: its name and docstring are the command's.
-
-    Parameters
-    ----------
-    options : what :func:`opt` declares.
-    actions : commands below this one.
-    """
+    """Make a command of a function: its name and docstring are the command's; ``actions`` are commands below it."""
 
     def mark(work: Work) -> Work:
         work.options, work.actions = (DEBUG, *options), actions
@@ -62,10 +54,8 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
     ----------
     usage : names, then the placeholder of the value. "DIR+" and "DIR*" take several values, "DIR..." may be repeated.
         Without placeholder and choices it is a flag; one that has a default can also be undone with --no-.
-    text : the help.
     default : a text is read as if it had been typed.
     kind : what makes the value of the text, or a tuple of choices.
-    how : further arguments of ``add_argument``.
     """
     names = tuple(word for word in usage.split() if word.startswith("-"))
     placeholder = usage.split()[-1]
@@ -79,9 +69,7 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
         how["action"] = argparse.BooleanOptionalAction if isinstance(default, bool) else "store_true"
     else:
         how |= {"metavar": placeholder, "type": partial(kind, names[-1]) if kind else str}
-    if default is not None:
-        how["default"] = default
-    return names or (placeholder.lower(),), {"help": text, **how}
+    return names or (placeholder.lower(),), {"help": text, "default": default, **how}
 
 
 def number(option: str, text: str) -> float:
@@ -116,9 +104,10 @@ PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
 METHODS = ("three-step", "direct")
 ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
-TARGET = (
+JUMP = (
     opt("--distance-m M", "travel of the feet [m] (default 1.0)", "1.0", number),
     opt("--height-m M", "rise of the CoM in flight [m] (default 0.5)", "0.5", number),
+    ROBOT,
 )
 
 
@@ -126,10 +115,8 @@ def judge(audit: Any, folder: str) -> None:
     """Say that the audit is clean, or refuse the plan."""
     failed = [check.name for check in audit.checks if not check.passed]
     if failed:
-        raise InfeasibleError(
-            f"the plan fails {len(failed)} of {len(audit.checks)} checks of its audit ({', '.join(failed)}); "
-            f"see passport.json in {folder!r}"
-        )
+        said = f"the plan fails {len(failed)} of {len(audit.checks)} checks of its audit ({', '.join(failed)})"
+        raise InfeasibleError(f"{said}; see passport.json in {folder!r}")
     print(f"audit: all {len(audit.checks)} checks passed")
 
 
@@ -143,9 +130,8 @@ def print_summary(summary: Mapping[str, Any]) -> None:
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:
     """What the simulation made of it."""
-    distance, rise = (
-        "none" if metrics[name] is None else f"{metrics[name]:.3f} m" for name in ("foot_distance_m", "com_rise_m")
-    )
+    lengths = (metrics["foot_distance_m"], metrics["com_rise_m"])
+    distance, rise = ("none" if x is None else f"{x:.3f} m" for x in lengths)
     print(f"simulated: distance {distance}, rise {rise}")
     verdict = "stands" if metrics["landed"] else "FAILED"
     print(f"landing: {verdict}, {metrics['standing_s']:.2f} s on its feet after touchdown ({metrics['reason']})")

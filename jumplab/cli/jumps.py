@@ -1,16 +1,13 @@
 """The commands about one jump and its folder: run, plan, audit, simulate, view, export."""
 
-from __future__ import annotations
-
 import ast
 import math
 import time
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import METHODS, MODE, PLAN, ROBOT, TARGET, Late, command, folder, needing, number, opt
+from jumplab.cli.common import JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 
@@ -23,32 +20,27 @@ HTML = needing("name a file that ends in .html", lambda text: text.lower().endsw
 ORDERS = ("depth-first", "breadth-first")
 
 
-def _pair(option: str, text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not (equals and name.isidentifier()):
-        raise InputError(f"{option} must be NAME=VALUE, got {text!r}")
-    try:
-        return name, ast.literal_eval(value)
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
-        return name, value
-
-
 @command(
-    *TARGET,
-    ROBOT,
+    *JUMP,
     opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
     opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
-    opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", [], _pair),
+    opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
 )
 def run(args: Namespace) -> None:
     """Execute the notebooks: plan, audit, simulation, figures."""
     task = JumpTask(args.distance_m, args.height_m)
-    values: dict[str, Any] = {"distance_m": task.distance_m, "height_m": task.height_m, "robot": args.robot}
-    for name, value in args.parameter:
+    values = {"distance_m": task.distance_m, "height_m": task.height_m, "robot": args.robot}
+    for pair in args.parameter:
+        name, equals, text = pair.partition("=")
+        if not (equals and name.isidentifier()):
+            raise InputError(f"--parameter must be NAME=VALUE, got {pair!r}")
         if name in values:
             raise InputError(f"--parameter {name} is given twice, or has an option of its own")
-        values[name] = value
+        try:
+            values[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            values[name] = text
     chosen = notebooks.find_notebooks(args.notebook)
     report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen)
     if (report.out / "plan.npz").is_file():
@@ -62,8 +54,7 @@ def run(args: Namespace) -> None:
 
 
 @command(
-    *TARGET,
-    ROBOT,
+    *JUMP,
     opt("--out DIR", "folder for the plan", None, folder, required=True),
     opt("--platform-m M", "height of the landing surface [m] (default 0)", "0", number),
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),

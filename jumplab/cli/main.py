@@ -4,8 +4,6 @@ Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad
 limits, 4 internal failure, 130 and 143 interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os
@@ -39,8 +37,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
-    names, how = DEBUG
-    parser.add_argument(*names, **how)
+    parser.add_argument("--debug", **DEBUG[1])
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     declare(parser, COMMANDS)
     return parser
@@ -67,9 +64,9 @@ def _work(argv: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _heeded() -> Iterator[list[int]]:
-    """Let signals end what is run; yields those that came. An ignored Ctrl-C stays ignored.
+    """Signals end what runs within, but an ignored Ctrl-C stays ignored. Yields those that came.
 
-    They are noted, since CasADi can lose what is raised within its calls: only a failure is left.
+    CasADi can lose what is raised within its calls: then only a failure is left.
     """
     seen: list[int] = []
 
@@ -77,10 +74,9 @@ def _heeded() -> Iterator[list[int]]:
         seen.append(signum)
         raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
 
-    ours = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        ours.append(signal.SIGINT)
-    before = {number: signal.signal(number, stop) for number in ours}
+    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    numbers = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,)
+    before = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield seen
     finally:
@@ -88,18 +84,23 @@ def _heeded() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _verdict(e: BaseException, seen: list[int], debug: bool) -> tuple[int, str]:
-    """Exit code and sentence of what has ended a command."""
+def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
+    """Say in one sentence what has ended a command; returns the exit code."""
     if isinstance(e, KeyboardInterrupt) or seen[-1:] == [signal.SIGINT]:
-        said = str(e) if isinstance(e, KeyboardInterrupt) else ""
-        return INTERRUPTED, said or "interrupted; what was there before is unchanged"
-    if seen:
-        return TERMINATED, ""
-    if isinstance(e, JumplabError):
-        return e.exit_code, str(e)
-    first = (str(e).strip().splitlines() or ["no message"])[0]
-    hint = "" if debug else "; run it again with --debug for the traceback"
-    return INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
+        said = isinstance(e, KeyboardInterrupt) and str(e)
+        code, said = INTERRUPTED, said or "interrupted; what was there before is unchanged"
+    elif seen:
+        return TERMINATED
+    elif isinstance(e, JumplabError):
+        code, said = e.exit_code, str(e)
+    else:
+        first = (str(e).strip().splitlines() or ["no message"])[0]
+        hint = "" if debug else "; run it again with --debug for the traceback"
+        code, said = INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
+    if debug:
+        traceback.print_exc()
+    print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -113,10 +114,5 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return INTERNAL
         except (KeyboardInterrupt, Exception) as e:
-            code, said = _verdict(e, seen, debug="--debug" in argv)
-            if said and "--debug" in argv:
-                traceback.print_exc()
-            if said:
-                print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
-            return code
+            return _tell(e, seen, "--debug" in argv)
     return 0

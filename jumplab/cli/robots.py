@@ -1,7 +1,5 @@
 """The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
 
-from __future__ import annotations
-
 import os
 from argparse import Namespace
 from pathlib import Path
@@ -45,7 +43,11 @@ def check(args: Namespace) -> None:
         if word not in jumper.REPAIRS:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
     if args.config is not None:
-        result = checkup.check(args.urdf, _read(args.config))
+        try:
+            text = Path(args.config).read_text()
+        except (OSError, ValueError) as e:
+            raise InputError(f"--config {args.config}: cannot be read as text ({type(e).__name__})") from e
+        result = checkup.check(args.urdf, text)
     elif args.urdf not in describe.SHIPPED:
         result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out))
     elif "[source]" in describe.SHIPPED[args.urdf].read_text():
@@ -66,13 +68,6 @@ def check(args: Namespace) -> None:
 def robot(args: Namespace) -> None:
     """The robots that are there, and whether a URDF can jump."""
     raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
-
-
-def _read(config: str) -> str:
-    try:
-        return Path(config).read_text()
-    except (OSError, ValueError) as e:
-        raise InputError(f"--config {config}: cannot be read as text ({type(e).__name__})") from e
 
 
 def _draft(urdf: str, repair: tuple[str, ...], out: str | None) -> str:

@@ -1,7 +1,5 @@
 """The commands about many jumps: trials, chain, envelope, sweep, bench."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -12,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jumplab.cli.common import METHODS, MODE, ROBOT, TARGET, Kind, Late, command, folder, needing, number, opt, whole
+from jumplab.cli.common import JUMP, METHODS, MODE, ROBOT, Kind, Late, command, folder, needing, number, opt, whole
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.task import JumpTask
 
@@ -23,10 +21,7 @@ pages, pictures, style = Late("jumplab.show.page"), Late("jumplab.show.envelope"
 
 MOST = 100_000  # trials: two days of one core; more is surely a typo
 RUNS = whole(1, 10_000)  # chains: a day of two cores
-JOBS = needing(
-    "be a number of processes, or -1 for all processors",
-    lambda text: text == "-1" or (text.isdecimal() and 1 <= int(text) <= 4096),
-)
+JOBS = needing("be a number of processes, or -1 for all processors", {"-1", *map(str, range(1, 4097))}.__contains__)
 REPEATS = needing("be a number from 1 to 1000", lambda text: text.isdecimal() and 1 <= int(text) <= 1000)
 FILE = needing(
     "name a file in a folder that exists",
@@ -65,7 +60,6 @@ def trials(args: Namespace) -> None:
     start = time.perf_counter()
     if args.basin and args.seed is not None:
         raise InputError("--seed says which robots are drawn, and --basin draws none; leave one of them away")
-
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
@@ -90,10 +84,6 @@ def trials(args: Namespace) -> None:
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
 
 
-def _revision(option: str, text: str) -> float | None:
-    return None if text == "never" else number(option, text)
-
-
 @command(
     ROBOT,
     opt("--distances-m M+", "travel of the feet, per jump [m]", None, number, required=True),
@@ -103,7 +93,7 @@ def _revision(option: str, text: str) -> float | None:
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
     opt("--ranges", "how much they differ", "slight", ("slight", "wide")),
     opt("--look-s S", "when the next jump is planned, from touchdown on [s]; negative: in the air", "-0.3", number),
-    opt("--revise-s S", "when it is planned again, from touchdown on [s], or 'never'", "0.1", _revision),
+    opt("--revise-s S", "when it is planned again, from touchdown on [s], or 'never'", "0.1"),
     opt("--solve-s S", "charge each plan this [s] instead of its wall clock", None, number),
     opt("--landing", "how it lands", "spring", ("planned", "spring")),
     opt("--method", "of planning", METHODS[0], METHODS),
@@ -113,7 +103,8 @@ def _revision(option: str, text: str) -> float | None:
 def chain(args: Namespace) -> None:
     """Several jumps in a row, each planned while the one before lands."""
     start = time.perf_counter()
-    how = {name: getattr(args, name) for name in ("look_s", "revise_s", "landing", "solve_s", "method")}
+    how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method")}
+    how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
     course, robot = chains.Course.of(args.distances_m, args.height_m, args.platforms_m), robots.load_robot(args.robot)
     store.ensure_writable(args.out)
@@ -125,8 +116,7 @@ def chain(args: Namespace) -> None:
         report = chains.run_chains(course, robot, args.runs, seed, ranges=ranges, jobs=args.jobs, **how)
     where = {"scene": result.scene, "marks_m": course.goals_m}
     page = pages.page(result.robot, simulation=result, title="A chain of jumps", **where)
-    series = None if report is None else report.to_json()
-    audits = chains.write_chain(args.out, result, {"chain.html": page.html}, series=series)
+    audits = chains.write_chain(args.out, result, {"chain.html": page.html}, series=report and report.to_json())
     _print_chain(result, report)
     print(f"chain in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     failed = [f"jump {k}: {c.name}" for k, a in enumerate(audits, 1) for c in a.checks if not c.passed]
@@ -233,14 +223,13 @@ def sweep(args: Namespace) -> None:
     cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
     rows = sweeps.run(cases, args.out, jobs=int(args.jobs), cluster=args.cluster)
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
-    table = f"{args.out}/{sweeps.TABLE}"
-    print(f"{len(rows)} cases, {planned} planned, {clean} of them clean in the audit; table in {table}")
+    outcome = f"{planned} planned, {clean} of them clean in the audit"
+    print(f"{len(rows)} cases, {outcome}; table in {args.out}/{sweeps.TABLE}")
     print(f"whole sweep: {time.perf_counter() - began:.1f} s")
 
 
 @command(
-    *TARGET,
-    ROBOT,
+    *JUMP,
     opt("--repeats N", "how often everything is timed (default 7)", "7", REPEATS),
     opt("--json FILE", "file for ratios and all raw times", None, FILE),
 )
