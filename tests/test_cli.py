@@ -265,7 +265,7 @@ def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
 def test_help_is_quick_and_complete():
     """Asked of a new process: help must not import the numerical libraries."""
     code = (
-        "import sys; from jumplab.cli.main import main\n"
+        "import sys; from jumplab.cli import check_parameters; from jumplab.cli.main import main\n"
         "try: main(['--help'])\n"
         "except SystemExit as e: assert not e.code\n"
         "print(sorted({'numpy', 'casadi', 'pinocchio', 'pybullet', 'papermill'} & set(sys.modules)))"

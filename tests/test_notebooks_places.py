@@ -57,8 +57,11 @@ def everything(folder):
 
 
 # our two notebooks make no plan: what `run` prints of one is left out
-NO_PLAN = "from jumplab.cli import common; common.print_summary = common.print_simulation = lambda x: None;" \
-          "from jumplab.io import folder as store; store.read_plan = lambda x: (0, 0, 0); store.read_json = lambda x: 0"  # fmt: skip
+NO_PLAN = """
+from jumplab.cli import common
+from jumplab.io import folder as store
+common.print_summary = common.print_simulation = lambda x: None
+store.read_plan, store.read_json = lambda x: (0, 0, 0), lambda x: 0"""
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from jumplab.errors import InfeasibleError, InputError
 Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
 Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
 Work = Callable[[argparse.Namespace], None]
-SEVERAL = {"+": {"nargs": "+"}, "*": {"nargs": "*"}, "...": {"action": "append"}}
 
 
 class Late:
@@ -59,7 +58,7 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
     """
     names = tuple(word for word in usage.split() if word.startswith("-"))
     placeholder = usage.split()[-1]
-    for sign, meaning in SEVERAL.items():
+    for sign, meaning in (("+", {"nargs": "+"}), ("*", {"nargs": "*"}), ("...", {"action": "append"})):
         if placeholder.endswith(sign):
             how |= meaning
             placeholder = placeholder.removesuffix(sign)

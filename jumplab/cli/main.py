@@ -5,13 +5,13 @@ limits, 4 internal failure, 130 and 143 interrupted.
 """
 
 import argparse
-import contextlib
 import os
 import re
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from jumplab.cli.common import DEBUG, declare
@@ -62,26 +62,10 @@ def _work(argv: Sequence[str]) -> None:
     sys.stdout.flush()
 
 
-@contextlib.contextmanager
-def _heeded() -> Iterator[list[int]]:
-    """Signals end what runs within, but an ignored Ctrl-C stays ignored. Yields those that came.
-
-    CasADi can lose what is raised within its calls: then only a failure is left.
-    """
-    seen: list[int] = []
-
-    def stop(signum: int, frame: Any) -> NoReturn:
-        seen.append(signum)
-        raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
-
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    numbers = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,)
-    before = {number: signal.signal(number, stop) for number in numbers}
-    try:
-        yield seen
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
+    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
+    seen.append(signum)
+    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
 
 
 def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
@@ -107,12 +91,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
-    with _heeded() as seen:
-        try:
-            _work(argv)
-        except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return INTERNAL
-        except (KeyboardInterrupt, Exception) as e:
-            return _tell(e, seen, "--debug" in argv)
+    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored Ctrl-C stays ignored
+    numbers, seen = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,), []
+    before = {number: signal.signal(number, partial(_stop, seen)) for number in numbers}
+    try:
+        _work(argv)
+    except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return INTERNAL
+    except (KeyboardInterrupt, Exception) as e:
+        return _tell(e, seen, "--debug" in argv)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0

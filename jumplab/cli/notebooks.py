@@ -12,13 +12,13 @@ import math
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import DEVNULL
 from typing import Any
 
 from jumplab import errors
@@ -29,7 +29,6 @@ from jumplab.task import JumpTask
 store, robots = Late("jumplab.io.folder"), Late("jumplab.robot")
 
 STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
-INJECTED = "# Parameters\n"  # how the cell begins that papermill adds
 PATTERN = "[0-9][0-9]_*.ipynb"
 _PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
 
@@ -47,7 +46,7 @@ def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> Non
         ``STANDARD`` are always known.
     """
     known = {**STANDARD, **extra}
-    cells = [source for source in namespace.get("In", []) if source.startswith(INJECTED)]
+    cells = [source for source in namespace.get("In", []) if source.startswith("# Parameters\n")]  # what papermill adds
     for target in (t for n in ast.walk(ast.parse("\n".join(cells))) if isinstance(n, ast.Assign) for t in n.targets):
         if isinstance(target, ast.Name) and target.id not in known:
             raise InputError(f"unknown notebook parameter {target.id!r}; this notebook knows {', '.join(known)}")
@@ -217,11 +216,10 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool
 
     executed = work.parent / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
-        kernel = _kernel(Path(scratch), notebook.parent)
-        kernel_options = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": kernel}
+        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": _kernel(scratch, notebook)}
         files = literal(notebook), literal(executed)
         try:
-            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=bar, **kernel_options)
+            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=bar, **kernel)
         except papermill.PapermillExecutionError as e:
             failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, failed)
@@ -241,33 +239,30 @@ def _explained(name: str, e: Any, place: str) -> JumplabError:
     return (kind if ours else JumplabError)(f"notebook {name}, cell In [{e.exec_count}]: {text} (see {place})")
 
 
-def _kernel(scratch: Path, beside: Path) -> type:
+def _kernel(scratch: str, notebook: Path) -> type:
     """Kernel manager whose one kernel is this interpreter: no user configuration, the notebook's folder on its path."""
     from jupyter_client.kernelspec import KernelSpec
     from jupyter_client.manager import AsyncKernelManager
     from traitlets import Unicode
 
     checkout = [_PACKAGE_PARENT] if (_PACKAGE_PARENT / "pyproject.toml").is_file() else []  # perhaps not installed
-    path = [*checkout, beside, *filter(None, [os.environ.get("PYTHONPATH")])]
+    path = [*checkout, notebook.parent, *filter(None, [os.environ.get("PYTHONPATH")])]
     env = {
         "PYTHONPATH": os.pathsep.join(map(str, path)),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
-        "IPYTHONDIR": str(scratch / "ipython"),
-        "JUPYTER_RUNTIME_DIR": str(scratch),
-        "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+        "IPYTHONDIR": f"{scratch}/ipython",
+        "JUPYTER_RUNTIME_DIR": scratch,
         "JPY_SESSION_NAME": "",  # nobody looks, even if the runner was started from an open notebook
     }
-
     argv = [sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"]
     spec = {"argv": argv, "env": {k: v.replace("$", "$$") for k, v in env.items()}, "language": "python"}
 
     class ThisInterpreter(AsyncKernelManager):
         kernel_spec = KernelSpec(**spec, display_name="Python of jumplab")
-        connection_file = Unicode(str(scratch / "kernel.json"))
+        connection_file = Unicode(f"{scratch}/kernel.json")
 
         async def start_kernel(self, **kwargs: Any) -> None:
-            # What cells print reaches the notebook another way; here would only come the kernel's own chatter.
-            await super().start_kernel(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **kwargs)
+            await super().start_kernel(stdout=DEVNULL, stderr=DEVNULL, **kwargs)  # cells print another way
 
     return ThisInterpreter
 

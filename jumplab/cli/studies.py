@@ -8,7 +8,6 @@ import time
 from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from jumplab.cli.common import JUMP, METHODS, MODE, ROBOT, Kind, Late, command, folder, needing, number, opt, whole
 from jumplab.errors import InfeasibleError, InputError
@@ -19,8 +18,7 @@ many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.bas
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures, style = Late("jumplab.show.page"), Late("jumplab.show.envelope"), Late("jumplab.show.style")
 
-MOST = 100_000  # trials: two days of one core; more is surely a typo
-RUNS = whole(1, 10_000)  # chains: a day of two cores
+MOST, RUNS = 100_000, whole(1, 10_000)  # trials: two days of one core; chains: a day of two; more must be a typo
 JOBS = needing("be a number of processes, or -1 for all processors", {"-1", *map(str, range(1, 4097))}.__contains__)
 REPEATS = needing("be a number from 1 to 1000", lambda text: text.isdecimal() and 1 <= int(text) <= 1000)
 FILE = needing(
@@ -62,8 +60,7 @@ def trials(args: Namespace) -> None:
         raise InputError("--seed says which robots are drawn, and --basin draws none; leave one of them away")
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
-    noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = many.TrialSettings(args.mode, args.reaim, noise)
+    settings = many.TrialSettings(args.mode, args.reaim, sim.SensorNoise.typical() if args.noise else sim.SensorNoise())
     try:
         if args.basin:
             report = basins.landing_basin(args.dir, args.n, settings, jobs=args.jobs)
@@ -128,7 +125,7 @@ def chain(args: Namespace) -> None:
         raise InfeasibleError(f"the chain failed: {result.reason}; see chain.json in {args.out!r}")
 
 
-def _print_chain(result: Any, report: Any) -> None:
+def _print_chain(result, report) -> None:
     """Jump by jump, then the verdict; how the perturbed robots fared, if there are any."""
     heads = ("asked", "planned", "travel", "error", "in air", "solve", "ready", "needed")
     names = ("asked_m", "planned_m", "travel_m", "error_m", "air_s", "solve_s", "ready_s", "needed_s")
