@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from jumplab.cli import COMMANDS, notebooks
 from jumplab.cli import main as command_line
+from jumplab.cli import notebooks
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
@@ -98,7 +98,7 @@ def test_readme_knows_every_notebook_and_command():
     """And nothing that is not there: files that it links or names in code, commands with options that exist."""
     assert {p.stem for p in NOTEBOOKS} == set(re.findall(r"^\| `(\d\d_\w+)` \|", README, re.M))
     lines = re.findall(r"^jumplab (\w+) +(.*?) *(?:#.*)?$", README, re.M)
-    assert {name for name, _ in lines} == {c.__name__.rpartition(".")[2] for c in COMMANDS}
+    assert {name for name, _ in lines} == {c.__name__ for c in command_line.COMMANDS}
     commands = next(a for a in command_line._parser()._actions if a.dest == "command").choices
     for name, options in lines:
         for option in re.findall(r"--[\w-]+", options):

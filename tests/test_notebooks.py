@@ -214,7 +214,7 @@ def test_interrupted_chain_leaves_nothing_behind(tmp_path, number):
     sleeper = f"import os, pathlib, time\npathlib.Path({str(pid_file)!r}).write_text(str(os.getpid()))\ntime.sleep(300)"
     make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
     code = (
-        f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab import notebooks;"
+        f"import sys; from pathlib import Path; sys.path.insert(0, {str(ROOT)!r}); from jumplab.cli import notebooks;"
         f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r}); from jumplab.cli.main import main;"
         f"sys.exit(main(['run', '-p', 'n=2']))"
     )
@@ -247,12 +247,10 @@ def wait_for(condition, seconds=60.0):
 
 def test_what_a_notebook_asks_is_known_before_it_runs(tmp_path):
     """Types and ranges of the further parameters stand in the notebook; what cannot be read there is left to it."""
-    from jumplab.cli.parameters import declared_kinds
-
-    asked = {p.name[:2]: declared_kinds(p) for p in SOURCES}
+    asked = {p.name[:2]: notebooks.declared_parameters(p) for p in SOURCES}
     assert {"samples": range(1, 10_001)}.items() <= asked["01"].items() and asked["05"]["fast"] is bool
     chain = [make_notebook(tmp_path, "00_x", "check_parameters(globals(), n=range(2, 5), m=kinds['m'])")]
-    assert declared_kinds(chain[0]) == {"n": range(2, 5)}
+    assert notebooks.declared_parameters(chain[0]) == {**notebooks.STANDARD, "n": range(2, 5)}
     for value, said in ((5, "parameter n must be 2 ... 4, got 5"), (2.5, "parameter n must be of type int, got 2.5")):
         with pytest.raises(InputError) as e:
             notebooks.run_notebooks({"n": value}, notebooks=chain, progress=False)

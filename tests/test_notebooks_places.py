@@ -57,8 +57,11 @@ def everything(folder):
 
 
 # our two notebooks make no plan: what `run` prints of one is left out
-NO_PLAN = "from jumplab.cli import run; run.print_summary = run.print_simulation = lambda x: None;" \
-          "from jumplab import store; store.read_plan = lambda x: (0, 0, 0); store.read_json = lambda x: 0"  # fmt: skip
+NO_PLAN = """
+from jumplab.cli import common
+from jumplab.io import folder as store
+common.print_summary = common.print_simulation = lambda x: None
+store.read_plan, store.read_json = lambda x: (0, 0, 0), lambda x: 0"""
 
 
 @pytest.mark.slow
@@ -84,7 +87,7 @@ def test_killed_runner_takes_its_kernel_along(tmp_path):
     pid_file = tmp_path / "pid"
     sleeper = f"import os, pathlib, time\npathlib.Path({str(pid_file)!r}).write_text(str(os.getpid()))\ntime.sleep(300)"
     path = make_notebook(tmp_path, "00_sleep", RECORD % (0, 0), sleeper)
-    there = f"sys.path.insert(0, {str(ROOT)!r}); from pathlib import Path; from jumplab import notebooks;"
+    there = f"sys.path.insert(0, {str(ROOT)!r}); from pathlib import Path; from jumplab.cli import notebooks;"
     there += f"notebooks._PACKAGE_PARENT = Path({str(tmp_path)!r})"
     process = run_there(ROOT, "--out", tmp_path / "out", code=there)
     wait_for(lambda: process.poll() is not None or (pid_file.exists() and pid_file.read_text()))

@@ -13,7 +13,7 @@ import pytest
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab.cli.sweep import values_of, weights_of
+from jumplab.cli.studies import values_of, weights_of
 from jumplab.errors import InputError
 from jumplab.robot.description import SHIPPED
 from jumplab.studies import sweep

@@ -1,9 +1,7 @@
-"""One module per command of the command line; each declares its options in ``add`` and does its work.
+"""The command line: what is typed comes in, text, a result folder and an exit code go out. Start reading in ``main``.
 
-A command imports the heavy libraries only once its input has been read, so that a mistake is told at once.
+``common`` says how a command is declared; ``jumps``, ``studies`` and ``robots`` hold the commands; ``notebooks`` checks
+what a notebook was given, and runs them.
 """
 
-from jumplab.cli import audit, bench, chain, envelope, export, plan, robot, run, simulate, sweep, trials, view
-
-# in the order of ``jumplab --help``
-COMMANDS = (run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep, bench)
+from jumplab.cli.notebooks import check_parameters as check_parameters

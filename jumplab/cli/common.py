@@ -1,38 +1,74 @@
-"""What several commands share: targets and folders as they are typed, and what is printed of results."""
-
-from __future__ import annotations
+"""What the commands share: how one is declared, its options and what they take, and what is printed of a result."""
 
 import argparse
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
 from typing import Any
 
 from jumplab.errors import InfeasibleError, InputError
-from jumplab.task import JumpTask
+
+Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
+Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
+Work = Callable[[argparse.Namespace], None]
 
 
-def common_options() -> argparse.ArgumentParser:
-    """Options of every command."""
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks")
-    return common
+class Late:
+    """A module that is imported when it is first used: help and refusals need not wait for the heavy libraries."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(import_module(self._name), attribute)
 
 
-def robot_option() -> argparse.ArgumentParser:
-    """The option ``--robot``."""
-    robot = argparse.ArgumentParser(add_help=False)
-    robot.add_argument(
-        "--robot", default="bhr", help="shipped robot (see 'jumplab robot list') or path of a robot's TOML file"
-    )
-    return robot
+def command(*options: Option, actions: Sequence[Work] = ()) -> Callable[[Work], Work]:
+    """Make a command of a function: its name and docstring are the command's; ``actions`` are commands below it."""
+
+    def mark(work: Work) -> Work:
+        work.options, work.actions = (DEBUG, *options), actions
+        return work
+
+    return mark
 
 
-def target_options() -> argparse.ArgumentParser:
-    """``--distance-m`` and ``--height-m``."""
-    target = argparse.ArgumentParser(add_help=False)
-    target.add_argument("--distance-m", default="1.0", metavar="M", help="travel of the feet [m] (default 1.0)")
-    target.add_argument("--height-m", default="0.5", metavar="M", help="rise of the CoM in flight [m] (default 0.5)")
-    return target
+def declare(parser: argparse.ArgumentParser, commands: Sequence[Work], dest: str = "command") -> None:
+    """Add a parser for each of these commands, and for those below them."""
+    below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
+    for work in commands:
+        text = work.__doc__ or ""
+        parser = below.add_parser(work.__name__.rstrip("_"), help=text[:1].lower() + text[1:].rstrip("."))
+        parser.set_defaults(work=work)
+        for names, how in work.options:
+            parser.add_argument(*names, **how)
+        if work.actions:
+            declare(parser, work.actions, "action")
+
+
+def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = None, **how: Any) -> Option:
+    """Declare an option, ``opt("--out DIR", "where to")``, or an argument, ``opt("DIR", "where from")``.
+
+    Parameters
+    ----------
+    usage : names, then the placeholder of the value. "DIR+" and "DIR*" take several values, "DIR..." may be repeated.
+        Without placeholder and choices it is a flag; one that has a default can also be undone with --no-.
+    default : a text is read as if it had been typed.
+    kind : what makes the value of the text, or a tuple of choices.
+    """
+    names = tuple(word for word in usage.split() if word.startswith("-"))
+    placeholder = usage.split()[-1]
+    for sign, meaning in (("+", {"nargs": "+"}), ("*", {"nargs": "*"}), ("...", {"action": "append"})):
+        if placeholder.endswith(sign):
+            how |= meaning
+            placeholder = placeholder.removesuffix(sign)
+    if isinstance(kind, tuple):
+        how["choices"] = kind
+    elif placeholder in names:
+        how["action"] = argparse.BooleanOptionalAction if isinstance(default, bool) else "store_true"
+    else:
+        how |= {"metavar": placeholder, "type": partial(kind, names[-1]) if kind else str}
+    return names or (placeholder.lower(),), {"help": text, "default": default, **how}
 
 
 def number(option: str, text: str) -> float:
@@ -43,31 +79,43 @@ def number(option: str, text: str) -> float:
         raise InputError(f"{option} must be a number, got {text!r}") from None
 
 
-def task_of(args: argparse.Namespace) -> JumpTask:
-    """The target that the options describe."""
-    return JumpTask(
-        distance_m=number("--distance-m", args.distance_m),
-        height_m=number("--height-m", args.height_m),
-        platform_m=number("--platform-m", getattr(args, "platform_m", "0")),
-        rotation_rad=math.radians(number("--rotation-deg", getattr(args, "rotation_deg", "0"))),
-    )
+def needing(what: str, fits: Callable[[Any], Any], make: Kind = lambda option, text: text) -> Kind:
+    """Kind of an option that must ``what``: refuses a value that does not fit."""
+
+    def kind(option: str, text: str) -> Any:
+        value = make(option, text)
+        if not fits(value):
+            raise InputError(f"{option} must {what}, got {text!r}")
+        return value
+
+    return kind
 
 
-def folder_of(option: str, text: str | None) -> str | None:
-    """A folder's name, refused if it is blank."""
-    if text is not None and not text.strip():
-        raise InputError(f"{option} must name a folder, got {text!r}")
-    return text
+def whole(least: int, most: int) -> Kind:
+    """Kind of an option that takes a whole number from ``least`` to ``most``."""
+    check = needing(f"be a whole number from {least} to {most}", range(least, most + 1).__contains__, number)
+    return lambda option, text: int(check(option, text))
+
+
+folder = needing("name a folder", str.strip)
+DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
+PLAN = opt("DIR", "folder of a plan")
+MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
+METHODS = ("three-step", "direct")
+ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
+JUMP = (
+    opt("--distance-m M", "travel of the feet [m] (default 1.0)", "1.0", number),
+    opt("--height-m M", "rise of the CoM in flight [m] (default 0.5)", "0.5", number),
+    ROBOT,
+)
 
 
 def judge(audit: Any, folder: str) -> None:
     """Say that the audit is clean, or refuse the plan."""
     failed = [check.name for check in audit.checks if not check.passed]
     if failed:
-        raise InfeasibleError(
-            f"the plan fails {len(failed)} of {len(audit.checks)} checks of its audit ({', '.join(failed)}); "
-            f"see passport.json in {folder!r}"
-        )
+        said = f"the plan fails {len(failed)} of {len(audit.checks)} checks of its audit ({', '.join(failed)})"
+        raise InfeasibleError(f"{said}; see passport.json in {folder!r}")
     print(f"audit: all {len(audit.checks)} checks passed")
 
 
@@ -81,9 +129,8 @@ def print_summary(summary: Mapping[str, Any]) -> None:
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:
     """What the simulation made of it."""
-    distance, rise = (
-        "none" if metrics[name] is None else f"{metrics[name]:.3f} m" for name in ("foot_distance_m", "com_rise_m")
-    )
+    lengths = (metrics["foot_distance_m"], metrics["com_rise_m"])
+    distance, rise = ("none" if x is None else f"{x:.3f} m" for x in lengths)
     print(f"simulated: distance {distance}, rise {rise}")
     verdict = "stands" if metrics["landed"] else "FAILED"
     print(f"landing: {verdict}, {metrics['standing_s']:.2f} s on its feet after touchdown ({metrics['reason']})")

@@ -4,8 +4,6 @@ Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad
 limits, 4 internal failure, 130 and 143 interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re
@@ -16,11 +14,14 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NoReturn
 
-from jumplab.cli import COMMANDS
-from jumplab.cli.common import common_options
+from jumplab.cli.common import DEBUG, declare
+from jumplab.cli.jumps import audit, export, plan, run, simulate, view
+from jumplab.cli.robots import robot
+from jumplab.cli.studies import bench, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
+COMMANDS = (run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep, bench)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -34,29 +35,31 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; '{self.prog} --help' shows what is possible")
 
 
-def _version() -> str:
-    from importlib import metadata
-
-    try:
-        return metadata.version("jumplab")
-    except metadata.PackageNotFoundError:
-        return "(not installed)"
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.", parents=[common_options()]
-    )
+    parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
+    parser.add_argument("--debug", **DEBUG[1])
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-    for command in COMMANDS:
-        command.add(commands)
+    declare(parser, COMMANDS)
     return parser
 
 
-def _names() -> str:
-    *first, last = (command.__name__.rpartition(".")[2] for command in COMMANDS)
-    return f"{', '.join(first)} or {last}"
+def _work(argv: Sequence[str]) -> None:
+    parser = _parser()
+    for text in argv:  # argparse would make an empty list of it
+        if re.fullmatch(r"-[^=]*=--", text):
+            parser.error(f"{text}: '--' is not a value")
+    args = parser.parse_args(argv)
+    if args.version:
+        from importlib import metadata
+
+        found = next(metadata.Distribution.discover(name="jumplab"), None)
+        print(f"jumplab {found.version if found else '(not installed)'}")
+    elif args.command is None:
+        *first, last = (work.__name__ for work in COMMANDS)
+        parser.error(f"choose a command: {', '.join(first)} or {last}")
+    else:
+        args.work(args)
+    sys.stdout.flush()
 
 
 def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
@@ -65,63 +68,40 @@ def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
     raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
 
 
-def _heed(seen: list[int]) -> dict:
-    """Handle the signals that end a command; returns the handlers before. An ignored Ctrl-C stays ignored."""
-    usual = {signal.SIGTERM: True, signal.SIGINT: signal.getsignal(signal.SIGINT) is signal.default_int_handler}
-    return {number: signal.signal(number, partial(_stop, seen)) for number, ours in usual.items() if ours}
-
-
-def _complain(text: str, debug: bool) -> None:
+def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
+    """Say in one sentence what has ended a command; returns the exit code."""
+    if isinstance(e, KeyboardInterrupt) or seen[-1:] == [signal.SIGINT]:
+        said = isinstance(e, KeyboardInterrupt) and str(e)
+        code, said = INTERRUPTED, said or "interrupted; what was there before is unchanged"
+    elif seen:
+        return TERMINATED
+    elif isinstance(e, JumplabError):
+        code, said = e.exit_code, str(e)
+    else:
+        first = (str(e).strip().splitlines() or ["no message"])[0]
+        hint = "" if debug else "; run it again with --debug for the traceback"
+        code, said = INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
     if debug:
         traceback.print_exc()
-    print(f"jumplab: {' '.join(text.split())}", file=sys.stderr)
-
-
-def _interrupted(said: str, debug: bool) -> int:
-    _complain(said or "interrupted; what was there before is unchanged", debug)
-    return INTERRUPTED
+    print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    debug = "--debug" in argv
-    seen: list[int] = []
-    before = _heed(seen)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
+    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored Ctrl-C stays ignored
+    numbers, seen = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,), []
+    before = {number: signal.signal(number, partial(_stop, seen)) for number in numbers}
     try:
-        parser = _parser()
-        for text in argv:  # argparse would make an empty list of it
-            if re.fullmatch(r"-[^=]*=--", text):
-                parser.error(f"{text}: '--' is not a value")
-        args = parser.parse_args(argv)
-        if args.version:
-            print(f"jumplab {_version()}")
-        elif args.command is None:
-            parser.error(f"choose a command: {_names()}")
-        else:
-            args.work(args)
-        sys.stdout.flush()
-    except KeyboardInterrupt as e:
-        return _interrupted(str(e), debug)
+        _work(argv)
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
-    except Exception as e:
-        if seen:
-            return TERMINATED if seen[-1] == signal.SIGTERM else _interrupted("", debug)
-        if isinstance(e, JumplabError):
-            _complain(str(e), debug)
-            return e.exit_code
-        first = (str(e).strip().splitlines() or ["no message"])[0]
-        hint = "" if debug else "; run it again with --debug for the traceback"
-        _complain(f"internal failure, {type(e).__name__}: {first}{hint}", debug)
-        return INTERNAL
+    except (KeyboardInterrupt, Exception) as e:
+        return _tell(e, seen, "--debug" in argv)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

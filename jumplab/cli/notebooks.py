@@ -1,89 +1,134 @@
-"""Runs the notebooks in order with papermill, under the very Python that runs this, and publishes what they made.
+"""The notebooks: what each asks of its parameters, and the runner, papermill under the very Python that runs this.
 
-A chain works in ``OUT/.run``: the notebooks execute there with ``out = "result"`` and ``figures = "figures"``. Only
-when the last one has passed are the results moved to OUT, the executed notebooks to ``OUT/notebooks`` and the figures
-to their folder. A chain that fails leaves all of them as they were, and the notebook that failed in ``OUT/failed``.
+A chain works in a staging folder, with ``out = "result"`` and ``figures = "figures"``. Only when the last notebook has
+passed are the results moved to OUT, the figures to their folder and the executed notebooks to ``OUT/notebooks``. A
+chain that fails leaves all of them as they were, and the notebook that failed in ``OUT/failed``.
 """
 
-from __future__ import annotations
-
+import ast
 import contextlib
-import inspect
+import json
+import math
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import DEVNULL
 from typing import Any
 
 from jumplab import errors
-from jumplab.cli.parameters import STANDARD, check_parameters, check_value, declared_kinds, declared_parameters, literal
-from jumplab.errors import InputError, JumplabError, as_path, require_type
-from jumplab.io import folder as store
-from jumplab.robot import Robot
+from jumplab.cli.common import Late
+from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
 
-__all__ = ["STANDARD", "RunReport", "check_parameters", "declared_parameters", "find_notebooks", "run_notebooks"]
+store, robots = Late("jumplab.io.folder"), Late("jumplab.robot")
+
+STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
 PATTERN = "[0-9][0-9]_*.ipynb"
 _PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
 
 
+def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> None:
+    """Refuse (:class:`InputError`) injected parameters that a notebook does not know, and values that cannot be meant.
+
+    papermill merely warns of an unknown name and then runs with the default. Call this in the cell after the
+    parameters: ``check_parameters(globals(), samples=range(1, 10_001), fast=bool)``.
+
+    Parameters
+    ----------
+    namespace : the notebook's ``globals()``.
+    extra : further parameters of this notebook: a type, or a range for a whole number within it; those of
+        ``STANDARD`` are always known.
+    """
+    known = {**STANDARD, **extra}
+    cells = [source for source in namespace.get("In", []) if source.startswith("# Parameters\n")]  # what papermill adds
+    for target in (t for n in ast.walk(ast.parse("\n".join(cells))) if isinstance(n, ast.Assign) for t in n.targets):
+        if isinstance(target, ast.Name) and target.id not in known:
+            raise InputError(f"unknown notebook parameter {target.id!r}; this notebook knows {', '.join(known)}")
+    for name, kind in known.items():
+        if name in namespace:
+            check_value(name, namespace[name], kind)
+    if "distance_m" in namespace or "height_m" in namespace:
+        JumpTask(namespace.get("distance_m", 0.0), namespace.get("height_m", 0.5))
+
+
+def check_value(name: str, value: Any, kind: type | range) -> None:
+    """Refuse (:class:`InputError`) a value that is not of the kind: a type, or a range of whole numbers."""
+    if isinstance(kind, range):
+        check_value(name, value, int)
+        if value not in kind:
+            raise InputError(f"parameter {name} must be {kind.start} ... {kind.stop - 1}, got {value}")
+        return
+    wanted = int | float if kind is float else kind
+    if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
+        raise InputError(f"parameter {name} must be of type {kind.__name__}, got {quoted(value)}")
+    if kind is float and not math.isfinite(value):
+        raise InputError(f"parameter {name} must be finite, got {value}")
+    if kind is str and (not value or "\0" in value):
+        raise InputError(f"parameter {name} must be a name or a path, got {quoted(value)}")
+
+
+def declared_parameters(notebook: Path) -> dict[str, type | range | None]:
+    """A notebook's parameters, and what its own ``check_parameters`` asks of each, read without running it.
+
+    None stands for what cannot be read that way: the notebook itself will still refuse it. Raises InputError.
+    """
+    from papermill import inspect_notebook
+
+    try:
+        found = {name: STANDARD.get(name) for name in inspect_notebook(literal(notebook))}
+    except Exception as e:  # nbformat raises a whole zoo
+        raise InputError(f"{notebook}: not a readable notebook ({type(e).__name__})") from e
+    for cell in json.loads(notebook.read_bytes())["cells"]:
+        with contextlib.suppress(SyntaxError, ValueError, TypeError):  # text, magics, a range of variables
+            for call in ast.walk(ast.parse("".join(cell["source"]))):
+                if isinstance(call, ast.Call) and ast.unparse(call.func) == "check_parameters":
+                    found |= {k.arg: _kind(k.value) for k in call.keywords if k.arg in found}
+    return found
+
+
+def _kind(node: ast.expr) -> type | range | None:
+    """``int``, ``bool``, ``float``, ``str``, or ``range(a, b)``, as it stands in a notebook; None for anything else."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func) == "range":
+        return range(*map(ast.literal_eval, node.args))
+    return {k.__name__: k for k in (int, bool, float, str)}.get(ast.unparse(node))
+
+
+def literal(path: Path) -> str:
+    """Path for papermill, which would otherwise fill in what stands between braces."""
+    return str(path).replace("{", "{{").replace("}", "}}")
+
+
 @dataclass(frozen=True)
 class RunReport:
-    """Where a finished chain put its things, and how long it took.
+    """Where a finished chain of notebooks put its things, and how long it took."""
 
-    Attributes
-    ----------
-    out : result folder: plan, simulation, and the executed notebooks in ``notebooks``.
-    figures : folder of the figures.
-    notebooks : names of the notebooks, in the order in which they ran.
-    wall_s : wall time of the whole chain [s].
-    """
-
-    out: Path
+    out: Path  # result folder: plan, simulation, and the executed notebooks in ``notebooks``
     figures: Path
-    notebooks: tuple[str, ...]
-    wall_s: float
-
-
-# ---------------------------------------------------------------------------------------------- finding them
+    notebooks: tuple[str, ...]  # their names, in the order in which they ran
+    wall_s: float  # of the whole chain [s]
 
 
 def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
     """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
 
-    Parameters
-    ----------
-    names : which ones, by number or whole name ("02", "02_srmp"); all if empty.
-
-    Raises
-    ------
-    InputError
-        If there are none, since an installed package carries no notebooks; or none of a name.
+    ``names`` says which ones, by number or whole name ("02", "02_srmp"); all if empty. Raises InputError if there are
+    none, since an installed package carries no notebooks, or none of a name.
     """
     places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
-    for place in places:
-        found = sorted(place.glob(PATTERN))
-        if found:
-            return _named(found, names)
-    raise InputError(
-        f"no notebooks in {' nor in '.join(repr(str(p)) for p in places)}; run this in a clone of the repository"
-    )
-
-
-def _named(found: list[Path], names: Sequence[str]) -> list[Path]:
+    found = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
+    if found is None:
+        there = " nor in ".join(repr(str(p)) for p in places)
+        raise InputError(f"no notebooks in {there}; run this in a clone of the repository")
     for name in names:
         if not any(name in (p.stem, p.stem[:2]) for p in found):
             raise InputError(f"no notebook {name!r}; there are {', '.join(p.stem for p in found)}")
     return [p for p in found if not names or {p.stem, p.stem[:2]} & set(names)]
-
-
-# ---------------------------------------------------------------------------------------------- running them
 
 
 def run_notebooks(
@@ -117,85 +162,67 @@ def run_notebooks(
         require_type(parameters, Mapping, "the notebooks' parameters")
     notebooks = [as_path(n, "a notebook").resolve() for n in notebooks or find_notebooks()]
     declared = {n: declared_parameters(n) for n in notebooks}
-    kinds = {k: v for n in notebooks for k, v in declared_kinds(n).items()}
-    values = _checked(dict(parameters or {}), set().union(*declared.values()), kinds)
-    root = notebooks[0].parent.parent.parent
+    values = _checked(dict(parameters or {}), declared.values())
+    root = notebooks[0].parent.parent
     asked = out is not None
     out = store.ensure_writable(out if asked else root / "executed").resolve()
-    if figures is None and asked:
+    if figures is None:
         figures = out / "figures"
-    figures = _figures_folder(figures, root, out)
-    with _workshop(out) as work:
+        if not asked:
+            with contextlib.suppress(InputError):
+                figures = store.ensure_writable(root / "figures")
+    figures = store.ensure_writable(figures).resolve()
+    executed = out / "notebooks"
+    if executed.is_dir():
+        with store.locked(executed, wait_s=0.0):
+            pass  # another chain is refused at once
+    with store.transaction(executed) as staging:
+        work = staging / "work"
+        for name in ("result", "figures"):
+            (work / name).mkdir(parents=True)
         for i, notebook in enumerate(notebooks, start=1):
             given = {k: v for k, v in values.items() if k in declared[notebook]}
-            label = f"{i}/{len(notebooks)} {notebook.stem}" if progress else None
-            _execute(notebook, given, work, label, keep_failed=out / "failed")
-        _publish(work, out, figures, sources=notebooks[0].parent)
+            bar = progress and {"desc": f"{i}/{len(notebooks)} {notebook.stem}", "disable": None}  # on a terminal
+            _execute(notebook, given, work, bar, out / "failed")
+        for old in executed.glob(PATTERN):
+            if not (notebooks[0].parent / old.name).exists():  # executed once, since removed or renamed
+                old.unlink()
+        _publish(work, out, figures)
+        shutil.rmtree(work)
+    shutil.rmtree(out / "failed", ignore_errors=True)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
 
 
-def _checked(values: dict[str, Any], known: set[str], kinds: Mapping[str, type | range]) -> dict[str, Any]:
-    kinds = {**kinds, **STANDARD}
+def _checked(values: dict[str, Any], declared: Iterable[dict]) -> dict[str, Any]:
+    known = sorted(set().union(*declared))
     for name, value in values.items():
         if name in ("out", "figures"):
             raise InputError(f"the parameter {name!r} is set by the runner; use its own argument {name}")
         if name not in known:
-            raise InputError(f"unknown notebook parameter {name!r}; the notebooks know {', '.join(sorted(known))}")
-        if name in kinds:
-            check_value(name, value, kinds[name])
+            raise InputError(f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}")
+        for kind in filter(None, (d.get(name) for d in declared)):
+            check_value(name, value, kind)
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
     if "robot" in values:
-        Robot.load(values["robot"])
+        robots.Robot.load(values["robot"])
         if Path(values["robot"]).is_file():
             values["robot"] = str(Path(values["robot"]).resolve())
     return {**values, "out": "result", "figures": "figures"}
 
 
-def _figures_folder(figures: str | Path | None, root: Path, out: Path) -> Path:
-    if figures is not None:
-        return store.ensure_writable(figures).resolve()
-    with contextlib.suppress(InputError):
-        return store.ensure_writable(root / "figures")
-    return out / "figures"
-
-
-@contextlib.contextmanager
-def _workshop(out: Path) -> Iterator[Path]:
-    """An empty ``.run`` in ``out``, for one chain at a time; gone at the end, however that comes."""
-    executed, work = out / "notebooks", out / ".run"
-    new = [p for p in (executed, out, *out.parents) if not p.exists()]
-    executed.mkdir(parents=True, exist_ok=True)
-    try:
-        with store.locked(executed, wait_s=0.0):
-            shutil.rmtree(work, ignore_errors=True)  # left by a chain that was killed
-            for name in ("result", "figures", "notebooks"):
-                (work / name).mkdir(parents=True)
-            try:
-                yield work
-            finally:
-                shutil.rmtree(work, ignore_errors=True)
-    finally:
-        for p in new:
-            with contextlib.suppress(OSError):  # only what is still empty goes
-                p.rmdir()
-
-
-def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | None, keep_failed: Path) -> None:
+def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool, failed: Path) -> None:
     import papermill
     from nbclient.exceptions import DeadKernelError
-    from papermill.exceptions import PapermillExecutionError
 
-    executed = work / "notebooks" / notebook.name
+    executed = work.parent / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
+        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": _kernel(scratch, notebook)}
+        files = literal(notebook), literal(executed)
         try:
-            papermill.execute_notebook(
-                literal(notebook), literal(executed), given, kernel_name="jumplab", language="python", cwd=str(work),
-                progress_bar={"desc": label, "disable": None} if label else False,  # None: only on a terminal
-                kernel_manager_class=_kernel_manager(Path(scratch), notebook.parent),
-            )  # fmt: skip
-        except PapermillExecutionError as e:
-            keep_failed.mkdir(exist_ok=True)
-            place = shutil.copy(executed, keep_failed)
+            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=bar, **kernel)
+        except papermill.PapermillExecutionError as e:
+            failed.mkdir(exist_ok=True)
+            place = shutil.copy(executed, failed)
             raise _explained(notebook.name, e, place) from e
         except DeadKernelError as e:
             raise JumplabError(f"notebook {notebook.name}: its Python process died; is there enough memory?") from e
@@ -204,7 +231,7 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, label: str | Non
 def _explained(name: str, e: Any, place: str) -> JumplabError:
     """The error of a cell as one sentence, of the class that the cell raised if that is ours."""
     kind = getattr(errors, e.ename, None)
-    ours = inspect.isclass(kind) and issubclass(kind, JumplabError)
+    ours = isinstance(kind, type) and issubclass(kind, JumplabError)
     plain = re.sub(r"\x1b\[[0-9;]*m", "", "\n".join(e.traceback))
     arrows = re.findall(r"^-+> \d+ (.*)$", plain, flags=re.MULTILINE)
     said = (e.evalue.strip().splitlines() or [""])[-1] or (arrows[-1].strip() if arrows else "no message")
@@ -212,70 +239,39 @@ def _explained(name: str, e: Any, place: str) -> JumplabError:
     return (kind if ours else JumplabError)(f"notebook {name}, cell In [{e.exec_count}]: {text} (see {place})")
 
 
-def _kernel_manager(scratch: Path, beside: Path) -> type:
-    """Kernel manager that knows one kernel: this interpreter, with no user configuration, and the notebook's folder."""
-    from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
+def _kernel(scratch: str, notebook: Path) -> type:
+    """Kernel manager whose one kernel is this interpreter: no user configuration, the notebook's folder on its path."""
+    from jupyter_client.kernelspec import KernelSpec
     from jupyter_client.manager import AsyncKernelManager
-    from traitlets import default
+    from traitlets import Unicode
 
-    path = [str(beside), *([os.environ["PYTHONPATH"]] if os.environ.get("PYTHONPATH") else [])]
-    if (_PACKAGE_PARENT / "pyproject.toml").is_file():  # a checkout, perhaps not installed
-        path.insert(0, str(_PACKAGE_PARENT))
+    checkout = [_PACKAGE_PARENT] if (_PACKAGE_PARENT / "pyproject.toml").is_file() else []  # perhaps not installed
+    path = [*checkout, notebook.parent, *filter(None, [os.environ.get("PYTHONPATH")])]
     env = {
-        "PYTHONPATH": os.pathsep.join(path),
+        "PYTHONPATH": os.pathsep.join(map(str, path)),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
-        "IPYTHONDIR": str(scratch / "ipython"),
-        "JUPYTER_RUNTIME_DIR": str(scratch),
-        "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+        "IPYTHONDIR": f"{scratch}/ipython",
+        "JUPYTER_RUNTIME_DIR": scratch,
         "JPY_SESSION_NAME": "",  # nobody looks, even if the runner was started from an open notebook
     }
+    argv = [sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+    spec = {"argv": argv, "env": {k: v.replace("$", "$$") for k, v in env.items()}, "language": "python"}
 
-    class ThisInterpreter(KernelSpecManager):
-        def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
-            argv = [sys.executable, "-Xfrozen_modules=off", "-m", "ipykernel_launcher", "-f", "{connection_file}"]
-            escaped = {k: v.replace("$", "$$") for k, v in env.items()}
-            return KernelSpec(argv=argv, env=escaped, language="python", display_name="Python of jumplab")
-
-    class Manager(AsyncKernelManager):
-        @default("kernel_spec_manager")
-        def _kernel_spec_manager_default(self) -> KernelSpecManager:
-            return ThisInterpreter(parent=self)
-
-        @default("connection_file")
-        def _connection_file_default(self) -> str:
-            return str(scratch / "kernel.json")
+    class ThisInterpreter(AsyncKernelManager):
+        kernel_spec = KernelSpec(**spec, display_name="Python of jumplab")
+        connection_file = Unicode(f"{scratch}/kernel.json")
 
         async def start_kernel(self, **kwargs: Any) -> None:
-            # What cells print reaches the notebook another way; here would only come the kernel's own chatter.
-            await super().start_kernel(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **kwargs)
+            await super().start_kernel(stdout=DEVNULL, stderr=DEVNULL, **kwargs)  # cells print another way
 
-    return Manager
-
-
-# ---------------------------------------------------------------------------------------------- publishing
+    return ThisInterpreter
 
 
-def _publish(work: Path, out: Path, figures: Path, sources: Path) -> None:
+def _publish(work: Path, out: Path, figures: Path) -> None:
     with store.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():
                 os.replace(p, staging / p.name)
-    for old in (out / "notebooks").glob(PATTERN):
-        if not (sources / old.name).exists():  # executed once, since removed or renamed
-            old.unlink()
-    _place(work / "notebooks", out / "notebooks")
-    _place(work / "figures", figures)
-    shutil.rmtree(out / "failed", ignore_errors=True)
-
-
-def _place(source: Path, target: Path) -> None:
-    """Copy a tree's files, then rename all of them into their places, so that nobody finds half a file."""
-    ready = []
-    for p in sorted(q for q in source.rglob("*") if q.is_file()):
-        final = target / p.relative_to(source)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        half = final.with_name(f".{final.name}.half")
-        shutil.copyfile(p, half)
-        ready.append((half, final))
-    for half, final in ready:
-        os.replace(half, final)
+    for p in (work / "figures").rglob("*"):
+        if p.is_file():
+            store.write_file(figures / p.relative_to(work / "figures"), p.read_bytes())

@@ -1,0 +1,134 @@
+"""The commands about one jump and its folder: run, plan, audit, simulate, view, export."""
+
+import ast
+import math
+import time
+from argparse import Namespace
+from pathlib import Path
+
+from jumplab.cli import common
+from jumplab.cli.common import JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
+from jumplab.errors import InputError
+from jumplab.task import JumpTask
+
+store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
+robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
+sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.page"), Late("jumplab.cli.notebooks")
+
+FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
+HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
+ORDERS = ("depth-first", "breadth-first")
+
+
+@command(
+    *JUMP,
+    opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
+    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
+    opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
+    opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
+)
+def run(args: Namespace) -> None:
+    """Execute the notebooks: plan, audit, simulation, figures."""
+    task = JumpTask(args.distance_m, args.height_m)
+    values = {"distance_m": task.distance_m, "height_m": task.height_m, "robot": args.robot}
+    for pair in args.parameter:
+        name, equals, text = pair.partition("=")
+        if not (equals and name.isidentifier()):
+            raise InputError(f"--parameter must be NAME=VALUE, got {pair!r}")
+        if name in values:
+            raise InputError(f"--parameter {name} is given twice, or has an option of its own")
+        try:
+            values[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            values[name] = text
+    chosen = notebooks.find_notebooks(args.notebook)
+    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen)
+    if (report.out / "plan.npz").is_file():
+        common.print_summary(store.read_plan(report.out)[2])
+    if (report.out / "simulation.json").is_file():
+        common.print_simulation(store.read_json(report.out / "simulation.json"))
+    print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
+    if (report.out / "jump.html").is_file():
+        print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")
+    print(f"whole run: {report.wall_s:.1f} s")
+
+
+@command(
+    *JUMP,
+    opt("--out DIR", "folder for the plan", None, folder, required=True),
+    opt("--platform-m M", "height of the landing surface [m] (default 0)", "0", number),
+    opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
+    opt("--method", "the paper's three steps, or the whole-body problem without them", METHODS[0], METHODS),
+)
+def plan(args: Namespace) -> None:
+    """The optimisations and the audit alone."""
+    start = time.perf_counter()
+    task = JumpTask(args.distance_m, args.height_m, args.platform_m, math.radians(args.rotation_deg))
+    robot = robots.Robot.load(args.robot)
+    store.ensure_writable(args.out)
+    found = planner.plan_jump(task, robot, method=args.method)
+    report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
+    common.print_summary(found.summary)
+    print(f"plan in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
+    common.judge(report, args.out)
+
+
+@command(PLAN)
+def audit(args: Namespace) -> None:
+    """Check a plan by a second code path."""
+    store.read_plan(args.dir)  # refuses a damaged folder
+    folder = store.ensure_writable(args.dir)
+    with store.transaction(folder) as staging:
+        report = auditing.write_audit(folder, into=staging)
+    print(report.table())
+    common.judge(report, args.dir)
+
+
+@command(PLAN, MODE)
+def simulate(args: Namespace) -> None:
+    """Simulate a plan in PyBullet."""
+    tape, robot, summary = store.read_plan(args.dir)
+    store.ensure_writable(args.dir)
+    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=sim.Scene.of_plan(summary, robot))
+    store.write_simulation(args.dir, result, summary)
+    common.print_simulation(result.to_json())
+
+
+@command(
+    opt("DIR", "folder of a plan, simulated or not"),
+    opt("--out FILE.html", "file to write (default: DIR/jump.html)", None, HTML),
+)
+def view(args: Namespace) -> None:
+    """A jump in 3-D, as one HTML file."""
+    tape, robot, summary = store.read_plan(args.dir)
+    path = Path(args.out or Path(args.dir, "jump.html"))
+    store.ensure_writable(path.parent)
+    simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
+    simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None
+    task, scene = JumpTask(**summary["target"]), sim.Scene.of_plan(summary, robot)
+    page = pages.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
+    page.save(path)
+    print(f"{page.title}: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in any browser")
+
+
+@command(
+    PLAN,
+    opt(
+        "--format",
+        "joint table at 1 kHz, arrays, clip for motion trackers, folder to replay",
+        None,
+        FORMATS,
+        required=True,
+    ),
+    opt("--out PATH", "file, or folder of a urdf-replay (default: in DIR)", None, folder),
+    opt("--simulated", "the simulated jump instead of the planned one"),
+    opt("--fps N", "frames per second of a motion-clip (default 50)", "50", number),
+    opt("--order", "of joints and bodies in a clip: MuJoCo's, or Isaac Lab's (breadth-first)", ORDERS[0], ORDERS),
+)
+def export(args: Namespace) -> None:
+    """A jump for other programs."""
+    tape, robot, _ = store.read_plan(args.dir)
+    motion = motions.Motion.of_simulation_file(args.dir, robot) if args.simulated else motions.Motion.of(tape)
+    path = Path(args.out or Path(args.dir, exports.default_name(args.format, motion.source)))
+    exports.write(args.format, motion, robot, path, fps=args.fps, order=args.order)
+    print(f"{motion.source}, {motion.duration:.3f} s, as {args.format}: {path}")

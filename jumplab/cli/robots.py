@@ -1,0 +1,92 @@
+"""The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
+
+import os
+from argparse import Namespace
+from pathlib import Path
+
+from jumplab.cli.common import Late, command, folder, opt
+from jumplab.errors import InputError, JumplabError, RobotError
+
+robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
+store, jumper, configs = (
+    Late("jumplab.io.folder"),
+    Late("jumplab.robot_import.jumper"),
+    Late("jumplab.robot_import.config"),
+)
+tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
+
+
+@command()
+def list_(args: Namespace) -> None:
+    """The shipped robots."""
+    rows = []
+    for name in describe.SHIPPED:
+        try:
+            robot = robots.Robot.load(name)
+            kg, joints, note = robot.total_mass, len(robot.joint_names), ""
+            arms = "swing" if robot.joints["shoulder_pitch"] else "held"
+        except JumplabError as e:
+            kg, joints, arms, note = None, None, "", str(e).rpartition(": ")[2]
+        rows.append({"name": name, "kg": kg, "joints": joints, "arms": arms, "note": note})
+    print(tables.table(rows, digits=3))
+
+
+@command(
+    opt("URDF", "the robot's URDF, or the name of a shipped robot"),
+    opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
+    opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
+    opt("--repair WHAT...", "allow a repair: symmetry, inertia or massless; may be repeated", []),
+)
+def check(args: Namespace) -> None:
+    """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
+    for word in args.repair:
+        if word not in jumper.REPAIRS:
+            raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
+    if args.config is not None:
+        try:
+            text = Path(args.config).read_text()
+        except (OSError, ValueError) as e:
+            raise InputError(f"--config {args.config}: cannot be read as text ({type(e).__name__})") from e
+        result = checkup.check(args.urdf, text)
+    elif args.urdf not in describe.SHIPPED:
+        result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out))
+    elif "[source]" in describe.SHIPPED[args.urdf].read_text():
+        result = checkup.examine(args.urdf)
+    else:
+        said = "is the default robot, described as jumplab wants it; there is nothing to check"
+        raise InputError(f"{args.urdf!r} {said}")
+    print(*result.lines(), sep="\n")
+    print(tables.table(result.rows()))
+    if args.out is not None:
+        caption = "Side view, moving joints from the front, and the five links of the sagittal plane, standing."
+        robot = result.robot
+        style.save_figure(sheets.robot_sheet(robot), robot.name, args.out, caption, robot=robot)
+        print(f"picture: {Path(args.out) / robot.name}.png")
+
+
+@command(actions=(check, list_))
+def robot(args: Namespace) -> None:
+    """The robots that are there, and whether a URDF can jump."""
+    raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
+
+
+def _draft(urdf: str, repair: tuple[str, ...], out: str | None) -> str:
+    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``."""
+    first, *others = checkup.all_faults(urdf, repair) or [None]
+    if first:
+        print("".join(f"{sentence}\n" for sentence in others), end="")
+        raise RobotError(first + (f" ({len(others)} further faults are printed above)" if others else ""))
+    found = checkup.draft(urdf, repair)
+    for note in found.roles.notes:
+        print(f"note: {note}")
+    print(f"sole: {found.sole.source}")
+    if out is not None:
+        path = Path(out) / f"{configs.read_toml(found.text, 'starter')['name']}.toml"
+        if os.path.exists(path):
+            raise InputError(f"{path}: is there already, perhaps with corrections; choose another --out or remove it")
+        try:
+            store.write_file(path, found.text.encode())
+        except InputError as e:
+            raise InputError(f"{path}: cannot be written ({getattr(e.__cause__, 'strerror', e)})") from e
+        print(f"starter configuration: {path}")
+    return found.text
