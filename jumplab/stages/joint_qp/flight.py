@@ -11,6 +11,8 @@ from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, Ste
 from jumplab.stages.joint_qp.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.stages.joint_qp.settings import Options
 
+PAIRS = ("hip", "knee", "ankle", "shoulder")  # mirrored
+
 
 @dataclass(frozen=True)
 class FlightTarget:
@@ -58,9 +60,7 @@ class FlightQp:
         self.steps = np.diff(self.t)
         self.step = float(self.steps[0])  # all alike
         self.joints = JointRows(body, nominal, options.limits)
-        form = options.form
-        pairs = ("hip",) if form.pairs == "hips" else ("hip", "knee", "ankle", "shoulder")
-        self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
+        self.S = body.symmetry_rows(PAIRS)
         self.com0, self.momentum0 = start.com, start.momentum
         self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
         wide = np.zeros((2, 3))
@@ -68,24 +68,18 @@ class FlightQp:
         both = Track(reference.foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (reference.foot.rate,
                      reference.foot.feed)))  # (n + 1, 2, 3)  # fmt: skip
         self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
-        self.layout = self._layout(pairs)
+        self.layout = self._layout()
         self._fixed = self._fixed_rows()
 
-    def _layout(self, pairs) -> Layout:
-        body, form = self.body, self.options.form
+    def _layout(self) -> Layout:
+        body = self.body
         axes = ("x", "y", "z", "rx", "ry", "rz")
         feet = [f"{s} {a}" for s in SIDES for a in "xyz"]
         cost = [("foot", feet), ("foot level", SIDES), ("joints", body.robot.joint_names), ("trunk turn", "xyz"),
-                ("acceleration", [str(i) for i in range(body.nv)])]  # fmt: skip
-        mirror = body.pair_names(pairs)
-        rows = [("base dynamics", axes[: form.base_rows]), ("symmetry", mirror)]
-        if form.inertia == "row":
-            rows.append(("inertia", ["rho"]))
-        else:
-            cost.append(("inertia", ["rho"]))
+                ("acceleration", [str(i) for i in range(body.nv)]), ("inertia", ["rho"])]  # fmt: skip
+        rows = [("base dynamics", axes), ("symmetry", body.pair_names(PAIRS))]
         ground = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
-        steady = ("joints", "trunk turn", "acceleration")
-        return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(body))
+        return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(body))
 
     def _fixed_rows(self):
         lay, w, nv = self.layout, self.options.flight, self.body.nv
@@ -107,11 +101,8 @@ class FlightQp:
         level = gain.foot_level.stiffness * off_level + gain.foot_level.damping * (turn_rate - terms.foot_spin[:, 1])
         joints, trunk = accelerations(terms, turned(self.nominal, turn), gain.posture, gain.trunk)
         trunk[1] += gain.trunk.damping * turn_rate
-        if self.options.form.hip_rule == "sum":
-            mirror = np.zeros(len(self.S))
-        else:
-            c = gain.contact
-            mirror = -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
+        c = gain.contact
+        mirror = -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
         return FlightTarget(foot, rho, self._drift(k, terms), level, self._floor(k, terms), joints, trunk, mirror)
 
     def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
@@ -137,23 +128,21 @@ class FlightQp:
 
     def matrices(self, terms: FullTerms, target: FlightTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        lay, w, form = self.layout, self.options.flight, self.options.form
+        lay, w = self.layout, self.options.flight
         A, E, G, R = (x.copy() for x in self._fixed)
         b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
         lower, upper = np.empty(len(R)), np.empty(len(R))
         root = np.sqrt(w.foot)
         A[:6] = root * terms.J_rd.reshape(6, -1)
-        b[:6] = (1.0 if form.half else 0.5) * root * (target.foot_accel - terms.drift_rd).ravel()
+        b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
         root = np.sqrt(w.foot_level)
         A[6:8] = root * terms.J_toe[:, 4]
         b[6:8] = root * (target.foot_pitch - terms.drift_toe[:, 4])
         b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
         b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
-        matrix, rows = lay.blocks["inertia"]
-        M, m, root = (E, e, 1.0) if matrix == "E" else (A, b, np.sqrt(w.inertia))
-        M[rows], m[rows] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
-        n = form.base_rows
-        E[:n], e[:n] = terms.M[:n], target.base_force[:n] - terms.H[:n]
+        root, at = np.sqrt(w.inertia), lay.at("inertia")
+        A[at], b[at] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
+        E[:6], e[:6] = terms.M[:6], target.base_force - terms.H[:6]
         e[lay.at("symmetry")] = target.symmetry
         on = np.isfinite(target.floor)
         if on.any():

@@ -14,6 +14,8 @@ from jumplab.stages.joint_qp.settings import Options
 WRENCH = 12
 FOOT_ROWS = ("F_z >= 0", "friction +x", "friction -x", "friction +y", "friction -y", "CoP left of right edge",
              "CoP right of left edge", "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")  # fmt: skip
+# on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
+PAIRS = ("hip", "shoulder")
 
 
 @dataclass(frozen=True)
@@ -72,34 +74,33 @@ class LaunchQp:
         start = body.terms(q0, np.zeros(body.nv))
         self.toe0, self.pivot = start.toe, start.sole.mean(0)
         self.joints = JointRows(body, q0, options.limits)
-        foot, form = body.robot.foot, options.form
-        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s) & (form.contact == "consistent")
-        # on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
-        pairs = ("hip",) if form.pairs == "hips" else ("hip", "shoulder")
-        self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
+        foot = body.robot.foot
+        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s)
+        self.S = body.symmetry_rows(PAIRS)
         w = options.launch
         com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
         force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
         self.roots = tuple(zip(com, force, strict=True))
         self.inertia_weights = self._inertia_weights()
-        self.layout = self._layout(pairs)
+        self.layout = self._layout()
         self._fixed = self._fixed_rows()
 
-    def _layout(self, pairs) -> Layout:
-        nv, form = self.body.nv, self.options.form
+    def _layout(self) -> Layout:
+        nv = self.body.nv
         names = self.body.robot.joint_names
         axes = ("x", "y", "z", "rx", "ry", "rz")
         wrench = [f"{s} {a}" for s in SIDES for a in ("fx", "fy", "fz", "mx", "my", "mz")]
         cost = [("com", "xyz"), ("force", "xyz"), ("moment", "xyz"), ("inertia", ["rho"]), ("joints", names),
                 ("trunk turn", "xyz"), ("wrench", wrench), ("acceleration", [str(i) for i in range(nv)])]  # fmt: skip
         contact = [f"{s} {a}" for s in SIDES for a in ("x", "y", "z", "rx", "rz")]
-        mirror = self.body.pair_names(pairs)
-        rows = [("base dynamics", axes[: form.base_rows]), ("tiptoe", contact)]
-        rows += [("foot pitch or toe moment", SIDES)] if form.contact == "consistent" else []
-        rows += [("symmetry", mirror)]
+        rows = [
+            ("base dynamics", axes),
+            ("tiptoe", contact),
+            ("foot pitch or toe moment", SIDES),
+            ("symmetry", self.body.pair_names(PAIRS)),
+        ]
         ground = [("ground", [f"{s} {r}" for s in SIDES for r in FOOT_ROWS]), ("heel", SIDES)]
-        steady = ("joints", "trunk turn", "wrench", "acceleration")
-        return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
+        return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
 
     def _inertia_weights(self) -> np.ndarray:
         """(n,) by step: the flat feet's, fading geometrically to the toes' before the heel rises."""
@@ -143,7 +144,7 @@ class LaunchQp:
 
     def target(self, k: int, terms: FullMotion) -> LaunchTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
-        ref, gain, form = self.reference, self.options.gains, self.options.form
+        ref, gain = self.reference, self.options.gains
         com = ref.com.command(k, terms.com - self.pivot, terms.com_velocity, gain.com)
         turn = -gain.momentum.damping * terms.momentum[3:]
         turn[1] = ref.momentum.command(k, 0.0, terms.momentum[4], gain.momentum)
@@ -157,44 +158,38 @@ class LaunchQp:
         joints, trunk = accelerations(terms, self.nominal, gain.posture, gain.trunk)
         asymmetry = self.S[:, 6:] @ terms.q[7:], self.S @ terms.v
         mirror = -gain.contact.stiffness * asymmetry[0] - gain.contact.damping * asymmetry[1]
-        if form.hip_rule == "sum":
-            mirror = np.zeros(len(self.S))
         on_toes = bool(self.on_toes[k])
         floor = self._heel_floor(terms, on_toes)
         weight, step = float(self.inertia_weights[k]), float(self.steps[k])
         return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight, step)
 
     def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
-        gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
-        if form.contact == "consistent" and not on_toes:
+        gain, limits = self.options.gains.ground, self.options.limits
+        if not on_toes:
             return np.full(2, -np.inf)  # the flat foot's own row holds the heel
-        if form.heel == "always":
-            return np.zeros(2)
         height = terms.heel[:, 2] - self.toe0[:, 2]
         floor = -gain.stiffness * height - gain.damping * terms.heel_velocity[:, 2]
         return np.where(height < limits.near_ground_m, floor, -np.inf)
 
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        lay, w, form, body = self.layout, self.options.launch, self.options.form, self.body
+        lay, w, body = self.layout, self.options.launch, self.body
         A0, E0, G0, R0, ground = self._fixed
         A, E, G, R = A0.copy(), E0.copy(), G0.copy(), R0.copy()
         b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
         lower, upper = np.empty(len(R)), np.empty(len(R))
-        half = 1.0 if form.half else 0.5  # without the 1/2 the optimum of X^T W X + f X is half of b
         com, force = self.roots[target.on_toes]
         A[:3, WRENCH:] = com[:, None] * terms.A_c
-        b[:3] = half * com * (target.com_acceleration - terms.B_c)
+        b[:3] = com * (target.com_acceleration - terms.B_c)
         A[3:9, :WRENCH] = force[:, None] * terms.A_f
-        b[3:9] = half * force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
+        b[3:9] = force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
         root = np.sqrt(target.inertia_weight)
         A[9, WRENCH:] = root * terms.J_rho
         b[9] = root * (target.inertia_accel - terms.drift_rho)
         b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
         b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
-        n = form.base_rows
-        E[:n, :WRENCH], E[:n, WRENCH:], e[:n] = -terms.J[:, :n].T, terms.M[:n], -terms.H[:n]  # base dynamics
-        self._contact(E, e, n, terms, target)
+        E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
+        self._contact(E, e, terms, target)
         e[lay.at("symmetry")] = target.symmetry
         G[: 2 * len(FOOT_ROWS), :WRENCH] = ground[target.on_toes]
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
@@ -203,16 +198,12 @@ class LaunchQp:
         self.joints.fill(R, lower, upper, terms, start, target.step, WRENCH)
         return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
 
-    def _contact(self, E, e, first, terms, target):
+    def _contact(self, E, e, terms, target):
         """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""
-        rows = [0, 1, 2, 3, 5]
-        E[first : first + 10, WRENCH:] = terms.J_toe[:, rows].reshape(10, -1)
-        e[first : first + 10] = (target.toe_acceleration - terms.drift_toe)[:, rows].ravel()
-        if self.options.form.contact == "free":
-            return
-        last = slice(first + 10, first + 12)
+        rows, asked = [0, 1, 2, 3, 5], target.toe_acceleration - terms.drift_toe
+        E[6:16, WRENCH:] = terms.J_toe[:, rows].reshape(10, -1)
+        e[6:16] = asked[:, rows].ravel()
         if target.on_toes:
-            E[[first + 10, first + 11], [4, 10]] = 1.0
+            E[[16, 17], [4, 10]] = 1.0
         else:
-            E[last, WRENCH:] = terms.J_toe[:, 4]
-            e[last] = (target.toe_acceleration - terms.drift_toe)[:, 4]
+            E[16:18, WRENCH:], e[16:18] = terms.J_toe[:, 4], asked[:, 4]

@@ -16,17 +16,13 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and one label per row.
-
-    ``steady`` names the cost blocks whose rows of A, being weights alone, never change.
-    """
+    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and one label per row."""
 
     blocks: dict
     labels: dict
-    steady: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, steady: tuple[str, ...] = (), **matrices) -> Layout:
+    def of(cls, **matrices) -> Layout:
         """From matrix -> list of (block name, row labels)."""
         blocks, labels = {}, {}
         for matrix, rows in matrices.items():
@@ -35,18 +31,11 @@ class Layout:
                 at = len(labels[matrix])
                 blocks[name] = (matrix, slice(at, at + len(own)))
                 labels[matrix] += [f"{name} {label}".strip() for label in own]
-        return cls(blocks, {k: tuple(v) for k, v in labels.items()}, steady)
+        return cls(blocks, {k: tuple(v) for k, v in labels.items()})
 
     def size(self, matrix: str) -> int:
         """Number of rows of a matrix."""
         return len(self.labels[matrix])
-
-    def steady_rows(self) -> np.ndarray:
-        """(rows of A,) True where they never change."""
-        out = np.zeros(self.size("A"), bool)
-        for name in self.steady:
-            out[self.at(name)] = True
-        return out
 
     def at(self, name: str) -> slice:
         """Rows of a block."""

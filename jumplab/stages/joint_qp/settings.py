@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
-from jumplab.errors import InputError
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -87,48 +85,6 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Form:
-    """How the paper's QPs are read. The defaults are right; :data:`PRINTED` is the letter of the paper.
-
-    Attributes
-    ----------
-    base_rows : 6, or 3 for "top three rows", which leave the rotation free.
-    half : False minimises X^T W X + f X as printed, whose optimum sits at half of the target.
-    heel : "near" keeps the heel above the ground close to it; "always" forbids downward acceleration at any height.
-    contact : "consistent" ties the CoP to the foot: flat foot with the CoP inside the sole, or heel up with the CoP at
-        the toe; "free" is the printed tiptoe contact, where the heel may rise wherever the CoP is.
-    pairs : "all" mirrors every joint pair, "hips" only the three hip joints.
-    hip_rule : "mirror" uses difference or sum as the axes demand; "sum" is the printed sum for all three.
-    inertia : "row" makes the inertia a hard row of the flight QP as printed; "term" a weighted term.
-    """
-
-    base_rows: int = 6
-    half: bool = True
-    heel: str = "near"
-    contact: str = "consistent"
-    pairs: str = "all"
-    hip_rule: str = "mirror"
-    inertia: str = "term"
-
-    def __post_init__(self):
-        choices = {
-            "base_rows": (3, 6),
-            "half": (True, False),
-            "heel": ("near", "always"),
-            "contact": ("consistent", "free"),
-            "pairs": ("all", "hips"),
-            "hip_rule": ("mirror", "sum"),
-            "inertia": ("row", "term"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(f"form: {name} = {getattr(self, name)!r}, must be one of {allowed}")
-
-
-PRINTED = Form(base_rows=3, half=False, heel="always", contact="free", pairs="hips", hip_rule="sum", inertia="row")
-
-
-@dataclass(frozen=True)
 class Options:
     """Everything adjustable about stage 2.
 
@@ -144,13 +100,8 @@ class Options:
     launch: LaunchWeights = LaunchWeights()
     flight: FlightWeights = FlightWeights()
     limits: Limits = Limits()
-    form: Form = Form()
     toe_s: float | None = None
     arm_rad: float = -1.5
-
-    def with_form(self, **changes) -> Options:
-        """A copy with some readings changed, e.g. ``options.with_form(base_rows=3)``."""
-        return replace(self, form=replace(self.form, **changes))
 
 
 # Where stage 1 asks for more than the joints can give, following it firmly drives them into their stops, and then no
