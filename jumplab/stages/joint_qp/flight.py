@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
-from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, StepQp, accelerations
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, Layout, State, StepQp, accelerations
 from jumplab.stages.joint_qp.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.stages.joint_qp.settings import Options
 
@@ -16,27 +16,16 @@ PAIRS = ("hip", "knee", "ankle", "shoulder")  # mirrored
 
 @dataclass(frozen=True)
 class FlightTarget:
-    """What one flight step asks for.
+    """What one flight step asks for; accelerations in [m/s^2, rad/s^2]."""
 
-    Attributes
-    ----------
-    foot_accel : p''_rd of the soles relative to the CoM, feed-forward + PD (2, 3) [m/s^2].
-    inertia_accel : rho''_ref, feed-forward + PD [kg m^2/s^2].
-    base_force : generalised force on the base that cancels numerical drift of the momentum (6,); physically zero.
-    foot_pitch : pitch acceleration of the feet towards level (2,) [rad/s^2].
-    floor : least vertical acceleration of left toe, left heel, right toe, right heel (4,) [m/s^2]; -inf where off.
-    joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
-    symmetry : right side of the symmetry rows, zero but for the drift control (k,).
-    """
-
-    foot_accel: np.ndarray
-    inertia_accel: float
-    base_force: np.ndarray
-    foot_pitch: np.ndarray
-    floor: np.ndarray
-    joints: np.ndarray
-    trunk: np.ndarray
-    symmetry: np.ndarray
+    foot_accel: np.ndarray  # p''_rd of the soles relative to the CoM (2, 3), feed-forward + PD
+    inertia_accel: float  # rho''_ref [kg m^2/s^2], feed-forward + PD
+    base_force: np.ndarray  # on the base (6,), cancels numerical drift of the momentum [N, N m]; physically zero
+    foot_pitch: np.ndarray  # of the feet towards level (2,)
+    floor: np.ndarray  # least vertical acceleration of left toe, left heel, right toe, right heel (4,); -inf where off
+    joints: np.ndarray  # towards the posture (nv - 6,)
+    trunk: np.ndarray  # the same (3,)
+    symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
 
 
 class FlightQp:
@@ -46,18 +35,17 @@ class FlightQp:
     ----------
     body : nine-link quantities.  nominal : (nq,) posture to lean towards.
     start : quantities at take-off; the references begin there and soon join stage 1's.
-    reference : stage 1's flight.  options : gains, weights, limits, form.
+    reference : stage 1's flight.  options : gains, weights, limits.
     ground : height of the launching surface [m].
     """
 
     name = "flight"
 
     def __init__(
-        self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground
+        self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground: float
     ):
         self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
-        self.t, self.ground = reference.t, ground
-        self.steps = np.diff(self.t)
+        self.t, self.steps, self.ground = reference.t, np.diff(reference.t), ground
         self.step = float(self.steps[0])  # all alike
         self.joints = JointRows(body, nominal, options.limits)
         self.S = body.symmetry_rows(PAIRS)
@@ -65,25 +53,24 @@ class FlightQp:
         self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
         wide = np.zeros((2, 3))
         wide[:, 1] = start.foot_com[:, 1]  # the feet keep their distance
-        both = Track(reference.foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (reference.foot.rate,
-                     reference.foot.feed)))  # (n + 1, 2, 3)  # fmt: skip
+        foot = reference.foot
+        both = Track(foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (foot.rate, foot.feed)))
         self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
         self.layout = self._layout()
         self._fixed = self._fixed_rows()
 
     def _layout(self) -> Layout:
         body = self.body
-        axes = ("x", "y", "z", "rx", "ry", "rz")
-        feet = [f"{s} {a}" for s in SIDES for a in "xyz"]
-        cost = [("foot", feet), ("foot level", SIDES), ("joints", body.robot.joint_names), ("trunk turn", "xyz"),
-                ("acceleration", [str(i) for i in range(body.nv)]), ("inertia", ["rho"])]  # fmt: skip
-        rows = [("base dynamics", axes), ("symmetry", body.pair_names(PAIRS))]
+        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", SIDES)]
+        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [("acceleration", map(str, range(body.nv))), ("inertia", ["rho"])]
+        rows = [("base dynamics", AXES), ("symmetry", body.pair_names(PAIRS))]
         ground = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
         return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(body))
 
     def _fixed_rows(self):
         lay, w, nv = self.layout, self.options.flight, self.body.nv
-        A, E, G, R = (np.zeros((lay.size(k), nv)) for k in "AEGR")
+        A, E, G, R = (lay.zeros(k, nv) for k in "AEGR")
         A[lay.at("joints"), 6:] = np.sqrt(w.posture) * np.eye(nv - 6)
         A[lay.at("trunk turn"), 3:6] = np.sqrt(w.trunk) * np.eye(3)
         A[lay.at("acceleration")] = np.sqrt(w.acceleration) * np.eye(nv)
@@ -131,7 +118,6 @@ class FlightQp:
         lay, w = self.layout, self.options.flight
         A, E, G, R = (x.copy() for x in self._fixed)
         b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
-        lower, upper = np.empty(len(R)), np.empty(len(R))
         root = np.sqrt(w.foot)
         A[:6] = root * terms.J_rd.reshape(6, -1)
         b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
@@ -149,8 +135,7 @@ class FlightQp:
             vertical = np.stack([terms.J_toe[:, 2], terms.J_heel[:, 2]], 1).reshape(4, -1)
             drift = np.stack([terms.drift_toe[:, 2], terms.drift_heel[:, 2]], 1).ravel()
             G[on], h[on] = -vertical[on], (drift - target.floor)[on]
-        self.joints.fill(R, lower, upper, terms, start, self.step, 0)
-        return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
+        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, self.step), lay)
 
 
 def turned(q: np.ndarray, angle: float) -> np.ndarray:

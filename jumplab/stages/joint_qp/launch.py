@@ -7,46 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
-from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
 from jumplab.stages.joint_qp.reference import LaunchReference
 from jumplab.stages.joint_qp.settings import Options
 
 WRENCH = 12
-FOOT_ROWS = ("F_z >= 0", "friction +x", "friction -x", "friction +y", "friction -y", "CoP left of right edge",
-             "CoP right of left edge", "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")  # fmt: skip
+FRICTION = tuple(f"friction {way}" for way in ("+x", "-x", "+y", "-y"))
+EDGES = ("CoP left of right edge", "CoP right of left edge")
+FOOT_ROWS = ("F_z >= 0", *FRICTION, *EDGES, "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")
 # on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
 PAIRS = ("hip", "shoulder")
 
 
 @dataclass(frozen=True)
 class LaunchTarget:
-    """What one launch step asks for.
+    """What one launch step asks for; accelerations in [m/s^2, rad/s^2]."""
 
-    Attributes
-    ----------
-    com_acceleration : c''_ref, feed-forward + PD (3,) [m/s^2].
-    momentum_rate : rate of the centroidal angular momentum, L'_ref + feedback in the middle (3,) [N m].
-    inertia_accel : rho''_ref [kg m^2/s^2].
-    toe_acceleration : p''_foot of the tiptoes, zero but for the drift control (2, 6), linear then angular.
-    heel_floor : least vertical acceleration of the heels (2,) [m/s^2]; -inf where the row is off.
-    joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
-    symmetry : right side of the symmetry rows, zero but for the drift control (k,).
-    on_toes : heel up, CoP at the toe.
-    inertia_weight : of the inertia's term at this step, see :class:`~jumplab.stages.joint_qp.settings.LaunchWeights`.
-    step : its length [s].
-    """
-
-    com_acceleration: np.ndarray
-    momentum_rate: np.ndarray
-    inertia_accel: float
-    toe_acceleration: np.ndarray
-    heel_floor: np.ndarray
-    joints: np.ndarray
-    trunk: np.ndarray
-    symmetry: np.ndarray
-    on_toes: bool
-    inertia_weight: float
-    step: float
+    com_acceleration: np.ndarray  # c''_ref (3,), feed-forward + PD
+    momentum_rate: np.ndarray  # of the centroidal angular momentum (3,) [N m], L'_ref + feedback in the middle
+    inertia_accel: float  # rho''_ref [kg m^2/s^2]
+    toe_acceleration: np.ndarray  # p''_foot of the tiptoes (2, 6), linear then angular; zero but for the drift control
+    heel_floor: np.ndarray  # least vertical acceleration of the heels (2,); -inf where the row is off
+    joints: np.ndarray  # towards the posture (nv - 6,)
+    trunk: np.ndarray  # the same (3,)
+    symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
+    on_toes: bool  # heel up, CoP at the toe
+    inertia_weight: float  # of the inertia's term at this step, see LaunchWeights
+    step: float  # its length [s]
 
 
 class LaunchQp:
@@ -55,7 +42,7 @@ class LaunchQp:
     Parameters
     ----------
     body : nine-link quantities.  q0 : (nq,) configuration at the start, soles flat.
-    reference : stage 1's launch.  options : gains, weights, limits, form.
+    reference : stage 1's launch.  options : gains, weights, limits.
     toe_s : length of the toe phase [s]; None starts it where the reference's CoP stays at the toe.
 
     Attributes
@@ -69,8 +56,7 @@ class LaunchQp:
     def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
         self.body, self.reference, self.options = body, reference, options
         self.nominal = swung_arms(body, q0, options.arm_rad)
-        self.t = reference.t
-        self.steps = np.diff(self.t)
+        self.t, self.steps = reference.t, np.diff(reference.t)
         start = body.terms(q0, np.zeros(body.nv))
         self.toe0, self.pivot = start.toe, start.sole.mean(0)
         self.joints = JointRows(body, q0, options.limits)
@@ -81,25 +67,22 @@ class LaunchQp:
         com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
         force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
         self.roots = tuple(zip(com, force, strict=True))
-        self.inertia_weights = self._inertia_weights()
-        self.layout = self._layout()
-        self._fixed = self._fixed_rows()
+        self.inertia_weights, self.layout = self._inertia_weights(), self._layout()
+        self._fixed, self._ground = self._fixed_rows(), (self._ground_rows(False), self._ground_rows(True))
 
     def _layout(self) -> Layout:
-        nv = self.body.nv
-        names = self.body.robot.joint_names
-        axes = ("x", "y", "z", "rx", "ry", "rz")
-        wrench = [f"{s} {a}" for s in SIDES for a in ("fx", "fy", "fz", "mx", "my", "mz")]
-        cost = [("com", "xyz"), ("force", "xyz"), ("moment", "xyz"), ("inertia", ["rho"]), ("joints", names),
-                ("trunk turn", "xyz"), ("wrench", wrench), ("acceleration", [str(i) for i in range(nv)])]  # fmt: skip
-        contact = [f"{s} {a}" for s in SIDES for a in ("x", "y", "z", "rx", "rz")]
-        rows = [
-            ("base dynamics", axes),
-            ("tiptoe", contact),
-            ("foot pitch or toe moment", SIDES),
-            ("symmetry", self.body.pair_names(PAIRS)),
+        def both(rows):
+            return [f"{side} {row}" for side in SIDES for row in rows]
+
+        cost = [(name, "xyz") for name in ("com", "force", "moment")] + [("inertia", ["rho"])]
+        cost += [("joints", self.body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [
+            ("wrench", both(["fx", "fy", "fz", "mx", "my", "mz"])),
+            ("acceleration", map(str, range(self.body.nv))),
         ]
-        ground = [("ground", [f"{s} {r}" for s in SIDES for r in FOOT_ROWS]), ("heel", SIDES)]
+        rows = [("base dynamics", AXES), ("tiptoe", both(["x", "y", "z", "rx", "rz"]))]
+        rows += [("foot pitch or toe moment", SIDES), ("symmetry", self.body.pair_names(PAIRS))]
+        ground = [("ground", both(FOOT_ROWS)), ("heel", SIDES)]
         return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
 
     def _inertia_weights(self) -> np.ndarray:
@@ -110,18 +93,16 @@ class LaunchQp:
         return np.where(self.on_toes, w.inertia_toe, w.inertia_toe * (w.inertia / w.inertia_toe) ** left)
 
     def _fixed_rows(self):
-        """Matrices with all rows that never change filled in, and the weights' roots."""
+        """A, E, G and R with all rows that never change filled in."""
         lay, w, nv = self.layout, self.options.launch, self.body.nv
-        n = WRENCH + nv
-        A, E, G, R = (np.zeros((lay.size(k), n)) for k in "AEGR")
+        A, E, G, R = (lay.zeros(k, WRENCH + nv) for k in "AEGR")
         A[lay.at("joints"), WRENCH + 6 :] = np.sqrt(w.posture) * np.eye(nv - 6)
         A[lay.at("trunk turn"), WRENCH + 3 : WRENCH + 6] = np.sqrt(w.trunk) * np.eye(3)
         A[lay.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
         A[lay.at("acceleration"), WRENCH:] = np.sqrt(w.acceleration) * np.eye(nv)
         E[lay.at("symmetry"), WRENCH:] = self.S
         R[nv - 6 :, WRENCH + 6 :] = np.eye(nv - 6)
-        rows = self._ground_rows(False), self._ground_rows(True)
-        return A, E, G, R, rows
+        return A, E, G, R
 
     def _ground_rows(self, on_toes: bool) -> np.ndarray:
         """(22, 12) unilateral, friction and CoP rows on F; rows that are off stay zero, 0 <= 0."""
@@ -174,10 +155,8 @@ class LaunchQp:
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
         lay, w, body = self.layout, self.options.launch, self.body
-        A0, E0, G0, R0, ground = self._fixed
-        A, E, G, R = A0.copy(), E0.copy(), G0.copy(), R0.copy()
+        A, E, G, R = (x.copy() for x in self._fixed)
         b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
-        lower, upper = np.empty(len(R)), np.empty(len(R))
         com, force = self.roots[target.on_toes]
         A[:3, WRENCH:] = com[:, None] * terms.A_c
         b[:3] = com * (target.com_acceleration - terms.B_c)
@@ -191,12 +170,11 @@ class LaunchQp:
         E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
         self._contact(E, e, terms, target)
         e[lay.at("symmetry")] = target.symmetry
-        G[: 2 * len(FOOT_ROWS), :WRENCH] = ground[target.on_toes]
+        G[: 2 * len(FOOT_ROWS), :WRENCH] = self._ground[target.on_toes]
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
             G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
             h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
-        self.joints.fill(R, lower, upper, terms, start, target.step, WRENCH)
-        return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
+        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, target.step), lay)
 
     def _contact(self, E, e, terms, target):
         """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""

@@ -10,32 +10,34 @@ from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
 from jumplab.robot import SAGITTAL_JOINTS
 from jumplab.stages.joint_qp.settings import Gain, Limits
 
-OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # our choice: [N m], [rad/s] bounds of a row that is switched off, beyond all motion
-SIDES = ("left", "right")
+OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # [N m], [rad/s] bounds of a row that is switched off, beyond all motion
+SIDES, AXES = ("left", "right"), ("x", "y", "z", "rx", "ry", "rz")
+RIGHT_SIDES = {"A": ("b",), "E": ("e",), "G": ("h",), "R": ("lower", "upper")}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and one label per row."""
+    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and by matrix one label per row."""
 
-    blocks: dict
-    labels: dict
+    blocks: dict[str, tuple[str, slice]]
+    labels: dict[str, tuple[str, ...]]
 
     @classmethod
-    def of(cls, **matrices) -> Layout:
+    def of(cls, **matrices: list) -> Layout:
         """From matrix -> list of (block name, row labels)."""
         blocks, labels = {}, {}
         for matrix, rows in matrices.items():
-            labels[matrix] = []
-            for name, own in rows:
-                at = len(labels[matrix])
-                blocks[name] = (matrix, slice(at, at + len(own)))
-                labels[matrix] += [f"{name} {label}".strip() for label in own]
-        return cls(blocks, {k: tuple(v) for k, v in labels.items()})
+            own: list[str] = []
+            for name, ends in rows:
+                ends = tuple(ends)
+                blocks[name] = (matrix, slice(len(own), len(own) + len(ends)))
+                own += [f"{name} {end}".strip() for end in ends]
+            labels[matrix] = tuple(own)
+        return cls(blocks, labels)
 
-    def size(self, matrix: str) -> int:
-        """Number of rows of a matrix."""
-        return len(self.labels[matrix])
+    def zeros(self, matrix: str, columns: int) -> np.ndarray:
+        """A matrix of these rows, all zero."""
+        return np.zeros((len(self.labels[matrix]), columns))
 
     def at(self, name: str) -> slice:
         """Rows of a block."""
@@ -64,8 +66,7 @@ class StepQp:
     def block(self, name: str) -> tuple[np.ndarray, ...]:
         """Matrix and right side (or lower and upper side) of the rows of one named block."""
         matrix, rows = self.layout.blocks[name]
-        sides = {"A": ("A", "b"), "E": ("E", "e"), "G": ("G", "h"), "R": ("R", "lower", "upper")}
-        return tuple(getattr(self, x)[rows] for x in sides[matrix])
+        return tuple(getattr(self, x)[rows] for x in (matrix, *RIGHT_SIDES[matrix]))
 
     def objective(self, x: np.ndarray) -> float:
         """Value of the cost at ``x``."""
@@ -132,24 +133,18 @@ class JointRows:
         left = np.maximum(left, 0.0)
         return np.minimum(self.limits.stop_rate * left, np.sqrt(2 * self.brake * left))
 
-    def fill(
-        self,
-        R: np.ndarray,
-        lower: np.ndarray,
-        upper: np.ndarray,
-        terms: FullTerms,
-        start: State,
-        step: float,
-        first: int,
-    ) -> None:
-        """Write 2 n rows: torque M theta'' + H - J^T F, then acceleration; theta'' begins at column ``first`` of x."""
-        n = len(self.speed)
+    def fill(self, R: np.ndarray, terms: FullTerms, start: State, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Write the torque rows M theta'' + H - J^T F into R (2 n, size of x); lowest and highest value of all rows.
+
+        The rows below, of the accelerations, are ones and never change.
+        """
+        n, first = len(self.speed), R.shape[1] - len(terms.v)
         R[:n, first:] = terms.M[6:]
         if first:
             R[:n, :first] = -terms.J[:, 6:].T
-        low, high = self.torque(terms.v[6:])
-        lower[:n], upper[:n] = low - terms.H[6:], high - terms.H[6:]
-        lower[n:], upper[n:] = self.acceleration(start.q[7:], start.v[6:], step)
+        torque, acceleration = self.torque(terms.v[6:]), self.acceleration(start.q[7:], start.v[6:], step)
+        low, high = (np.concatenate([x - terms.H[6:], y]) for x, y in zip(torque, acceleration, strict=True))
+        return low, high
 
     @staticmethod
     def labels(body: FullBody) -> list[tuple[str, list[str]]]:

@@ -34,27 +34,24 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
     peak of L in the launch; at take-off, and the largest), ``launch_inertia_rms``, ``flight_inertia_rms`` (share of the
     mean of rho), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and ``touchdown_foot`` [m].
     """
-    end = n - 1
-    speed = reference["com_velocity"][end]
-    L_error = np.abs(actual["L"][:n] - reference["L"][:n])
-    peak = max(np.abs(reference["L"][:n]).max(), 1e-9)
-    rho_error = actual["rho"] - reference["rho"]
-    foot = np.linalg.norm(actual["foot_com"] - reference["foot_com"], axis=1)
-    place = np.linalg.norm(actual["com"][:n] - reference["com"][:n], axis=1)
+    off = {k: x - reference[k] for k, x in actual.items()}
+    speed, foot = reference["com_velocity"][n - 1], np.linalg.norm(off["foot_com"], axis=1)
+    momentum = np.abs(off["L"][:n]) / max(np.abs(reference["L"][:n]).max(), 1e-9)
 
     def rms(x, size):
-        return float(np.sqrt(np.mean(x**2)) / size)
+        return np.sqrt(np.mean(x**2)) / size
 
-    return {
-        "takeoff_velocity": float(np.linalg.norm(actual["com_velocity"][end] - speed) / np.linalg.norm(speed)),
-        "takeoff_momentum": float(L_error[end] / peak),
-        "launch_momentum": float(L_error.max() / peak),
-        "launch_inertia_rms": rms(rho_error[:n], reference["rho"][:n].mean()),
-        "flight_inertia_rms": rms(rho_error[n:], reference["rho"][n:].mean()),
-        "launch_com": float(place.max()),
+    found = {
+        "takeoff_velocity": np.linalg.norm(off["com_velocity"][n - 1]) / np.linalg.norm(speed),
+        "takeoff_momentum": momentum[-1],
+        "launch_momentum": momentum.max(),
+        "launch_inertia_rms": rms(off["rho"][:n], reference["rho"][:n].mean()),
+        "flight_inertia_rms": rms(off["rho"][n:], reference["rho"][n:].mean()),
+        "launch_com": np.linalg.norm(off["com"][:n], axis=1).max(),
         "flight_foot_rms": rms(foot, 1.0),
-        "touchdown_foot": float(foot[-1]),
+        "touchdown_foot": foot[-1],
     }
+    return {k: float(x) for k, x in found.items()}
 
 
 @dataclass(frozen=True)
@@ -72,38 +69,29 @@ class Statistics:
 
 @dataclass(frozen=True)
 class JointPlan:
-    """Result of stage 2 at the nodes of launch and flight; the instant of take-off appears once per phase.
+    """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once per phase.
 
-    Attributes
-    ----------
-    t : (N,) [s].  phase : (N,) "launch" or "flight".  contact : (N,) "flat", "toe" or "air".
-    q, v : (N, nq), (N, nv) Pinocchio configuration and rates.
-    a, predicted : (N, nv) accelerations held from this node to the next, and those that its QP was written
-        for; the last node of a phase repeats the one before.
-    f : (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of ``contact_frames``, in the
-        middle of the step that begins at the node.  tau : (N, nv - 6) joint torques there [N m].
-    actual, reference : name -> (N, ...) com [m], com_velocity [m/s], L [kg m^2/s], rho [kg m^2], and in flight foot_com
-        [m] (mean of both soles relative to the CoM), of this motion and of stage 1; com relative to the pivot.
-    tracking : summary of errors, see :func:`jumplab.stages.joint_qp.rollout.tracking`.
-    statistics : what it cost.  options : gains, weights and limits of the QPs that made it.
+    Wrenches and torques are those in the middle of the step that begins at the node. ``actual`` and ``reference`` say
+    what the motion does and what stage 1 asks for, by name: com (from the pivot) [m], com_velocity [m/s],
+    L [kg m^2/s], rho [kg m^2], and in flight foot_com (mean of both soles relative to the CoM) [m].
     """
 
-    t: np.ndarray
-    phase: np.ndarray
-    contact: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    predicted: np.ndarray
-    f: np.ndarray
-    tau: np.ndarray
+    t: np.ndarray  # (N,) [s]
+    phase: np.ndarray  # (N,) "launch" or "flight"
+    contact: np.ndarray  # (N,) "flat", "toe" or "air"
+    q: np.ndarray  # (N, nq) Pinocchio configuration
+    v: np.ndarray  # (N, nv) rates
+    a: np.ndarray  # (N, nv) accelerations held from this node to the next; a phase's last node repeats the one before
+    predicted: np.ndarray  # (N, nv) accelerations that the step's QP was written for
+    f: np.ndarray  # (N, 2, 6) wrenches on the feet, force then moment, world axes, at the contact frames' origins
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
     joint_names: tuple[str, ...]
     contact_frames: tuple[str, ...]
-    actual: dict
-    reference: dict
-    tracking: dict
+    actual: dict[str, np.ndarray]
+    reference: dict[str, np.ndarray]
+    tracking: dict[str, float]  # summary of errors, see the function
     statistics: Statistics
-    options: Options
+    options: Options  # of the QPs that made it
 
     def rows(self, phase: str) -> slice:
         """Rows of one phase."""
@@ -117,18 +105,13 @@ class JointPlan:
 
 @dataclass
 class Rolled:
-    """One phase as it is rolled out.
-
-    Attributes
-    ----------
-    states, nodes : state and quantities at every node.
-    steps : of every step, the quantities in its middle, the accelerations predicted for it, and its answer.
-    build_s, solve_s : time spent on matrices, and in the solver.
-    """
+    """One phase as it is rolled out: state and quantities at the nodes, what each step was solved with, times [s]."""
 
     states: list[State]
     nodes: list[FullMotion] = field(default_factory=list)
-    steps: list[tuple[FullTerms, np.ndarray, Answer]] = field(default_factory=list)
+    terms: list[FullTerms] = field(default_factory=list)  # in the middle of the step
+    predicted: list[np.ndarray] = field(default_factory=list)  # accelerations (nv,)
+    answers: list[Answer] = field(default_factory=list)
     build_s: float = 0.0
     solve_s: float = 0.0
 
@@ -154,8 +137,8 @@ class JointMapper:
         options: Options | None = None,
         q0: np.ndarray | None = None,
     ):
-        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else None
-        for step in parts or (step_s,):
+        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s, step_s, step_s)
+        for step in parts:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
@@ -164,17 +147,15 @@ class JointMapper:
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.flight_reference = FlightReference.sample(srmp_plan, parts[2] if parts else step_s)
-        toe_s = self.options.toe_s
-        toe_s = getattr(srmp_plan, "toe_s", None) if toe_s is None else toe_s
-        toe = (toe_s, parts[1]) if parts and toe_s is not None else None
-        launch = LaunchReference.sample(srmp_plan, parts[0] if parts else step_s, toe)
+        self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
+        toe_s = getattr(srmp_plan, "toe_s", None) if self.options.toe_s is None else self.options.toe_s
+        toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
+        launch = LaunchReference.sample(srmp_plan, parts[0], toe)
         self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
-        ground = float(self.launch.toe0[:, 2].mean())
-        start = self.body.motion(takeoff.q, takeoff.v)
+        ground, start = float(self.launch.toe0[:, 2].mean()), self.body.motion(takeoff.q, takeoff.v)
         return self.flight_qp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
 
     def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
@@ -219,65 +200,55 @@ class JointMapper:
             before, state = state.a, State(q, state.v + a * h, a)
             out.states.append(state)
             out.nodes.append(node)
-            out.steps.append((terms, predicted, answer))
+            out.terms.append(terms)
+            out.predicted.append(predicted)
+            out.answers.append(answer)
         out.nodes.append(self.body.motion(state.q, state.v))
         return out
 
     def run(self, method: str = "cvxpy") -> JointPlan:
         """Roll out launch and flight with "cvxpy" or "direct"."""
         solver_type = solver_class(method)
-        began = time.perf_counter()
-        rest = np.zeros(self.body.nv)
+        began, rest = time.perf_counter(), np.zeros(self.body.nv)
         launch = self.roll(self.launch, solver_type, State(self.q0, rest, rest))
         takeoff = launch.states[-1]
         flight = self.roll(self.flight_from(takeoff), solver_type, takeoff)
-        total, answers = time.perf_counter() - began, [step[2] for step in launch.steps + flight.steps]
+        total, answers = time.perf_counter() - began, launch.answers + flight.answers
         spent = launch.build_s + flight.build_s, launch.solve_s + flight.solve_s, total
         iterations, worst = sum(x.iterations for x in answers), max(x.residual for x in answers)
         return self._plan(launch, flight, Statistics(method, len(answers), iterations, *spent, worst))
 
     def _plan(self, launch: Rolled, flight: Rolled, statistics: Statistics) -> JointPlan:
         """Put both phases together, and freeze them."""
-        n, m = len(launch.steps), len(flight.steps)
-        states, nodes = launch.states + flight.states, launch.nodes + flight.nodes
-        terms, predicted, answers = zip(*launch.steps, *flight.steps, strict=True)
+        n, m = len(launch.terms), len(flight.terms)
+        terms, states = launch.terms + flight.terms, launch.states + flight.states
         held = np.r_[0:n, n - 1, n : n + m, n + m - 1]  # node -> step that begins there; the last of a phase repeats
         a = np.array([x.a for x in launch.states[1:] + flight.states[1:]])  # (n + m, nv)
         F = np.zeros((n + m, 2, 6))
-        F[:n] = np.array([x.x[:WRENCH] for x in answers[:n]]).reshape(n, 2, 6)
+        F[:n] = np.array([x.x[:WRENCH] for x in launch.answers]).reshape(n, 2, 6)
         tau = np.array([(x.M @ ai + x.H - x.J.T @ Fi.ravel())[6:] for x, ai, Fi in zip(terms, a, F, strict=True)])
-        contact = np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])
         data = {
             "t": np.concatenate([self.launch.t, self.launch.t[-1] + self.flight_reference.t]),
-            "phase": np.array(["launch"] * (n + 1) + ["flight"] * (m + 1)),
-            "contact": contact[held],
+            "phase": np.repeat(["launch", "flight"], [n + 1, m + 1]),
+            "contact": np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])[held],
             "q": np.array([x.q for x in states]),
             "v": np.array([x.v for x in states]),
             "a": a[held],
-            "predicted": np.array(predicted)[held],
+            "predicted": np.array(launch.predicted + flight.predicted)[held],
             "tau": tau[held],
             "f": self._at_origins(terms, F)[held],
         }
-        actual, reference = self._series(nodes, n + 1)
+        actual, reference = self._series(launch.nodes + flight.nodes, n + 1)
         for x in (*data.values(), *actual.values(), *reference.values()):
             x.setflags(write=False)
-        return JointPlan(
-            **data,
-            joint_names=self.body.robot.joint_names,
-            contact_frames=self.body.robot.foot.frames,
-            actual=actual,
-            reference=reference,
-            tracking=tracking(actual, reference, n + 1),
-            statistics=statistics,
-            options=self.options,
-        )
+        names = {"joint_names": self.body.robot.joint_names, "contact_frames": self.body.robot.foot.frames}
+        seen = {"actual": actual, "reference": reference, "tracking": tracking(actual, reference, n + 1)}
+        return JointPlan(**data, **names, **seen, statistics=statistics, options=self.options)
 
     def _at_origins(self, terms, F) -> np.ndarray:
         """Wrenches moved from the tiptoes to the origins of the foot frames."""
-        foot = self.body.robot.foot
-        offset = np.array([foot.toe, 0.0, foot.sole_z])
-        arm = np.array([x.foot_rotation @ offset for x in terms])  # origin to tiptoe (N, 2, 3)
-        out = F.copy()
+        foot, out = self.body.robot.foot, F.copy()
+        arm = np.array([x.foot_rotation @ [foot.toe, 0.0, foot.sole_z] for x in terms])  # origin to tiptoe (N, 2, 3)
         out[..., 3:] += np.cross(arm, F[..., :3])
         return out
 
@@ -316,7 +287,7 @@ def map_to_joints(
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
     robot : the robot.  step_s : step of the roll-out [s], or one each for flat feet, toes and flight.
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
-    options : gains, weights, limits, form; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
+    options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
     q0 : (nq,) start at rest; the robot's stance by default.
 
     Raises
