@@ -16,7 +16,7 @@ from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.planner import COARSE, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.problem import build_problem
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
-from jumplab.stages.whole_body.terms import WholeBodyTerms
+from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
 # our choice: a solve that needs more is lost; plans took 94 iterations at most on the coarse mesh, 112 on the fine one
@@ -117,7 +117,8 @@ class FlipPlanner(WholeBodyPlanner):
         for name, guess in first.guess(self.mesh.intervals()).items():
             jerk = np.diff(guess.a, axis=0) * (len(guess.a) - 1) / guess.duration
             before = np.vstack([np.zeros(jerk.shape[1]), jerk])
-            out[name] = replace(guess, z=np.array([WholeBodyTerms.relative(x).full().ravel() for x in before]))
+            links = np.pad(before, ((0, 0), (5 - before.shape[1], 0)))  # a flat foot has none
+            out[name] = replace(guess, z=relative(links.T).T)
         return out
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:

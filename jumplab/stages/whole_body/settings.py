@@ -1,12 +1,23 @@
-"""Limits, weights and mesh of stage 3. The paper prints none of them: every number is our choice, with its reason."""
+"""Limits, weights and mesh of stage 3. The paper prints none of these numbers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
-# our choice: [rad/s^3] by how much the jerk of a joint may jump from interval to interval; a tape of 1 kHz misses the
-# acceleration in the middle of such a step by an eighth of that times 1 ms, and the audit allows 4 rad/s^2
+JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
+RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
+# [rad/s^3] by how much the jerk of a joint may jump from interval to interval: half a sample of 1 kHz later a tape then
+# misses the acceleration by 3.9 rad/s^2, and the audit allows 4
 FOLLOWED_JERK_STEP = 31_000.0
+
+
+class Contact(StrEnum):
+    """How the robot stands, or does not: the three phases of a jump by their names."""
+
+    FLAT = "flat"
+    TOE = "toe"
+    FLIGHT = "flight"
 
 
 @dataclass(frozen=True)
