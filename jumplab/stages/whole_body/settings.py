@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import numpy as np
+
 JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
 # [rad/s^3] by how much the jerk of a joint may jump from interval to interval: half a sample of 1 kHz later a tape then
@@ -128,6 +130,11 @@ class Mesh:
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
         return {"flat": self.flat, "toe": self.toe, "flight": self.flight}
+
+    def nodes(self, split: float, takeoff: float, end: float) -> dict[str, np.ndarray]:
+        """Times of the nodes [s] from the start of the launch, by the ends of the phases."""
+        ends = {"flat": (0.0, split), "toe": (split, takeoff), "flight": (takeoff, end)}
+        return {name: np.linspace(*ends[name], n + 1) for name, n in self.intervals().items()}
 
     def coarse(self) -> Mesh:
         """Half of the intervals: where a solve begins before it is refined on this mesh."""
