@@ -19,13 +19,11 @@ from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
-# our choice: a solve that needs more is lost; plans took 94 iterations at most on the coarse mesh, 112 on the fine one
-EFFORT = {"max_iter": 150, "max_wall_time": 15.0}
-# our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
-MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
-# Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
-# of 0.6 m on the spot; six of the flat foot, three of the toe phase, six of the flight, the last of one turn. Back: the
-# arms swing up and forward, the trunk follows. Front: the trunk leans back first, then whips forward over braked feet.
+EFFORT = {"max_iter": 150, "max_wall_time": 15.0}  # a solve that needs more is lost
+MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}  # the second search, where the adaptive barrier wanders
+# Postures of the guess: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip of 0.6 m on
+# the spot; six of the flat foot, three of the toe phase, six of the flight. Back: the arms swing up and forward, the
+# trunk follows. Front: the trunk leans back first, then whips forward over braked feet.
 POSTURES = {
     -1: ([0.0, 0.15, -0.25, 0.32, 0.52], [0.0, -0.06, -0.24, 1.04, 1.77], [0.0, -0.02, -0.38, 1.49, 2.65],
          [0.0, 0.50, -0.88, 1.12, 1.84], [0.0, 0.81, -1.20, 0.81, 0.74], [0.0, 0.77, -1.28, 0.66, -0.47],
@@ -38,11 +36,11 @@ POSTURES = {
         [1.07, 0.24, -0.36, 0.86, -0.75], [2.56, 1.69, -0.21, 1.81, 0.92], [4.23, 3.36, 1.02, 3.01, 2.61],
         [5.54, 4.80, 2.45, 4.42, 4.15], [6.26, 6.08, 3.97, 5.64, 5.13], [6.28, 6.53, 5.13, 6.58, 5.51]),
 }  # fmt: skip
-FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # our choice: how long the phases of the launch last in those solutions
-FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # our choice: of the flat foot, when its postures are
-EASY_M = 0.5  # our choice: searches from postures end well up to here; of those at 0.7 m two in three did not
-CLIMB_M = 0.04  # our choice: from flip to flip on the way up; with steps of 0.07 m two in six of 0.7 m got lost
-LOW_M = 0.03  # our choice: the CoM touches down this much above its take-off height
+FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # how long the phases of the launch last in those solutions
+FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # of the flat foot, when its postures are
+EASY_M = 0.5  # searches from postures end well up to here
+CLIMB_M = 0.04  # from flip to flip on the way up; longer steps get lost
+LOW_M = 0.03  # the CoM touches down this much above its take-off height
 
 
 class FlipPlanner(WholeBodyPlanner):

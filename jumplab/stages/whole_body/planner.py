@@ -164,30 +164,14 @@ class WholeBodyPlanner:
         asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
         return self._evened(self._begun(asked, guess, near), asked)
 
-    def _solve(
-        self,
-        nlp: Nlp,
-        asked: Asked,
-        start: Solution | Near | Mapping[str, PhaseGuess],
-        mesh: Mesh | None = None,
-        *,
-        explain: bool = False,
-    ) -> Solution:
-        """Solve on a mesh, by default the planner's, from start values or a solution on any mesh."""
+    def _solve(self, nlp: Nlp, asked: Asked, start, mesh: Mesh | None = None, *, explain: bool = False) -> Solution:
+        """Solve on a mesh, by default the planner's, from start values or from a solution on any mesh."""
         mesh = mesh or self.mesh
-        if isinstance(start, Solution | Near):
-            guess = start.guess(mesh.intervals())
-        else:
-            guess = _on(mesh, start)
-        return nlp.solve(
-            asked.parameters,
-            guess,
-            references=self.references(asked.srmp, mesh),
-            weights=asked.weights,
-            off=asked.off,
-            multipliers=start.multipliers if isinstance(start, Solution) else None,
-            explain=explain,
-        )
+        multipliers = start.multipliers if isinstance(start, Solution) else None
+        known = isinstance(start, Solution | Near)
+        how = {"references": self.references(asked.srmp, mesh), "weights": asked.weights, "off": asked.off}
+        guess = start.guess(mesh.intervals()) if known else _on(mesh, start)
+        return nlp.solve(asked.parameters, guess, multipliers=multipliers, explain=explain, **how)
 
     def _evened(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
         """The plan, with a dearer jerk if it jumps too far. Whoever sets the jerk's weight or drops it is obeyed."""
