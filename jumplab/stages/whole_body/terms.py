@@ -30,7 +30,7 @@ def cost(name: str, equation: str, unit: str, of: Callable, weight: float, at: s
 
 
 def row(
-    name: str, equation: str, unit: str, of: Callable, lower: object = 0.0, upper: object = 0.0, at="node", **how
+    name: str, equation: str, unit: str, of: Callable, lower: object = 0.0, upper: object = 0.0, at: str = "node", **how
 ) -> Term:
     """A constraint on it: an equality, or from ``lower`` to ``upper``; ``how`` as in :class:`Term`."""
     return Term(name, equation, unit, at, of, None, lower, upper, **how)
