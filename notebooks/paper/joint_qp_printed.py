@@ -98,10 +98,12 @@ class PrintedLaunch(LaunchQp):
             self.on_toes = np.zeros_like(self.on_toes)
             self.inertia_weights = self._inertia_weights()
 
-    def _heel_floor(self, terms, on_toes):
-        if self.form.contact == "consistent" and not on_toes:
-            return super()._heel_floor(terms, on_toes)
-        return np.zeros(2) if self.form.heel == "always" else super()._heel_floor(terms, True)
+    def _heel_floor(self, terms, k):
+        if self.form.contact == "consistent" and not self.on_toes[k]:
+            return super()._heel_floor(terms, k)
+        if self.form.heel == "always":
+            return np.zeros(2)
+        return self._near_ground(terms)
 
     def matrices(self, terms, target, start) -> StepQp:
         """As the library's, then read in the form."""

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
-from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, Layout, State, StepQp, accelerations
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.stages.joint_qp.settings import Options
-
-PAIRS = ("hip", "knee", "ankle", "shoulder")  # mirrored
 
 
 @dataclass(frozen=True)
@@ -28,27 +26,29 @@ class FlightTarget:
     symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
 
 
-class FlightQp:
+class FlightQp(PhaseQp):
     """Targets and matrices of the flight, step by step. Pure: nothing here solves or remembers a state.
 
     Parameters
     ----------
-    body : nine-link quantities.  nominal : (nq,) posture to lean towards.
+    body, nominal, reference, options : as in the base class.
     start : quantities at take-off; the references begin there and soon join stage 1's.
-    reference : stage 1's flight.  options : gains, weights, limits.
     ground : height of the launching surface [m].
     """
 
-    name = "flight"
+    name, first, pairs = "flight", 0, ("hip", "knee", "ankle", "shoulder")
 
     def __init__(
         self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground: float
     ):
-        self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
-        self.t, self.steps, self.ground = reference.t, np.diff(reference.t), ground
+        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", SIDES)]
+        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [("acceleration", map(str, range(body.nv))), ("inertia", ["rho"])]
+        points = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
+        rows = {"A": cost, "E": [("base dynamics", AXES)], "G": points}
+        self._set_up(body, reference, options, nominal, options.flight, **rows)
+        self.joints, self.ground = JointRows(body, nominal, options.limits), ground
         self.step = float(self.steps[0])  # all alike
-        self.joints = JointRows(body, nominal, options.limits)
-        self.S = body.symmetry_rows(PAIRS)
         self.com0, self.momentum0 = start.com, start.momentum
         self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
         wide = np.zeros((2, 3))
@@ -56,27 +56,6 @@ class FlightQp:
         foot = reference.foot
         both = Track(foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (foot.rate, foot.feed)))
         self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
-        self.layout = self._layout()
-        self._fixed = self._fixed_rows()
-
-    def _layout(self) -> Layout:
-        body = self.body
-        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", SIDES)]
-        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
-        cost += [("acceleration", map(str, range(body.nv))), ("inertia", ["rho"])]
-        rows = [("base dynamics", AXES), ("symmetry", body.pair_names(PAIRS))]
-        ground = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
-        return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(body))
-
-    def _fixed_rows(self):
-        lay, w, nv = self.layout, self.options.flight, self.body.nv
-        A, E, G, R = (lay.zeros(k, nv) for k in "AEGR")
-        A[lay.at("joints"), 6:] = np.sqrt(w.posture) * np.eye(nv - 6)
-        A[lay.at("trunk turn"), 3:6] = np.sqrt(w.trunk) * np.eye(3)
-        A[lay.at("acceleration")] = np.sqrt(w.acceleration) * np.eye(nv)
-        E[lay.at("symmetry")] = self.S
-        R[nv - 6 :, 6:] = np.eye(nv - 6)
-        return A, E, G, R
 
     def target(self, k: int, terms: FullMotion) -> FlightTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
@@ -86,11 +65,10 @@ class FlightQp:
         turn, turn_rate = self.reference.turn[k], (self.reference.turn[k + 1] - self.reference.turn[k]) / self.step
         off_level = np.angle(np.exp(1j * (turn - terms.foot_pitch)))  # the short way round
         level = gain.foot_level.stiffness * off_level + gain.foot_level.damping * (turn_rate - terms.foot_spin[:, 1])
-        joints, trunk = accelerations(terms, turned(self.nominal, turn), gain.posture, gain.trunk)
+        joints, trunk = self._towards(terms, turned(self.nominal, turn))
         trunk[1] += gain.trunk.damping * turn_rate
-        c = gain.contact
-        mirror = -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
-        return FlightTarget(foot, rho, self._drift(k, terms), level, self._floor(k, terms), joints, trunk, mirror)
+        own = foot, rho, self._drift(k, terms), level, self._floor(k, terms)
+        return FlightTarget(*own, joints, trunk, self._mirror(terms))
 
     def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what integration lost."""
@@ -116,20 +94,16 @@ class FlightQp:
     def matrices(self, terms: FullTerms, target: FlightTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
         lay, w = self.layout, self.options.flight
-        A, E, G, R = (x.copy() for x in self._fixed)
-        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
+        A, E, G, R, b, e, h = self._begun(target)
         root = np.sqrt(w.foot)
         A[:6] = root * terms.J_rd.reshape(6, -1)
         b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
         root = np.sqrt(w.foot_level)
         A[6:8] = root * terms.J_toe[:, 4]
         b[6:8] = root * (target.foot_pitch - terms.drift_toe[:, 4])
-        b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
-        b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
         root, at = np.sqrt(w.inertia), lay.at("inertia")
         A[at], b[at] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
         E[:6], e[:6] = terms.M[:6], target.base_force - terms.H[:6]
-        e[lay.at("symmetry")] = target.symmetry
         on = np.isfinite(target.floor)
         if on.any():
             vertical = np.stack([terms.J_toe[:, 2], terms.J_heel[:, 2]], 1).reshape(4, -1)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
-from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
+from jumplab.robot import SAGITTAL_JOINTS
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import LaunchReference
 from jumplab.stages.joint_qp.settings import Options
 
@@ -15,8 +16,6 @@ WRENCH = 12
 FRICTION = tuple(f"friction {way}" for way in ("+x", "-x", "+y", "-y"))
 EDGES = ("CoP left of right edge", "CoP right of left edge")
 FOOT_ROWS = ("F_z >= 0", *FRICTION, *EDGES, "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")
-# on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
-PAIRS = ("hip", "shoulder")
 
 
 @dataclass(frozen=True)
@@ -36,54 +35,44 @@ class LaunchTarget:
     step: float  # its length [s]
 
 
-class LaunchQp:
+class LaunchQp(PhaseQp):
     """Targets and matrices of the launch, step by step. Pure: nothing here solves or remembers a state.
 
     Parameters
     ----------
-    body : nine-link quantities.  q0 : (nq,) configuration at the start, soles flat.
-    reference : stage 1's launch.  options : gains, weights, limits.
+    body, reference, options : as in the base class.  q0 : (nq,) configuration at the start, soles flat.
     toe_s : length of the toe phase [s]; None starts it where the reference's CoP stays at the toe.
 
     Attributes
     ----------
+    on_toes : (n,) steps with the heel up.  inertia_weights : (n,) weight of the inertia's term by step.
     roots : square roots of the weights of the CoM's rows (3,) and of the momentum's (6,), feet flat and on the toes.
-    inertia_weights : (n,) weight of the inertia's term by step.  steps : (n,) their lengths [s].
     """
 
-    name = "launch"
+    name, first = "launch", WRENCH
+    pairs = ("hip", "shoulder")  # mirrored hips leave flat feet's knees and ankles no choice: more would be dependent
 
     def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
-        self.body, self.reference, self.options = body, reference, options
-        self.nominal = swung_arms(body, q0, options.arm_rad)
-        self.t, self.steps = reference.t, np.diff(reference.t)
-        start = body.terms(q0, np.zeros(body.nv))
-        self.toe0, self.pivot = start.toe, start.sole.mean(0)
-        self.joints = JointRows(body, q0, options.limits)
-        foot = body.robot.foot
-        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s)
-        self.S = body.symmetry_rows(PAIRS)
-        w = options.launch
-        com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
-        force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
-        self.roots = tuple(zip(com, force, strict=True))
-        self.inertia_weights, self.layout = self._inertia_weights(), self._layout()
-        self._fixed, self._ground = self._fixed_rows(), (self._ground_rows(False), self._ground_rows(True))
-
-    def _layout(self) -> Layout:
         def both(rows):
             return [f"{side} {row}" for side in SIDES for row in rows]
 
+        w, foot = options.launch, body.robot.foot
         cost = [(name, "xyz") for name in ("com", "force", "moment")] + [("inertia", ["rho"])]
-        cost += [("joints", self.body.robot.joint_names), ("trunk turn", "xyz")]
-        cost += [
-            ("wrench", both(["fx", "fy", "fz", "mx", "my", "mz"])),
-            ("acceleration", map(str, range(self.body.nv))),
-        ]
+        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [("wrench", both(["fx", "fy", "fz", "mx", "my", "mz"])), ("acceleration", map(str, range(body.nv)))]
         rows = [("base dynamics", AXES), ("tiptoe", both(["x", "y", "z", "rx", "rz"]))]
-        rows += [("foot pitch or toe moment", SIDES), ("symmetry", self.body.pair_names(PAIRS))]
+        rows += [("foot pitch or toe moment", SIDES)]
         ground = [("ground", both(FOOT_ROWS)), ("heel", SIDES)]
-        return Layout.of(A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
+        self._set_up(body, reference, options, swung_arms(body, q0, options.arm_rad), w, A=cost, E=rows, G=ground)
+        self._fixed[0][self.layout.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
+        self._ground = self._ground_rows(False), self._ground_rows(True)
+        self.joints, start = JointRows(body, q0, options.limits), body.terms(q0, np.zeros(body.nv))
+        self.toe0, self.pivot = start.toe, start.sole.mean(0)
+        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s)
+        self.inertia_weights = self._inertia_weights()
+        com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
+        force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
+        self.roots = tuple(zip(com, force, strict=True))
 
     def _inertia_weights(self) -> np.ndarray:
         """(n,) by step: the flat feet's, fading geometrically to the toes' before the heel rises."""
@@ -91,18 +80,6 @@ class LaunchQp:
         heel_off = start[self.on_toes][0] if self.on_toes.any() else self.t[-1]
         left = np.clip((heel_off - start) / w.inertia_fade_s, 0.0, 1.0)
         return np.where(self.on_toes, w.inertia_toe, w.inertia_toe * (w.inertia / w.inertia_toe) ** left)
-
-    def _fixed_rows(self):
-        """A, E, G and R with all rows that never change filled in."""
-        lay, w, nv = self.layout, self.options.launch, self.body.nv
-        A, E, G, R = (lay.zeros(k, WRENCH + nv) for k in "AEGR")
-        A[lay.at("joints"), WRENCH + 6 :] = np.sqrt(w.posture) * np.eye(nv - 6)
-        A[lay.at("trunk turn"), WRENCH + 3 : WRENCH + 6] = np.sqrt(w.trunk) * np.eye(3)
-        A[lay.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
-        A[lay.at("acceleration"), WRENCH:] = np.sqrt(w.acceleration) * np.eye(nv)
-        E[lay.at("symmetry"), WRENCH:] = self.S
-        R[nv - 6 :, WRENCH + 6 :] = np.eye(nv - 6)
-        return A, E, G, R
 
     def _ground_rows(self, on_toes: bool) -> np.ndarray:
         """(22, 12) unilateral, friction and CoP rows on F; rows that are off stay zero, 0 <= 0."""
@@ -136,45 +113,37 @@ class LaunchQp:
         error[:, 3], error[:, 4], error[:, 5] = side[:, 2], terms.foot_pitch, -side[:, 0]
         speed = np.concatenate([terms.toe_velocity, terms.foot_spin], 1)
         contact = -gain.contact.stiffness * error - gain.contact.damping * speed
-        joints, trunk = accelerations(terms, self.nominal, gain.posture, gain.trunk)
-        asymmetry = self.S[:, 6:] @ terms.q[7:], self.S @ terms.v
-        mirror = -gain.contact.stiffness * asymmetry[0] - gain.contact.damping * asymmetry[1]
-        on_toes = bool(self.on_toes[k])
-        floor = self._heel_floor(terms, on_toes)
-        weight, step = float(self.inertia_weights[k]), float(self.steps[k])
-        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight, step)
+        posture, on_toes, floor = self._towards(terms, self.nominal), bool(self.on_toes[k]), self._heel_floor(terms, k)
+        now = on_toes, float(self.inertia_weights[k]), float(self.steps[k])
+        return LaunchTarget(com, turn, rho, contact, floor, *posture, self._mirror(terms), *now)
 
-    def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
-        gain, limits = self.options.gains.ground, self.options.limits
-        if not on_toes:
-            return np.full(2, -np.inf)  # the flat foot's own row holds the heel
-        height = terms.heel[:, 2] - self.toe0[:, 2]
+    def _heel_floor(self, terms: FullMotion, k: int) -> np.ndarray:
+        """Least vertical acceleration of the heels (2,) [m/s^2]; on flat feet the foot's own row holds them."""
+        return self._near_ground(terms) if self.on_toes[k] else np.full(2, -np.inf)
+
+    def _near_ground(self, terms: FullMotion) -> np.ndarray:
+        gain, height = self.options.gains.ground, terms.heel[:, 2] - self.toe0[:, 2]
         floor = -gain.stiffness * height - gain.damping * terms.heel_velocity[:, 2]
-        return np.where(height < limits.near_ground_m, floor, -np.inf)
+        return np.where(height < self.options.limits.near_ground_m, floor, -np.inf)
 
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        lay, w, body = self.layout, self.options.launch, self.body
-        A, E, G, R = (x.copy() for x in self._fixed)
-        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
+        A, E, G, R, b, e, h = self._begun(target)
         com, force = self.roots[target.on_toes]
         A[:3, WRENCH:] = com[:, None] * terms.A_c
         b[:3] = com * (target.com_acceleration - terms.B_c)
         A[3:9, :WRENCH] = force[:, None] * terms.A_f
-        b[3:9] = force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
+        b[3:9] = force * force_target(self.body.mass, self.body.gravity, target.com_acceleration, target.momentum_rate)
         root = np.sqrt(target.inertia_weight)
         A[9, WRENCH:] = root * terms.J_rho
         b[9] = root * (target.inertia_accel - terms.drift_rho)
-        b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
-        b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
         E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
         self._contact(E, e, terms, target)
-        e[lay.at("symmetry")] = target.symmetry
         G[: 2 * len(FOOT_ROWS), :WRENCH] = self._ground[target.on_toes]
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
             G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
             h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
-        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, target.step), lay)
+        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, target.step), self.layout)
 
     def _contact(self, E, e, terms, target):
         """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""
@@ -185,3 +154,12 @@ class LaunchQp:
             E[[16, 17], [4, 10]] = 1.0
         else:
             E[16:18, WRENCH:], e[16:18] = terms.J_toe[:, 4], asked[:, 4]
+
+
+def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
+    """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
+    robot, q = body.robot, q0.copy()
+    for name, row, sign in robot.role_signs():
+        if SAGITTAL_JOINTS[row] == "shoulder":
+            q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
+    return q
