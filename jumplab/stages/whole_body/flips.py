@@ -95,13 +95,12 @@ class FlipPlanner(WholeBodyPlanner):
             searches = self._searches if guess is None else self._searches[:1]
             solution, first = self._search(asked[0], guess or self.naive_guess(way[0]), searches)
             for following in asked[1:]:
-                solution = self._solve(self.nlp, following, solution.guess())
+                solution = self._run(self.nlp.solve, following, solution.guess(), explain=False)
         except SolverError as e:
             where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
-            text = (
-                f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its limits"
-            )
-            raise SolverError(f"{text}, ask for another height or distance", stage=e.stage, status=e.status) from e
+            text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
+            remedy = "limits, ask for another height or distance"
+            raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status) from e
         return WholeBodyPlan(task, solution, first)
 
     def _search(self, asked: Asked, guess, searches) -> tuple[Solution, Statistics]:
@@ -109,13 +108,13 @@ class FlipPlanner(WholeBodyPlanner):
         failure = None
         for search in searches:
             try:
-                first = self._solve(search, asked, guess, self.rough)
-                return self._solve(self.nlp, asked, self._refined(first)), first.statistics
+                first = self._run(search.solve, asked, guess, self.rough, explain=False)
+                return self._run(self.nlp.solve, asked, self._finer(first), explain=False), first.statistics
             except SolverError as e:
                 failure = failure or e
         raise failure
 
-    def _refined(self, first: Solution) -> dict[str, PhaseGuess]:
+    def _finer(self, first: Solution) -> dict[str, PhaseGuess]:
         """A coarse solution as the fine problem's start, the jerks that its intervals carry on included."""
         out = {}
         for name, guess in first.guess(self.mesh.intervals()).items():

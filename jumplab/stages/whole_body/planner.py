@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -164,14 +164,19 @@ class WholeBodyPlanner:
         asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
         return self._evened(self._begun(asked, guess, near), asked)
 
-    def _solve(self, nlp: Nlp, asked: Asked, start, mesh: Mesh | None = None, *, explain: bool = False) -> Solution:
-        """Solve on a mesh, by default the planner's, from start values or from a solution on any mesh."""
+    def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
+        """Call an NLP's ``solve`` or ``approach`` with start values, or with a solution on any mesh.
+
+        ``mesh`` is that of the NLP, by default the planner's; ``how`` are further arguments. All solves pass here.
+        """
         mesh = mesh or self.mesh
-        multipliers = start.multipliers if isinstance(start, Solution) else None
-        known = isinstance(start, Solution | Near)
-        how = {"references": self.references(asked.srmp, mesh), "weights": asked.weights, "off": asked.off}
-        guess = start.guess(mesh.intervals()) if known else _on(mesh, start)
-        return nlp.solve(asked.parameters, guess, multipliers=multipliers, explain=explain, **how)
+        if isinstance(start, Solution | Near):
+            how |= {"multipliers": start.multipliers} if isinstance(start, Solution) else {}
+            guess = start.guess(mesh.intervals())
+        else:
+            guess = {name: start[name].resampled(n) for name, n in mesh.intervals().items()}
+        how |= {"references": self.references(asked.srmp, mesh), "weights": asked.weights, "off": asked.off}
+        return solve(asked.parameters, guess, **how)
 
     def _evened(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
         """The plan, with a dearer jerk if it jumps too far. Whoever sets the jerk's weight or drops it is obeyed."""
@@ -182,7 +187,7 @@ class WholeBodyPlanner:
                 break
             dearer = replace(asked, weights={**asked.weights, "jerk": factor * self.weights.jerk})
             try:
-                even = self._solve(self._warm, dearer, found.solution)
+                even = self._run(self._warm.solve, dearer, found.solution, explain=False)
             except SolverError:
                 break  # the audit says what is wrong with the tape
             found = replace(found, solution=even, uneven=(*found.uneven, found.solution.statistics))
@@ -192,7 +197,7 @@ class WholeBodyPlanner:
         """The solution, from the plan for a target close by, from the coarse mesh or from the guess itself."""
         if near is not None:
             try:
-                return WholeBodyPlan(asked.task, self._solve(self._warm, asked, near.solution))
+                return WholeBodyPlan(asked.task, self._run(self._warm.solve, asked, near.solution, explain=False))
             except SolverError:
                 pass  # as if there had been none
         if self._coarse is not None:
@@ -200,22 +205,24 @@ class WholeBodyPlanner:
                 return self._refine(asked, guess)
             except SolverError:
                 pass  # the fine mesh has the last word, and the better explanation
-        return WholeBodyPlan(asked.task, self._solve(self.nlp, asked, guess, explain=True))
+        return WholeBodyPlan(asked.task, self._run(self.nlp.solve, asked, guess))
 
     def _refine(self, asked: Asked, guess) -> WholeBodyPlan:
         """The solution from a few steps on the coarse mesh, or where they lead nowhere, from ipopt's solution there."""
         mesh = self.mesh.coarse()
         if self.tracking:
             guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
+
+        def refined(first):
+            solution = self._run(self._refined.solve, asked, first, explain=False)
+            return WholeBodyPlan(asked.task, solution, first.statistics)
+
         if self._steps:
-            references, how = self.references(asked.srmp, mesh), {"weights": asked.weights, "off": asked.off}
             try:
-                first = self._coarse.approach(asked.parameters, _on(mesh, guess), references=references, **how)
-                return WholeBodyPlan(asked.task, self._solve(self._refined, asked, first), first.statistics)
+                return refined(self._run(self._coarse.approach, asked, guess, mesh))
             except SolverError:
                 pass  # too far away for linear rows; what stays inside all limits finds more, and takes longer
-        first = self._solve(self._coarse, asked, guess, mesh)
-        return WholeBodyPlan(asked.task, self._solve(self._refined, asked, first), first.statistics)
+        return refined(self._run(self._coarse.solve, asked, guess, mesh, explain=False))
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:
         """Parameter values of the problem for a target and a ``start`` (see :meth:`plan`).
@@ -251,7 +258,7 @@ class WholeBodyPlanner:
     def _posture(self, name: str) -> np.ndarray:
         """Absolute link angles (5,) of a named posture of :data:`POSTURES`, CoM roughly above the sole."""
         knee, trunk, heel, arm = POSTURES[name]
-        angles = stance_angles(self.robot, knee, within_limits=False) if knee < 1.8 else self.stance.copy()
+        angles = stance_angles(self.robot, knee, within_limits=False)
         return angles + np.array([heel, heel * 0.5, 0.0, trunk - angles[3], trunk + arm - angles[4]])
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
@@ -270,11 +277,6 @@ class WholeBodyPlanner:
         phases = ("flat", 0.7, flat, {}), ("toe", TOE_PHASE_S, toe, {}), ("flight", flight_s, fly, ballistic)
         still = {name: np.zeros_like(q) for name, _, q, _ in phases}
         return {name: PhaseGuess(s, q, still[name], still[name], None, c) for name, s, q, c in phases}
-
-
-def _on(mesh: Mesh, guess: Mapping[str, PhaseGuess]) -> dict[str, PhaseGuess]:
-    """Start values at the nodes of a mesh."""
-    return {name: guess[name].resampled(n) for name, n in mesh.intervals().items()}
 
 
 def _through(knots, shares, intervals) -> np.ndarray:
