@@ -226,8 +226,8 @@ def guess_from_joints(
     motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
     takeoff, naive, out = float(joints.t[row]), planner.naive_guess(task), {}
     now, names = (x[row : row + 1] for x in motion), ("com", "com_velocity")
-    com, velocity = planar_quantities(planner.robot, *now, np.zeros((1, 2)), task.gravity, names).values()
-    ballistic = dict(com_x=com[0], com_z=com[1], vel_x=velocity[0], vel_z=velocity[1])
+    at_takeoff = planar_quantities(planner.robot, *now, np.zeros((1, 2)), task.gravity, names)
+    ballistic = dict(zip(("com_x", "com_z", "vel_x", "vel_z"), np.ravel([at_takeoff[k] for k in names]), strict=True))
     for name, t in planner.mesh.nodes(takeoff - toe_s, takeoff, joints.t[-1]).items():
         q, v, a = (np.stack([np.interp(t, joints.t, x) for x in y.T], -1) for y in motion)
         if name == "flat":
