@@ -165,7 +165,8 @@ def test_launch_matrices_are_the_written_problem(steps):
         for k in range(2):
             slip = x.J_toe[k] @ acc + x.drift_toe[k] - target.toe_acceleration[k]
             rows += [slip[[0, 1, 2, 3, 5]] == 0, F[6 * k + 4] == 0 if target.on_toes else slip[4] == 0]
-        ground, h = matrices.block("ground")
+        on_ground = matrices.layout.at("ground")
+        ground, h = matrices.G[on_ground], matrices.h[on_ground]
         limits, lower, upper = matrices.R, matrices.lower, matrices.upper
         both = cp.hstack([F, acc])
         rows += [ground @ both <= h, limits @ both >= lower, limits @ both <= upper]

@@ -12,7 +12,6 @@ from jumplab.stages.joint_qp.settings import Limits, Options
 
 OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # [N m], [rad/s] bounds of a row that is switched off, beyond all motion
 SIDES, AXES = ("left", "right"), ("x", "y", "z", "rx", "ry", "rz")
-RIGHT_SIDES = {"A": ("b",), "E": ("e",), "G": ("h",), "R": ("lower", "upper")}
 
 
 @dataclass(frozen=True)
@@ -58,11 +57,6 @@ class StepQp:
     lower: np.ndarray
     upper: np.ndarray
     layout: Layout = field(repr=False)
-
-    def block(self, name: str) -> tuple[np.ndarray, ...]:
-        """Matrix and right side (or lower and upper side) of the rows of one named block."""
-        matrix, rows = self.layout.blocks[name]
-        return tuple(getattr(self, x)[rows] for x in (matrix, *RIGHT_SIDES[matrix]))
 
     def objective(self, x: np.ndarray) -> float:
         """Value of the cost at ``x``."""

@@ -19,7 +19,7 @@ from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
 from jumplab.stages.joint_qp.problem import State, StepQp
 from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference
 from jumplab.stages.joint_qp.settings import GENTLE, Options
-from jumplab.stages.joint_qp.solve import Answer, solver_class
+from jumplab.stages.joint_qp.solve import SOLVERS, Answer
 
 CORRECTIONS = (1.0, 0.5, 0.0)  # shares of a misprediction that the next guess takes over; the second one is damped
 PREDICTED_RATE = 0.4  # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
@@ -56,12 +56,11 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the roll-out cost: steps, solver iterations, and time [s] for building, in the solver, and in all."""
+    """What the roll-out cost: steps, solver iterations, and time [s] in the solver and in all."""
 
     method: str
     steps: int
     iterations: int
-    build_s: float
     solve_s: float
     total_s: float
     worst_residual: float
@@ -83,10 +82,8 @@ class JointPlan:
     v: np.ndarray  # (N, nv) rates
     a: np.ndarray  # (N, nv) accelerations held from this node to the next; a phase's last node repeats the one before
     predicted: np.ndarray  # (N, nv) accelerations that the step's QP was written for
-    f: np.ndarray  # (N, 2, 6) wrenches on the feet, force then moment, world axes, at the contact frames' origins
+    f: np.ndarray  # (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of their frames
     tau: np.ndarray  # (N, nv - 6) joint torques [N m]
-    joint_names: tuple[str, ...]
-    contact_frames: tuple[str, ...]
     actual: dict[str, np.ndarray]
     reference: dict[str, np.ndarray]
     tracking: dict[str, float]  # summary of errors, see the function
@@ -112,7 +109,6 @@ class Rolled:
     terms: list[FullTerms] = field(default_factory=list)  # in the middle of the step
     predicted: list[np.ndarray] = field(default_factory=list)  # accelerations (nv,)
     answers: list[Answer] = field(default_factory=list)
-    build_s: float = 0.0
     solve_s: float = 0.0
 
 
@@ -178,10 +174,8 @@ class JointMapper:
 
     def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> Rolled:
         """Solve and integrate all steps of one phase."""
-        first, clock = WRENCH if qp is self.launch else 0, time.perf_counter
         out, solver, before = Rolled(states=[state]), None, state.a
         for k, h in enumerate(qp.steps):
-            began = clock()
             node = self.body.motion(state.q, state.v)
             target = qp.target(k, node)
             guess = 2 * state.a - before
@@ -189,10 +183,10 @@ class JointMapper:
                 terms = self.middle(state, guess, h)
                 matrices = qp.matrices(terms, target, state)
                 solver = solver or solver_type(matrices)
-                built = clock()
+                began = time.perf_counter()
                 answer = solver.solve(matrices, qp.name, qp.t[k])
-                out.build_s, out.solve_s, began = out.build_s + built - began, out.solve_s + clock() - built, clock()
-                a, predicted = answer.x[first:], guess
+                out.solve_s += time.perf_counter() - began
+                a, predicted = answer.x[qp.first :], guess
                 if np.abs(a - guess).max() * h / 2 < PREDICTED_RATE:
                     break
                 guess = guess + share * (a - guess)
@@ -208,15 +202,17 @@ class JointMapper:
 
     def run(self, method: str = "cvxpy") -> JointPlan:
         """Roll out launch and flight with "cvxpy" or "direct"."""
-        solver_type = solver_class(method)
+        if not isinstance(method, str) or method not in SOLVERS:
+            raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")
+        solver_type = SOLVERS[method]
         began, rest = time.perf_counter(), np.zeros(self.body.nv)
         launch = self.roll(self.launch, solver_type, State(self.q0, rest, rest))
         takeoff = launch.states[-1]
         flight = self.roll(self.flight_from(takeoff), solver_type, takeoff)
         total, answers = time.perf_counter() - began, launch.answers + flight.answers
-        spent = launch.build_s + flight.build_s, launch.solve_s + flight.solve_s, total
         iterations, worst = sum(x.iterations for x in answers), max(x.residual for x in answers)
-        return self._plan(launch, flight, Statistics(method, len(answers), iterations, *spent, worst))
+        spent = Statistics(method, len(answers), iterations, launch.solve_s + flight.solve_s, total, worst)
+        return self._plan(launch, flight, spent)
 
     def _plan(self, launch: Rolled, flight: Rolled, statistics: Statistics) -> JointPlan:
         """Put both phases together, and freeze them."""
@@ -241,9 +237,8 @@ class JointMapper:
         actual, reference = self._series(launch.nodes + flight.nodes, n + 1)
         for x in (*data.values(), *actual.values(), *reference.values()):
             x.setflags(write=False)
-        names = {"joint_names": self.body.robot.joint_names, "contact_frames": self.body.robot.foot.frames}
         seen = {"actual": actual, "reference": reference, "tracking": tracking(actual, reference, n + 1)}
-        return JointPlan(**data, **names, **seen, statistics=statistics, options=self.options)
+        return JointPlan(**data, **seen, statistics=statistics, options=self.options)
 
     def _at_origins(self, terms, F) -> np.ndarray:
         """Wrenches moved from the tiptoes to the origins of the foot frames."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from proxsuite import proxqp
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import SolverError
 from jumplab.stages.joint_qp.diagnosis import ADVICE, conflict, lines, row_scale, sentence
 from jumplab.stages.joint_qp.problem import StepQp
 
@@ -194,10 +194,3 @@ class DirectSolver:
 
 
 SOLVERS = {"cvxpy": CvxpySolver, "direct": DirectSolver}
-
-
-def solver_class(method: str) -> type:
-    """The solver class of a method's name."""
-    if not isinstance(method, str) or method not in SOLVERS:
-        raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")
-    return SOLVERS[method]
