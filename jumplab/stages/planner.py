@@ -146,14 +146,15 @@ class Planner:
 
     def _pass(self, task: JumpTask, start: np.ndarray | None = None) -> tuple[SrmpPlan, JointPlan]:
         q0 = None if start is None else configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
-        srmp, robot = self.stage("srmp").plan(task, start=self._rod(start)), self.robot.under_gravity(task.gravity)
+        srmp, robot = self._pendulum(task, start), self.robot.under_gravity(task.gravity)
         try:
             return srmp, map_to_joints(srmp, robot, STEPS_S, "direct", q0=q0)
         except SolverError:  # at its limits a jump needs more of them
             return srmp, map_to_joints(srmp, robot, method="direct", q0=q0)
 
-    def _rod(self, start: np.ndarray | None) -> np.ndarray | None:
-        return None if start is None else rod_of(self.robot, start)
+    def _pendulum(self, task: JumpTask, start: np.ndarray | None, **near: SrmpPlan) -> SrmpPlan:
+        """Stage 1, from the rod of a posture in which the robot waits."""
+        return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **near)
 
     def _nearest(self, task: JumpTask) -> str:
         """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
@@ -189,7 +190,7 @@ class Planner:
         if previous.method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
         else:
-            srmp, last = self.stage("srmp").plan(task, near=previous.srmp, start=self._rod(start)), "whole body"
+            srmp, last = self._pendulum(task, start, near=previous.srmp), "whole body"
         body = self.stage(last).plan(task, srmp, near=previous.whole_body, start=start)
         return self._finished(previous.method, body, srmp)
 

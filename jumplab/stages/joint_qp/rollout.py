@@ -144,7 +144,7 @@ class JointMapper:
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
         self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
-        toe_s = getattr(srmp_plan, "toe_s", None) if self.options.toe_s is None else self.options.toe_s
+        toe_s = getattr(srmp_plan, "toe_s", None)
         toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
         launch = LaunchReference.sample(srmp_plan, parts[0], toe)
         self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)

@@ -87,7 +87,6 @@ class Options:
     launch: LaunchWeights = LaunchWeights()
     flight: FlightWeights = FlightWeights()
     limits: Limits = Limits()
-    toe_s: float | None = None  # toe phase before take-off [s]; None: the plan's, else while its CoP stays at the toe
     arm_rad: float = -1.5  # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
 
 

@@ -72,14 +72,12 @@ class WholeBodyTerms:
             p.memo["torques"] = self.state(p).torques(None if self.flying else (0.0, 0.0))
         return p.memo["torques"]
 
-    def ballistic_com(self, p: Point) -> ca.SX:
-        """Place of the CoM (2,) on its parabola [m]."""
-        t = p.time
-        return ca.vertcat(p.c.com_x + p.c.vel_x * t, p.c.com_z + p.c.vel_z * t - p.p.gravity * t * t / 2)
-
     def toe(self, p: Point) -> ca.SX:
-        """Place of the toe (2,) [m]: the origin in launch; in flight the parabola less the CoM from the toe."""
-        return self.ballistic_com(p) - self.state(p).com if self.flying else ca.SX.zeros(2)
+        """Place of the toe (2,) [m]: the origin in launch; in flight the CoM's parabola less the CoM from the toe."""
+        if not self.flying:
+            return ca.SX.zeros(2)
+        t, c = p.time, p.c
+        return ca.vertcat(c.com_x + c.vel_x * t, c.com_z + c.vel_z * t - p.p.gravity * t * t / 2) - self.state(p).com
 
     def ground(self, p: Point, x: ca.SX) -> ca.SX:
         """Height of the surface below x: a step of the platform's height at the edge, smoothed."""
