@@ -11,7 +11,8 @@ import pytest
 from fixtures_core import planner
 
 from jumplab.robot import Robot
-from jumplab.stages.joint_qp import solve
+from jumplab.stages.joint_qp import DirectSolver
+from jumplab.stages.joint_qp.solve import Program
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
@@ -71,40 +72,38 @@ def test_joint_map_is_the_same_to_the_last_bit():
     assert len(seen) == 1
 
 
-# ------------------------------------------------------------------------------------------ the polishing behind it
+# ------------------------------------------------------------------------------------------ rows known to bind
 
 
-def small_problem(twice: bool):
+def small_program(twice: bool):
     """min |x - (2, 2, 2)|^2 / 2 with x_0 + x_1 = 1 and x_2 <= 1 (said twice if asked): x = (1/2, 1/2, 1)."""
     rows = np.array([[0.0, 0.0, 1.0]] * (2 if twice else 1) + [[1.0, 0.0, 0.0]])
     low, high = np.full(len(rows), -np.inf), np.r_[np.ones(len(rows) - 1), 7.0]
-    multipliers = np.r_[np.full(len(rows) - 1, 1.0 / (len(rows) - 1)), 0.0]
-    return (np.eye(3), -2 * np.ones(3), np.array([[1.0, 1.0, 0.0]]), np.ones(1), rows, low, high), multipliers
+    return Program(np.eye(3), -2 * np.ones(3), np.array([[1.0, 1.0, 0.0]]), np.ones(1), rows, low, high)
 
 
 @pytest.mark.parametrize("twice", [False, True])
-def test_polishing_finds_the_closed_form(twice):
+def test_from_a_rough_answer_to_the_closed_form(twice):
     """From 1e-8 off to round-off, dependent rows or not."""
-    data, multipliers = small_problem(twice)
-    rough = np.array([0.5 + 1e-8, 0.5 - 1e-8, 1.0 + 2e-8])
-    np.testing.assert_allclose(solve.polished(*data, rough, multipliers), [0.5, 0.5, 1.0], rtol=0, atol=1e-15)
+    program, n = small_program(twice), 2 if twice else 1
+    binding = program.binding(np.array([0.5 + 1e-8, 0.5 - 1e-8, 1.0 + 2e-8]), np.r_[np.full(n, 1.0 / n), 0.0])
+    assert list(binding[0]) == [True] * n + [False] and not binding[1].any()
+    np.testing.assert_allclose(program.settled(*binding)[0], [0.5, 0.5, 1.0], rtol=0, atol=1e-15)
 
 
-def test_polishing_never_replaces_an_answer():
-    """Wrong multipliers let the row go; what comes out is far off, and the solver's answer is kept."""
-    data, multipliers = small_problem(False)
-    x = np.array([0.5, 0.5, 1.0])
-    assert solve.polished(*data, x, 0 * multipliers) is x
+def test_without_settled_rows_the_solvers_answer_stays(monkeypatch):
+    from test_joint_map_inputs import small_qp
 
-
-# ------------------------------------------------------------------------------------------ rows known to bind
+    monkeypatch.setattr(Program, "settled", lambda self, top, bottom: None)
+    solver = DirectSolver(small_qp())
+    for _ in range(2):
+        np.testing.assert_allclose(solver.solve(small_qp(), "test", 0.0).x, [0.2, 0.8], atol=1e-7)
 
 
 @pytest.mark.parametrize("top, tries", [([True, False], 1), ([False, False], 2), ([True, True], 2)])
 def test_binding_rows_join_and_leave(top, tries):
     """Known, missing, or one too many: the rows that bind are found, and with them the closed form."""
-    data, _ = small_problem(False)
-    x, at_top, at_bottom, count = solve.from_binding(*data, np.array(top), np.zeros(2, bool))
+    x, at_top, at_bottom, count = small_program(False).settled(np.array(top), np.zeros(2, bool))
     np.testing.assert_allclose(x, [0.5, 0.5, 1.0], rtol=0, atol=1e-14)
     assert list(at_top) == [True, False] and not at_bottom.any() and count == tries
 
@@ -118,7 +117,7 @@ def test_binding_rows_end_at_the_optimum_or_say_nothing():
     top = bottom = np.zeros(6, bool)
     for k in range(40):
         push = linear + k * drift
-        found = solve.from_binding(hessian, push, *no_rows, rows, -high, high, top, bottom)
+        found = Program(hessian, push, *no_rows, rows, -high, high).settled(top, bottom)
         if found is None:
             continue
         x, top, bottom, _ = found

@@ -25,15 +25,9 @@ from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS = ("three-step", "direct")
-# Our choice: shares of the arms' swing in stage 3's guess. Stage 2's arms swing two to three times as far as stage 3's,
-# whichever way inertia and L ask for: from half of their swing alone, 13 of 24 targets ended in one that costs up
-# to 44 % more. From this mixture one of 41 does (7 %), after 11 iterations on the fine mesh
-OWN_ARMS, NAIVE_ARMS = 0.25, 0.75
-# our choice: stage 2's steps on flat feet, on the toes, in flight [s]. Its motion is only stage 3's start here, and it
-# keeps all of stage 2's gates over 24 targets (toe drift 0.79 mm of 1, inertia within 2.8 % of 3) in two thirds of the
-# time that 10 ms take; with 20 ms on flat feet inertia misses its gate, with 20 ms on the toes they drift by 1.7 mm
-STEPS_S = (0.015, 0.0125, 0.02)
-SHORTER = (0.9, 0.7, 0.5)  # our choice: of the distance; tried after a refusal, half a second each
+OWN_ARMS, NAIVE_ARMS = 0.25, 0.75  # shares of the arms' swing in stage 3's guess: stage 2's arms swing too far
+STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
+SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
 
@@ -46,27 +40,31 @@ class Planner:
     def __init__(self, robot: Robot, mesh: Mesh = Mesh(), *, keep: bool = False):
         require_type(robot, Robot, "the robot to plan for")
         self.robot, self.mesh, self.keep = robot, mesh, keep
-        self._stages: dict = {}
+        self._stages: dict[str, Any] = {}
 
     def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "srmp", "whole body" or "direct"."""
+        """A stage's planner: "reach", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
         if name not in self._stages:
             build = {
                 "reach": lambda: reach(self.robot),
                 "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
                 "srmp flip": lambda: SrmpPlanner(self.robot, SrmpSettings().of_flip(), keep=self.keep),
                 "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
-                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
                 "whole body flip": lambda: FlipPlanner(self.robot),
+                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
                 "direct flip": lambda: FlipPlanner(self.robot, tracking=False),
             }
             self._stages[name] = build[name]()
         return self._stages[name]
 
     def plan(
-        self, task: JumpTask, method: str = "three-step", *, weights: Mapping[str, float] | None = None,
+        self,
+        task: JumpTask,
+        method: str = "three-step",
+        *,
+        weights: Mapping[str, float] | None = None,
         start: np.ndarray | None = None,
-    ) -> JumpPlan:  # fmt: skip
+    ) -> JumpPlan:
         """Plan one jump.
 
         Parameters
@@ -86,46 +84,57 @@ class Planner:
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
         check_platform(task, self.robot)
-        where = _from(start, task)
+        if start is not None and task.rotation_rad:
+            raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
+        where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
-            body = planner.plan(task, weights=weights, **where)
-            rows = body_rows("direct", body)
-            return JumpPlan(task, self.robot, method, make_tape(body, self.robot), None, None, body, rows)
+            return self._finished(method, planner.plan(task, weights=weights, **where))
         if task.rotation_rad:
             return self._flip(task)
         srmp, joints = self._first_two(task, start)
         last = self.stage("whole body")
-        body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s), weights=weights,
-                         **where)  # fmt: skip
-        rows = (_row("1 SRMP", srmp.solution.statistics), _joint_row(joints), *body_rows("3 whole body", body))
-        return JumpPlan(task, self.robot, method, make_tape(body, self.robot, srmp), srmp, joints, body, rows)
+        guess = guess_from_joints(joints, last, task, srmp.toe_s)
+        body = last.plan(task, srmp, guess=guess, weights=weights, **where)
+        return self._finished(method, body, srmp, joints, (_joint_row(joints),))
+
+    def _finished(
+        self,
+        method: str,
+        body: WholeBodyPlan,
+        srmp: SrmpPlan | None = None,
+        joints: JointPlan | None = None,
+        rows: tuple[StageRow, ...] = (),
+        skipped: str | None = None,
+    ) -> JumpPlan:
+        """The plan with its tape and the table of stages; ``rows`` are stage 2's."""
+        if srmp is not None:
+            rows = (_row("1 SRMP", srmp.solution.statistics), *rows)
+        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
+        tape = make_tape(body, self.robot, srmp)
+        return JumpPlan(body.task, self.robot, method, tape, srmp, joints, body, rows, skipped)
 
     def _flip(self, task: JumpTask) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
-        srmp, joints, skipped = self.stage("srmp flip").plan(task), None, None
-        last = self.stage("whole body flip")
-        rows = [_row("1 SRMP", srmp.solution.statistics)]
+        first, last = self.stage("srmp flip"), self.stage("whole body flip")
+        srmp, joints, body, skipped, rows = first.plan(task), None, None, None, ()
         try:
             joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
-            rows.append(_joint_row(joints))
+            rows = (_joint_row(joints),)
         except SolverError as e:
             skipped = f"{e}; {OTHERWISE}"
-        body, climb = None, self.stage("srmp flip").plan
         if joints is not None:
             try:
                 body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
             except SolverError as e:
                 skipped, joints = f"stage 2: its motion led nowhere ({e}); {OTHERWISE}", None
-        body = body or last.plan(task, srmp, stage1=climb)
-        rows = (*rows, *body_rows("3 whole body", body))
-        return JumpPlan(task, self.robot, "three-step", make_tape(body, self.robot, srmp), srmp, joints, body, rows,
-                        skipped)  # fmt: skip
+        body = body or last.plan(task, srmp, stage1=first.plan)
+        return self._finished("three-step", body, srmp, joints, rows, skipped)
 
-    def _first_two(self, task: JumpTask, start=None) -> tuple[SrmpPlan, JointPlan]:
+    def _first_two(self, task: JumpTask, start: np.ndarray | None) -> tuple[SrmpPlan, JointPlan]:
         """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
         try:
             return self._pass(task, start)
@@ -137,15 +146,15 @@ class Planner:
 
     def _pass(self, task: JumpTask, start: np.ndarray | None = None) -> tuple[SrmpPlan, JointPlan]:
         q0 = None if start is None else configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
-        srmp = self.stage("srmp").plan(task, start=self._rod(start))
-        robot = self.robot.under_gravity(task.gravity)
+        srmp, robot = self._pendulum(task, start), self.robot.under_gravity(task.gravity)
         try:
             return srmp, map_to_joints(srmp, robot, STEPS_S, "direct", q0=q0)
-        except SolverError:  # at its limits a jump needs more of them: 2 of 143
+        except SolverError:  # at its limits a jump needs more of them
             return srmp, map_to_joints(srmp, robot, method="direct", q0=q0)
 
-    def _rod(self, start: np.ndarray | None) -> np.ndarray | None:
-        return None if start is None else rod_of(self.robot, start)
+    def _pendulum(self, task: JumpTask, start: np.ndarray | None, **near: SrmpPlan) -> SrmpPlan:
+        """Stage 1, from the rod of a posture in which the robot waits."""
+        return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **near)
 
     def _nearest(self, task: JumpTask) -> str:
         """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
@@ -177,27 +186,22 @@ class Planner:
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         check_platform(task, self.robot)
+        srmp, last = None, "direct"
         if previous.method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
-            body, srmp, rows = self.stage("direct").plan(task, near=previous.whole_body, start=start), None, ()
         else:
-            srmp = self.stage("srmp").plan(task, near=previous.srmp, start=self._rod(start))
-            body = self.stage("whole body").plan(task, srmp, near=previous.whole_body, start=start)
-            rows = (_row("1 SRMP", srmp.solution.statistics),)
-        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
-        tape = make_tape(body, self.robot, srmp)
-        return JumpPlan(task, self.robot, previous.method, tape, srmp, None, body, rows)
-
-
-def _from(start: np.ndarray | None, task: JumpTask) -> dict[str, np.ndarray]:
-    """The argument ``start`` of stage 3, which has none for flips."""
-    if start is not None and task.rotation_rad:
-        raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
-    return {} if start is None else {"start": start}
+            srmp, last = self._pendulum(task, start, near=previous.srmp), "whole body"
+        body = self.stage(last).plan(task, srmp, near=previous.whole_body, start=start)
+        return self._finished(previous.method, body, srmp)
 
 
 def _row(stage: str, s: Statistics) -> StageRow:
     return StageRow(stage, s.iterations, s.build_s, s.solve_s)
+
+
+def _joint_row(joints: JointPlan) -> StageRow:
+    s = joints.statistics
+    return StageRow("2 joint map", s.iterations, s.total_s - s.solve_s, s.solve_s)
 
 
 def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
@@ -207,11 +211,6 @@ def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
     return (*coarse, *uneven, _row(stage, body.solution.statistics))
 
 
-def _joint_row(joints: JointPlan) -> StageRow:
-    s = joints.statistics
-    return StageRow("2 joint map", s.iterations, s.total_s - s.solve_s, s.solve_s)
-
-
 def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> JumpPlan:
     """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
     return Planner(robot, keep=True).plan(task, method)
@@ -219,28 +218,34 @@ def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> Ju
 
 def guess_from_joints(
     joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float
-) -> Mapping[str, PhaseGuess]:
+) -> dict[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing mostly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`.
+    The arms swing mostly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`. ``toe_s`` is the length of
+    the toe phase [s].
     """
-    robot = planner.robot
-    angles, rates, accels = to_link_angles(robot, joints.q, joints.v, joints.a)
-    takeoff = int(np.argmax(joints.phase == "flight"))
-    rel = planar_quantities(robot, *(x[takeoff : takeoff + 1] for x in (angles, rates, accels)), np.zeros((1, 2)),
-                            task.gravity, ("com", "com_velocity"))  # fmt: skip
-    guess = planner.guess_from_motion(joints.t, angles, rates, accels, float(joints.t[takeoff]), toe_s, rel["com"],
-                                      rel["com_velocity"])  # fmt: skip
-    naive = planner.naive_guess(task)
-    return {name: _with_arms(body, naive[name]) for name, body in guess.items()}
+    motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
+    takeoff, naive, out = float(joints.t[row]), planner.naive_guess(task), {}
+    now, names = (x[row : row + 1] for x in motion), ("com", "com_velocity")
+    at_takeoff = planar_quantities(planner.robot, *now, np.zeros((1, 2)), task.gravity, names)
+    ballistic = dict(zip(("com_x", "com_z", "vel_x", "vel_z"), np.ravel([at_takeoff[k] for k in names]), strict=True))
+    for name, t in planner.mesh.nodes(takeoff - toe_s, takeoff, joints.t[-1]).items():
+        q, v, a = (np.stack([np.interp(t, joints.t, x) for x in y.T], -1) for y in motion)
+        if name == "flat":
+            q, v, a = q[:, 1:], v[:, 1:], a[:, 1:]
+        if name == "toe":
+            q[:, 0] = np.maximum(q[:, 0], 0.0)
+        body = PhaseGuess(t[-1] - t[0], q, v, a, None, ballistic if name == "flight" else {})
+        out[name] = _with_arms(body, naive[name])
+    return out
 
 
 def _with_arms(body: PhaseGuess, arms: PhaseGuess) -> PhaseGuess:
     """One phase of a guess, its last link swinging partly as in another guess, in its own time."""
     pace, joined = arms.duration / body.duration, []
     for k, (x, y) in enumerate(((body.q, arms.q), (body.v, arms.v), (body.a, arms.a))):
-        other = 0.0 if y is None else y[:, -1] * pace**k
-        joined.append(np.column_stack([x[:, :-1], OWN_ARMS * x[:, -1] + NAIVE_ARMS * other]))
+        arm = OWN_ARMS * x[:, -1] + NAIVE_ARMS * (y[:, -1] * pace**k)
+        joined.append(np.column_stack([x[:, :-1], arm]))
     return replace(body, q=joined[0], v=joined[1], a=joined[2])
 
 
@@ -267,8 +272,8 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
     """The 1 kHz tape of a whole-body plan, with planar and stage-1 trajectories under their own names."""
     gravity = body.task.gravity
     motion = planar_motion(body.solution.phases, gravity, robot)
-    values = planar_quantities(robot, motion["angles"], motion["rates"], motion["accels"], motion["toe_acceleration"],
-                               gravity)  # fmt: skip
+    state = (motion[k] for k in ("angles", "rates", "accels", "toe_acceleration"))
+    values = planar_quantities(robot, *state, gravity)
     extra = {
         "planar_com": motion["toe"] + values["com"],
         "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"],

@@ -11,7 +11,7 @@ from jumplab.ocp import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
 
-SHORTEST_STEP = 0.05  # our choice: share of a sample; a shorter last step is joined to the one before
+SHORTEST_STEP = 0.05  # share of a sample; a shorter last step is joined to the one before
 COM = ("com", "com_velocity", "com_acceleration")
 _EVALUATORS: dict = {}
 
@@ -38,13 +38,6 @@ def planar_quantities(
     return {k: v.full().T.squeeze() for k, v in out.items()}
 
 
-def _joint_columns(robot: Robot):
-    """Column in v, row of the role and sign of every joint with a role."""
-    model, rows = robot.model, robot.role_signs()
-    columns = [model.idx_vs[model.getJointId(name)] for name, _, _ in rows]
-    return np.array(columns), np.array([row for _, row, _ in rows]), np.array([sign for _, _, sign in rows])
-
-
 def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:
     """Sample the planner's own interpolant at 1 kHz: t, angles, rates, accels (n, 5), toe with derivatives (n, 2).
 
@@ -58,21 +51,23 @@ def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot
     q, v, a = _launch_samples(flat, toe, np.maximum(t_launch, 0.0))
     t_flight = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
     qf, vf, af = flight.sample(t_flight)
-    c = flight.constants
-    com = np.stack([c["com_x"] + c["vel_x"] * t_flight,
-                    c["com_z"] + c["vel_z"] * t_flight - gravity * t_flight**2 / 2], -1)  # fmt: skip
-    com_v = np.stack([np.full_like(t_flight, c["vel_x"]), c["vel_z"] - gravity * t_flight], -1)
+    c, t = flight.constants, t_flight
+    com = np.stack([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - gravity * t**2 / 2], -1)
+    com_v = np.stack([np.full_like(t, c["vel_x"]), c["vel_z"] - gravity * t], -1)
     rel = planar_quantities(robot, qf, vf, af, np.zeros((len(qf), 2)), gravity, COM)
-    toe_f = com - rel["com"], com_v - rel["com_velocity"], np.array([0.0, -gravity]) - rel["com_acceleration"]
-    start = t_launch[0]
-    zeros = np.zeros((len(t_launch), 2))
-    return dict(
-        t=np.concatenate([t_launch - start, launch_s - start + t_flight]),
-        angles=np.concatenate([q, qf]), rates=np.concatenate([v, vf]), accels=np.concatenate([a, af]),
-        toe=np.concatenate([zeros, toe_f[0]]), toe_velocity=np.concatenate([zeros, toe_f[1]]),
-        toe_acceleration=np.concatenate([zeros, toe_f[2]]),
-        flying=np.concatenate([np.zeros(len(t_launch), bool), np.ones(len(t_flight), bool)]),
-        toe_phase_start=np.array(flat.duration - start))  # fmt: skip
+    fall = np.array([0.0, -gravity])
+    start, zeros = t_launch[0], np.zeros((len(t_launch), 2))
+    return {
+        "t": np.concatenate([t_launch - start, launch_s - start + t]),
+        "angles": np.concatenate([q, qf]),
+        "rates": np.concatenate([v, vf]),
+        "accels": np.concatenate([a, af]),
+        "toe": np.concatenate([zeros, com - rel["com"]]),
+        "toe_velocity": np.concatenate([zeros, com_v - rel["com_velocity"]]),
+        "toe_acceleration": np.concatenate([zeros, fall - rel["com_acceleration"]]),
+        "flying": np.repeat([False, True], [len(t_launch), len(t)]),
+        "toe_phase_start": np.array(flat.duration - start),
+    }
 
 
 def _launch_samples(flat, toe, t):
@@ -96,29 +91,29 @@ def expand(
     Foot wrenches are half of the planar ground wrench each; joint torques follow from inverse dynamics of the full
     robot, whose base rows are left for the audit to judge.
     """
-    model, n = robot.model, len(motion["t"])
-    columns, role, signs = _joint_columns(robot)
-    origin = -robot.sagittal.sole_center
-    angles, rates, accels = motion["angles"], motion["rates"], motion["accels"]
-    q = configuration(robot, angles, motion["toe"] + origin)
+    model, n, roles = robot.model, len(motion["t"]), robot.role_signs()
+    columns = [model.idx_vs[model.getJointId(name)] for name, _, _ in roles]
+    role, signs = [row for _, row, _ in roles], np.array([sign for _, _, sign in roles])
+    angles, rates, accels, flying = (motion[k] for k in ("angles", "rates", "accels", "flying"))
+    toe = motion["toe"] - robot.sagittal.sole_center
+    q = configuration(robot, angles, toe)
     v, a = np.zeros((n, model.nv)), np.zeros((n, model.nv))
     v[:, columns] = robot.sagittal.joint_angles(rates)[:, role] * signs
     a[:, columns] = robot.sagittal.joint_angles(accels)[:, role] * signs
     base_v, base_a = _base_motion(robot, motion)
-    pitch, w, alpha = angles[:, 3], rates[:, 3], accels[:, 3]
+    pitch, w = angles[:, 3], rates[:, 3]
     v[:, [0, 2]], v[:, 4] = _into_body(pitch, base_v), w
     # derivative of the body-frame velocity: R' (a - w x v)
     cross = np.stack([w * base_v[:, 1], -w * base_v[:, 0]], -1)
-    a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), alpha
+    a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), accels[:, 3]
     if wrench is None:
-        some = planar_quantities(robot, angles, rates, accels, motion["toe_acceleration"], gravity, ("ground_wrench",))
-        wrench = some["ground_wrench"]
-    wrench = np.where(motion["flying"][:, None], 0.0, wrench)
-    f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, motion["toe"] + origin, ~motion["flying"])
-    phase = np.where(motion["flying"], "flight", "launch")
-    planar = {f"planar_{k}": x for k, x in motion.items() if k not in ("t", "flying")}
-    return Tape(motion["t"], q, v, a, tau, phase, np.array(robot.foot.frames), f, np.array(robot.joint_names),
-                {**planar, **(extra or {})})  # fmt: skip
+        now = angles, rates, accels, motion["toe_acceleration"]
+        wrench = planar_quantities(robot, *now, gravity, ("ground_wrench",))["ground_wrench"]
+    wrench = np.where(flying[:, None], 0.0, wrench)
+    f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, toe, ~flying)
+    phase, names = np.where(flying, "flight", "launch"), (np.array(robot.foot.frames), np.array(robot.joint_names))
+    extra = {f"planar_{k}": x for k, x in motion.items() if k not in ("t", "flying")} | (extra or {})
+    return Tape(motion["t"], q, v, a, tau, phase, names[0], f, names[1], extra)
 
 
 def _into_body(pitch, vectors):

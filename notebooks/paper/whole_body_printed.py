@@ -26,7 +26,7 @@ from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import ROLES
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.settings import Limits, Weights
+from jumplab.stages.whole_body.settings import Contact, Limits, Weights
 from jumplab.stages.whole_body.terms import WholeBodyTerms
 from jumplab.task import JumpTask
 
@@ -105,8 +105,8 @@ def _moment(lever, force):
 class PrintedTerms(WholeBodyTerms):
     """Expressions of Sec. V at one instant in the paper's coordinates; pure. Inertia terms are those of ours."""
 
-    def __init__(self, robot: Robot, weights: Weights):
-        super().__init__(robot, Limits(), weights)
+    def __init__(self, robot: Robot, weights: Weights, contact: Contact = Contact.TOE):
+        super().__init__(robot, Limits(), weights, contact)
         self.base = PaperCoordinates(robot.sagittal).base
 
     def state(self, p: Point) -> PlanarState:
@@ -151,11 +151,11 @@ class PrintedTerms(WholeBodyTerms):
         return Term(name, "WF-D1" if flying else "WL-D1..D3", "m g, 0.1 m g", at,
                     lambda p: self.base_rows(p, flying) / size, skip=skip)  # fmt: skip
 
-    def _shared(self, flying: bool) -> list[Term]:
+    def _shared(self) -> list[Term]:
         kept, w = ("track inertia", "track inertia rate", "ankle rate"), self.weights
-        smooth = "WF-J2" if flying else "WL-J2"
+        smooth = "WF-J2" if self.flying else "WL-J2"
         return [
-            *(t for t in self.tracking(flying) if t.name in kept),
+            *(t for t in self.tracking() if t.name in kept),
             Term("acceleration", smooth, "m/s^2, rad/s^2", "node", lambda p: p.a, weight=w.joint_acceleration),
             Term("jerk", smooth, "m/s^3, rad/s^3", "mid", lambda p: p.j, weight=w.jerk),
         ]
@@ -164,7 +164,7 @@ class PrintedTerms(WholeBodyTerms):
         """WL-*: tracking, smoothness, heel; dynamics, contact, end velocity."""
         moving, w = (1, 0), self.weights  # the start is given
         return (
-            *self._shared(False),
+            *self._shared(),
             Term("track velocity", "WL-J1", "m/s", "node", lambda p: self.com(p, 1) - p.ref.velocity,
                  weight=w.track_velocity),
             Term("ground force", "WL-J2", "N", "node", lambda p: p.z, weight=FORCE_WEIGHT),
@@ -178,7 +178,7 @@ class PrintedTerms(WholeBodyTerms):
     def flight(self) -> tuple[Term, ...]:
         """WF-*: tracking, smoothness; dynamics, symmetric end."""
         return (
-            *self._shared(True),
+            *self._shared(),
             self._base(AT_TAKEOFF, True, "start"),
             self._base("base rows", True, "node", (1, 0)),
             Term("symmetric foot", "WF-E2", "m", "end", lambda p: self.foot_ahead(p) + p.p.foot_ahead),
@@ -191,7 +191,8 @@ def _given(name: str):
 
 def build_printed(robot: Robot, weights: Weights = Weights(), intervals: int = INTERVALS) -> tuple[Problem, Problem]:
     """The launch problem and the flight problem of Sec. V, each alone; durations are stage 1's."""
-    terms, m, fixed = PrintedTerms(robot, weights), robot.sagittal, (_given("duration"), _given("duration"))
+    terms, flown = PrintedTerms(robot, weights), PrintedTerms(robot, weights, Contact.FLIGHT)
+    m, fixed = robot.sagittal, (_given("duration"), _given("duration"))
     low, high, rate = -np.array(BASE_BOX), np.array(BASE_BOX), np.array([*BASE_RATE_BOX, *m.speed])
     boxes = (Bound("position box", "WL-S, WF-S", "m, rad", "q", [*low, *m.lower], [*high, *m.upper], "inner"),
              Bound("rate box", "WL-S, WF-S", "m/s, rad/s", "v", -rate, rate, "inner"),
@@ -207,7 +208,7 @@ def build_printed(robot: Robot, weights: Weights = Weights(), intervals: int = I
     rest = tuple(Bound(f"joints at rest ({k})", "WF-E1", "rad, s", k, 0.0 - joints, joints, "end") for k in "va")
     launch = Phase("launch", COORDINATES, intervals, fixed, terms.launch(), boxes + start, ("F_x", "F_z"),
                    references={"rho": 1, "rho_rate": 1, "velocity": 2, "L_rate": 1}, scales=SCALES)  # fmt: skip
-    flight = Phase("flight", COORDINATES, intervals, fixed, terms.flight(), boxes + link + rest,
+    flight = Phase("flight", COORDINATES, intervals, fixed, flown.flight(), boxes + link + rest,
                    references={"rho": 1, "rho_rate": 1}, scales=SCALES)  # fmt: skip
     common = dict(theta=7, duration=1, gravity=1)
     linked = {"theta'": 7, "theta''": 7, "foot_ahead": 1}

@@ -9,8 +9,8 @@ import numpy as np
 
 from jumplab.stages.joint_qp.problem import StepQp
 
-CONFLICT_SHARE = 1e-3  # our choice: rows that give way by less than this share of the worst are not named
-PRICE_SHARE = 0.05  # our choice: limits whose price is below this share of the dearest are not named
+CONFLICT_SHARE = 1e-3  # rows that give way by less than this share of the worst are not named
+PRICE_SHARE = 0.05  # limits with a price below this are not named
 MAX_NAMED = 5
 ADVICE = "ask for another distance, height or fewer turns, or plan it by the method 'direct'"
 # block of rows -> what it says, unit of its linear rows, unit of its angular ones
@@ -33,16 +33,10 @@ ANGULAR = ("rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class Conflict:
-    """Rows that cannot hold together.
+    """Rows that cannot hold together."""
 
-    Attributes
-    ----------
-    gives : (block, row, amount) of the rows that give way in the least total (scaled) relaxation, worst first.
-    limits : (block, row) of the inequalities that force them to, dearest first.
-    """
-
-    gives: tuple[tuple[str, str, float], ...]
-    limits: tuple[tuple[str, str], ...]
+    gives: tuple[tuple[str, str, float], ...]  # (block, row, amount) that give way in the least total, worst first
+    limits: tuple[tuple[str, str], ...]  # (block, row) of the inequalities that force them to, dearest first
 
 
 def row_scale(qp: StepQp) -> dict[str, np.ndarray]:
@@ -53,10 +47,10 @@ def row_scale(qp: StepQp) -> dict[str, np.ndarray]:
 
 def _named(qp: StepQp) -> dict[str, list[tuple[str, str]]]:
     """(block, row) of every row of E, G and R."""
-    out = {k: [("", "")] * qp.layout.size(k) for k in "EGR"}
+    out = {k: [("", "")] * len(qp.layout.labels[k]) for k in "EGR"}
     for block, (matrix, rows) in qp.layout.blocks.items():
-        for i in range(*rows.indices(qp.layout.size(matrix))) if matrix in out else ():
-            out[matrix][i] = (block, qp.layout.labels[matrix][i].removeprefix(block).strip())
+        if matrix in out:
+            out[matrix][rows] = [(block, x.removeprefix(block).strip()) for x in qp.layout.labels[matrix][rows]]
     return out
 
 
@@ -83,24 +77,22 @@ def conflict(qp: StepQp) -> Conflict | None:
     if problem.status not in ("optimal", "optimal_inaccurate"):
         return None
     names = _named(qp)
-    slack = [(float(v), float(v * s), name) for k in give
-             for v, s, name in zip(give[k].value, scale[k], names[k], strict=True)]  # fmt: skip
+    slack = [row for k, v in give.items() for row in zip(v.value, v.value * scale[k], names[k], strict=True)]
     worst = max((v for v, _, _ in slack), default=0.0)
-    found = sorted((f for f in slack if f[0] > max(CONFLICT_SHARE * worst, 1e-7)), reverse=True)
+    found = sorted((row for row in slack if row[0] > max(CONFLICT_SHARE * worst, 1e-7)), reverse=True)
     if not found:
         return None
-    on = {k: np.abs(getattr(qp, k)).max(axis=1, initial=0.0) > 0 for k in "GR"}  # a row of zeros is switched off
     price = [
-        (float(p * s), name)
+        (p * s, name)
         for k in "GR"
         for c in sides[k]
-        for p, s, name, used in zip(np.abs(c.dual_value), scale[k], names[k], on[k], strict=True)
-        if used
+        for p, s, name, row in zip(np.abs(c.dual_value), scale[k], names[k], getattr(qp, k), strict=True)
+        if row.any()  # a row of zeros is switched off
     ]
-    dear = sorted((p for p in price if p[0] > PRICE_SHARE), reverse=True)
     giving = {name for _, _, name in found}
-    limits = dict.fromkeys(name for _, name in dear if name not in giving)
-    return Conflict(tuple((*name, amount) for _, amount, name in found[:MAX_NAMED]), tuple(limits)[:MAX_NAMED])
+    dear = [name for p, name in sorted(price, reverse=True) if p > PRICE_SHARE and name not in giving]
+    gives = tuple((*name, float(amount)) for _, amount, name in found[:MAX_NAMED])
+    return Conflict(gives, tuple(dict.fromkeys(dear))[:MAX_NAMED])
 
 
 def _words(block: str, phase: str) -> tuple[str, str, str]:
@@ -123,18 +115,14 @@ def lines(found: Conflict, phase: str) -> tuple[str, ...]:
     )
 
 
-def _limits(found: Conflict, phase: str) -> str:
-    """The limits by block: "what it says (row, row)"."""
-    blocks: dict[str, list[str]] = {}
-    for block, row in found.limits:
-        blocks.setdefault(block, []).append(row)
-    return " and ".join(f"{_words(b, phase)[0]} ({', '.join(sorted(own))})" for b, own in blocks.items())
-
-
 def sentence(found: Conflict, phase: str, t: float) -> str:
     """Phase, time, what would give way and by how much, which limits stand against it, and what to do."""
     text = f"stage 2: at t = {t:.3f} s of the {phase} no joint motion follows stage 1; the nearest one misses "
     text += " and ".join(lines(found, phase))
-    if found.limits:
-        text += f", held back by {_limits(found, phase)}"
+    blocks: dict[str, list[str]] = {}
+    for block, row in found.limits:
+        blocks.setdefault(block, []).append(row)
+    if blocks:
+        held = (f"{_words(block, phase)[0]} ({', '.join(sorted(rows))})" for block, rows in blocks.items())
+        text += f", held back by {' and '.join(held)}"
     return f"{text}; {ADVICE}"

@@ -7,95 +7,55 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
-from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, StepQp, accelerations
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.stages.joint_qp.settings import Options
 
 
 @dataclass(frozen=True)
 class FlightTarget:
-    """What one flight step asks for.
+    """What one flight step asks for; accelerations in [m/s^2, rad/s^2]."""
 
-    Attributes
-    ----------
-    foot_accel : p''_rd of the soles relative to the CoM, feed-forward + PD (2, 3) [m/s^2].
-    inertia_accel : rho''_ref, feed-forward + PD [kg m^2/s^2].
-    base_force : generalised force on the base that cancels numerical drift of the momentum (6,); physically zero.
-    foot_pitch : pitch acceleration of the feet towards level (2,) [rad/s^2].
-    floor : least vertical acceleration of left toe, left heel, right toe, right heel (4,) [m/s^2]; -inf where off.
-    joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
-    symmetry : right side of the symmetry rows, zero but for the drift control (k,).
-    """
-
-    foot_accel: np.ndarray
-    inertia_accel: float
-    base_force: np.ndarray
-    foot_pitch: np.ndarray
-    floor: np.ndarray
-    joints: np.ndarray
-    trunk: np.ndarray
-    symmetry: np.ndarray
+    foot_accel: np.ndarray  # p''_rd of the soles relative to the CoM (2, 3), feed-forward + PD
+    inertia_accel: float  # rho''_ref [kg m^2/s^2], feed-forward + PD
+    base_force: np.ndarray  # on the base (6,), cancels numerical drift of the momentum [N, N m]; physically zero
+    foot_pitch: np.ndarray  # of the feet towards level (2,)
+    floor: np.ndarray  # least vertical acceleration of left toe, left heel, right toe, right heel (4,); -inf where off
+    joints: np.ndarray  # towards the posture (nv - 6,)
+    trunk: np.ndarray  # the same (3,)
+    symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
 
 
-class FlightQp:
+class FlightQp(PhaseQp):
     """Targets and matrices of the flight, step by step. Pure: nothing here solves or remembers a state.
 
     Parameters
     ----------
-    body : nine-link quantities.  nominal : (nq,) posture to lean towards.
+    body, nominal, reference, options : as in the base class.
     start : quantities at take-off; the references begin there and soon join stage 1's.
-    reference : stage 1's flight.  options : gains, weights, limits, form.
     ground : height of the launching surface [m].
     """
 
-    name = "flight"
+    name, first, pairs = "flight", 0, ("hip", "knee", "ankle", "shoulder")
 
     def __init__(
-        self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground
+        self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground: float
     ):
-        self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
-        self.t, self.ground = reference.t, ground
-        self.steps = np.diff(self.t)
+        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", SIDES)]
+        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [("acceleration", map(str, range(body.nv))), ("inertia", ["rho"])]
+        points = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
+        rows = {"A": cost, "E": [("base dynamics", AXES)], "G": points}
+        self._set_up(body, reference, options, nominal, options.flight, **rows)
+        self.joints, self.ground = JointRows(body, nominal, options.limits), ground
         self.step = float(self.steps[0])  # all alike
-        self.joints = JointRows(body, nominal, options.limits)
-        form = options.form
-        pairs = ("hip",) if form.pairs == "hips" else ("hip", "knee", "ankle", "shoulder")
-        self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
         self.com0, self.momentum0 = start.com, start.momentum
         self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
         wide = np.zeros((2, 3))
         wide[:, 1] = start.foot_com[:, 1]  # the feet keep their distance
-        both = Track(reference.foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (reference.foot.rate,
-                     reference.foot.feed)))  # (n + 1, 2, 3)  # fmt: skip
+        foot = reference.foot
+        both = Track(foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (foot.rate, foot.feed)))
         self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
-        self.layout = self._layout(pairs)
-        self._fixed = self._fixed_rows()
-
-    def _layout(self, pairs) -> Layout:
-        body, form = self.body, self.options.form
-        axes = ("x", "y", "z", "rx", "ry", "rz")
-        feet = [f"{s} {a}" for s in SIDES for a in "xyz"]
-        cost = [("foot", feet), ("foot level", SIDES), ("joints", body.robot.joint_names), ("trunk turn", "xyz"),
-                ("acceleration", [str(i) for i in range(body.nv)])]  # fmt: skip
-        mirror = body.pair_names(pairs)
-        rows = [("base dynamics", axes[: form.base_rows]), ("symmetry", mirror)]
-        if form.inertia == "row":
-            rows.append(("inertia", ["rho"]))
-        else:
-            cost.append(("inertia", ["rho"]))
-        ground = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
-        steady = ("joints", "trunk turn", "acceleration")
-        return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(body))
-
-    def _fixed_rows(self):
-        lay, w, nv = self.layout, self.options.flight, self.body.nv
-        A, E, G, R = (np.zeros((lay.size(k), nv)) for k in "AEGR")
-        A[lay.at("joints"), 6:] = np.sqrt(w.posture) * np.eye(nv - 6)
-        A[lay.at("trunk turn"), 3:6] = np.sqrt(w.trunk) * np.eye(3)
-        A[lay.at("acceleration")] = np.sqrt(w.acceleration) * np.eye(nv)
-        E[lay.at("symmetry")] = self.S
-        R[nv - 6 :, 6:] = np.eye(nv - 6)
-        return A, E, G, R
 
     def target(self, k: int, terms: FullMotion) -> FlightTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
@@ -105,14 +65,10 @@ class FlightQp:
         turn, turn_rate = self.reference.turn[k], (self.reference.turn[k + 1] - self.reference.turn[k]) / self.step
         off_level = np.angle(np.exp(1j * (turn - terms.foot_pitch)))  # the short way round
         level = gain.foot_level.stiffness * off_level + gain.foot_level.damping * (turn_rate - terms.foot_spin[:, 1])
-        joints, trunk = accelerations(terms, turned(self.nominal, turn), gain.posture, gain.trunk)
+        joints, trunk = self._towards(terms, turned(self.nominal, turn))
         trunk[1] += gain.trunk.damping * turn_rate
-        if self.options.form.hip_rule == "sum":
-            mirror = np.zeros(len(self.S))
-        else:
-            c = gain.contact
-            mirror = -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
-        return FlightTarget(foot, rho, self._drift(k, terms), level, self._floor(k, terms), joints, trunk, mirror)
+        own = foot, rho, self._drift(k, terms), level, self._floor(k, terms)
+        return FlightTarget(*own, joints, trunk, self._mirror(terms))
 
     def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what integration lost."""
@@ -137,31 +93,23 @@ class FlightQp:
 
     def matrices(self, terms: FullTerms, target: FlightTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        lay, w, form = self.layout, self.options.flight, self.options.form
-        A, E, G, R = (x.copy() for x in self._fixed)
-        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
-        lower, upper = np.empty(len(R)), np.empty(len(R))
+        lay, w = self.layout, self.options.flight
+        A, E, G, R, b, e, h = self._begun(target)
         root = np.sqrt(w.foot)
         A[:6] = root * terms.J_rd.reshape(6, -1)
-        b[:6] = (1.0 if form.half else 0.5) * root * (target.foot_accel - terms.drift_rd).ravel()
+        b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
         root = np.sqrt(w.foot_level)
         A[6:8] = root * terms.J_toe[:, 4]
         b[6:8] = root * (target.foot_pitch - terms.drift_toe[:, 4])
-        b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
-        b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
-        matrix, rows = lay.blocks["inertia"]
-        M, m, root = (E, e, 1.0) if matrix == "E" else (A, b, np.sqrt(w.inertia))
-        M[rows], m[rows] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
-        n = form.base_rows
-        E[:n], e[:n] = terms.M[:n], target.base_force[:n] - terms.H[:n]
-        e[lay.at("symmetry")] = target.symmetry
+        root, at = np.sqrt(w.inertia), lay.at("inertia")
+        A[at], b[at] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
+        E[:6], e[:6] = terms.M[:6], target.base_force - terms.H[:6]
         on = np.isfinite(target.floor)
         if on.any():
             vertical = np.stack([terms.J_toe[:, 2], terms.J_heel[:, 2]], 1).reshape(4, -1)
             drift = np.stack([terms.drift_toe[:, 2], terms.drift_heel[:, 2]], 1).ravel()
             G[on], h[on] = -vertical[on], (drift - target.floor)[on]
-        self.joints.fill(R, lower, upper, terms, start, self.step, 0)
-        return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
+        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, self.step), lay)
 
 
 def turned(q: np.ndarray, angle: float) -> np.ndarray:

@@ -7,99 +7,72 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
-from jumplab.stages.joint_qp.problem import SIDES, JointRows, Layout, State, StepQp, accelerations, swung_arms
+from jumplab.robot import SAGITTAL_JOINTS
+from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import LaunchReference
 from jumplab.stages.joint_qp.settings import Options
 
 WRENCH = 12
-FOOT_ROWS = ("F_z >= 0", "friction +x", "friction -x", "friction +y", "friction -y", "CoP left of right edge",
-             "CoP right of left edge", "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")  # fmt: skip
+FRICTION = tuple(f"friction {way}" for way in ("+x", "-x", "+y", "-y"))
+EDGES = ("CoP left of right edge", "CoP right of left edge")
+FOOT_ROWS = ("F_z >= 0", *FRICTION, *EDGES, "torsion +", "torsion -", "CoP behind toe", "CoP ahead of heel")
 
 
 @dataclass(frozen=True)
 class LaunchTarget:
-    """What one launch step asks for.
+    """What one launch step asks for; accelerations in [m/s^2, rad/s^2]."""
 
-    Attributes
-    ----------
-    com_acceleration : c''_ref, feed-forward + PD (3,) [m/s^2].
-    momentum_rate : rate of the centroidal angular momentum, L'_ref + feedback in the middle (3,) [N m].
-    inertia_accel : rho''_ref [kg m^2/s^2].
-    toe_acceleration : p''_foot of the tiptoes, zero but for the drift control (2, 6), linear then angular.
-    heel_floor : least vertical acceleration of the heels (2,) [m/s^2]; -inf where the row is off.
-    joints, trunk : accelerations towards the posture (nv - 6,), (3,) [rad/s^2].
-    symmetry : right side of the symmetry rows, zero but for the drift control (k,).
-    on_toes : heel up, CoP at the toe.
-    inertia_weight : of the inertia's term at this step, see :class:`~jumplab.stages.joint_qp.settings.LaunchWeights`.
-    step : its length [s].
-    """
-
-    com_acceleration: np.ndarray
-    momentum_rate: np.ndarray
-    inertia_accel: float
-    toe_acceleration: np.ndarray
-    heel_floor: np.ndarray
-    joints: np.ndarray
-    trunk: np.ndarray
-    symmetry: np.ndarray
-    on_toes: bool
-    inertia_weight: float
-    step: float
+    com_acceleration: np.ndarray  # c''_ref (3,), feed-forward + PD
+    momentum_rate: np.ndarray  # of the centroidal angular momentum (3,) [N m], L'_ref + feedback in the middle
+    inertia_accel: float  # rho''_ref [kg m^2/s^2]
+    toe_acceleration: np.ndarray  # p''_foot of the tiptoes (2, 6), linear then angular; zero but for the drift control
+    heel_floor: np.ndarray  # least vertical acceleration of the heels (2,); -inf where the row is off
+    joints: np.ndarray  # towards the posture (nv - 6,)
+    trunk: np.ndarray  # the same (3,)
+    symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
+    on_toes: bool  # heel up, CoP at the toe
+    inertia_weight: float  # of the inertia's term at this step, see LaunchWeights
+    step: float  # its length [s]
 
 
-class LaunchQp:
+class LaunchQp(PhaseQp):
     """Targets and matrices of the launch, step by step. Pure: nothing here solves or remembers a state.
 
     Parameters
     ----------
-    body : nine-link quantities.  q0 : (nq,) configuration at the start, soles flat.
-    reference : stage 1's launch.  options : gains, weights, limits, form.
+    body, reference, options : as in the base class.  q0 : (nq,) configuration at the start, soles flat.
     toe_s : length of the toe phase [s]; None starts it where the reference's CoP stays at the toe.
 
     Attributes
     ----------
+    on_toes : (n,) steps with the heel up.  inertia_weights : (n,) weight of the inertia's term by step.
     roots : square roots of the weights of the CoM's rows (3,) and of the momentum's (6,), feet flat and on the toes.
-    inertia_weights : (n,) weight of the inertia's term by step.  steps : (n,) their lengths [s].
     """
 
-    name = "launch"
+    name, first = "launch", WRENCH
+    pairs = ("hip", "shoulder")  # mirrored hips leave flat feet's knees and ankles no choice: more would be dependent
 
     def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
-        self.body, self.reference, self.options = body, reference, options
-        self.nominal = swung_arms(body, q0, options.arm_rad)
-        self.t = reference.t
-        self.steps = np.diff(self.t)
-        start = body.terms(q0, np.zeros(body.nv))
+        def both(rows):
+            return [f"{side} {row}" for side in SIDES for row in rows]
+
+        w, foot = options.launch, body.robot.foot
+        cost = [(name, "xyz") for name in ("com", "force", "moment")] + [("inertia", ["rho"])]
+        cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
+        cost += [("wrench", both(["fx", "fy", "fz", "mx", "my", "mz"])), ("acceleration", map(str, range(body.nv)))]
+        rows = [("base dynamics", AXES), ("tiptoe", both(["x", "y", "z", "rx", "rz"]))]
+        rows += [("foot pitch or toe moment", SIDES)]
+        ground = [("ground", both(FOOT_ROWS)), ("heel", SIDES)]
+        self._set_up(body, reference, options, swung_arms(body, q0, options.arm_rad), w, A=cost, E=rows, G=ground)
+        self._fixed[0][self.layout.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
+        self._ground = self._ground_rows(False), self._ground_rows(True)
+        self.joints, start = JointRows(body, q0, options.limits), body.terms(q0, np.zeros(body.nv))
         self.toe0, self.pivot = start.toe, start.sole.mean(0)
-        self.joints = JointRows(body, q0, options.limits)
-        foot, form = body.robot.foot, options.form
-        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s) & (form.contact == "consistent")
-        # on flat feet mirrored hips leave knees and ankles no choice; more rows would be linearly dependent
-        pairs = ("hip",) if form.pairs == "hips" else ("hip", "shoulder")
-        self.S = np.abs(body.symmetry_rows(pairs)) if form.hip_rule == "sum" else body.symmetry_rows(pairs)
-        w = options.launch
+        self.on_toes = reference.toe_steps((foot.toe - foot.heel) / 2, toe_s)
+        self.inertia_weights = self._inertia_weights()
         com = [np.sqrt([ahead, w.com, w.com]) for ahead in (w.com_x, w.com)]
         force = [np.sqrt([ahead, w.force, w.force] + [w.moment] * 3) for ahead in (w.force_x, w.force)]
         self.roots = tuple(zip(com, force, strict=True))
-        self.inertia_weights = self._inertia_weights()
-        self.layout = self._layout(pairs)
-        self._fixed = self._fixed_rows()
-
-    def _layout(self, pairs) -> Layout:
-        nv, form = self.body.nv, self.options.form
-        names = self.body.robot.joint_names
-        axes = ("x", "y", "z", "rx", "ry", "rz")
-        wrench = [f"{s} {a}" for s in SIDES for a in ("fx", "fy", "fz", "mx", "my", "mz")]
-        cost = [("com", "xyz"), ("force", "xyz"), ("moment", "xyz"), ("inertia", ["rho"]), ("joints", names),
-                ("trunk turn", "xyz"), ("wrench", wrench), ("acceleration", [str(i) for i in range(nv)])]  # fmt: skip
-        contact = [f"{s} {a}" for s in SIDES for a in ("x", "y", "z", "rx", "rz")]
-        mirror = self.body.pair_names(pairs)
-        rows = [("base dynamics", axes[: form.base_rows]), ("tiptoe", contact)]
-        rows += [("foot pitch or toe moment", SIDES)] if form.contact == "consistent" else []
-        rows += [("symmetry", mirror)]
-        ground = [("ground", [f"{s} {r}" for s in SIDES for r in FOOT_ROWS]), ("heel", SIDES)]
-        steady = ("joints", "trunk turn", "wrench", "acceleration")
-        return Layout.of(steady, A=cost, E=rows, G=ground, R=JointRows.labels(self.body))
 
     def _inertia_weights(self) -> np.ndarray:
         """(n,) by step: the flat feet's, fading geometrically to the toes' before the heel rises."""
@@ -107,20 +80,6 @@ class LaunchQp:
         heel_off = start[self.on_toes][0] if self.on_toes.any() else self.t[-1]
         left = np.clip((heel_off - start) / w.inertia_fade_s, 0.0, 1.0)
         return np.where(self.on_toes, w.inertia_toe, w.inertia_toe * (w.inertia / w.inertia_toe) ** left)
-
-    def _fixed_rows(self):
-        """Matrices with all rows that never change filled in, and the weights' roots."""
-        lay, w, nv = self.layout, self.options.launch, self.body.nv
-        n = WRENCH + nv
-        A, E, G, R = (np.zeros((lay.size(k), n)) for k in "AEGR")
-        A[lay.at("joints"), WRENCH + 6 :] = np.sqrt(w.posture) * np.eye(nv - 6)
-        A[lay.at("trunk turn"), WRENCH + 3 : WRENCH + 6] = np.sqrt(w.trunk) * np.eye(3)
-        A[lay.at("wrench"), :WRENCH] = np.sqrt(w.wrench) * np.eye(WRENCH)
-        A[lay.at("acceleration"), WRENCH:] = np.sqrt(w.acceleration) * np.eye(nv)
-        E[lay.at("symmetry"), WRENCH:] = self.S
-        R[nv - 6 :, WRENCH + 6 :] = np.eye(nv - 6)
-        rows = self._ground_rows(False), self._ground_rows(True)
-        return A, E, G, R, rows
 
     def _ground_rows(self, on_toes: bool) -> np.ndarray:
         """(22, 12) unilateral, friction and CoP rows on F; rows that are off stay zero, 0 <= 0."""
@@ -143,7 +102,7 @@ class LaunchQp:
 
     def target(self, k: int, terms: FullMotion) -> LaunchTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
-        ref, gain, form = self.reference, self.options.gains, self.options.form
+        ref, gain = self.reference, self.options.gains
         com = ref.com.command(k, terms.com - self.pivot, terms.com_velocity, gain.com)
         turn = -gain.momentum.damping * terms.momentum[3:]
         turn[1] = ref.momentum.command(k, 0.0, terms.momentum[4], gain.momentum)
@@ -154,65 +113,53 @@ class LaunchQp:
         error[:, 3], error[:, 4], error[:, 5] = side[:, 2], terms.foot_pitch, -side[:, 0]
         speed = np.concatenate([terms.toe_velocity, terms.foot_spin], 1)
         contact = -gain.contact.stiffness * error - gain.contact.damping * speed
-        joints, trunk = accelerations(terms, self.nominal, gain.posture, gain.trunk)
-        asymmetry = self.S[:, 6:] @ terms.q[7:], self.S @ terms.v
-        mirror = -gain.contact.stiffness * asymmetry[0] - gain.contact.damping * asymmetry[1]
-        if form.hip_rule == "sum":
-            mirror = np.zeros(len(self.S))
-        on_toes = bool(self.on_toes[k])
-        floor = self._heel_floor(terms, on_toes)
-        weight, step = float(self.inertia_weights[k]), float(self.steps[k])
-        return LaunchTarget(com, turn, rho, contact, floor, joints, trunk, mirror, on_toes, weight, step)
+        posture, on_toes, floor = self._towards(terms, self.nominal), bool(self.on_toes[k]), self._heel_floor(terms, k)
+        now = on_toes, float(self.inertia_weights[k]), float(self.steps[k])
+        return LaunchTarget(com, turn, rho, contact, floor, *posture, self._mirror(terms), *now)
 
-    def _heel_floor(self, terms: FullMotion, on_toes: bool) -> np.ndarray:
-        gain, limits, form = self.options.gains.ground, self.options.limits, self.options.form
-        if form.contact == "consistent" and not on_toes:
-            return np.full(2, -np.inf)  # the flat foot's own row holds the heel
-        if form.heel == "always":
-            return np.zeros(2)
-        height = terms.heel[:, 2] - self.toe0[:, 2]
+    def _heel_floor(self, terms: FullMotion, k: int) -> np.ndarray:
+        """Least vertical acceleration of the heels (2,) [m/s^2]; on flat feet the foot's own row holds them."""
+        return self._near_ground(terms) if self.on_toes[k] else np.full(2, -np.inf)
+
+    def _near_ground(self, terms: FullMotion) -> np.ndarray:
+        gain, height = self.options.gains.ground, terms.heel[:, 2] - self.toe0[:, 2]
         floor = -gain.stiffness * height - gain.damping * terms.heel_velocity[:, 2]
-        return np.where(height < limits.near_ground_m, floor, -np.inf)
+        return np.where(height < self.options.limits.near_ground_m, floor, -np.inf)
 
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        lay, w, form, body = self.layout, self.options.launch, self.options.form, self.body
-        A0, E0, G0, R0, ground = self._fixed
-        A, E, G, R = A0.copy(), E0.copy(), G0.copy(), R0.copy()
-        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
-        lower, upper = np.empty(len(R)), np.empty(len(R))
-        half = 1.0 if form.half else 0.5  # without the 1/2 the optimum of X^T W X + f X is half of b
+        A, E, G, R, b, e, h = self._begun(target)
         com, force = self.roots[target.on_toes]
         A[:3, WRENCH:] = com[:, None] * terms.A_c
-        b[:3] = half * com * (target.com_acceleration - terms.B_c)
+        b[:3] = com * (target.com_acceleration - terms.B_c)
         A[3:9, :WRENCH] = force[:, None] * terms.A_f
-        b[3:9] = half * force * force_target(body.mass, body.gravity, target.com_acceleration, target.momentum_rate)
+        b[3:9] = force * force_target(self.body.mass, self.body.gravity, target.com_acceleration, target.momentum_rate)
         root = np.sqrt(target.inertia_weight)
         A[9, WRENCH:] = root * terms.J_rho
         b[9] = root * (target.inertia_accel - terms.drift_rho)
-        b[lay.at("joints")] = np.sqrt(w.posture) * target.joints
-        b[lay.at("trunk turn")] = np.sqrt(w.trunk) * target.trunk
-        n = form.base_rows
-        E[:n, :WRENCH], E[:n, WRENCH:], e[:n] = -terms.J[:, :n].T, terms.M[:n], -terms.H[:n]  # base dynamics
-        self._contact(E, e, n, terms, target)
-        e[lay.at("symmetry")] = target.symmetry
-        G[: 2 * len(FOOT_ROWS), :WRENCH] = ground[target.on_toes]
+        E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
+        self._contact(E, e, terms, target)
+        G[: 2 * len(FOOT_ROWS), :WRENCH] = self._ground[target.on_toes]
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
             G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
             h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
-        self.joints.fill(R, lower, upper, terms, start, target.step, WRENCH)
-        return StepQp(A, b, E, e, G, h, R, lower, upper, lay)
+        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, target.step), self.layout)
 
-    def _contact(self, E, e, first, terms, target):
+    def _contact(self, E, e, terms, target):
         """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""
-        rows = [0, 1, 2, 3, 5]
-        E[first : first + 10, WRENCH:] = terms.J_toe[:, rows].reshape(10, -1)
-        e[first : first + 10] = (target.toe_acceleration - terms.drift_toe)[:, rows].ravel()
-        if self.options.form.contact == "free":
-            return
-        last = slice(first + 10, first + 12)
+        rows, asked = [0, 1, 2, 3, 5], target.toe_acceleration - terms.drift_toe
+        E[6:16, WRENCH:] = terms.J_toe[:, rows].reshape(10, -1)
+        e[6:16] = asked[:, rows].ravel()
         if target.on_toes:
-            E[[first + 10, first + 11], [4, 10]] = 1.0
+            E[[16, 17], [4, 10]] = 1.0
         else:
-            E[last, WRENCH:] = terms.J_toe[:, 4]
-            e[last] = (target.toe_acceleration - terms.drift_toe)[:, 4]
+            E[16:18, WRENCH:], e[16:18] = terms.J_toe[:, 4], asked[:, 4]
+
+
+def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
+    """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
+    robot, q = body.robot, q0.copy()
+    for name, row, sign in robot.role_signs():
+        if SAGITTAL_JOINTS[row] == "shoulder":
+            q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
+    return q

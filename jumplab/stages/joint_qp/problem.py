@@ -3,50 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
-from jumplab.robot import SAGITTAL_JOINTS
-from jumplab.stages.joint_qp.settings import Gain, Limits
+from jumplab.stages.joint_qp.settings import Limits, Options
 
-OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # our choice: [N m], [rad/s] bounds of a row that is switched off, beyond all motion
-SIDES = ("left", "right")
+OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # [N m], [rad/s] bounds of a row that is switched off, beyond all motion
+SIDES, AXES = ("left", "right"), ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and one label per row.
+    """Names of the rows: block name -> (matrix "A", "E", "G" or "R", slice), and by matrix one label per row."""
 
-    ``steady`` names the cost blocks whose rows of A, being weights alone, never change.
-    """
-
-    blocks: dict
-    labels: dict
-    steady: tuple[str, ...] = ()
+    blocks: dict[str, tuple[str, slice]]
+    labels: dict[str, tuple[str, ...]]
 
     @classmethod
-    def of(cls, steady: tuple[str, ...] = (), **matrices) -> Layout:
+    def of(cls, **matrices: list) -> Layout:
         """From matrix -> list of (block name, row labels)."""
         blocks, labels = {}, {}
         for matrix, rows in matrices.items():
-            labels[matrix] = []
-            for name, own in rows:
-                at = len(labels[matrix])
-                blocks[name] = (matrix, slice(at, at + len(own)))
-                labels[matrix] += [f"{name} {label}".strip() for label in own]
-        return cls(blocks, {k: tuple(v) for k, v in labels.items()}, steady)
-
-    def size(self, matrix: str) -> int:
-        """Number of rows of a matrix."""
-        return len(self.labels[matrix])
-
-    def steady_rows(self) -> np.ndarray:
-        """(rows of A,) True where they never change."""
-        out = np.zeros(self.size("A"), bool)
-        for name in self.steady:
-            out[self.at(name)] = True
-        return out
+            own: list[str] = []
+            for name, ends in rows:
+                ends = tuple(ends)
+                blocks[name] = (matrix, slice(len(own), len(own) + len(ends)))
+                own += [f"{name} {end}".strip() for end in ends]
+            labels[matrix] = tuple(own)
+        return cls(blocks, labels)
 
     def at(self, name: str) -> slice:
         """Rows of a block."""
@@ -71,12 +57,6 @@ class StepQp:
     lower: np.ndarray
     upper: np.ndarray
     layout: Layout = field(repr=False)
-
-    def block(self, name: str) -> tuple[np.ndarray, ...]:
-        """Matrix and right side (or lower and upper side) of the rows of one named block."""
-        matrix, rows = self.layout.blocks[name]
-        sides = {"A": ("A", "b"), "E": ("E", "e"), "G": ("G", "h"), "R": ("R", "lower", "upper")}
-        return tuple(getattr(self, x)[rows] for x in sides[matrix])
 
     def objective(self, x: np.ndarray) -> float:
         """Value of the cost at ``x``."""
@@ -143,45 +123,67 @@ class JointRows:
         left = np.maximum(left, 0.0)
         return np.minimum(self.limits.stop_rate * left, np.sqrt(2 * self.brake * left))
 
-    def fill(
-        self,
-        R: np.ndarray,
-        lower: np.ndarray,
-        upper: np.ndarray,
-        terms: FullTerms,
-        start: State,
-        step: float,
-        first: int,
-    ) -> None:
-        """Write 2 n rows: torque M theta'' + H - J^T F, then acceleration; theta'' begins at column ``first`` of x."""
-        n = len(self.speed)
+    def fill(self, R: np.ndarray, terms: FullTerms, start: State, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Write the torque rows M theta'' + H - J^T F into R (2 n, size of x); lowest and highest value of all rows.
+
+        The rows below, of the accelerations, are ones and never change.
+        """
+        n, first = len(self.speed), R.shape[1] - len(terms.v)
         R[:n, first:] = terms.M[6:]
         if first:
             R[:n, :first] = -terms.J[:, 6:].T
-        low, high = self.torque(terms.v[6:])
-        lower[:n], upper[:n] = low - terms.H[6:], high - terms.H[6:]
-        lower[n:], upper[n:] = self.acceleration(start.q[7:], start.v[6:], step)
-
-    @staticmethod
-    def labels(body: FullBody) -> list[tuple[str, list[str]]]:
-        """Blocks of the rows that :meth:`fill` writes."""
-        names = list(body.robot.joint_names)
-        return [("torque", names), ("speed and range", names)]
+        torque, acceleration = self.torque(terms.v[6:]), self.acceleration(start.q[7:], start.v[6:], step)
+        low, high = (np.concatenate([x - terms.H[6:], y]) for x, y in zip(torque, acceleration, strict=True))
+        return low, high
 
 
-def swung_arms(body: FullBody, q0: np.ndarray, arm_rad: float) -> np.ndarray:
-    """The posture (nq,) that the joints lean towards: ``q0`` with the shoulders at ``arm_rad`` about +y."""
-    robot, q = body.robot, q0.copy()
-    for name, row, sign in robot.role_signs():
-        if SAGITTAL_JOINTS[row] == "shoulder":
-            q[body.model.idx_qs[body.model.getJointId(name)]] = arm_rad * sign
-    return q
+class PhaseQp:
+    """What the QPs of launch and flight share: rows on the joints, posture, symmetry, and all that never changes.
 
+    Attributes
+    ----------
+    body : nine-link quantities.  reference : stage 1's phase.  options : gains, weights, limits.
+    nominal : (nq,) posture to lean towards.  t, steps : (n + 1,) times of the nodes, (n,) lengths of the steps [s].
+    joints : rows on the joints.  S : (k, nv) symmetry rows.  layout : names of the rows.
+    """
 
-def accelerations(terms: FullMotion, nominal: np.ndarray, posture: Gain, trunk: Gain) -> tuple[np.ndarray, np.ndarray]:
-    """PD accelerations of the joints (nv - 6,) towards ``nominal`` (nq,), and of the trunk (3,), in base axes."""
-    joints = posture.stiffness * (nominal[7:] - terms.q[7:]) - posture.damping * terms.v[6:]
-    vector, scalar, wish, wish_scalar = terms.q[3:6], terms.q[6], nominal[3:6], nominal[6]
-    turn = wish_scalar * vector - scalar * wish - skew(wish) @ vector  # of the quaternion from nominal to q
-    near = 1.0 if wish_scalar * scalar + wish @ vector >= 0 else -1.0  # q and -q are the same orientation
-    return joints, -trunk.stiffness * 2 * near * turn - trunk.damping * terms.v[3:6]
+    name: str
+    first: int  # column of x at which theta'' begins
+    pairs: tuple[str, ...]  # groups of joints that are mirrored
+
+    def _set_up(self, body: FullBody, reference, options: Options, nominal: np.ndarray, weights, **rows: list):
+        """Take over what is given; ``rows`` are A, E and G as in :meth:`Layout.of`, E without the symmetry."""
+        self.body, self.reference, self.options, self.nominal = body, reference, options, nominal
+        self.t, self.steps, self.S = reference.t, np.diff(reference.t), body.symmetry_rows(self.pairs)
+        names, self._weights = body.robot.joint_names, weights
+        rows["E"] = [*rows["E"], ("symmetry", body.pair_names(self.pairs))]
+        self.layout = lay = Layout.of(**rows, R=[("torque", names), ("speed and range", names)])
+        first, nv = self.first, body.nv
+        self._fixed = A, E, _, R = [np.zeros((len(lay.labels[k]), first + nv)) for k in "AEGR"]
+        A[lay.at("joints"), first + 6 :] = np.sqrt(weights.posture) * np.eye(nv - 6)
+        A[lay.at("trunk turn"), first + 3 : first + 6] = np.sqrt(weights.trunk) * np.eye(3)
+        A[lay.at("acceleration"), first:] = np.sqrt(weights.acceleration) * np.eye(nv)
+        E[lay.at("symmetry"), first:], R[nv - 6 :, first + 6 :] = self.S, np.eye(nv - 6)
+
+    def _begun(self, target: Any) -> list[np.ndarray]:
+        """A, E, G, R, b, e and h with everything filled in but the phase's own rows."""
+        A, E, G, R = (x.copy() for x in self._fixed)
+        b, e, h = np.zeros(len(A)), np.zeros(len(E)), np.zeros(len(G))
+        b[self.layout.at("joints")] = np.sqrt(self._weights.posture) * target.joints
+        b[self.layout.at("trunk turn")] = np.sqrt(self._weights.trunk) * target.trunk
+        e[self.layout.at("symmetry")] = target.symmetry
+        return [A, E, G, R, b, e, h]
+
+    def _mirror(self, terms: FullMotion) -> np.ndarray:
+        """Right side of the symmetry rows (k,): zero but for the drift control."""
+        c = self.options.gains.contact
+        return -c.stiffness * (self.S[:, 6:] @ terms.q[7:]) - c.damping * (self.S @ terms.v)
+
+    def _towards(self, terms: FullMotion, nominal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """PD accelerations of the joints (nv - 6,) towards ``nominal`` (nq,), and of the trunk (3,), in base axes."""
+        posture, trunk = self.options.gains.posture, self.options.gains.trunk
+        joints = posture.stiffness * (nominal[7:] - terms.q[7:]) - posture.damping * terms.v[6:]
+        vector, scalar, wish, wish_scalar = terms.q[3:6], terms.q[6], nominal[3:6], nominal[6]
+        turn = wish_scalar * vector - scalar * wish - skew(wish) @ vector  # of the quaternion from nominal to q
+        near = 1.0 if wish_scalar * scalar + wish @ vector >= 0 else -1.0  # q and -q are the same orientation
+        return joints, -trunk.stiffness * 2 * near * turn - trunk.damping * terms.v[3:6]

@@ -10,10 +10,10 @@ import numpy as np
 from jumplab.errors import InputError
 from jumplab.stages.joint_qp.settings import Gain
 
-STEP_TOLERANCE = 1e-3  # our choice: relative unevenness above which the time axis counts as having a gap
-COP_AT_TOE_M = 0.015  # our choice: reference CoP this close to the toe edge counts as standing on the toes
-FOOT_BLEND_S = 0.15  # our choice: a quarter of a flight; longer, and the rates of take-off carry the legs far off
-INERTIA_BLEND_S = 0.08  # our choice: arms and trunk are quicker than legs; shorter, they are at their limits
+STEP_TOLERANCE = 1e-3  # relative unevenness above which the time axis counts as having a gap
+COP_AT_TOE_M = 0.015  # reference CoP this close to the toe edge counts as standing on the toes
+FOOT_BLEND_S = 0.15  # a quarter of a flight; longer, and the rates of take-off carry the legs far off
+INERTIA_BLEND_S = 0.08  # arms and trunk are quicker than legs; shorter, they are at their limits
 COM = {"com": 2, "com_velocity": 2, "com_acceleration": 2}
 INERTIA = {"rho": 1, "rho_rate": 1, "rho_accel": 1}
 NEEDED = {  # array -> columns
@@ -32,12 +32,11 @@ def checked(srmp: Any, phase: str) -> dict[str, np.ndarray]:
     if t.ndim != 1 or len(t) < 3 or not np.all(np.isfinite(t)):
         raise InputError(f"{where}: t must be at least 3 finite times, got shape {t.shape}")
     steps = np.diff(t)
-    odd = np.flatnonzero(np.abs(steps - np.median(steps)) > STEP_TOLERANCE * abs(np.median(steps)))
-    if np.median(steps) <= 0 or len(odd):
+    usual = np.median(steps)
+    odd = np.flatnonzero(np.abs(steps - usual) > STEP_TOLERANCE * abs(usual))
+    if usual <= 0 or len(odd):
         k = int(odd[0]) if len(odd) else 0
-        raise InputError(
-            f"{where}: gap after t = {t[k]:.4f} s, the step there is {steps[k]:.4g} s, not {np.median(steps):.4g} s"
-        )
+        raise InputError(f"{where}: gap after t = {t[k]:.4f} s, the step there is {steps[k]:.4g} s, not {usual:.4g} s")
     out = {"t": t - t[0]}
     for name, columns in NEEDED[phase].items():
         if not hasattr(source, name):
@@ -62,9 +61,7 @@ def hermite(
     """
     h = grid[1] - grid[0]
     k = np.clip(((t - grid[0]) / h).astype(int), 0, len(grid) - 2)
-    s = (t - grid[k]) / h
-    shape = (-1,) + (1,) * (np.ndim(value) - 1)
-    s = s.reshape(shape)
+    s = ((t - grid[k]) / h).reshape((-1,) + (1,) * (np.ndim(value) - 1))
     p0, p1, v0, v1 = value[k], value[k + 1], h * rate[k], h * rate[k + 1]
     if accel is None:
         c = [p0, v0, 3 * (p1 - p0) - 2 * v0 - v1, -2 * (p1 - p0) + v0 + v1]
@@ -79,17 +76,11 @@ def hermite(
 
 @dataclass(frozen=True)
 class Track:
-    """A reference at the nodes of n steps.
+    """A reference at the nodes of n steps."""
 
-    Attributes
-    ----------
-    value, rate : at the nodes (n + 1, d).
-    feed : mean acceleration over each step (n, d), so that feed-forward alone reproduces the rates at the nodes.
-    """
-
-    value: np.ndarray
-    rate: np.ndarray
-    feed: np.ndarray
+    value: np.ndarray  # at the nodes (n + 1, d)
+    rate: np.ndarray  # at the nodes (n + 1, d)
+    feed: np.ndarray  # mean acceleration over each step (n, d): alone it reproduces the rates at the nodes
 
     @classmethod
     def of(cls, t: np.ndarray, value: np.ndarray, rate: np.ndarray) -> Track:
@@ -109,8 +100,8 @@ class Track:
     def from_state(self, t: np.ndarray, value: np.ndarray, rate: np.ndarray, blend_s: float) -> Track:
         """The same reference, but beginning at a given value and rate and joining it smoothly after ``blend_s``.
 
-        The quintic that carries the initial offset down to zero is added (our choice: SRMP's pivot stays on the ground
-        while the robot's heel may be up at take-off, so the two can meet only in the air).
+        The quintic that carries the initial offset down to zero is added. SRMP's pivot stays on the ground while the
+        robot's heel may be up at take-off, so the two can meet only in the air.
         """
         start = np.asarray(value) - self.value[0], np.asarray(rate) - self.rate[0]
         zero, ends = np.zeros_like(start[0]), np.array([0.0, min(blend_s, t[-1])])
@@ -129,6 +120,12 @@ def planar(x: np.ndarray) -> np.ndarray:
     return np.stack([x[:, 0], np.zeros(len(x)), x[:, 1]], 1)
 
 
+def followed(r: dict[str, np.ndarray], t: np.ndarray) -> tuple[Track, Track]:
+    """CoM (3,) and inertia at times ``t``, from the arrays of a phase."""
+    com = Track.sample(r["t"], *(planar(r[k]) for k in COM), t)
+    return com, Track.sample(r["t"], *(r[k] for k in INERTIA), t)
+
+
 @dataclass(frozen=True)
 class LaunchReference:
     """Launch reference at the nodes; CoM relative to the pivot (3,), ``momentum`` with L as its rate, inertia."""
@@ -143,14 +140,14 @@ class LaunchReference:
     def sample(cls, srmp: Any, step_s: float, toe: tuple[float, float] | None = None) -> LaunchReference:
         """From stage 1's launch; ``toe`` is the length [s] of a last part that has another step, and that step [s]."""
         r = checked(srmp, "launch")
-        t, grid = nodes(r["t"][-1], step_s), r["t"]
+        grid = r["t"]
+        t = nodes(grid[-1], step_s)
         if toe is not None and 0 < toe[0] < grid[-1]:
             split = grid[-1] - toe[0]
             t = np.concatenate([nodes(split, step_s), split + nodes(*toe)[1:]])
-        com = Track.sample(grid, planar(r["com"]), planar(r["com_velocity"]), planar(r["com_acceleration"]), t)
+        com, inertia = followed(r, t)
         # L is a rate of nothing that is followed: its "value" has no gain
         momentum = Track.of(t, np.zeros_like(t), hermite(grid, r["L"], r["L_rate"], None, t)[0])
-        inertia = Track.sample(grid, r["rho"], r["rho_rate"], r["rho_accel"], t)
         return cls(t, com, momentum, inertia, np.interp(t, grid, r["cop_x"]))
 
     def toe_steps(self, toe_x: float, toe_s: float | None) -> np.ndarray:
@@ -165,25 +162,21 @@ class LaunchReference:
 
 @dataclass(frozen=True)
 class FlightReference:
-    """Flight reference at the nodes: CoM parabola, inertia, sole relative to the CoM (3,), constant L, and turn.
-
-    ``turn`` (n + 1,) is how far trunk and feet shall have rotated about +y [rad]: zero, or a share of the flip's 2 pi.
-    """
+    """Flight reference at the nodes."""
 
     t: np.ndarray
-    com: Track
+    com: Track  # the parabola (3,)
     inertia: Track
-    foot: Track
+    foot: Track  # sole relative to the CoM (3,)
     L: float
-    turn: np.ndarray
+    turn: np.ndarray  # how far trunk and feet shall have rotated about +y [rad]: zero, or a share of the flip's 2 pi
 
     @classmethod
     def sample(cls, srmp: Any, step_s: float) -> FlightReference:
         """From stage 1's flight."""
         r = checked(srmp, "flight")
         t, grid = nodes(r["t"][-1], step_s), r["t"]
-        com = Track.sample(grid, planar(r["com"]), planar(r["com_velocity"]), planar(r["com_acceleration"]), t)
-        inertia = Track.sample(grid, r["rho"], r["rho_rate"], r["rho_accel"], t)
+        com, inertia = followed(r, t)
         foot = Track.sample(grid, planar(r["foot_com"]), planar(r["foot_com_rate"]), planar(r["foot_com_accel"]), t)
         lean = np.asarray(getattr(srmp.flight, "lean", np.zeros_like(grid)), float)
         whole = np.round((lean[-1] - lean[0]) / (2 * np.pi)) * 2 * np.pi  # full turns only; leaning is no flip

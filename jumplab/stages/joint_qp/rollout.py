@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, SolverError
-from jumplab.models.full import FullBody, FullTerms
+from jumplab.models.full import FullBody, FullMotion, FullTerms
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.stages.joint_qp.flight import FlightQp
@@ -18,10 +19,12 @@ from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
 from jumplab.stages.joint_qp.problem import State, StepQp
 from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference
 from jumplab.stages.joint_qp.settings import GENTLE, Options
-from jumplab.stages.joint_qp.solve import solver_class
+from jumplab.stages.joint_qp.solve import SOLVERS, Answer
 
-# audit ------------------------------------------------------------------------------------------
-LOADED_N = 5.0  # our choice: a foot that carries less has no meaningful CoP or friction
+CORRECTIONS = (1.0, 0.5, 0.0)  # shares of a misprediction that the next guess takes over; the second one is damped
+PREDICTED_RATE = 0.4  # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
+LONGEST_STEP_S = 0.02  # the feedback (damping 40 1/s) would ring with longer steps
+SHORTEST_STEP_S = 0.0005  # half the control cycle; shorter steps are a typing error
 
 
 def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
@@ -31,129 +34,33 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
     peak of L in the launch; at take-off, and the largest), ``launch_inertia_rms``, ``flight_inertia_rms`` (share of the
     mean of rho), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and ``touchdown_foot`` [m].
     """
-    end = n - 1
-    speed = reference["com_velocity"][end]
-    L_error = np.abs(actual["L"][:n] - reference["L"][:n])
-    peak = max(np.abs(reference["L"][:n]).max(), 1e-9)
-    rho_error = actual["rho"] - reference["rho"]
-    foot = np.linalg.norm(actual["foot_com"] - reference["foot_com"], axis=1)
-    place = np.linalg.norm(actual["com"][:n] - reference["com"][:n], axis=1)
+    off = {k: x - reference[k] for k, x in actual.items()}
+    speed, foot = reference["com_velocity"][n - 1], np.linalg.norm(off["foot_com"], axis=1)
+    momentum = np.abs(off["L"][:n]) / max(np.abs(reference["L"][:n]).max(), 1e-9)
 
     def rms(x, size):
-        return float(np.sqrt(np.mean(x**2)) / size)
+        return np.sqrt(np.mean(x**2)) / size
 
-    return {
-        "takeoff_velocity": float(np.linalg.norm(actual["com_velocity"][end] - speed) / np.linalg.norm(speed)),
-        "takeoff_momentum": float(L_error[end] / peak),
-        "launch_momentum": float(L_error.max() / peak),
-        "launch_inertia_rms": rms(rho_error[:n], reference["rho"][:n].mean()),
-        "flight_inertia_rms": rms(rho_error[n:], reference["rho"][n:].mean()),
-        "launch_com": float(place.max()),
+    found = {
+        "takeoff_velocity": np.linalg.norm(off["com_velocity"][n - 1]) / np.linalg.norm(speed),
+        "takeoff_momentum": momentum[-1],
+        "launch_momentum": momentum.max(),
+        "launch_inertia_rms": rms(off["rho"][:n], reference["rho"][:n].mean()),
+        "flight_inertia_rms": rms(off["rho"][n:], reference["rho"][n:].mean()),
+        "launch_com": np.linalg.norm(off["com"][:n], axis=1).max(),
         "flight_foot_rms": rms(foot, 1.0),
-        "touchdown_foot": float(foot[-1]),
+        "touchdown_foot": foot[-1],
     }
-
-
-def audit(mapper: Any, data: dict, held: np.ndarray, nodes: list, steps: list) -> dict[str, float]:
-    """Largest violations, from Pinocchio's inverse dynamics and the robot's own limits, not from the QPs' matrices.
-
-    Keys: ``base_force`` (base rows of the inverse dynamics less the wrenches [N, N m]; in flight it shows the drift
-    control), ``toe_drift``, ``penetration``, ``cop_outside`` [m] (of the sole; of the toe edge once the heel is up),
-    ``pull`` [N] (negative F_z), ``friction`` (largest F_xy / F_z), ``torque``, ``speed`` (largest share of the limit),
-    ``torque_excess`` [N m] (beyond the actuator's torque-speed line), ``range`` [rad] (beyond a joint stop),
-    ``asymmetry`` [rad, rad/s] (of mirrored joints), ``flight_com`` [m] and ``flight_momentum`` [kg m^2/s] (off the
-    parabola, and lost).
-    """
-    body = mapper.body
-    n = len(mapper.launch.t)  # nodes of the launch
-    first = np.unique(held, return_index=True)[1]  # the node at which each step begins
-    a, f, tau, contact = (data[k][first] for k in ("a", "f", "tau", "contact"))
-    out = {"base_force": _base_force(body, steps, a, f)}
-    out |= _ground(mapper.robot, f[: n - 1], steps[: n - 1], contact[: n - 1])
-    out |= _joints(body.robot, data["q"][:, 7:], data["v"][:, 6:], tau, np.array([x.v[6:] for x in steps]))
-    left, right, sign = (np.array(x) for x in zip(*body.pairs, strict=True))
-    joints, rates = data["q"][:, 1:], data["v"]  # angle of tangent column i is q[i + 1]: a quaternion has four numbers
-    out["asymmetry"] = float(max(np.abs(x[:, right] - sign * x[:, left]).max() for x in (joints, rates)))
-    toe = np.array([x.toe for x in nodes[:n]])
-    rising = nodes[: n + (len(nodes) - n) // 2]
-    lowest = min(np.r_[x.toe[:, 2], x.heel[:, 2]].min() for x in rising)
-    out["toe_drift"] = float(np.abs(toe - toe[0]).max())
-    out["penetration"] = float(max(0.0, toe[0, :, 2].mean() - lowest))
-    start, t = nodes[n], (data["t"][n:] - data["t"][n])[:, None]
-    parabola = start.com + start.com_velocity * t + np.array([0.0, 0.0, -body.gravity]) * t**2 / 2
-    out["flight_com"] = float(np.linalg.norm(np.array([x.com for x in nodes[n:]]) - parabola, axis=1).max())
-    out["flight_momentum"] = float(max(abs(x.momentum[4] - start.momentum[4]) for x in nodes[n:]))
-    return out
-
-
-def _base_force(body, steps, accelerations, wrenches) -> float:
-    """Largest base row of pin.rnea less the wrenches (N, 2, 6) at the origins of the foot frames, about the base."""
-    model, scratch, foot = body.model, body.model.createData(), body.robot.foot
-    needed = np.array([pin.rnea(model, scratch, x.q, x.v, a)[:6] for x, a in zip(steps, accelerations, strict=True)])
-    turn, base = np.array([x.base_rotation for x in steps]), np.array([x.q[:3] for x in steps])
-    toe, force = np.array([x.toe for x in steps]), wrenches[..., :3]
-    origin = toe - _arms(steps, foot)
-    moment = (wrenches[..., 3:] + np.cross(origin - base[:, None], force)).sum(1)
-    given = np.concatenate([_into(turn, force.sum(1)), _into(turn, moment)], 1)
-    return float(np.abs(needed - given).max())
-
-
-def _into(turn, x) -> np.ndarray:
-    """World vectors (N, 3) in frames turned by (N, 3, 3)."""
-    return np.einsum("nij,ni->nj", turn, x)
-
-
-def _arms(terms, foot) -> np.ndarray:
-    """From the origins of the foot frames to the tiptoes (N, 2, 3), world axes."""
-    return np.array([x.foot_rotation for x in terms]) @ np.array([foot.toe, 0.0, foot.sole_z])
-
-
-def _joints(robot, angles, rates, tau, tau_rates) -> dict[str, float]:
-    """Shares of torque and speed limits, and how far the motion goes beyond the torque-speed line and the stops."""
-    actuators = [robot.actuators[name] for name in robot.joint_names]
-    limit = {k: np.array([a[k] for a in actuators]) for k in actuators[0]}
-    left = (limit["speed"] - np.abs(tau_rates)) / (limit["speed"] - limit["corner_speed"])
-    allowed = np.where(tau * tau_rates > 0, limit["effort"] * np.clip(left, 0.0, 1.0), limit["effort"])
-    return {
-        "torque": float((np.abs(tau) / limit["effort"]).max()),
-        "torque_excess": float(np.maximum(np.abs(tau) - allowed, 0.0).max()),
-        "speed": float((np.abs(rates) / limit["speed"]).max()),
-        "range": float(np.maximum(np.maximum(angles - limit["upper"], limit["lower"] - angles), 0.0).max()),
-    }
-
-
-def _ground(robot, wrenches, terms, contact) -> dict[str, float]:
-    """Unilaterality, friction and CoP of each foot, from the wrenches at the foot frames."""
-    foot, force = robot.foot, wrenches[..., :3]
-    moment = wrenches[..., 3:] - np.cross(_arms(terms, foot), force)  # about the tiptoes
-    loaded = force[..., 2] >= LOADED_N
-    back = np.where(contact == "toe", 0.0, foot.heel - foot.toe)[:, None]
-    lift = np.where(loaded, force[..., 2], 1.0)
-    along, across = -moment[..., 1] / lift, moment[..., 0] / lift  # from the tiptoe
-    beyond = np.maximum(np.maximum(along, back - along), np.abs(across) - foot.half_width)
-    return {
-        "pull": float(max(-force[..., 2].min(initial=0.0), 0.0)),
-        "friction": float((np.hypot(force[..., 0], force[..., 1]) / lift)[loaded].max(initial=0.0)),
-        "cop_outside": float(beyond[loaded].max(initial=0.0)),
-    }
-
-
-# rollout ------------------------------------------------------------------------------------------
-# our choice: shares of a misprediction that the next guess takes over; two more solves at most, the second one damped
-CORRECTIONS = (1.0, 0.5, 0.0)
-PREDICTED_RATE = 0.4  # our choice: [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
-LONGEST_STEP_S = 0.02  # our choice: the feedback (damping 40 1/s) would ring with longer steps
-SHORTEST_STEP_S = 0.0005  # our choice: half the control cycle; shorter steps are a typing error
+    return {k: float(x) for k, x in found.items()}
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the roll-out cost: steps, solver iterations, and time [s] for building, in the solver, and in all."""
+    """What the roll-out cost: steps, solver iterations, and time [s] in the solver and in all."""
 
     method: str
     steps: int
     iterations: int
-    build_s: float
     solve_s: float
     total_s: float
     worst_residual: float
@@ -161,38 +68,27 @@ class Statistics:
 
 @dataclass(frozen=True)
 class JointPlan:
-    """Result of stage 2 at the nodes of launch and flight; the instant of take-off appears once per phase.
+    """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once per phase.
 
-    Attributes
-    ----------
-    t : (N,) [s].  phase : (N,) "launch" or "flight".  contact : (N,) "flat", "toe" or "air".
-    q, v : (N, nq), (N, nv) Pinocchio configuration and rates.
-    a : (N, nv) accelerations held from this node to the next; the last node of a phase repeats the one before.
-    f : (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of ``contact_frames``, in the
-        middle of the step that begins at the node.  tau : (N, nv - 6) joint torques there [N m].
-    actual, reference : name -> (N, ...) com [m], com_velocity [m/s], L [kg m^2/s], rho [kg m^2], and in flight foot_com
-        [m] (mean of both soles relative to the CoM), of this motion and of stage 1; com relative to the pivot.
-    tracking : summary of errors, see :func:`jumplab.stages.joint_qp.rollout.tracking`.
-    residuals : name -> largest violation, re-evaluated by Pinocchio, see :func:`jumplab.stages.joint_qp.rollout.audit`.
-    statistics : what it cost.  options : gains, weights, limits and form of the QPs that made it.
+    Wrenches and torques are those in the middle of the step that begins at the node. ``actual`` and ``reference`` say
+    what the motion does and what stage 1 asks for, by name: com (from the pivot) [m], com_velocity [m/s],
+    L [kg m^2/s], rho [kg m^2], and in flight foot_com (mean of both soles relative to the CoM) [m].
     """
 
-    t: np.ndarray
-    phase: np.ndarray
-    contact: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    f: np.ndarray
-    tau: np.ndarray
-    joint_names: tuple[str, ...]
-    contact_frames: tuple[str, ...]
-    actual: dict
-    reference: dict
-    tracking: dict
-    residuals: dict
+    t: np.ndarray  # (N,) [s]
+    phase: np.ndarray  # (N,) "launch" or "flight"
+    contact: np.ndarray  # (N,) "flat", "toe" or "air"
+    q: np.ndarray  # (N, nq) Pinocchio configuration
+    v: np.ndarray  # (N, nv) rates
+    a: np.ndarray  # (N, nv) accelerations held from this node to the next; a phase's last node repeats the one before
+    predicted: np.ndarray  # (N, nv) accelerations that the step's QP was written for
+    f: np.ndarray  # (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of their frames
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    actual: dict[str, np.ndarray]
+    reference: dict[str, np.ndarray]
+    tracking: dict[str, float]  # summary of errors, see the function
     statistics: Statistics
-    options: Options
+    options: Options  # of the QPs that made it
 
     def rows(self, phase: str) -> slice:
         """Rows of one phase."""
@@ -204,6 +100,18 @@ class JointPlan:
         return State(self.q[k], self.v[k], self.a[k])
 
 
+@dataclass
+class Rolled:
+    """One phase as it is rolled out: state and quantities at the nodes, what each step was solved with, times [s]."""
+
+    states: list[State]
+    nodes: list[FullMotion] = field(default_factory=list)
+    terms: list[FullTerms] = field(default_factory=list)  # in the middle of the step
+    predicted: list[np.ndarray] = field(default_factory=list)  # accelerations (nv,)
+    answers: list[Answer] = field(default_factory=list)
+    solve_s: float = 0.0
+
+
 class JointMapper:
     """Both QPs of one jump, ready to be rolled out, or looked at one step at a time.
 
@@ -211,33 +119,40 @@ class JointMapper:
     ----------
     srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
     step_s : step of the roll-out [s], at most, or one each for flat feet, toes and flight; each is divided evenly.
-    options : gains, weights, limits, form.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
+    options : gains, weights, limits.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
     """
 
-    def __init__(self, srmp_plan, robot: Robot, step_s: float | tuple[float, float, float] = 0.01,
-                 options: Options | None = None, q0=None):  # fmt: skip
-        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else None
-        for step in parts or (step_s,):
+    launch_qp: Callable[..., LaunchQp] = LaunchQp
+    flight_qp: Callable[..., FlightQp] = FlightQp
+
+    def __init__(
+        self,
+        srmp_plan: Any,
+        robot: Robot,
+        step_s: float | tuple[float, float, float] = 0.01,
+        options: Options | None = None,
+        q0: np.ndarray | None = None,
+    ):
+        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s, step_s, step_s)
+        for step in parts:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
-        self.robot, self.options = robot, options or Options()
+        self.options = options or Options()
         self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.flight_reference = FlightReference.sample(srmp_plan, parts[2] if parts else step_s)
-        toe_s = self.options.toe_s
-        toe_s = getattr(srmp_plan, "toe_s", None) if toe_s is None else toe_s
-        toe = (toe_s, parts[1]) if parts and toe_s is not None else None
-        launch = LaunchReference.sample(srmp_plan, parts[0] if parts else step_s, toe)
-        self.launch = LaunchQp(self.body, self.q0, launch, self.options, toe_s)
+        self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
+        toe_s = getattr(srmp_plan, "toe_s", None)
+        toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
+        launch = LaunchReference.sample(srmp_plan, parts[0], toe)
+        self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
-        ground = float(self.launch.toe0[:, 2].mean())
-        start = self.body.motion(takeoff.q, takeoff.v)
-        return FlightQp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
+        ground, start = float(self.launch.toe0[:, 2].mean()), self.body.motion(takeoff.q, takeoff.v)
+        return self.flight_qp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
 
     def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
         """Quantities in the middle of a step, predicted with a guess of its accelerations (nv,).
@@ -257,13 +172,10 @@ class JointMapper:
         terms = self.middle(start, start.a, qp.steps[k])
         return terms, target, qp.matrices(terms, target, start)
 
-    def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> dict:
-        """Solve and integrate all steps of one phase; lists by name, and where the time went."""
-        first, clock = WRENCH if qp is self.launch else 0, time.perf_counter
-        out = {"states": [state], "nodes": [], "steps": [], "F": [], "answers": []}
-        solver, build_s, solve_s, before = None, 0.0, 0.0, state.a
+    def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> Rolled:
+        """Solve and integrate all steps of one phase."""
+        out, solver, before = Rolled(states=[state]), None, state.a
         for k, h in enumerate(qp.steps):
-            began = clock()
             node = self.body.motion(state.q, state.v)
             target = qp.target(k, node)
             guess = 2 * state.a - before
@@ -271,71 +183,67 @@ class JointMapper:
                 terms = self.middle(state, guess, h)
                 matrices = qp.matrices(terms, target, state)
                 solver = solver or solver_type(matrices)
-                built = clock()
+                began = time.perf_counter()
                 answer = solver.solve(matrices, qp.name, qp.t[k])
-                build_s, solve_s, began = build_s + built - began, solve_s + clock() - built, clock()
-                a = answer.x[first:]
+                out.solve_s += time.perf_counter() - began
+                a, predicted = answer.x[qp.first :], guess
                 if np.abs(a - guess).max() * h / 2 < PREDICTED_RATE:
                     break
                 guess = guess + share * (a - guess)
             q = pin.integrate(self.body.model, state.q, state.v * h + a * (h * h / 2))
             before, state = state.a, State(q, state.v + a * h, a)
-            values = (state, node, terms, answer.x[:first], answer)
-            for name, value in zip(out, values, strict=True):
-                out[name].append(value)
-        out["nodes"].append(self.body.motion(state.q, state.v))
-        return {**out, "build_s": build_s, "solve_s": solve_s}
+            out.states.append(state)
+            out.nodes.append(node)
+            out.terms.append(terms)
+            out.predicted.append(predicted)
+            out.answers.append(answer)
+        out.nodes.append(self.body.motion(state.q, state.v))
+        return out
 
     def run(self, method: str = "cvxpy") -> JointPlan:
         """Roll out launch and flight with "cvxpy" or "direct"."""
-        solver_type = solver_class(method)
-        began = time.perf_counter()
-        rest = np.zeros(self.body.nv)
+        if not isinstance(method, str) or method not in SOLVERS:
+            raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")
+        solver_type = SOLVERS[method]
+        began, rest = time.perf_counter(), np.zeros(self.body.nv)
         launch = self.roll(self.launch, solver_type, State(self.q0, rest, rest))
-        takeoff = launch["states"][-1]
+        takeoff = launch.states[-1]
         flight = self.roll(self.flight_from(takeoff), solver_type, takeoff)
-        total = time.perf_counter() - began
-        answers = launch["answers"] + flight["answers"]
-        stats = Statistics(
-            method, len(answers), sum(x.iterations for x in answers), launch["build_s"] + flight["build_s"],
-            launch["solve_s"] + flight["solve_s"], total, max(x.residual for x in answers))  # fmt: skip
-        return self._plan(launch, flight, stats)
+        total, answers = time.perf_counter() - began, launch.answers + flight.answers
+        iterations, worst = sum(x.iterations for x in answers), max(x.residual for x in answers)
+        spent = Statistics(method, len(answers), iterations, launch.solve_s + flight.solve_s, total, worst)
+        return self._plan(launch, flight, spent)
 
-    def _plan(self, launch, flight, statistics) -> JointPlan:
-        """Put both phases together, look at them again, and freeze them."""
-        n, m = len(launch["steps"]), len(flight["steps"])
-        states, steps, nodes = (launch[k] + flight[k] for k in ("states", "steps", "nodes"))
+    def _plan(self, launch: Rolled, flight: Rolled, statistics: Statistics) -> JointPlan:
+        """Put both phases together, and freeze them."""
+        n, m = len(launch.terms), len(flight.terms)
+        terms, states = launch.terms + flight.terms, launch.states + flight.states
         held = np.r_[0:n, n - 1, n : n + m, n + m - 1]  # node -> step that begins there; the last of a phase repeats
-        a = np.array([x.a for x in launch["states"][1:] + flight["states"][1:]])  # (n + m, nv)
+        a = np.array([x.a for x in launch.states[1:] + flight.states[1:]])  # (n + m, nv)
         F = np.zeros((n + m, 2, 6))
-        F[:n] = np.array(launch["F"]).reshape(n, 2, 6)
-        tau = np.array([(x.M @ ai + x.H - x.J.T @ Fi.ravel())[6:] for x, ai, Fi in zip(steps, a, F, strict=True)])
-        contact = np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])
+        F[:n] = np.array([x.x[:WRENCH] for x in launch.answers]).reshape(n, 2, 6)
+        tau = np.array([(x.M @ ai + x.H - x.J.T @ Fi.ravel())[6:] for x, ai, Fi in zip(terms, a, F, strict=True)])
         data = {
             "t": np.concatenate([self.launch.t, self.launch.t[-1] + self.flight_reference.t]),
-            "phase": np.array(["launch"] * (n + 1) + ["flight"] * (m + 1)),
-            "contact": contact[held],
+            "phase": np.repeat(["launch", "flight"], [n + 1, m + 1]),
+            "contact": np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])[held],
             "q": np.array([x.q for x in states]),
             "v": np.array([x.v for x in states]),
             "a": a[held],
+            "predicted": np.array(launch.predicted + flight.predicted)[held],
             "tau": tau[held],
-            "f": self._at_origins(steps, F)[held],
+            "f": self._at_origins(terms, F)[held],
         }
-        actual, reference = self._series(nodes, n + 1)
-        errors = tracking(actual, reference, n + 1)
-        residuals = audit(self, data, held, nodes, steps)
+        actual, reference = self._series(launch.nodes + flight.nodes, n + 1)
         for x in (*data.values(), *actual.values(), *reference.values()):
             x.setflags(write=False)
-        names = {"joint_names": self.robot.joint_names, "contact_frames": self.robot.foot.frames}
-        seen = {"actual": actual, "reference": reference, "tracking": errors, "residuals": residuals}
-        return JointPlan(**data, **names, **seen, statistics=statistics, options=self.options)
+        seen = {"actual": actual, "reference": reference, "tracking": tracking(actual, reference, n + 1)}
+        return JointPlan(**data, **seen, statistics=statistics, options=self.options)
 
     def _at_origins(self, terms, F) -> np.ndarray:
         """Wrenches moved from the tiptoes to the origins of the foot frames."""
-        foot = self.robot.foot
-        offset = np.array([foot.toe, 0.0, foot.sole_z])
-        arm = np.array([x.foot_rotation @ offset for x in terms])  # origin to tiptoe (N, 2, 3)
-        out = F.copy()
+        foot, out = self.body.robot.foot, F.copy()
+        arm = np.array([x.foot_rotation @ [foot.toe, 0.0, foot.sole_z] for x in terms])  # origin to tiptoe (N, 2, 3)
         out[..., 3:] += np.cross(arm, F[..., :3])
         return out
 
@@ -374,7 +282,7 @@ def map_to_joints(
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
     robot : the robot.  step_s : step of the roll-out [s], or one each for flat feet, toes and flight.
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
-    options : gains, weights, limits, form; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
+    options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
     q0 : (nq,) start at rest; the robot's stance by default.
 
     Raises

@@ -1,10 +1,8 @@
-"""Gains, weights, limits and readings of stage 2's QPs. The paper prints no number here: all are our choice."""
+"""Gains, weights and limits of stage 2's QPs. The paper prints none of these numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
-from jumplab.errors import InputError
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -19,9 +17,8 @@ class Gain:
 class Gains:
     """Feedback around the feed-forward references (Sec. IV-B: "PD controllers cooperating with feedforward").
 
-    All are critically damped. 20 rad/s where a reference is followed: a step of 10 ms carries 100 rad/s, and contact
-    gains of 50 rang with it; 30 for the CoM, which must be back on its way at take-off. 5 to 10 rad/s where something
-    is only suggested.
+    All are critically damped: 20 rad/s where a reference is followed (steps of 10 ms ring with 50), 30 for the CoM,
+    which must be back on its way at take-off, 5 to 10 where something is only suggested.
     """
 
     com: Gain = Gain(900.0, 60.0)
@@ -42,17 +39,13 @@ class LaunchWeights:
 
     com: float = 1.0  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
     force: float = 1e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
-    # both forwards, feet flat: on the toes the CoP cannot move and an error in x grows as in a falling pendulum, so x
-    # must be right when the heel rises
+    # both forwards, feet flat: on the toes an error in x grows as in a falling pendulum
     com_x: float = 900.0
     force_x: float = 0.9
     moment: float = 50.0  # [cost] / [N m]^2, angular rows of A_f F - B_f; L is what the flight cannot mend
-    # [cost] / [kg m^2/s^2]^2, feet flat; not printed: without it rho is left to chance. Where the hip is at its stop
-    # the robot can have either rho or the CoM's height; this much keeps rho, and the height returns before take-off
-    # because the weight fades to that on the toes over the last inertia_fade_s before the heel rises
-    inertia: float = 0.05
+    inertia: float = 0.05  # [cost] / [kg m^2/s^2]^2, feet flat; a hip at its stop then keeps rho, not the CoM's height
     inertia_toe: float = 1.2e-4  # the same on the toes: more drives the ankle to its speed limit and costs speed
-    inertia_fade_s: float = 0.2  # [s]
+    inertia_fade_s: float = 0.2  # [s] before the heel rises, from the one to the other: the CoM's height returns
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
@@ -87,77 +80,21 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Form:
-    """How the paper's QPs are read. The defaults are right; :data:`PRINTED` is the letter of the paper.
-
-    Attributes
-    ----------
-    base_rows : 6, or 3 for "top three rows", which leave the rotation free.
-    half : False minimises X^T W X + f X as printed, whose optimum sits at half of the target.
-    heel : "near" keeps the heel above the ground close to it; "always" forbids downward acceleration at any height.
-    contact : "consistent" ties the CoP to the foot: flat foot with the CoP inside the sole, or heel up with the CoP at
-        the toe; "free" is the printed tiptoe contact, where the heel may rise wherever the CoP is.
-    pairs : "all" mirrors every joint pair, "hips" only the three hip joints.
-    hip_rule : "mirror" uses difference or sum as the axes demand; "sum" is the printed sum for all three.
-    inertia : "row" makes the inertia a hard row of the flight QP as printed; "term" a weighted term.
-    """
-
-    base_rows: int = 6
-    half: bool = True
-    heel: str = "near"
-    contact: str = "consistent"
-    pairs: str = "all"
-    hip_rule: str = "mirror"
-    inertia: str = "term"
-
-    def __post_init__(self):
-        choices = {
-            "base_rows": (3, 6),
-            "half": (True, False),
-            "heel": ("near", "always"),
-            "contact": ("consistent", "free"),
-            "pairs": ("all", "hips"),
-            "hip_rule": ("mirror", "sum"),
-            "inertia": ("row", "term"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(f"form: {name} = {getattr(self, name)!r}, must be one of {allowed}")
-
-
-PRINTED = Form(base_rows=3, half=False, heel="always", contact="free", pairs="hips", hip_rule="sum", inertia="row")
-
-
-@dataclass(frozen=True)
 class Options:
-    """Everything adjustable about stage 2.
-
-    Attributes
-    ----------
-    arm_rad : shoulder angle of the posture that the joints lean towards [rad], forward negative. Our choice: arms swing
-        forward and up, as people's do; with hanging arms stage 3 often ends in a costlier local solution.
-    toe_s : length of the toe phase before take-off [s]; None takes it from the plan's ``toe_s``, and if it has none,
-        from where the reference's CoP stays at the toe.
-    """
+    """Everything adjustable about stage 2."""
 
     gains: Gains = Gains()
     launch: LaunchWeights = LaunchWeights()
     flight: FlightWeights = FlightWeights()
     limits: Limits = Limits()
-    form: Form = Form()
-    toe_s: float | None = None
-    arm_rad: float = -1.5
-
-    def with_form(self, **changes) -> Options:
-        """A copy with some readings changed, e.g. ``options.with_form(base_rows=3)``."""
-        return replace(self, form=replace(self.form, **changes))
+    arm_rad: float = -1.5  # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
 
 
-# Where stage 1 asks for more than the joints can give, following it firmly drives them into their stops, and then no
-# step is feasible. This follows less closely (15 % of take-off speed are lost at 1.1 m and 0.6 m), but arrives. Our
-# choice: the CoM at 20 rad/s and no stronger forwards, L and rho weaker
+# For a stage 1 that asks for more than the joints can give: followed firmly, it drives them into their stops. This
+# follows less closely, but arrives: the CoM at 20 rad/s and no stronger forwards, L and rho weaker
 GENTLE = Options(
     gains=Gains(com=Gain(400.0, 40.0)),
-    launch=LaunchWeights(com=3.0, force=3e-3, com_x=3.0, force_x=3e-3, moment=1.0, inertia=3e-3, inertia_toe=6e-5,
-                         inertia_fade_s=0.01),
-)  # fmt: skip
+    launch=LaunchWeights(
+        com=3.0, force=3e-3, com_x=3.0, force_x=3e-3, moment=1.0, inertia=3e-3, inertia_toe=6e-5, inertia_fade_s=0.01
+    ),
+)

@@ -13,19 +13,17 @@ from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.planner import COARSE, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body.planner import COARSE, Asked, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.problem import build_problem
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
-from jumplab.stages.whole_body.terms import WholeBodyTerms
+from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
-# our choice: a solve that needs more is lost; plans took 94 iterations at most on the coarse mesh, 112 on the fine one
-EFFORT = {"max_iter": 150, "max_wall_time": 15.0}
-# our choice: the second search; where the adaptive barrier wanders, the monotone one finds nearly all of the rest
-MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}
-# Postures of the guess, our choice: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip
-# of 0.6 m on the spot; six of the flat foot, three of the toe phase, six of the flight, the last of one turn. Back: the
-# arms swing up and forward, the trunk follows. Front: the trunk leans back first, then whips forward over braked feet.
+EFFORT = {"max_iter": 150, "max_wall_time": 15.0}  # a solve that needs more is lost
+MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}  # the second search, where the adaptive barrier wanders
+# Postures of the guess: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip of 0.6 m on
+# the spot; six of the flat foot, three of the toe phase, six of the flight. Back: the arms swing up and forward, the
+# trunk follows. Front: the trunk leans back first, then whips forward over braked feet.
 POSTURES = {
     -1: ([0.0, 0.15, -0.25, 0.32, 0.52], [0.0, -0.06, -0.24, 1.04, 1.77], [0.0, -0.02, -0.38, 1.49, 2.65],
          [0.0, 0.50, -0.88, 1.12, 1.84], [0.0, 0.81, -1.20, 0.81, 0.74], [0.0, 0.77, -1.28, 0.66, -0.47],
@@ -38,11 +36,11 @@ POSTURES = {
         [1.07, 0.24, -0.36, 0.86, -0.75], [2.56, 1.69, -0.21, 1.81, 0.92], [4.23, 3.36, 1.02, 3.01, 2.61],
         [5.54, 4.80, 2.45, 4.42, 4.15], [6.26, 6.08, 3.97, 5.64, 5.13], [6.28, 6.53, 5.13, 6.58, 5.51]),
 }  # fmt: skip
-FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # our choice: how long the phases of the launch last in those solutions
-FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # our choice: of the flat foot, when its postures are
-EASY_M = 0.5  # our choice: searches from postures end well up to here; of those at 0.7 m two in three did not
-CLIMB_M = 0.04  # our choice: from flip to flip on the way up; with steps of 0.07 m two in six of 0.7 m got lost
-LOW_M = 0.03  # our choice: the CoM touches down this much above its take-off height
+FLAT_S, TOE_S = 0.9, {-1: 0.1, 1: 0.3}  # how long the phases of the launch last in those solutions
+FLAT_SHARES = (0.2, 0.4, 0.6, 0.8, 0.9, 1.0)  # of the flat foot, when its postures are
+EASY_M = 0.5  # searches from postures end well up to here
+CLIMB_M = 0.04  # from flip to flip on the way up; longer steps get lost
+LOW_M = 0.03  # the CoM touches down this much above its take-off height
 
 
 class FlipPlanner(WholeBodyPlanner):
@@ -51,20 +49,33 @@ class FlipPlanner(WholeBodyPlanner):
     A jump without rotation is another planner's and stays the same problem whatever flips need.
     """
 
-    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), limits: Limits = Limits(), weights: Weights = Weights(), *,
-                 tracking: bool = True, options: Mapping | None = None):  # fmt: skip
-        options, weights = {**EFFORT, **(options or {})}, weights.of_flip()
-        super().__init__(robot, mesh.of_flip(), limits.of_flip(), weights, tracking=tracking, options=options,
-                         refine=False)  # fmt: skip
+    def __init__(
+        self,
+        robot: Robot,
+        mesh: Mesh = Mesh(),
+        limits: Limits = Limits(),
+        weights: Weights = Weights(),
+        *,
+        tracking: bool = True,
+        options: Mapping | None = None,
+    ):
+        settings, options = (mesh.of_flip(), limits.of_flip(), weights.of_flip()), {**EFFORT, **(options or {})}
+        super().__init__(robot, *settings, tracking=tracking, options=options, refine=False)
         # the first idea of the motion may be rough: its jerks jump as they like
-        self.rough = self.mesh.coarse()
-        rough = build_problem(robot, self.rough, replace(self.limits, jerk_step=None), weights, tracking=tracking)
-        first = Nlp(rough, {**COARSE, **options})
+        self.rough, loose = self.mesh.coarse(), replace(self.limits, jerk_step=None)
+        first = Nlp(build_problem(robot, self.rough, loose, self.weights, tracking=tracking), {**COARSE, **options})
         self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
 
-    def plan(self, task: JumpTask, srmp: SrmpPlan | None = None, *, guess: Mapping[str, PhaseGuess] | None = None,
-             weights: Mapping[str, float] | None = None, off: tuple[str, ...] = (),
-             stage1: Callable[[JumpTask], SrmpPlan] | None = None) -> WholeBodyPlan:  # fmt: skip
+    def plan(
+        self,
+        task: JumpTask,
+        srmp: SrmpPlan | None = None,
+        *,
+        guess: Mapping[str, PhaseGuess] | None = None,
+        weights: Mapping[str, float] | None = None,
+        off: tuple[str, ...] = (),
+        stage1: Callable[[JumpTask], SrmpPlan] | None = None,
+    ) -> WholeBodyPlan:
         """Solve for a target: searches on the coarse mesh, then the fine one; a high flip by way of lower ones.
 
         Parameters
@@ -77,47 +88,40 @@ class FlipPlanner(WholeBodyPlanner):
         SolverError
             After some seconds, if a search ends without a plan; it says at which height.
         """
-        how = dict(weights=weights, off=off, explain=False)
         way = [task] if guess is not None or (self.tracking and stage1 is None) else climb(task)
         plans = [srmp if t is task or not self.tracking else stage1(t) for t in way]
+        asked = [Asked(t, one, self.parameters(t, one), weights or {}, off) for t, one in zip(way, plans, strict=True)]
         try:
             searches = self._searches if guess is None else self._searches[:1]
-            start = guess or self.naive_guess(way[0])
-            solution, first = self._search(way[0], plans[0], start, searches, how)
-            for easier, one in zip(way[1:], plans[1:], strict=True):
-                solution = self.nlp.solve(self.parameters(easier, one), solution.guess(),
-                                          references=self.references(one, self.mesh), **how)  # fmt: skip
+            solution, first = self._search(asked[0], guess or self.naive_guess(way[0]), searches)
+            for following in asked[1:]:
+                solution = self._run(self.nlp.solve, following, solution.guess(), explain=False)
         except SolverError as e:
             where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
-            raise SolverError(
-                f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its "
-                f"limits, ask for another height or distance",
-                stage=e.stage, status=e.status,
-            ) from e  # fmt: skip
+            text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
+            remedy = "limits, ask for another height or distance"
+            raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status) from e
         return WholeBodyPlan(task, solution, first)
 
-    def _search(self, task: JumpTask, srmp, guess, searches, how) -> tuple[Solution, Statistics]:
+    def _search(self, asked: Asked, guess, searches) -> tuple[Solution, Statistics]:
         """The fine solution from a guess, and what the coarse one before it cost."""
-        parameters, failure = self.parameters(task, srmp), None
-        start = {name: guess[name].resampled(n) for name, n in self.rough.intervals().items()}
+        failure = None
         for search in searches:
             try:
-                first = search.solve(parameters, start, references=self.references(srmp, self.rough), **how)
-                fine = self.nlp.solve(parameters, self._refined(first), references=self.references(srmp, self.mesh),
-                                      **how)  # fmt: skip
+                first = self._run(search.solve, asked, guess, self.rough, explain=False)
+                return self._run(self.nlp.solve, asked, self._finer(first), explain=False), first.statistics
             except SolverError as e:
                 failure = failure or e
-            else:
-                return fine, first.statistics
         raise failure
 
-    def _refined(self, first: Solution) -> dict[str, PhaseGuess]:
+    def _finer(self, first: Solution) -> dict[str, PhaseGuess]:
         """A coarse solution as the fine problem's start, the jerks that its intervals carry on included."""
         out = {}
         for name, guess in first.guess(self.mesh.intervals()).items():
             jerk = np.diff(guess.a, axis=0) * (len(guess.a) - 1) / guess.duration
             before = np.vstack([np.zeros(jerk.shape[1]), jerk])
-            out[name] = replace(guess, z=np.array([WholeBodyTerms.relative(x).full().ravel() for x in before]))
+            links = np.pad(before, ((0, 0), (5 - before.shape[1], 0)))  # a flat foot has none
+            out[name] = replace(guess, z=relative(links.T).T)
         return out
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
@@ -129,18 +133,15 @@ class FlipPlanner(WholeBodyPlanner):
         shares = np.arange(1, 7) / 6
         knots[-6:] += (shares * (task.rotation_rad - way * 2 * np.pi))[:, None]
         takeoff, land_s = FLAT_S + TOE_S[way], task.flight_time(min(task.platform_m, 0.9 * task.height_m) - LOW_M)
-        times = [0.0, *(FLAT_S * np.array(FLAT_SHARES)), *(FLAT_S + TOE_S[way] * np.arange(1, 4) / 3),
-                 *(takeoff + land_s * shares)]  # fmt: skip
-        curve, n = PchipInterpolator(times, knots), self.mesh
+        launch = *(FLAT_S * np.array(FLAT_SHARES)), *(FLAT_S + TOE_S[way] * np.arange(1, 4) / 3)
+        curve = PchipInterpolator([0.0, *launch, *(takeoff + land_s * shares)], knots)
         com, down = com_from_toe(self.robot, knots[-7]), com_from_toe(self.robot, knots[-1])
         speed = (task.distance_m - com[0] + down[0]) / land_s
-        constants = dict(com_x=com[0], com_z=com[1], vel_x=speed, vel_z=task.takeoff_speed)
+        ballistic = dict(com_x=com[0], com_z=com[1], vel_x=speed, vel_z=task.takeoff_speed)
         out = {}
-        for name, first, last, count in (("flat", 0.0, FLAT_S, n.flat), ("toe", FLAT_S, takeoff, n.toe),
-                                         ("flight", takeoff, takeoff + land_s, n.flight)):  # fmt: skip
-            t = np.linspace(first, last, count + 1)
+        for name, t in self.mesh.nodes(FLAT_S, takeoff, takeoff + land_s).items():
             q, v = (curve(t, order)[:, 1 if name == "flat" else 0 :] for order in (0, 1))
-            out[name] = PhaseGuess(last - first, q, v, 0 * q, None, constants if name == "flight" else {})
+            out[name] = PhaseGuess(t[-1] - t[0], q, v, 0 * q, None, ballistic if name == "flight" else {})
         return out
 
 

@@ -1,17 +1,30 @@
-"""Limits, weights and mesh of stage 3. The paper prints none of them: every number is our choice, with its reason."""
+"""Limits, weights and mesh of stage 3. The paper prints none of these numbers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
-# our choice: [rad/s^3] by how much the jerk of a joint may jump from interval to interval; a tape of 1 kHz misses the
-# acceleration in the middle of such a step by an eighth of that times 1 ms, and the audit allows 4 rad/s^2
+import numpy as np
+
+JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
+RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
+# [rad/s^3] by how much the jerk of a joint may jump from interval to interval: half a sample of 1 kHz later a tape then
+# misses the acceleration by 3.9 rad/s^2, and the audit allows 4
 FOLLOWED_JERK_STEP = 31_000.0
+
+
+class Contact(StrEnum):
+    """How the robot stands, or does not: the three phases of a jump by their names."""
+
+    FLAT = "flat"
+    TOE = "toe"
+    FLIGHT = "flight"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a plan may use of the robot and the ground; all our choice, since the paper prints no bound."""
+    """What a plan may use of the robot and the ground."""
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
@@ -29,21 +42,15 @@ class Limits:
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
-    # [rad/s] if set: a foot that still turns meets the ground with toe or heel first, and the impact spins it;
-    # what is left is the tilt of the simulated flight, 1 to 2 mrad, which no bound of the plan takes away
-    touchdown_foot_rate: float | None = 0.3
-    # [rad] stroke left to absorb the fall; the impact turns a straighter knee faster than its motor can (20 rad/s), at
-    # 0.7 rad by 7 %
-    touchdown_knee: tuple[float, float] = (0.95, 1.4)
+    touchdown_foot_rate: float | None = 0.3  # [rad/s] if set: a foot that turns lands on toe or heel, and is spun
+    touchdown_knee: tuple[float, float] = (0.95, 1.4)  # [rad] the impact turns a straighter one faster than its motor
     touchdown_ankle_stroke: float | None = None  # [rad] if set, least way left to the stop that the shank leans into
     touchdown_trunk: tuple[float, float] = (0.0, 0.30)  # [rad]
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope v_x (measured)
     capture_slope_s: float = 0.13
     capture_window_m: tuple[float, float] = (-0.02, 0.02)
-    # if set, angular momentum about the sole's middle at touchdown [kg m^2/s], from ... to; then not the window
-    capture_moment: tuple[float, float] | None = None
-    # with it, for flips backward instead: where an impact that pushes at the toes leaves the capture point, ahead of
-    # them [m], more at a slower fall: point + slope * take-off speed, from ... to (measured)
+    capture_moment: tuple[float, float] | None = None  # if set, not the window but L about the soles [kg m^2/s]
+    # with it, backward: capture point + slope * take-off speed, ahead of the toes (measured)
     capture_beyond_toes_m: tuple[float, float] | None = None
     capture_beyond_slope_s: float = 0.05
     least_push: float = 0.0  # share of the weight that flat feet carry at least
@@ -58,33 +65,32 @@ class Limits:
     def of_flip(self) -> Limits:
         """The same for a jump that turns over: it arrives turning, and any limb may pass close to the ground.
 
-        The trunk cannot stop before touchdown while L stays what the turn needed, so it may still turn (5 rad/s). Where
-        the soles belong then depends on that momentum as much as on v_x: what counts is the angular momentum about the
-        soles, which the impact does not change. Front flips ask for it about their middle. A backflip lands with the
-        CoM ahead of the toes; its ankles meet their stop while the knees bend, the heels rise, and for 0.1 s the ground
-        pushes at the toes. So its capture point, x + v_x / sqrt(g / z), is asked for as such an impact leaves it: 2 to
-        5 cm behind them flips of 0.4 m landed in both modes, 1 or 6 cm behind them some fell; higher ones, which push
-        longer, landed 3 to 9 cm behind. An ankle at its stop cannot keep a tilted robot's soles flat either, 0.12 rad
-        are left for that. Flat feet keep 4 % of the weight: else flips of 0.7 m hop first.
-        Torques would jump from node to node were the steps of the jerk not bounded; 32,000 rad/s^3 is what the audit's
-        tape can follow. Stage 1's rod turns with other inertia than the body, so its L is followed to 15 %.
-
-        The launch is open loop and longer than the fall of an upright body (0.25 s): with the CoP at the sole's edge
-        for 0.6 s, 4 of 12 perturbed backflips landed; 3 cm off it, 11 of 14 did. Front flips lean over the toes before
-        they brake on them: with 0.15 s for that two of nine were clean. Backflips of 0.7 m that also travel forward
-        need more than 0.9 s to wind up.
+        Where the soles belong depends on that turning. A front flip asks for its angular momentum about the soles,
+        which the impact does not change; a backflip for its capture point, x + v_x / sqrt(g / z), ahead of the toes.
+        The launch is open loop and longer than an upright body's fall, so the CoP keeps off the sole's edges.
         """
-        points = ("hand", "mid-arm", "knee", "hip", "shoulder")
-        return replace(self, touchdown_trunk_rate=5.0, touchdown_foot_rate=None, touchdown_ankle_stroke=0.12,
-                       capture_moment=(6.0, 10.0), capture_beyond_toes_m=(0.09, 0.12), least_push=0.04,
-                       flight_clear=points, flight_clearance_m=0.06, jerk_step=FOLLOWED_JERK_STEP,
-                       envelope_between=True,
-                       flat_s=(0.25, 1.3), toe_s=(0.06, 0.45), cop_reserve_m=0.03, momentum_share=0.15)  # fmt: skip
+        return replace(
+            self,
+            flat_s=(0.25, 1.3),  # time to wind up
+            toe_s=(0.06, 0.45),  # a front flip leans over the toes before it brakes on them
+            envelope_between=True,
+            least_push=0.04,  # or high flips hop first
+            cop_reserve_m=0.03,
+            jerk_step=FOLLOWED_JERK_STEP,  # or torques jump from node to node
+            momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
+            flight_clear=("hand", "mid-arm", "knee", "hip", "shoulder"),
+            flight_clearance_m=0.06,
+            touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
+            touchdown_foot_rate=None,
+            touchdown_ankle_stroke=0.12,  # an ankle at its stop cannot keep a tilted robot's soles flat
+            capture_moment=(6.0, 10.0),
+            capture_beyond_toes_m=(0.09, 0.12),
+        )
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Cost weights, integrated over time; all our choice. Units: [1] / [unit of the term]^2 / [s]."""
+    """Cost weights, integrated over time. Units: [1] / [unit of the term]^2 / [s]."""
 
     joint_acceleration: float = 4e-3  # [1] / [rad/s^2]^2 / [s]
     jerk: float = 4e-7  # [1] / [rad/s^3]^2 / [s]
@@ -117,6 +123,11 @@ class Mesh:
     def intervals(self) -> dict[str, int]:
         """By the names of the phases."""
         return {"flat": self.flat, "toe": self.toe, "flight": self.flight}
+
+    def nodes(self, split: float, takeoff: float, end: float) -> dict[str, np.ndarray]:
+        """Times of the nodes [s] from the start of the launch, by the ends of the phases."""
+        ends = {"flat": (0.0, split), "toe": (split, takeoff), "flight": (takeoff, end)}
+        return {name: np.linspace(*ends[name], n + 1) for name, n in self.intervals().items()}
 
     def coarse(self) -> Mesh:
         """Half of the intervals: where a solve begins before it is refined on this mesh."""
