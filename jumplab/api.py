@@ -15,7 +15,7 @@ from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
     from jumplab.auditing import AuditReport
-    from jumplab.show.page import Page
+    from jumplab.show.viewer import Page
     from jumplab.sim import SimulationResult
 
 
@@ -112,7 +112,7 @@ def load(folder: str | Path) -> Saved:
 
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     """The jump in 3-D, plan and simulation: a notebook shows the page, ``view(...).save("jump.html")`` writes it."""
-    from jumplab.show.page import page
+    from jumplab.show.viewer import page
     from jumplab.sim import Scene
 
     require_type(plan, JumpPlan, "the plan to view")

@@ -24,7 +24,7 @@ from jumplab.errors import InputError
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion
 from jumplab.robot import Robot
-from jumplab.show import page as viewer
+from jumplab.show import viewer as viewer
 from jumplab.show.style import PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
 

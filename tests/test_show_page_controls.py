@@ -8,8 +8,8 @@ import pytest
 from fixtures_core import jump
 from test_show_page import CHROMIUM, FLAGS, browser, count
 
-from jumplab.show import page as viewer
-from jumplab.show.page import FPS
+from jumplab.show import viewer as viewer
+from jumplab.show.viewer import FPS
 from jumplab.sim import simulate_jump
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")

@@ -13,7 +13,7 @@ from jumplab.task import JumpTask
 
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
-sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.page"), Late("jumplab.cli.notebooks")
+sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))

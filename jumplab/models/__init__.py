@@ -3,3 +3,10 @@
 In: states and their rates. Out: momentum, inertia, forces, torques, and for the nine links their Jacobians.
 Start reading in :mod:`jumplab.models.srmp` (stage 1); then ``planar.py`` (stage 3), ``full.py`` (stage 2).
 """
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__,
+    submodules=["full", "planar", "srmp"],
+)

@@ -10,13 +10,12 @@ launch blue, flight orange, landing green; the reference is dashed, a limit thin
 A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide)
 and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what was asked for; :class:`Silhouette` with
 :func:`draw_robot`, :func:`strobe` or :func:`film_strip` draws bodies; :func:`legend_above` takes :func:`phase_handles`.
-The page is in :mod:`jumplab.show.page`, progress bars are in :mod:`jumplab.show.widgets`.
+The 3-D page is :func:`page`; tables are :func:`table`, progress bars :func:`progress`.
 """
 
-from importlib import import_module
-from typing import Any
+import lazy_loader as lazy
 
-_PLACES = {  # module: its public names, loaded when they are first used
+_NAMES = {  # module: its public names, loaded when they are first used
     # for plans
     "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
     # for simulations
@@ -24,25 +23,15 @@ _PLACES = {  # module: its public names, loaded when they are first used
     "render": "frame_strip draw_frames Renderer Camera",
     # for studies
     "studies": "trials envelope_map chain_strobe chain_timeline draw_scene",
-    # helpers: bodies, with the sheet of a robot; curves, colours and saving; tables; what moves
+    # the jump in 3-D, tables, progress bars
+    "viewer": "Page page",
+    "tables": "Table table versions",
+    "widgets": "progress watched",
+    # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "
     "draw_path draw_com equal_scales",
     "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
     "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
     "VERMILION INK LIMIT_STYLE REFERENCE_STYLE",
-    "tables": "Table table",
-    "page": "Page",
-    "widgets": "progress watched",
 }
-_MODULE_OF = {name: module for module, names in _PLACES.items() for name in names.split()}
-__all__ = list(_MODULE_OF)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
-    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy.attach(__name__, submod_attrs={k: names.split() for k, names in _NAMES.items()})

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.io import folder
+
 
 @dataclass(frozen=True, repr=False)
 class Table:
@@ -75,3 +77,8 @@ def _text(x: Any, form: str) -> str:
     if _number(x):
         return f"{float(x):{form}}" if math.isfinite(x) else "—"
     return str(x)
+
+
+def versions() -> Table:
+    """The versions of Python and of every package that shapes a result."""
+    return table([{"package": name, "version": version} for name, version in folder.versions().items()])

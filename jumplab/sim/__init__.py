@@ -3,26 +3,21 @@
 Names are loaded when they are first used: a scene or a perturbation needs no engine.
 """
 
-from importlib import import_module
-from typing import Any
+import lazy_loader as lazy
 
 STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
 
-_PLACES = {
-    "estimator": "Estimator",
-    "landing": "LandingController LandingGains",
-    "loop": "Disturbance simulate_jump simulate_landing",
-    "perturbation": "SLIGHT Perturbation Ranges SensorNoise",
-    "reference": "LandingReference",
-    "result": "Finding Metrics SimulationResult",
-    "scene": "Block Scene",
-    "world": "World base_from_bullet base_to_bullet",
-}
-_MODULE_OF = {name: module for module, names in _PLACES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    return value
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__,
+    submodules=["checks", "kinematics", "pilot", "playback", "reaim"],
+    submod_attrs={
+        "estimator": ["Estimator"],
+        "landing": ["LandingController", "LandingGains"],
+        "loop": ["Disturbance", "simulate_jump", "simulate_landing"],
+        "perturbation": ["SLIGHT", "Perturbation", "Ranges", "SensorNoise"],
+        "reference": ["LandingReference"],
+        "result": ["Finding", "Metrics", "SimulationResult"],
+        "scene": ["Block", "Scene"],
+        "world": ["World", "base_from_bullet", "base_to_bullet"],
+    },
+)

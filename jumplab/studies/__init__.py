@@ -3,3 +3,10 @@
 In come a robot, targets and a result folder; out go frozen reports and a log, with which a stopped study goes on. Start
 at :func:`jumplab.studies.trials.run_trials`.
 """
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__,
+    submodules=["basin", "bench", "chain", "envelope", "sweep", "trials"],
+)
