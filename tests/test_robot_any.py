@@ -25,8 +25,8 @@ from fixtures_robots import (
 from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.checkup import reduction_error
 from jumplab.robot.description import Robot as Described
+from jumplab.robot.reduction import reduction_error
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper

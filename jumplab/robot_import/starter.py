@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import ROLES
 from jumplab.robot_import.roles import Roles, find_roles, robot_axes
 from jumplab.robot_import.tree import Tree
+from jumplab.robot_import.urdf import parse, read_urdf
 
 # None of these numbers is printed by the paper.
 SOLE_M = 0.012  # points this near the lowest one belong to the sole
@@ -106,3 +108,21 @@ def safe_name(text: str) -> str:
 
 def _texts(values: tuple[str, ...]) -> str:
     return json.dumps(values, ensure_ascii=False)  # an array of texts is the same in JSON and in TOML
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found."""
+
+    text: str
+    roles: Roles
+    sole: Sole
+
+
+def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
+    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`."""
+    path = Path(path)
+    root = parse(read_urdf(path), path.name)
+    urdf_checks.check(root, path.name, repair)
+    tree = Tree(root, path.name, path, "inertia" in repair)
+    return Draft(*starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair))
