@@ -6,7 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
-from jumplab.auditing import contact, dynamics, joints, motion
+from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import AuditReport
 from jumplab.errors import InputError, as_path, quoted, require_type
@@ -21,10 +21,10 @@ GROUPS = (
     motion.checks,
     dynamics.checks,
     contact.checks,
-    joints.checks,
+    dynamics.joints,
     motion.target,
     contact.collisions,
-    joints.description,
+    dynamics.description,
 )
 
 

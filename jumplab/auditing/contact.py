@@ -8,9 +8,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.limits import LIMITS, METHOD
 from jumplab.auditing.replay import Replay
-from jumplab.auditing.report import Check
+from jumplab.auditing.report import LIMITS, METHOD, Check
 
 
 def checks(r: Replay) -> list[Check]:

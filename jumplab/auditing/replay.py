@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.integrate import cumulative_trapezoid
 
-from jumplab.auditing.limits import METHOD
+from jumplab.auditing.report import METHOD
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
