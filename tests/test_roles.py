@@ -9,8 +9,7 @@ from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 
 from jumplab.errors import RobotError
 from jumplab.robot.checkup import check, draft
-from jumplab.robot_import.roles import find_roles
-from jumplab.robot_import.starter import find_sole, starter
+from jumplab.robot_import.roles import find_roles, find_sole, starter
 from jumplab.robot_import.tree import Tree, repaired
 
 LEGS = {

@@ -15,9 +15,8 @@ from jumplab.robot.stance import check_stance, com_from_toe, configuration
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper, make_jumper
-from jumplab.robot_import.roles import Roles
-from jumplab.robot_import.starter import Sole, safe_name, starter
-from jumplab.robot_import.tree import Tree, moving_count
+from jumplab.robot_import.roles import Roles, Sole, safe_name, starter
+from jumplab.robot_import.tree import MOVING, Tree
 from jumplab.robot_import.urdf import parse, read_urdf
 
 SAMPLES = 24  # fixed random postures over the whole joint range
@@ -125,9 +124,10 @@ class Checkup:
         """What else is worth knowing, a line each."""
         r, tree, e = self.robot, self.jumper.tree, self.error
         moving, foot, com = len(r.joint_names), r.foot, com_from_toe(r, self.stance)
+        movable = sum(joint.kind in MOVING for joint in tree.joints.values())
         out = [
             f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
-            f"{moving_count(tree)} joints move, {len(self.jumper.lumped.held)} are held off zero",
+            f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
             f"standing: CoM {com[1]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "

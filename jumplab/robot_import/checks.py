@@ -119,10 +119,14 @@ def _end(joint: ET.Element, end: str) -> str:
 def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[str]:
     known = {j.get("name") for j in joints}
     for joint in joints:
-        mimic = joint.find("mimic")
-        if mimic is not None and mimic.get("joint") not in known:
-            leader = mimic.get("joint")
-            yield f"{where}: joint {joint.get('name')!r} mimics {leader!r}, which does not exist; correct the name"
+        mimic, at = joint.find("mimic"), f"{where}: joint {joint.get('name')!r}"
+        if mimic is None:
+            continue
+        if mimic.get("joint") not in known:
+            yield f"{at} mimics {mimic.get('joint')!r}, which does not exist; correct the name"
+        for key in ("multiplier", "offset"):
+            if numbers(mimic.get(key, "0"), 1) is None:
+                yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
     for link, times in Counter(_end(j, "child") for j in joints).items():
         if times > 1:
             above = ", ".join(repr(j.get("name")) for j in joints if _end(j, "child") == link)
@@ -145,29 +149,26 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
 
 
 # inertials ------------------------------------------------------------------------------------------------------
-def _inertial_faults(link: ET.Element, at: str, strict: bool) -> Iterator[str]:
+def _inertial_faults(link: ET.Element, at: str, strict: bool) -> list[str]:
     inertial, mass, tensor = (link.find(path) for path in ("inertial", "inertial/mass", "inertial/inertia"))
     if inertial is None:
-        return
+        return []
     if mass is None:
-        yield f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
-        return
+        return [f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"]
     value = numbers(mass.get("value"), 1)
     if value is None:
-        yield f"{at}: mass = {mass.get('value')!r} must be a finite number of kg"
-        return
+        return [f"{at}: mass = {mass.get('value')!r} must be a finite number of kg"]
     if value[0] < 0:
-        yield f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"
-        return
-    yield from _triple_faults(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")
+        return [f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"]
+    found = [*_triple_faults(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")]
     if tensor is None:
-        yield f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"
-        return
+        return [*found, f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"]
     wrong = next((key for key in TENSOR if numbers(tensor.get(key), 1) is None), None)
     if wrong:
-        yield f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2"
+        found.append(f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2")
     elif strict and value[0] >= FRAME_KG:
-        yield from _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
+        found += _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
+    return found
 
 
 def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:

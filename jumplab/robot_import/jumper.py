@@ -7,7 +7,6 @@ so is the configuration. Both results stand on their own, so a result folder can
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -17,7 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
-from jumplab.robot_import.config import entry, roles_table, table
+from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
 from jumplab.robot_import.tree import Tree
 from jumplab.robot_import.urdf import parse
@@ -266,23 +265,15 @@ def _is_box(row: object) -> bool:
 
 
 # the configuration ----------------------------------------------------------------------------------------------
-def _list(values: Sequence[str | float]) -> str:
-    return "[" + ", ".join(f'"{v}"' if isinstance(v, str) else f"{v:.12g}" for v in values) + "]"
-
-
 def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped) -> str:
-    return (
-        Path(__file__)
-        .with_suffix(".toml.in")
-        .read_text(encoding="utf-8")
-        .format(
-            name=entry(config, "name", kind=str),
-            sha256=hashlib.sha256(urdf.encode()).hexdigest(),
-            held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
-            joints="\n".join(f"{role} = {_list(pair)}" for role, pair in roles.items()),
-            links=_list(feet),
-            sole=sole,
-            stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
-            corner=entry(config, "actuators", "corner_speed_ratio"),
-        )
+    return filled(
+        "jumper.toml.in",
+        name=entry(config, "name", kind=str),
+        sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+        held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
+        joints="\n".join(f"{role} = {texts(pair)}" for role, pair in roles.items()),
+        links=texts(feet),
+        sole=sole,
+        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
+        corner=entry(config, "actuators", "corner_speed_ratio"),
     )

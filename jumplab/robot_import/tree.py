@@ -195,8 +195,3 @@ def _corners(shape: ET.Element) -> np.ndarray:
     else:
         half = np.array([size[0], size[0], size[1] / 2 + (size[0] if shape.tag == "capsule" else 0.0)])
     return half * np.array([*product((-1, 1), repeat=3)])
-
-
-def moving_count(tree: Tree) -> int:
-    """Joints of the URDF that could move."""
-    return sum(joint.kind in MOVING for joint in tree.joints.values())
