@@ -113,15 +113,8 @@ def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, mome
 class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
 
-    Parameters
-    ----------
-    robot : the robot.  gravity : [m/s^2], positive; the robot's own 9.8 by default.
-
-    Attributes
-    ----------
-    robot, model : the robot and its Pinocchio model.
-    nq, nv, mass, gravity : sizes [-], kg, m/s^2 (positive).
-    pairs : (left column, right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
+    ``gravity`` is positive, the robot's own 9.8 by default [m/s^2]; ``mass`` is in kg; ``pairs`` are (left column,
+    right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
     """
 
     def __init__(self, robot: Robot, gravity: float | None = None):

@@ -34,20 +34,13 @@ def _turned(arms: np.ndarray, turns) -> list:
 
 @dataclass(frozen=True)
 class PlanarState:
-    """All planar quantities at one instant, as CasADi expressions; positions are relative to the toe.
-
-    Parameters
-    ----------
-    model : the sagittal robot.
-    angles, rates, accels : (5,) absolute link angles and derivatives [rad, rad/s, rad/s^2].
-    gravity : [m/s^2].
-    """
+    """All planar quantities at one instant, as CasADi expressions; positions are relative to the toe."""
 
     model: SagittalModel
-    angles: ca.SX
-    rates: ca.SX
-    accels: ca.SX
-    gravity: float = GRAVITY
+    angles: ca.SX  # (5,) absolute link angles [rad]
+    rates: ca.SX  # (5,) [rad/s]
+    accels: ca.SX  # (5,) [rad/s^2]
+    gravity: float = GRAVITY  # [m/s^2]
 
     @cached_property
     def _turns(self):
