@@ -16,7 +16,7 @@ def _norm(x: np.ndarray) -> np.ndarray:
 
 def checks(r: Replay) -> list[Check]:
     """All checks of the group "dynamics"."""
-    return [*_inverse(r), *_impulses(r), *_flight(r), *_takeoff(r), _energy(r), _mass(r)]
+    return [*_inverse(r), *_impulses(r), *_flight(r), *_takeoff(r), *_balances(r)]
 
 
 def _inverse(r: Replay) -> list[Check]:
@@ -73,18 +73,16 @@ def _takeoff(r: Replay) -> list[Check]:
     ]
 
 
-def _energy(r: Replay) -> Check:
+def _balances(r: Replay) -> list[Check]:
     power = (r.tape.tau * r.tape.v[:, 6:]).sum(axis=1)
     missing = r.energy - r.energy[0] - r.integral(power)
-    span = max(float(np.ptp(r.energy)), 1e-9)
-    return LIMITS["energy balance"].worst(100 * np.abs(missing) / span, r.tape.t, span=span)
-
-
-def _mass(r: Replay) -> Check:
-    s = r.launch
+    span, s = max(float(np.ptp(r.energy)), 1e-9), r.launch
     push, accelerated = r.tape.f[s][..., 2].sum(axis=1), r.com_acceleration[s][:, 2] + r.gravity
     moved = float(push @ accelerated / max(accelerated @ accelerated, 1e-9))
-    return LIMITS["mass"].check(100 * abs(moved / r.mass - 1), moved=moved, mass=r.mass)
+    return [
+        LIMITS["energy balance"].worst(100 * np.abs(missing) / span, r.tape.t, span=span),
+        LIMITS["mass"].check(100 * abs(moved / r.mass - 1), moved=moved, mass=r.mass),
+    ]
 
 
 def available_torque(r: Replay) -> np.ndarray:

@@ -4,7 +4,7 @@ Configuration: absolute angles of foot, shank, thigh, trunk and arm, positive ab
 vector per angle, so the toe can be fixed (launch) or follow from the ballistic CoM (flight) without any contact
 equation. Moments, momentum and inertia sum m_i times products of two such vectors; the sum over the links is taken
 once, in numbers, and what is left are ten differences of angles. Derivatives of that form are cheap, the second ones
-above all. :func:`lagrangian` is an independent derivation that tests compare with.
+above all. Tests compare it with an independent derivation.
 """
 
 from __future__ import annotations

@@ -89,10 +89,7 @@ class Nlp:
     def gauss_newton_steps(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], **how: Any) -> Near:
         """Come near a solution in a few steps; ``how`` are references, weights, off as of :meth:`solve`.
 
-        Raises
-        ------
-        SolverError
-            If a step is no number.
+        Raises :class:`SolverError` if a step is no number.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
         method, began = self._gauss_newton, time.perf_counter()
@@ -115,6 +112,9 @@ class Nlp:
     ) -> Solution:
         """Solve for one target.
 
+        Raises :class:`SolverError` if ipopt stops without an acceptable point or the re-evaluated rows contradict it;
+        it says which terms are violated, where and by how much.
+
         Parameters
         ----------
         parameters : name -> number or column, exactly those of the problem.
@@ -124,12 +124,6 @@ class Nlp:
         off : names of terms and bounds to leave out.
         multipliers : of a solution close by, on any mesh; used if ipopt's option ``warm_start_init_point`` is "yes".
         explain : look for the terms in conflict if there is no solution; it costs about as much as the solve.
-
-        Raises
-        ------
-        SolverError
-            If ipopt stops without an acceptable point or the re-evaluated rows contradict it; says which terms are
-            violated, where and by how much.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, references, weights, off)
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}

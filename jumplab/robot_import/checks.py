@@ -111,13 +111,9 @@ def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
             yield f"{at}: axis xyz = {axis.get('xyz')!r} has no direction; give a unit vector"
 
 
-def _end(joint: ET.Element, end: str) -> str:
-    """Name of a joint's "parent" or "child" link."""
-    return joint.find(end).get("link")
-
-
 def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[str]:
     known = {j.get("name") for j in joints}
+    ends = [(j.find("child").get("link"), j.find("parent").get("link"), j.get("name")) for j in joints]
     for joint in joints:
         mimic, at = joint.find("mimic"), f"{where}: joint {joint.get('name')!r}"
         if mimic is None:
@@ -127,12 +123,12 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
         for key in ("multiplier", "offset"):
             if numbers(mimic.get(key, "0"), 1) is None:
                 yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
-    for link, times in Counter(_end(j, "child") for j in joints).items():
+    for link, times in Counter(child for child, _, _ in ends).items():
         if times > 1:
-            above = ", ".join(repr(j.get("name")) for j in joints if _end(j, "child") == link)
+            above = ", ".join(repr(name) for child, _, name in ends if child == link)
             yield f"{where}: link {link!r} hangs on {times} joints ({above}): a closed loop; cut it to leave a tree"
             return
-    parent = {_end(j, "child"): _end(j, "parent") for j in joints}
+    parent = {child: above for child, above, _ in ends}
     roots = sorted(names - set(parent))
     if not roots:
         yield f"{where}: no link is the root: the joints form a cycle; each robot needs one link without a parent"
@@ -219,20 +215,15 @@ def _shape_faults(root: ET.Element, where: str) -> Iterator[str]:
         at = f"{where}: link {link.get('name')!r}"
         for collision in link.findall("collision"):
             yield from _triple_faults(collision.find("origin"), f"{at}: collision origin", "xyz", "rpy")
-            for shape in collision.findall("geometry/*"):
-                yield from _size_faults(shape, at)
-
-
-def _size_faults(shape: ET.Element, at: str) -> Iterator[str]:
-    for key, count in SIZES.get(shape.tag, {}).items():
-        values = numbers(shape.get(key), count)
-        if values is None or np.any(values <= 0):
-            wanted = "three positive numbers" if count == 3 else "a positive number"
-            yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
-    if shape.tag == "mesh":
-        if not shape.get("filename"):
-            yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
-        yield from _triple_faults(shape, f"{at}: mesh", "scale")
+        for shape in link.findall("collision/geometry/*"):
+            for key, count in SIZES.get(shape.tag, {}).items():
+                values = numbers(shape.get(key), count)
+                if values is None or np.any(values <= 0):
+                    wanted = "three positive numbers" if count == 3 else "a positive number"
+                    yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
+            if shape.tag == "mesh" and not shape.get("filename"):
+                yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
+            yield from _triple_faults(shape if shape.tag == "mesh" else None, f"{at}: mesh", "scale")
 
 
 # limits ---------------------------------------------------------------------------------------------------------

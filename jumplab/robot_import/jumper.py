@@ -102,14 +102,12 @@ def _cut_hips(lumped: Lumped, roles: RoleJoints, urdf: str) -> Lumped:
     if cut == 0.0:
         return lumped
     mirrored = (low, high) if left.axis @ right.axis > 0 else (-high, -low)
-    new = {left.name: _within(left, low, high), right.name: _within(right, *mirrored)}
+    new = {}
+    for body, (least, most) in ((left, (low, high)), (right, mirrored)):
+        limits = {"lower": max(body.limits["lower"], least), "upper": min(body.limits["upper"], most)}
+        new[body.name] = replace(body, limits=body.limits | limits)
     changed = lumped.changed | {"hip range cut, thigh meets trunk": (cut, "rad")}
     return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
-
-
-def _within(body: Body, low: float, high: float) -> Body:
-    limits = {"lower": max(body.limits["lower"], low), "upper": min(body.limits["upper"], high)}
-    return replace(body, limits=body.limits | limits)
 
 
 def _free_range(lumped: Lumped, roles: RoleJoints, urdf: str) -> tuple[float, float]:
