@@ -16,8 +16,7 @@ from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper, make_jumper
 from jumplab.robot_import.roles import Roles, Sole, safe_name, starter
-from jumplab.robot_import.tree import MOVING, Tree
-from jumplab.robot_import.urdf import parse, read_urdf
+from jumplab.robot_import.urdf import MOVING, Tree, parse, read_urdf
 
 SAMPLES = 24  # fixed random postures over the whole joint range
 RATE_RAD_S = 3.0  # of every link, for the momentum

@@ -14,8 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.tree import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix
-from jumplab.robot_import.urdf import numbers
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix, numbers
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 

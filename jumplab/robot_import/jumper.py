@@ -18,8 +18,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
-from jumplab.robot_import.tree import Tree
-from jumplab.robot_import.urdf import parse
+from jumplab.robot_import.urdf import Tree, parse
 
 REPAIRS = ("inertia", "massless", "symmetry")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")

@@ -16,7 +16,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.config import entry, table
 from jumplab.robot_import.roles import LEG, robot_axes
-from jumplab.robot_import.tree import LIMITS, Tree
+from jumplab.robot_import.urdf import LIMITS, Tree
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])

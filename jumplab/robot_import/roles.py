@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.config import ROLES, filled, texts
-from jumplab.robot_import.tree import MOVING, Joint, Tree
+from jumplab.robot_import.urdf import MOVING, Joint, Tree
 
 # None of these numbers is printed by the paper.
 PARALLEL = 0.999  # cosine: axes canted by less than 2.6 deg count as pitch
