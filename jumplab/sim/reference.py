@@ -177,7 +177,9 @@ class Replan:
         if self._due - STEP_S / 2 <= time <= UNTIL_S:
             self._due += EVERY_S
             now = touchdown_of_state(self._robot, q, v, impact=False)
-            if abs(_off(now, *reference.at(time)[:2])) > OFF_M:
+            com, velocity, _ = reference.at(time)
+            rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))  # the capture point is x + v_x / rate
+            if abs(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate) > OFF_M:
                 plan, _, spent_s = _landing(self._robot, now)
                 if plan is None:  # from here stage 1 knows no landing; the older one is the best there is
                     self.refused += 1
@@ -189,9 +191,3 @@ class Replan:
     def to_json(self) -> dict:
         """What the settings of a result say."""
         return {"made": self.made, "refused": self.refused, "slowest_s": self.slowest_s}
-
-
-def _off(now: Touchdown, com: np.ndarray, velocity: np.ndarray) -> float:
-    """Distance between the capture points x + v_x / sqrt(g / z) of a state and of a plan [m]."""
-    rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))
-    return float(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate)
