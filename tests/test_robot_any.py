@@ -193,7 +193,14 @@ def prismatic() -> str:
     return text(robot)
 
 
+STONE = """<link name="stone"><inertial><mass value="2.5"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+<joint name="free" type="floating"><parent link="trunk"/><child link="stone"/></joint></robot>"""
+
+
 REFUSED = [
+    (text(root()).replace("</robot>", STONE), config("x"),
+     "my.urdf: 2.500 kg do not hang on the trunk ('stone'); they are joined to it by no joint of a robot"),
     (text(root()), config("x", trunk="pelvis"),
      "my.urdf: the configuration names the link 'pelvis', which the URDF lacks"),
     (text(root()), config("x", forward="ahead"),

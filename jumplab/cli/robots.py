@@ -13,7 +13,7 @@ store, jumper, configs = (
     Late("jumplab.robot_import.jumper"),
     Late("jumplab.robot_import.config"),
 )
-starters = Late("jumplab.robot_import.starter")
+starters = Late("jumplab.robot_import.roles")
 tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
 
 

@@ -13,9 +13,8 @@ from jumplab.robot.stance import check_stance, com_from_toe
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper
-from jumplab.robot_import.starter import draft
-from jumplab.robot_import.tree import moving_count
-from jumplab.robot_import.urdf import parse, read_urdf
+from jumplab.robot_import.roles import draft
+from jumplab.robot_import.urdf import MOVING, parse, read_urdf
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,10 @@ class Checkup:
         """What else is worth knowing, a line each."""
         r, tree, e = self.robot, self.jumper.tree, self.error
         moving, foot, com = len(r.joint_names), r.foot, com_from_toe(r, self.stance)
+        movable = sum(joint.kind in MOVING for joint in tree.joints.values())
         out = [
             f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
-            f"{moving_count(tree)} joints move, {len(self.jumper.lumped.held)} are held off zero",
+            f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
             f"standing: CoM {com[1]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "

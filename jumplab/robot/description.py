@@ -19,7 +19,7 @@ from jumplab.robot.sagittal import SagittalModel, reduce
 from jumplab.robot.stance import check_stance
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
 from jumplab.robot_import.jumper import Jumper, make_jumper
-from jumplab.robot_import.starter import draft
+from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import locate, read_urdf
 from jumplab.task import GRAVITY
 
