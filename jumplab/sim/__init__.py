@@ -9,7 +9,7 @@ STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
 
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
-    submodules=["checks", "kinematics", "perturbation", "pilot", "playback", "reaim", "result"],
+    submodules=["checks", "kinematics", "pilot", "playback", "reaim"],
     submod_attrs={
         "estimator": ["Estimator"],
         "landing": ["LandingController", "LandingGains"],
