@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.api import simulate as simulate
     from jumplab.api import view as view
     from jumplab.ocp import Term as Term
-    from jumplab.robot import Robot as Robot
+    from jumplab.robot.description import Robot as Robot
     from jumplab.sim.perturbation import Perturbation as Perturbation
     from jumplab.sim.scene import Scene as Scene
     from jumplab.stages.plan import JumpPlan as JumpPlan
