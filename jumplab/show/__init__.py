@@ -32,6 +32,6 @@ _NAMES = {  # module: its public names, loaded when they are first used
     "draw_path draw_com equal_scales",
     "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
     "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
-    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE",
+    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE MIN_FONT_PT",
 }
 __getattr__, __dir__, __all__ = lazy.attach(__name__, submod_attrs={k: names.split() for k, names in _NAMES.items()})
