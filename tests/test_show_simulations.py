@@ -7,13 +7,12 @@ import pytest
 from fixtures_core import jump
 from matplotlib.path import Path
 from matplotlib.text import Text
-from paper import diagrams
+from paper import diagrams, render
 from scipy.ndimage import binary_dilation
 
 from jumplab import show as plotting
 from jumplab.errors import RobotError
 from jumplab.robot.stance import stance_configuration
-from jumplab.show import render
 from jumplab.show import simulations as pictures
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
@@ -40,7 +39,7 @@ def smallest_font(fig) -> float:
 
 
 def test_frames_show_each_phase_and_its_turning_points(result):
-    rows = pictures.frame_rows(result)
+    rows = render.frame_rows(result)
     assert len(rows) == 12 and (np.diff(rows) > 0).all()
     assert [str(p) for p in result.phase[rows]] == ["launch"] * 4 + ["flight"] * 4 + ["landing"] * 4
     flight = np.flatnonzero(result.phase == "flight")
@@ -55,7 +54,7 @@ def test_frames_show_each_phase_and_its_turning_points(result):
 def test_frames_of_half_a_jump_are_evenly_spaced(result, end):
     cut = int(np.argmax(result.phase == "flight")) + (0 if end == "before take-off" else 300)
     short = replace(result, **{k: getattr(result, k)[:cut] for k in ("t", "q", "com", "phase")})
-    rows = pictures.frame_rows(short)
+    rows = render.frame_rows(short)
     assert len(rows) == 12 and rows[0] == 0 and rows[-1] == cut - 1
     assert np.ptp(np.diff(rows)) <= 1
 
@@ -64,7 +63,7 @@ def test_frames_of_a_fall(result):
     """The CoM ends lower than in the deepest knee bend: half-way up does not exist, half of the time does."""
     com = result.com.copy()
     com[-1, 2] = 0.1
-    rows = pictures.frame_rows(replace(result, com=com))
+    rows = render.frame_rows(replace(result, com=com))
     assert rows[10] == (rows[9] + rows[11]) // 2
 
 
@@ -143,7 +142,7 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
     with render.Renderer(bhr, scene=Scene("empty", ())) as studio:
-        for row in pictures.frame_rows(result)[[0, 1, 5, 9]]:
+        for row in render.frame_rows(result)[[0, 1, 5, 9]]:
             q = result.q[row]
             seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
             places = np.column_stack([x.ravel() + q[0], z.ravel()])

@@ -1,7 +1,4 @@
-"""Pictures of one simulated jump: in one frame (Fig. 1), against its plan (Fig. 12), and how it lands.
-
-Rendered pictures (Fig. 11) are in :mod:`jumplab.show.render`.
-"""
+"""Pictures of one simulated jump: in one frame (Fig. 1), against its plan (Fig. 12), and how it lands."""
 
 from __future__ import annotations
 
@@ -63,29 +60,6 @@ def _strip_rows(result: SimulationResult) -> np.ndarray:
     if on + 1 < len(result.t):
         rows += [on + 1, on + 1 + int(np.argmin(result.com[on + 1 :, 2])), len(result.t) - 1]
     return np.array(rows)
-
-
-def frame_rows(result: SimulationResult) -> np.ndarray:
-    """Twelve rows of a log worth a picture, four per phase; of a jump without flight or landing, twelve evenly spaced.
-
-    Launch: start, crouch, half-way up, lift-off; flight: evenly; landing: touchdown, deepest, half-way up, the end.
-    """
-    count, flight = len(result.t), np.flatnonzero(result.phase == "flight")
-    if not len(flight) or flight[0] == 0 or flight[-1] + 1 == count:
-        return np.linspace(0, count - 1, 12).astype(int)
-    z, off, on = result.com[:, 2], int(flight[0]), int(flight[-1]) + 1
-    crouch = int(np.argmin(z[:off]))
-    deepest = on + int(np.argmin(z[on : on + round(AFTER_TOUCHDOWN_S / (result.t[1] - result.t[0]))]))
-    launch = [0, crouch, _halfway(z, crouch, off - 1), off - 1]
-    air = [off + (on - off) * share for share in (0.125, 0.375, 0.625, 0.875)]
-    return np.array([*launch, *air, on, deepest, _halfway(z, deepest, count - 1), count - 1]).astype(int)
-
-
-def _halfway(z: np.ndarray, start: int, end: int) -> int:
-    """First row after ``start`` that is half of the way up to the height at ``end``; in a fall, half of the time."""
-    if z[end] <= z[start]:
-        return (start + end) // 2
-    return start + int(np.argmax(z[start : end + 1] >= (z[start] + z[end]) / 2))
 
 
 @styled

@@ -14,8 +14,6 @@ from matplotlib.patheffects import withStroke
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, Silhouette, draw_path, strobe
-from jumplab.show.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames
-from jumplab.show.simulations import frame_rows
 from jumplab.show.studies import LEGEND_IN, draw_goals, draw_scene, span
 from jumplab.show.style import (
     COLUMN_IN,
@@ -41,6 +39,7 @@ from jumplab.show.style import (
     tint,
 )
 from jumplab.studies.trials import wilson
+from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame_rows
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Scene, SimulationResult
