@@ -19,9 +19,9 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # for plans
     "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
     # for simulations
-    "simulations": "jump_strobe momentum landing_loads",
+    "simulations": "jump_strobe momentum",
     # for studies
-    "studies": "trials envelope_map chain_strobe chain_timeline draw_scene",
+    "studies": "trials envelope_map chain_strobe draw_scene",
     # the jump in 3-D, tables
     "viewer": "Page page",
     "tables": "Table table versions",
