@@ -105,12 +105,11 @@ def rows(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [{"what": n, "CPU [s]": t, "ratio": ratios.get(n)} for n, t in {"three steps": steps_s, **cpu}.items()]
 
 
-# measure ------------------------------------------------------------------------------------------
 TASK, MESH = JumpTask(1.0, 0.5), Mesh()  # the paper's target, the usual mesh
 NEIGHBOUR_M = 0.05  # how much farther the re-planned target is
 NODES = (20, 40, 60, 80, 100, 120)  # intervals of the three phases together
 NODE_REPEATS = 3  # the growth is a fit over many meshes
-TARGETS = (1, 2, 4, 8)
+TARGETS = (1, 2, 4, 8)  # numbers of targets for the growth with targets
 # shares of the target's distance and rise; how many iterations one target takes is a matter of luck
 SPREAD = ((0.0, 0.8), (0.2, 0.6), (0.3, 1.0), (0.4, 0.4), (0.6, 1.0), (0.8, 0.6), (1.0, 0.6), (1.1, 0.8))
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
@@ -163,18 +162,12 @@ def bench(
     cold: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Measure everything; returns plain types, see :func:`report`.
+    """Measure everything ``repeats`` times; returns plain types, see :func:`report`.
 
-    Raises :class:`InputError` for fewer repeats than 1, another :class:`JumplabError` if the target has no plan.
-
-    Parameters
-    ----------
-    robot_name : shipped robot, or path of a TOML file.  task : the target.
-    repeats : how often each thing is done; at least 1.
-    mesh : of stage 3 and of the direct NLP; ``cold`` processes know only the default.
-    nodes : numbers of intervals for the growth with nodes.
-    spread : further targets, as shares of the target's distance and rise, planned once in both ways.
-    cold : also time new processes.  say : is told what goes on.
+    ``mesh`` is that of stage 3 and of the direct NLP (new processes, timed if ``cold``, know only the default),
+    ``nodes`` are numbers of intervals for the growth with nodes, ``spread`` further targets, as shares of the target's
+    distance and rise; ``say`` is told what goes on. Raises :class:`InputError` for fewer repeats than 1, another
+    :class:`JumplabError` if the target has no plan.
     """
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
@@ -197,11 +190,13 @@ def bench(
             if cold:
                 peaks.append(_cold(watch, robot_name, task, audits, kept))
     say("growth with nodes and targets")
-    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
-    growth["spread"] = _spread(planner, ways, task, spread)
+    each = Stopwatch()
+    for k in range(TARGETS[-1]):  # different targets with one planner
+        each("plan", planner.plan, replace(task, distance_m=task.distance_m - 0.02 * k))
+    growth = {"nodes": _nodes(planner, task, nodes), "spread": _spread(planner, ways, task, spread)}
+    growth["targets_cpu_s"] = {str(n): sum(each.cpu["plan"][:n]) for n in TARGETS}
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
     head["iterations"] = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
-    # CPU time of function evaluations in the solve on the fine mesh
     head["functions_s"] = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
     return report(head, watch, audits, growth, peaks)
 
@@ -226,9 +221,8 @@ def _once(
 
 
 def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, list[bool]], kept: str) -> float:
-    """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
-    in the folder ``kept``; returns the larger peak of memory [GiB]. Python's own bytecode is on file for both, as it is
-    after any first run."""
+    """One plan in a new process that builds everything, one in another that finds functions on file in ``kept``; both
+    find Python's bytecode there. Returns the larger peak of memory [GiB]."""
     peak = 0.0
     environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -266,8 +260,8 @@ def _nodes(planner: Planner, task: JumpTask, nodes: Sequence[int]) -> list[dict[
 def _spread(
     planner: Planner, ways: Mapping[str, Callable], task: JumpTask, spread: Sequence[tuple[float, float]]
 ) -> list[dict[str, Any]]:
-    """Other targets, each planned once by three steps and directly, by ipopt at once and begun with Gauss-Newton steps:
-    CPU times [s] (the peers' of their solves alone, as everywhere), and the ratios; not those without a plan."""
+    """Other targets, each planned once by three steps, by ipopt at once and begun with Gauss-Newton steps: CPU times
+    [s] and their ratios; not those without a plan."""
     rows = []
     for distance, height in spread:
         place = {"distance_m": distance * task.distance_m, "height_m": height * task.height_m}
@@ -283,11 +277,3 @@ def _spread(
         times |= {"approached_s": begun_s, "ratio_approached": plan_s / begun_s}
         rows.append(place | times | {"clean": audit(plan.tape, planner.robot, other).passed})
     return rows
-
-
-def _targets(planner: Planner, task: JumpTask) -> dict[str, float]:
-    """CPU time [s] of planning so many different targets with one planner."""
-    watch = Stopwatch()
-    for k in range(TARGETS[-1]):
-        watch("plan", planner.plan, replace(task, distance_m=task.distance_m - 0.02 * k))
-    return {str(n): sum(watch.cpu["plan"][:n]) for n in TARGETS}
