@@ -197,6 +197,7 @@ def bench(
     growth["targets_cpu_s"] = {str(n): sum(each.cpu["plan"][:n]) for n in TARGETS}
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
     head["iterations"] = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
+    # CPU time of function evaluations in the solve on the fine mesh
     head["functions_s"] = {name: plan.whole_body.solution.statistics.functions_s for name, plan in plans.items()}
     return report(head, watch, audits, growth, peaks)
 

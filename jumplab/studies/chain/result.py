@@ -160,18 +160,14 @@ class ChainResult:
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``chain.json``."""
-        robot, counts = dict(name=self.robot.name, hash=self.robot.hash), dict(replans=len(self.replans))
+        robot = dict(name=self.robot.name, hash=self.robot.hash)
         said = dict(schema=SCHEMA, target=asdict(self.course), robot=robot, stood=self.stood, reason=self.reason)
-        said |= counts | dict(in_time=self.in_time, waits_s=self.waits_s, settings=self.settings)
+        said |= dict(replans=len(self.replans), in_time=self.in_time, waits_s=self.waits_s, settings=self.settings)
         return said | {"jumps": self.rows()}
 
 
 def write_chain(
-    folder: str | Path,
-    result: ChainResult,
-    further: Mapping[str, str] | None = None,
-    *,
-    series: Mapping | None = None,
+    folder: str | Path, result: ChainResult, further: Mapping[str, str] | None = None, *, series: Mapping | None = None
 ) -> tuple[AuditReport, ...]:
     """Write a chain, whole or not at all, in the place of an older one; returns the audits of its plans.
 
