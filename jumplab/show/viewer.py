@@ -155,7 +155,6 @@ def _assemble(title: str, facts: Mapping[str, Any], commands: list[str]) -> str:
     engine = (resources.files("meshcat") / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
     if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
-
     form = dict(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     data = {"FACTS": facts, "COMMANDS": commands}
     data = {name: json.dumps(x, **form).replace("<", "\\u003c") for name, x in data.items()}

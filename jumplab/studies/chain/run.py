@@ -98,7 +98,6 @@ def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise
     for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
         if not isinstance(value, str) or value not in known:
             raise InputError(f"{name} {quoted(value)}: choose one of {', '.join(known)}")
-
     solve_s, revise_s = (0.0 if x is None else x for x in (solve_s, revise_s))
     rows = ("solve_s", solve_s, 0.0, 60.0), ("look_s", look_s, EARLIEST_LOOK_S, 2.0), ("revise_s", revise_s, 0.0, 2.0)
     for name, value, low, high in rows:
@@ -127,12 +126,11 @@ class ChainTrial:
     @classmethod
     def of(cls, seed: int, result: ChainResult) -> ChainTrial:
         """What is kept of a chain."""
-        plans = [
-            dict(jump=p.number, air=p.air, solve_s=p.solve_s, cpu_s=p.cpu_s, spare_s=p.spare_s) for p in result.replans
-        ]
+        names = ("air", "solve_s", "cpu_s", "spare_s")
+        plans = tuple({"jump": p.number} | {n: getattr(p, n) for n in names} for p in result.replans)
         numbers = (tuple(map(float, x)) for x in (result.errors_m, result.travels_m))
         air = tuple(j.air_s for j in result.jumps)
-        return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, tuple(plans))
+        return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, plans)
 
 
 @dataclass(frozen=True)
