@@ -8,11 +8,8 @@ from jumplab.cli.common import Late, command, folder, opt
 from jumplab.errors import InputError, JumplabError, RobotError
 
 robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
-store, jumper, configs = (
-    Late("jumplab.io.folder"),
-    Late("jumplab.robot_import.jumper"),
-    Late("jumplab.robot_import.config"),
-)
+store, jumper = Late("jumplab.io.folder"), Late("jumplab.robot_import.jumper")
+configs = Late("jumplab.robot_import.config")
 starters = Late("jumplab.robot_import.roles")
 tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
 
