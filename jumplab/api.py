@@ -20,15 +20,10 @@ if TYPE_CHECKING:  # what only some of the functions need is imported by them
 
 
 class Saved(NamedTuple):
-    """What a result folder holds.
+    """What a result folder holds."""
 
-    Attributes
-    ----------
-    plan : the plan; results of its stages are not on file.  run : its simulation, or None.
-    """
-
-    plan: JumpPlan
-    run: SimulationResult | None
+    plan: JumpPlan  # results of its stages are not on file
+    run: SimulationResult | None  # its simulation, if there is one
 
 
 def plan(
@@ -96,13 +91,7 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
 
 
 def load(folder: str | Path) -> Saved:
-    """Read a result folder: ``plan, run = jl.load("out")``.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no finished plan, or a file is damaged or not the one that the summary speaks of.
-    """
+    """Read a result folder: ``plan, run = jl.load("out")``; raises :class:`InputError` if there is no sound plan."""
     from jumplab.sim import SimulationResult
 
     tape, robot, summary = folders.read_plan(folder)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 _SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60  # our choice: enough to recognise what one has typed
+_SHORT.maxstring = _SHORT.maxother = 60  # enough to recognise what one has typed
 
 
 class JumplabError(Exception):
@@ -38,14 +38,8 @@ class InfeasibleError(JumplabError):
 class SolverError(JumplabError):
     """A solver stopped without an answer that passes its own re-evaluated residuals.
 
-    Attributes
-    ----------
-    stage : str
-        Name of the stage that failed.
-    status : str
-        What the solver said.
-    violations : tuple of str
-        The worst violated terms, "name: amount unit at node k, t = ... s".
+    ``stage`` names the stage that failed, ``status`` is what the solver said, and ``violations`` are the worst violated
+    terms, each as "name: amount unit at node k, t = ... s".
     """
 
     exit_code = 3

@@ -9,7 +9,7 @@ from fixtures_robots import child, write
 from jumplab.cli.main import main
 from jumplab.errors import InputError
 from jumplab.robot import Robot
-from jumplab.show.studies import envelope_map
+from jumplab.show.jumps import envelope_map
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.studies.envelope import BEYOND, CELLS, OPEN, VERDICT, Cell, Envelope, envelope, usage

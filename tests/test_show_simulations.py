@@ -110,12 +110,12 @@ def test_trials_sort_robots_by_their_fate(result):
     m = result.metrics
     fell = replace(m, landed=False)
     rows = [m, replace(m, foot_distance_m=0.9), fell, replace(fell, foot_distance_m=None)]
-    fig = plotting.trials(rows, TASK, nominal=m)
+    fig = experiments.trials(rows, TASK, nominal=m)
     (ax,) = fig.axes
     drawn = {line.get_label(): np.column_stack(line.get_data()) for line in ax.lines}
     assert {k: len(v) for k, v in drawn.items()} == {"target": 1, "landed": 2, "fell": 1, "as planned": 1}
     assert drawn["landed"][1] == pytest.approx([0.9, m.com_rise_m])
-    assert [len(plotting.trials(some, TASK).axes) for some in ([], rows[3:])] == [1, 1]
+    assert [len(experiments.trials(some, TASK).axes) for some in ([], rows[3:])] == [1, 1]
     assert smallest_font(fig) >= MIN_FONT_PT
 
 

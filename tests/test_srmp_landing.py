@@ -186,15 +186,16 @@ def test_too_fast_a_fall_forward_names_what_gives():
     assert any(word in str(caught.value) for word in ("CoP", "friction", "touchdown", "stance"))
 
 
-def test_catch_from_a_full_state_or_nothing():
+def test_a_landing_is_planned_from_a_full_state_or_refused():
     robot = Robot.load()
     q = configuration(robot, np.array([0.0, 0.45, -0.55, 0.15, 0.0]), toe=(0.3, 0.0))
     falling, away = np.zeros(robot.model.nv), np.zeros(robot.model.nv)
     falling[2], away[0], away[2] = -2.5, 8.0, -2.5
-    caught = planner().catch(q, falling)
+    caught = planner().plan(touchdown_of_state(robot, q, falling))
     assert caught.touchdown.com_velocity[1] > -2.5
     np.testing.assert_allclose(caught.com[0], caught.touchdown.com, atol=1e-6)
-    assert planner().catch(q, away) is None
+    with pytest.raises(SolverError, match="landing"):
+        planner().plan(touchdown_of_state(robot, q, away))
 
 
 def test_the_landing_controller_takes_the_plan_as_its_reference():

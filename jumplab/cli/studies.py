@@ -16,7 +16,7 @@ from jumplab.task import JumpTask
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
-pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.studies")
+pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
 
 MOST, RUNS = 100_000, whole(1, 10_000)  # trials: two days of one core; chains: a day of two; more must be a typo

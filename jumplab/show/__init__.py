@@ -16,12 +16,8 @@ The 3-D page is :func:`page`; tables are :func:`table`.
 import lazy_loader as lazy
 
 _NAMES = {  # module: its public names, loaded when they are first used
-    # for plans
-    "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
-    # for simulations
-    "simulations": "jump_strobe momentum",
-    # for studies
-    "studies": "trials envelope_map chain_strobe draw_scene",
+    # for plans, for simulations, and the map of what a robot can do
+    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum envelope_map",
     # the jump in 3-D, tables
     "viewer": "Page page",
     "tables": "Table table versions",

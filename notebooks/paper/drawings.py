@@ -14,7 +14,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, equal_scales, film_strip, strobe
-from jumplab.show.simulations import AFTER_TOUCHDOWN_S
+from jumplab.show.jumps import AFTER_TOUCHDOWN_S
 from jumplab.show.style import (
     BAND,
     COLUMN_IN,

@@ -10,18 +10,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, Silhouette, draw_path, strobe
-from jumplab.show.studies import LEGEND_IN, draw_goals, draw_scene, span
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
+    GROUND,
     INK,
     LANDING,
+    LAUNCH,
     LIMIT_STYLE,
     NOTE_STYLE,
     PAGE_IN,
@@ -46,12 +47,17 @@ from jumplab.task import GRAVITY
 from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame_rows
 
 if TYPE_CHECKING:  # pictures need no simulator
-    from jumplab.sim import Scene, SimulationResult
+    from jumplab.sim import Metrics, Scene, SimulationResult
     from jumplab.studies.basin import BasinReport
     from jumplab.studies.chain import ChainResult, ChainTrial
     from jumplab.studies.trials import Trial
+    from jumplab.task import JumpTask
     from paper.measurement import Measurement
 
+WITHIN_M = (0.05, 0.03)  # of distance and rise
+AROUND_M, GROUND_M = 0.45, 0.05  # what is shown of the ground beyond the soles of a chain, and below it
+WAITING = 0.55  # strength of a robot between jumps
+LEGEND_IN, CHAIN_TALLEST_IN = 0.3, 4.2
 APART_M = 1.2  # how far start and end are moved away from the jump
 DITCH_SHOWN_M = 0.25  # a ditch that nobody falls into is cut off at this depth
 GROUND_SHOWN_M = 0.04
@@ -428,3 +434,86 @@ def chain_timeline(result: ChainResult) -> Figure:
     bars.insert(2, Line2D([], [], color=INK, linewidth=0.7, label="still enough"))
     legend_above(fig, [*phase_handles(*PHASE_COLORS), *bars])
     return fig
+
+
+@styled
+def trials(rows: Sequence[Metrics], task: JumpTask, *, nominal: Metrics | None = None) -> Figure:
+    """Travel of the feet against rise of the CoM for many robots: landed, fallen, as planned (``nominal``), the target.
+
+    Robots that never left the ground or never came down are not drawn; the box is :data:`WITHIN_M` around it.
+    """
+    fig = new_figure(COLUMN_IN, 2.5)
+    ax = fig.subplots()
+    corner, size = np.array([task.distance_m, task.height_m]) - WITHIN_M, 2 * np.array(WITHIN_M)
+    box = dict(facecolor=tint(INK, 0.06), edgecolor=INK, linestyle=(0, (4, 2)), linewidth=0.8)
+    ax.add_patch(Rectangle(corner, *size, **box))
+    ax.plot(task.distance_m, task.height_m, "+", color=INK, markersize=7, label="target")
+    kinds = (
+        ([m for m in rows if m.landed], "o", LANDING, "landed"),
+        ([m for m in rows if not m.landed], "x", VERMILION, "fell"),
+        ([nominal] if nominal else [], "D", LAUNCH, "as planned"),
+    )
+    for found, marker, color, label in kinds:
+        places = np.array([(m.foot_distance_m, m.com_rise_m) for m in found if m.foot_distance_m is not None])
+        if len(places):
+            ax.plot(*places.T, linestyle="none", marker=marker, color=color, markersize=4.5, label=label)
+    ax.set(xlabel="travel of the feet [m]", ylabel="rise of the CoM [m]")
+    ax.margins(0.12)
+    legend_above(fig, ax.get_legend_handles_labels()[0])
+    return fig
+
+
+@styled
+def chain_strobe(result: ChainResult) -> Figure:
+    """The whole chain where it happened: the crouch before each jump, the apex of each flight, and the end."""
+    body, frames = Silhouette(result.robot), []
+    for jump in result.jumps:
+        s = jump.simulation
+        flight = np.flatnonzero(s.phase == "flight")
+        frames.append((WAITING, s.q[0], "landing" if jump.number else "launch"))
+        if len(flight):
+            frames.append((1.0, s.q[flight[np.argmax(s.com[flight, 2])]], "flight"))
+    frames.append((1.0, result.jumps[-1].simulation.q[-1], "landing"))
+    strengths, postures, phases = zip(*sorted(frames, key=lambda f: f[0]), strict=True)  # robots in the air in front
+    left, right = span(result)
+    top = max(map(body.top, postures)) + GROUND_M
+    fig = new_figure(PAGE_IN, min(LEGEND_IN + PAGE_IN * (top + GROUND_M) / (right - left), CHAIN_TALLEST_IN))
+    ax = fig.subplots()
+    strobe(ax, body, postures, [PHASE_COLORS[p] for p in phases], strengths=strengths)
+    draw_path(ax, result.com[:, 0], result.com[:, 2])
+    draw_scene(ax, result.scene, left, right, -GROUND_M)
+    draw_goals(ax, result)
+    ax.set(xlim=(left, right), ylim=(-GROUND_M, top))
+    legend_above(fig, phase_handles(*PHASE_COLORS))
+    bare(ax)
+    return fig
+
+
+def span(result: ChainResult) -> tuple[float, float]:
+    """What to show of the ground of a chain: from, to [m]."""
+    x = result.q[:, 0]
+    return float(x.min()) - AROUND_M, float(x.max()) + AROUND_M
+
+
+def draw_goals(ax: Axes, result: ChainResult) -> None:
+    """Where the toes should stand after each jump."""
+    foot = result.robot.foot
+    zero = foot.toe - float(foot.center[0])
+    for goal, top in zip(result.course.goals_m, result.course.platforms_m, strict=True):
+        ax.plot([zero + goal] * 2, [top - 0.035, top], color=VERMILION, linewidth=1.4, zorder=6)
+
+
+def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float) -> None:
+    """Cross-section of the ground from ``left`` to ``right``, cut off at ``bottom`` [m]."""
+    line = dict(color=GROUND, linewidth=0.8, zorder=1.5)
+    fill = dict(facecolor=tint(GROUND, 0.35), edgecolor="none", zorder=1)
+    for block in sorted(scene.blocks, key=lambda b: b.top):
+        start, end = max(left, block.x_from), min(right, block.x_to)
+        if start >= end or block.top <= bottom:
+            continue
+        ax.add_patch(Rectangle((start, bottom), end - start, block.top - bottom, **fill))
+        ax.plot([start, end], [block.top] * 2, **line)
+        for x in (block.x_from, block.x_to):
+            if left < x < right:
+                below = max((b.top for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to), default=bottom)
+                ax.plot([x, x], [max(below, bottom), block.top], **line)

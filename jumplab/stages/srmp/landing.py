@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import SolverError
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
@@ -215,13 +214,6 @@ class LandingPlanner:
         t = grid(phase.duration)
         columns = on_ground(self._mass, gravity, t, *phase.sample(t))
         return LandingPlan(*columns, touchdown, solution.statistics, phase)
-
-    def catch(self, q: np.ndarray, v: np.ndarray) -> LandingPlan | None:
-        """Landing from a state of the full robot at the first touch, None if there is none; see :meth:`plan`."""
-        try:
-            return self.plan(touchdown_of_state(self.robot, q, v))
-        except SolverError:
-            return None
 
     def _parameters(self, touchdown: Touchdown) -> dict:
         (x, z), (dx, dz) = touchdown.com, touchdown.com_velocity

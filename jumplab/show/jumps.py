@@ -1,0 +1,268 @@
+"""Pictures of a jump, from its tape or its simulation's log, and the map of the jumps that a robot can do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+
+from jumplab.io.tape import Tape
+from jumplab.robot import SAGITTAL_JOINTS, Robot
+from jumplab.show import style
+from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip, five_link_points
+from jumplab.stages.whole_body import Limits
+from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Envelope
+from jumplab.task import GRAVITY
+
+if TYPE_CHECKING:  # pictures need no simulator
+    from jumplab.sim import SimulationResult
+
+REFUSED = {
+    OPEN: ("#9A9A9A", "no plan found"),
+    VERDICT: ("#D5D5D5", "refused before solving"),
+    BEYOND: ("#F0F0F0", "not tried"),
+}
+MOST_TICKS = 14  # more would touch
+AFTER_TOUCHDOWN_S = 0.25  # how much of the landing is shown
+FLIGHT_SHARES = (0.25, 0.5, 0.75)  # when frames of the flight are shown
+STRIP_M = 0.72  # from frame to frame, just more than a robot with its arms stretched out
+LEAST_FORCE_SHARE = 0.02  # below this share of the weight, CoP and friction are 0/0 and not drawn
+
+
+def heel_up_time(tape: Tape) -> float:
+    """When the heel leaves the ground [s]."""
+    return float(tape.extra["planar_toe_phase_start"])
+
+
+# Fig. 8 ---------------------------------------------------------------------------------------------------------
+@style.styled
+def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...] | None = None) -> Figure:
+    """F-8: one column per joint, angle above and velocity below, launch and flight in two colours, limits thin.
+
+    Parameters
+    ----------
+    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's.
+    """
+    fig = style.new_figure(style.PAGE_IN, 3.1)
+    axes = fig.subplots(2, 4, sharex=True)
+    m, e = robot.sagittal, tape.extra
+    rows = (
+        (e["planar_joints"], m.lower, m.upper, "angle [rad]"),
+        (e["planar_joint_rates"], -m.speed, m.speed, "velocity [rad/s]"),
+    )
+    for k, (y, low, high, label) in enumerate(rows):
+        for i, ax in enumerate(axes[k]):
+            dashed = [] if guess is None else [(guess[0], guess[1 + k][:, i])]
+            style.compare(ax, (tape.t, y[:, i], tape.phase), *dashed, marks=[heel_up_time(tape)])
+            style.limits(ax, low[i], high[i])
+            room = 0.06 * (high[i] - low[i])
+            ax.set_ylim(low[i] - room, high[i] + room)
+        axes[k, 0].set_ylabel(label)
+    for name, (top, bottom) in zip(SAGITTAL_JOINTS, axes.T, strict=True):
+        top.set_title(name)
+        bottom.set_xlabel("time [s]")
+    fig.align_ylabels(axes[:, 0])
+    dashed = "stage 2, the guess" if guess is not None else None
+    style.legend_above(fig, style.phase_handles("launch", "flight", limit="limit", reference=dashed))
+    return fig
+
+
+# Fig. 9 ---------------------------------------------------------------------------------------------------------
+@style.styled
+def inertia_and_momentum(tape: Tape) -> Figure:
+    """F-9: inertia, CoM velocity and angular momentum of the plan, and dashed what stage 1 asked for."""
+    fig = style.new_figure(style.PAGE_IN, 3.3)
+    axes = fig.subplots(2, 2, sharex=True)
+    e, takeoff, known = tape.extra, tape.takeoff_time, "srmp_launch_t" in tape.extra
+    curves = (
+        ("rho", ..., "$\\rho$ [kg m$^2$]"),
+        ("L", ..., "$L$ [kg m$^2$/s]"),
+        ("com_velocity", (..., 0), "$v_x$ of the CoM [m/s]"),
+        ("com_velocity", (..., 1), "$v_z$ of the CoM [m/s]"),
+    )
+    for ax, (key, part, label) in zip(axes.flat, curves, strict=True):
+        asked = []
+        if known:
+            starts = {"launch": takeoff - e["srmp_launch_t"][-1], "flight": takeoff}
+            asked = [(e[f"srmp_{p}_t"] + start, e[f"srmp_{p}_{key}"][part]) for p, start in starts.items()]
+        marks = (heel_up_time(tape), takeoff)
+        style.compare(ax, (tape.t, e[f"planar_{key}"][part], tape.phase), *asked, label=label, marks=marks)
+    for ax in axes[1]:
+        ax.set_xlabel("time [s]")
+    fig.align_ylabels()
+    style.legend_above(
+        fig, style.phase_handles("launch", "flight", reference="stage 1, the reference" if known else None)
+    )
+    return fig
+
+
+# limits ---------------------------------------------------------------------------------------------------------
+@style.styled
+def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
+    """Torque against speed of each joint in its envelope; CoP in the sole and friction used through the launch.
+
+    ``limits`` are the planner's (its defaults if None), drawn dashed inside what the motors could do.
+    """
+    limits = limits or Limits()
+    fig = style.new_figure(style.PAGE_IN, 3.9)
+    names = [["hip", "knee", "ankle", "shoulder"], ["cop", "cop", "friction", "friction"]]
+    axes = fig.subplot_mosaic(names, height_ratios=(1.15, 1.0))
+    for i, name in enumerate(SAGITTAL_JOINTS):
+        _torque_speed(axes[name], tape, robot, i, limits)
+        axes[name].set_title(name)
+    axes["hip"].set_ylabel("torque of both sides [N m]")
+    r, cop, friction = ground_reaction(tape, robot), axes["cop"], axes["friction"]
+    heel = 100 * robot.sagittal.heel[0]
+    cop.fill_between(r["t"], heel, 0.0, color=style.BAND, linewidth=0)
+    style.limits(cop, heel, 0.0)
+    cop.plot(r["t"], 100 * r["cop_x"], color=style.LAUNCH)
+    cop.set(ylabel="CoP from the toe [cm]", ylim=(heel - 3, 3))
+    cop.annotate("heel", (0, heel), (2, 2), **style.NOTE_STYLE)
+    cop.annotate("toe", (0, 0), (2, -2), va="top", **style.NOTE_STYLE)
+    friction.plot(r["t"], np.abs(r["F_x"]) / r["F_z"], color=style.LAUNCH)
+    friction.axhline(limits.friction, **style.REFERENCE_STYLE)
+    friction.set(ylabel="friction used $|F_x|/F_z$", ylim=(0, 1.15 * limits.friction))
+    for ax in (cop, friction):
+        style.mark_time(ax, [heel_up_time(tape)])
+        ax.set_xlabel("time [s]")
+    style.legend_above(
+        fig, style.phase_handles("launch", "flight", limit="limit", reference="what the planner may use")
+    )
+    return fig
+
+
+def _torque_speed(ax: Axes, tape: Tape, robot: Robot, i: int, limits: Limits) -> None:
+    m = robot.sagittal
+    speed, corner, effort = m.speed[i], m.corner_speed[i], m.effort[i]
+    # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
+    x = np.array([-speed, -corner, 0.0, corner, speed])
+    upper = np.array([effort, effort, effort, effort, 0.0])
+    ax.fill_between(x, -upper[::-1], upper, color=style.BAND, linewidth=0)
+    for bound in (upper, -upper[::-1]):
+        ax.plot(x, bound, **style.LIMIT_STYLE)
+    cut, top = limits.speed_share * speed, limits.torque_share * effort
+    allowed = np.array([[-cut, corner, cut, cut], [top, top, top * (speed - cut) / (speed - corner), -top]])
+    for sign in (1, -1):
+        ax.plot(*(sign * allowed), **style.REFERENCE_STYLE)
+    rates, torques = (tape.extra[f"planar_{name}"][:, i] for name in ("joint_rates", "torques"))
+    style.by_phase(ax, rates, torques, tape.phase, linewidth=1.3)
+    ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * speed, 1.08 * speed), ylim=(-1.12 * effort, 1.12 * effort))
+
+
+def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
+    """Launch's ground reaction, both feet together: t [s], F_x, F_z [N], CoP and heel height [m] (n,).
+
+    The CoP counts from the toe's first place; it is NaN where the ground hardly pushes.
+    """
+    launch = tape.phase == "launch"
+    force = tape.f[launch].sum(axis=1)  # (n, 6), at the ankles
+    angles, toe = tape.extra["planar_angles"][launch], tape.extra["planar_toe"][launch]
+    points = [five_link_points(robot.sagittal, a, x - toe[0]) for a, x in zip(angles, toe, strict=True)]
+    ankle, heel = (np.array([p[name] for p in points]) for name in ("ankle", "heel"))
+    up = force[:, 2] > LEAST_FORCE_SHARE * robot.total_mass * GRAVITY
+    down = np.where(up, force[:, 2], np.nan)
+    cop = ankle[:, 0] - (force[:, 4] + ankle[:, 1] * force[:, 0]) / down
+    return dict(t=tape.t[launch], F_x=force[:, 0], F_z=down, cop_x=cop, heel_z=heel[:, 1])
+
+
+@style.styled
+def envelope_map(envelope: Envelope) -> Figure:
+    """Distance against height; a cell's colour is the limit that it uses most, its strength how much of it."""
+    fig = style.new_figure(1.6 * style.COLUMN_IN, 3.2)
+    ax = fig.subplots()
+    names = sorted({c.limiting for c in envelope.cells if c.solved})
+    palette = matplotlib.color_sequences["okabe_ito"]
+    colors = {name: palette[(i + 1) % len(palette)] for i, name in enumerate(names)}
+    edges = envelope.distances, envelope.heights
+    size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in edges])
+    for c in envelope.cells:
+        place = np.array([c.distance_m, c.height_m])
+        if c.solved:
+            face = style.tint(colors[c.limiting], 0.25 + 0.75 * float(np.clip(c.share, 0, 1)))
+            ax.text(*place, f"{100 * c.share:.0f}", ha="center", va="center", fontsize=5.5)
+        else:
+            face = REFUSED[c.limiting][0]
+        ax.add_patch(Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6))
+    x, y = ((min(values) - d / 2, max(values) + d / 2) for values, d in zip(edges, size, strict=True))
+    title = f"{envelope.robot}: limit used most, in %"
+    ax.set(xlim=x, ylim=y, xlabel="distance [m]", ylabel="rise of the CoM [m]", title=title)
+    if max(map(len, edges)) <= MOST_TICKS:
+        ax.set(xticks=envelope.distances, yticks=envelope.heights)
+    ax.grid(False)
+    seen = {c.limiting for c in envelope.cells}
+    handles = [Patch(color=color, label=name) for name, color in colors.items()]
+    handles += [Patch(color=color, label=text) for kind, (color, text) in REFUSED.items() if kind in seen]
+    ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=7, frameon=False)
+    return fig
+
+
+# simulations ----------------------------------------------------------------------------------------------------
+@style.styled
+def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
+    """F-1: the simulated jump in one picture, launch, flight and landing in their colours, with the CoM's path.
+
+    Heights are true; sideways the frames are evenly spaced, so that none hides another.
+    """
+    rows = _strip_rows(result)
+    fig = style.new_figure(style.PAGE_IN, 2.6)
+    ax = fig.subplots()
+    places = STRIP_M * np.arange(len(rows))
+    colors = [style.PHASE_COLORS[str(phase)] for phase in result.phase[rows]]
+    film_strip(ax, Silhouette(robot), result.q[rows], result.t[rows], colors, places, below=0.07)
+    for text, color in zip(ax.texts, colors, strict=True):
+        text.set_color(style.shade(color, 0.8))
+    air = (result.phase == "flight") & (result.t >= result.t[rows[0]])
+    draw_path(ax, np.interp(result.t[air], result.t[rows], places), result.com[air, 2])  # linear in time between frames
+    left, right = ax.get_xlim()
+    draw_ground(ax, left, right)
+    ax.set_xlim(left, right)
+    style.legend_above(fig, style.phase_handles(*style.PHASE_COLORS))
+    style.bare(ax)
+    return fig
+
+
+def _strip_rows(result: SimulationResult) -> np.ndarray:
+    """Rows of the frames: start, crouch, lift-off, some of the flight, touchdown, deepest, end."""
+    flight = np.flatnonzero(result.phase == "flight")
+    if not len(flight):  # it never left the ground
+        return np.linspace(0, len(result.t) - 1, 5).astype(int)
+    off, on = int(flight[0]), int(flight[-1])
+    rows = [0, int(np.argmin(result.com[:off, 2])), off - 1] if off else []
+    rows += [off + int(share * (on - off)) for share in FLIGHT_SHARES]
+    if on + 1 < len(result.t):
+        rows += [on + 1, on + 1 + int(np.argmin(result.com[on + 1 :, 2])), len(result.t) - 1]
+    return np.array(rows)
+
+
+@style.styled
+def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
+    """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation."""
+    fig = style.new_figure(style.PAGE_IN, 3.4)
+    axes = fig.subplot_mosaic([["x", "z", "L"], ["vx", "vz", "rho"]])
+    e = tape.extra
+    start = Silhouette(robot).com(tape.q[0])[0] - e["planar_com"][0, 0]  # the plan counts from the toe's first place
+    curves = {
+        "x": (result.com[:, 0], e["planar_com"][:, 0] + start, "CoM $x$ [m]"),
+        "z": (result.com[:, 2], e["planar_com"][:, 1], "CoM $z$ [m]"),
+        "vx": (result.com_velocity[:, 0], e["planar_com_velocity"][:, 0], "CoM $v_x$ [m/s]"),
+        "vz": (result.com_velocity[:, 2], e["planar_com_velocity"][:, 1], "CoM $v_z$ [m/s]"),
+        "L": (result.L, e["planar_L"], "$L$ [kg m$^2$/s], launch"),
+        "rho": (result.rho, e["planar_rho"], "$\\rho$ [kg m$^2$]"),
+    }
+    seen = result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
+    for name, (actual, planned, label) in curves.items():
+        a, p, marks = seen, slice(None), [tape.takeoff_time]
+        if name == "L":
+            a, p, marks = seen & (result.phase == "launch"), tape.phase == "launch", []
+        curve = (result.t[a], actual[a], result.phase[a])
+        style.compare(axes[name], curve, (tape.t[p], planned[p]), label=label, marks=marks)
+    for name in ("vx", "vz", "rho"):
+        axes[name].set_xlabel("time [s]")
+    style.panel_letters(axes[name] for name in curves)
+    fig.align_ylabels()
+    style.legend_above(fig, style.phase_handles(*style.PHASE_COLORS, reference="plan"))
+    return fig
