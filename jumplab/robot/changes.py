@@ -89,7 +89,7 @@ def masses(
 
 
 def _bodies(root: ET.Element) -> dict[str, list[ET.Element]]:
-    """Link -> its <inertial>; an imported trunk's is written as two links, of which the second is no link of its own."""
+    """Link -> its <inertial>; of an imported trunk, written as two links, both."""
     fixed = {j.get("name"): j.find("child").get("link") for j in root.findall("joint") if j.get("type") == "fixed"}
     found = {link.get("name"): link.findall("inertial") for link in root.findall("link")}
     for name in list(found):
