@@ -272,12 +272,12 @@ class Robot:
         """The symmetric five-link model of this robot."""
         return reduce(self._model, self.joints, self.foot, self.actuators, self.urdf)
 
-    def role_signs(self) -> list[tuple[str, int, float]]:
+    def role_signs(self) -> tuple[tuple[str, int, float], ...]:
         """(joint, row of its role, sign) for every joint with a role: joint angle = sign * sagittal angle."""
         rows = enumerate(zip(ROLES, self.sagittal.signs, strict=True))
-        return [
+        return tuple(
             (n, row, float(s)) for row, (role, signs) in rows for n, s in zip(self.joints[role], signs, strict=False)
-        ]
+        )
 
     @cached_property
     def total_mass(self) -> float:
