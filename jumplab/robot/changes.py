@@ -82,8 +82,8 @@ def masses(
             share = _number(robot, f"the factor on the mass of {link!r}", factor, positive=True)
         if f"{old * share:.12g}" != f"{old:.12g}":
             for part in parts:
-                _scale(part.find("mass"), ("value",), share)
-                _scale(part.find("inertia"), MOMENTS, share)
+                scale(part.find("mass"), ("value",), share)
+                scale(part.find("inertia"), MOMENTS, share)
             remarks.append(f"mass of link {link!r}, {old:.12g} -> {old * share:.12g} kg")
     return _text(root), remarks
 
@@ -132,7 +132,8 @@ def _number(robot: Robot, what: str, value: Any, positive: bool = False) -> floa
     return float(value)
 
 
-def _scale(element: ET.Element, attributes: Sequence[str], factor: float) -> None:
+def scale(element: ET.Element, attributes: Sequence[str], factor: float) -> None:
+    """Multiply numbers of an element, in place, written with twelve digits."""
     for key in attributes:
         element.set(key, f"{float(element.get(key)) * factor:.12g}")
 
