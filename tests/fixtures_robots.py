@@ -1,8 +1,13 @@
 """Robots made from the default one by hand: other proportions, axes, ankles, arms and base links."""
 
+import pickle
+from dataclasses import fields
 from xml.etree import ElementTree as ET
 
+import numpy as np
 from paper import bhr_table as table
+
+from jumplab.robot import Robot
 
 GOOD = table.URDF_PATH.read_text()
 CONFIG = """
@@ -199,3 +204,18 @@ def write(folder, variant, *args) -> str:
     path.write_text(toml)
     (folder / f"{variant.__name__}.urdf").write_text(urdf)
     return str(path)
+
+
+def alike(robot: Robot, other: Robot) -> bool:
+    """Same texts, same physics."""
+    same = robot.hash == other.hash and robot.model == other.model and robot.actuators == other.actuators
+    return same and all(map(np.array_equal, values(robot.sagittal), values(other.sagittal)))
+
+
+def values(sagittal) -> list:
+    return [getattr(sagittal, f.name) for f in fields(sagittal) if f.name != "points"]
+
+
+def through_processes(robot: Robot) -> Robot:
+    robot.sagittal, robot.actuators, robot.hash  # noqa: B018  (filled in, then sent)
+    return pickle.loads(pickle.dumps(robot))

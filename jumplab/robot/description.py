@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -14,8 +16,9 @@ import pinocchio as pin
 import tomlkit
 
 from jumplab.errors import RobotError, quoted
+from jumplab.robot import changes
 from jumplab.robot.reduction import check_reduction
-from jumplab.robot.sagittal import SagittalModel, reduce
+from jumplab.robot.sagittal import SagittalModel, read_only, reduce
 from jumplab.robot.stance import check_stance
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
 from jumplab.robot_import.jumper import Jumper, make_jumper
@@ -62,25 +65,30 @@ class Foot:
     def corners(self) -> np.ndarray:
         """(4, 3) corners of the sole in the foot frame [m]: heel right, heel left, toe right, toe left."""
         w = self.half_width
-        return np.array([[x, y, self.sole_z] for x in (self.heel, self.toe) for y in (-w, w)])
+        return read_only([[x, y, self.sole_z] for x in (self.heel, self.toe) for y in (-w, w)])
 
     @property
     def center(self) -> np.ndarray:
         """(3,) middle of the sole in the foot frame [m]."""
-        return np.array([(self.heel + self.toe) / 2, 0.0, self.sole_z])
+        return read_only([(self.heel + self.toe) / 2, 0.0, self.sole_z])
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A humanoid: URDF text, roles of its joints, soles, stance and actuators; made by :meth:`load`."""
+    """A humanoid: the texts of its URDF and of its TOML file, and all that follows from them; made by :meth:`load`.
 
-    name: str  # short, for file names and messages
-    urdf: str  # the XML text itself, so that a result folder can carry its robot
-    joints: dict[str, tuple[str, ...]]  # role -> (left, right) joint names; the shoulder's are () where arms are held
-    foot: Foot
-    stance: dict[str, float]  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
-    corner_speed_ratio: float  # [1] share of the speed limit up to which full torque is available
-    config_text: str = field(repr=False, default="")
+    Everything is read-only, so that :attr:`hash` names what is planned with; :meth:`with_limits`, :meth:`with_mass` and
+    :meth:`with_stance` give another robot. Only :attr:`model`, Pinocchio's, can be written to: each user's own copy.
+    """
+
+    urdf: str = field(repr=False)  # the XML text itself, so that a result folder can carry its robot
+    config_text: str = field(repr=False)
+    gravity: float = GRAVITY  # [m/s^2] that :attr:`model` feels; no part of the description
+    name: str = field(init=False)  # short, for file names and messages
+    joints: Mapping[str, tuple[str, ...]] = field(init=False)  # role -> (left, right) names; shoulder () if arms held
+    foot: Foot = field(init=False)
+    stance: Mapping[str, float] = field(init=False)  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
+    corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
 
     @classmethod
     def load(cls, name_or_path: str | Path = "bhr", *, repair: tuple[str, ...] = ()) -> Robot:
@@ -117,7 +125,10 @@ class Robot:
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:
         """Build a robot from the text of its URDF and of its TOML configuration; raises :class:`RobotError`."""
-        config = read_toml(config_text, "robot configuration")
+        return cls(urdf, config_text)
+
+    def __post_init__(self) -> None:
+        config = read_toml(self.config_text, "robot configuration")
         get = partial(entry, config)
         x, y = get("feet", "sole_x_m", count=2), get("feet", "sole_y_m", count=2)
         links = get("feet", "links", kind=str, count=2)
@@ -130,23 +141,28 @@ class Robot:
         corner = get("actuators", "corner_speed_ratio")
         if not 0 < corner < 1:
             raise RobotError(f"robot configuration: corner_speed_ratio = {corner:g} must lie between 0 and 1")
-        robot = cls(get("name", kind=str), urdf, joints, foot, stance, corner, config_text)
-        robot._check_names()
-        robot._check_numbers()
-        return robot
+        joints, stance = MappingProxyType(joints), MappingProxyType(stance)
+        told = dict(name=get("name", kind=str), joints=joints, foot=foot, stance=stance, corner_speed_ratio=corner)
+        for key, value in told.items():
+            object.__setattr__(self, key, value)  # once: from here on the dataclass is frozen
+        self._check_names()
+        self._check_numbers()
+
+    def __reduce__(self) -> tuple:
+        return Robot, (self.urdf, self.config_text, self.gravity)  # so what another process gets is read-only as well
 
     def _check_names(self) -> None:
         for role, pair in self.joints.items():
             for name in pair:
-                if not self.model.existJointName(name):
+                if not self._model.existJointName(name):
                     raise RobotError(f"robot {self.name}: role {role} names the joint {name!r}, which the URDF lacks")
         for name in self.foot.frames:
-            if not self.model.existFrame(name):
+            if not self._model.existFrame(name):
                 raise RobotError(f"robot {self.name}: the foot link {name!r} is not in the URDF")
 
     def _check_numbers(self) -> None:
-        for joint, inertia in enumerate(self.model.inertias):
-            name = self.model.names[joint]
+        for joint, inertia in enumerate(self._model.inertias):
+            name = self._model.names[joint]
             if joint and not (np.isfinite(inertia.mass) and inertia.mass >= 0 and np.all(np.isfinite(inertia.inertia))):
                 raise RobotError(f"robot {self.name}: the body moved by {name!r} has mass {inertia.mass:g} kg")
         for name, a in self.actuators.items():
@@ -173,25 +189,72 @@ class Robot:
                     raise RobotError(f"{where}: the limit {key!r} must be a number, got {quoted(text)}") from None
 
     @cached_property
-    def model(self) -> pin.Model:
-        """Pinocchio model with a free-flyer base and g = 9.8. Call ``model.createData()`` for each user."""
+    def _model(self) -> pin.Model:
+        """The model that is never handed out."""
         self._check_xml()
         try:
             model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
         except ValueError as e:
             raise RobotError(f"robot {self.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}") from e
-        model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
+        model.gravity.linear = np.array([0.0, 0.0, -self.gravity])
         return model
 
+    @property
+    def model(self) -> pin.Model:
+        """Pinocchio model with a free-flyer base, a new copy each time (10 us): what is written to it stays in it.
+
+        Keep it in a variable, and call ``model.createData()`` for each user.
+        """
+        return self._model.copy()
+
     def under_gravity(self, gravity: float) -> Robot:
-        """The same robot whose :attr:`model` feels another gravity [m/s^2]; itself at 9.8."""
-        if gravity == GRAVITY:
+        """The same robot whose :attr:`model` feels another gravity [m/s^2]; itself at its own."""
+        return self if gravity == self.gravity else replace(self, gravity=gravity)
+
+    def with_limits(
+        self,
+        *,
+        effort: float | Mapping[str, float] = 1.0,
+        speed: float | Mapping[str, float] = 1.0,
+        joints: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+    ) -> Robot:
+        """Another robot, with other torques, speeds or ranges; the corner speeds follow the speeds.
+
+        Parameters
+        ----------
+        effort, speed : factors [1] on the limits as they are: one for all joints, or a mapping from joints or roles.
+        joints : joint or role -> ``lower``, ``upper`` [rad], one or both; a role's in the signs of :attr:`sagittal`.
+
+        Roles are those of :attr:`joints`, or hip, knee, ankle, shoulder; where a joint and its role are both named,
+        the joint's own counts. The URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new.
+        Raises :class:`RobotError` for names that the robot lacks, for numbers that are no limits, and if the robot
+        cannot stand within them.
+        """
+        factors = {"effort": effort, "speed": speed}
+        return self._changed(*changes.limits(self, factors, joints))
+
+    def with_mass(
+        self, link: str | Sequence[str], *, mass_kg: float | None = None, factor: float | None = None
+    ) -> Robot:
+        """Another robot, some links of which weigh otherwise: each ``mass_kg`` [kg], or ``factor`` times as much.
+
+        The inertia scales with the mass, the CoM of the link stays. Left and right move alike in every plan, so name
+        both, ``("left_thigh", "right_thigh")``: with one of them the robot leans, and the audit says by how much. The
+        URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for
+        links that the robot lacks or that have no mass, for numbers that are none, and if the robot cannot stand so.
+        """
+        return self._changed(*changes.masses(self, link, mass_kg, factor))
+
+    def _changed(self, urdf: str, remarks: list[str]) -> Robot:
+        """The robot of another URDF, checked to the end, with remarks in its TOML; itself without any."""
+        if not remarks:
             return self
-        other = replace(self)
-        model = self.model.copy()
-        model.gravity.linear = np.array([0.0, 0.0, -gravity])
-        other.__dict__["model"] = model  # fills the cached property
-        return other
+        from jumplab.robot.stance import check_stance  # it builds on this class
+
+        said = "".join(f"# changed: {remark}\n" for remark in remarks)
+        robot = replace(self, urdf=urdf, config_text=f"{self.config_text.rstrip()}\n{said}")
+        check_stance(robot)
+        return robot
 
     def with_stance(self, **stance: float) -> Robot:
         """The same robot, standing otherwise: ``knee_rad``, ``trunk_pitch_rad``, ``shoulder_rad`` [rad]; a new hash.
@@ -203,41 +266,41 @@ class Robot:
             raise RobotError(f"a stance has {', '.join(self.stance)}, not {', '.join(unknown)}")
         config = tomlkit.parse(self.config_text)
         config["stance"].update({key: float(angle) for key, angle in stance.items()})
-        return self.from_text(self.urdf, tomlkit.dumps(config))
+        return replace(self, config_text=tomlkit.dumps(config))
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints in Pinocchio's order (nv - 6 of them)."""
-        return tuple(self.model.names[2:])
+        return tuple(self._model.names[2:])
 
     @cached_property
-    def actuators(self) -> dict[str, dict[str, float]]:
+    def actuators(self) -> Mapping[str, Mapping[str, float]]:
         """joint -> lower, upper [rad], speed [rad/s], effort [N m], corner_speed [rad/s]; from the URDF."""
-        m, out = self.model, {}
+        m, out = self._model, {}
         for name in self.joint_names:
             j = m.getJointId(name)
             iq, iv = m.idx_qs[j], m.idx_vs[j]
             told = m.lowerPositionLimit[iq], m.upperPositionLimit[iq], m.upperVelocityLimit[iv], m.upperEffortLimit[iv]
-            out[name] = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
-            out[name]["corner_speed"] = self.corner_speed_ratio * out[name]["speed"]
-        return out
+            row = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
+            out[name] = MappingProxyType(row | {"corner_speed": self.corner_speed_ratio * row["speed"]})
+        return MappingProxyType(out)
 
     @cached_property
     def sagittal(self) -> SagittalModel:
         """The symmetric five-link model of this robot."""
-        return reduce(self.model, self.joints, self.foot, self.actuators, self.urdf)
+        return reduce(self._model, self.joints, self.foot, self.actuators, self.urdf)
 
-    def role_signs(self) -> list[tuple[str, int, float]]:
+    def role_signs(self) -> tuple[tuple[str, int, float], ...]:
         """(joint, row of its role, sign) for every joint with a role: joint angle = sign * sagittal angle."""
         rows = enumerate(zip(ROLES, self.sagittal.signs, strict=True))
-        return [
+        return tuple(
             (n, row, float(s)) for row, (role, signs) in rows for n, s in zip(self.joints[role], signs, strict=False)
-        ]
+        )
 
     @cached_property
     def total_mass(self) -> float:
         """Mass of the robot [kg]."""
-        return float(sum(inertia.mass for inertia in self.model.inertias))
+        return float(sum(inertia.mass for inertia in self._model.inertias))
 
     @cached_property
     def hash(self) -> str:

@@ -35,13 +35,14 @@ class ReductionError:
 
 def reduction_error(robot: Robot) -> ReductionError:
     """Compare mass, CoM, pitch inertia and angular momentum of both models on random symmetric motions."""
-    s, data, rng = robot.sagittal, robot.model.createData(), np.random.default_rng(8)
+    s, model, rng = robot.sagittal, robot.model, np.random.default_rng(8)
+    data = model.createData()
     com, full, flat = [], [], []
     for _ in range(SAMPLES):
         joints = s.lower + rng.uniform(0.05, 0.95, 4) * (s.upper - s.lower)
         angles = s.link_angles(joints, rng.uniform(-0.3, 0.8))
         rates = rng.uniform(-RATE_RAD_S, RATE_RAD_S, 5)
-        pin.ccrba(robot.model, data, configuration(robot, angles), _velocity(robot, angles, rates))
+        pin.ccrba(model, data, configuration(robot, angles), _velocity(robot, angles, rates))
         com.append(data.com[0][[0, 2]] - com_from_toe(robot, angles))
         full.append((data.Ig.inertia[1, 1], data.hg.angular[1]))
         flat.append(_planar(s, angles, rates))
@@ -59,12 +60,13 @@ def _planar(s: SagittalModel, angles: np.ndarray, rates: np.ndarray) -> tuple[fl
 
 def _velocity(robot: Robot, angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Rates (nv,) of the full robot: toe at rest, links turning at ``rates``."""
-    s, v, turn = robot.sagittal, np.zeros(robot.model.nv), np.exp(-1j * angles[:4])
+    s, model, turn = robot.sagittal, robot.model, np.exp(-1j * angles[:4])
+    v = np.zeros(model.nv)
     base = np.array([*s.span[:3], s.base]) @ [1, 1j] @ (-1j * rates[:4] * turn) / turn[3]
     v[0], v[2], v[4] = base.real, base.imag, rates[3]
     joints = s.joint_angles(rates)
     for name, row, sign in robot.role_signs():
-        v[robot.model.idx_vs[robot.model.getJointId(name)]] = sign * joints[row]
+        v[model.idx_vs[model.getJointId(name)]] = sign * joints[row]
     return v
 
 

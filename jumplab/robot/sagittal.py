@@ -5,8 +5,10 @@ Left and right limbs are merged: masses and inertias add, and so do the torque l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from itertools import product
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,13 @@ SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 JOINT_OF_ANGLES = np.array([[0.0, 0, 1, -1, 0], [0, 1, -1, 0, 0], [1, -1, 0, 0, 0], [0, 0, 0, -1, 1]])  # (joint, angle)
 # limits of the massless arm of a robot whose arms are held: it hardly moves and never binds
 HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "effort": 10.0}
+
+
+def read_only(values: Any) -> np.ndarray:
+    """A copy as an array that refuses to be written to."""
+    array = np.array(values)
+    array.flags.writeable = False
+    return array
 
 
 def rotated(angle: float | np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -52,7 +61,17 @@ class SagittalModel:
     speed: np.ndarray  # (4,) [rad/s]
     effort: np.ndarray  # (4,) of both sides together [N m]
     corner_speed: np.ndarray  # (4,) [rad/s]
-    points: dict  # on the links, for clearance: name -> (link index, (x, z) from the link's lower joint)
+    points: Mapping  # on the links, for clearance: name -> (link index, (x, z) from the link's lower joint)
+
+    def __post_init__(self) -> None:
+        points = {name: (link, read_only(point)) for name, (link, point) in self.points.items()}
+        for field in fields(self):
+            value = MappingProxyType(points) if field.name == "points" else read_only(getattr(self, field.name))
+            object.__setattr__(self, field.name, value)  # once: from here on the dataclass is frozen
+
+    def __reduce__(self) -> tuple:
+        values = {field.name: getattr(self, field.name) for field in fields(self)} | {"points": dict(self.points)}
+        return SagittalModel, tuple(values.values())  # so what another process gets is read-only as well
 
     @property
     def total_mass(self) -> float:
@@ -88,7 +107,7 @@ class SagittalModel:
         return np.stack([shank + ankle, shank, thigh, trunk_pitch + np.zeros_like(hip), trunk_pitch + shoulder], -1)
 
 
-def _members(model: pin.Model, joints: dict) -> list[list[int]]:
+def _members(model: pin.Model, joints: Mapping) -> list[list[int]]:
     """Pinocchio joint indices whose bodies belong to foot, shank, thigh, trunk and arm."""
     pitch = {joint: role for role, pair in joints.items() for joint in pair}
     part_below = {"hip_pitch": "thigh", "knee": "shank", "ankle_pitch": "foot", "shoulder_pitch": "arm"}
@@ -112,7 +131,7 @@ def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float
     return signs
 
 
-def _limits(actuators: dict, pair, signs) -> dict[str, float]:
+def _limits(actuators: Mapping, pair, signs) -> dict[str, float]:
     """What both sides can do: the overlap of their ranges, the lower speed, twice the lower effort."""
     both = [actuators[name] for name in pair]
     ranges = [sorted((s * a["lower"], s * a["upper"])) for a, s in zip(both, signs, strict=True)]
@@ -141,7 +160,7 @@ def _limb_tip(model: pin.Model, data: pin.Data, urdf: str, members: list[int], r
     return along * (max(reach) if reach else 2 * np.linalg.norm(com - root))
 
 
-def reduce(model: pin.Model, joints: dict, foot: Any, actuators: dict, urdf: str) -> SagittalModel:
+def reduce(model: pin.Model, joints: Mapping, foot: Any, actuators: Mapping, urdf: str) -> SagittalModel:
     """Merge the full robot into its sagittal five-link model.
 
     Parameters

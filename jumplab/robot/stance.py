@@ -89,16 +89,16 @@ def configuration(robot: Robot, angles: np.ndarray, toe: tuple[float, float] | n
 
     One posture, (5,) and (2,) -> (nq,), or many, (n, 5) and (n, 2) -> (n, nq).
     """
-    model, angles = robot.sagittal, np.asarray(angles)
+    model, full, angles = robot.sagittal, robot.model, np.asarray(angles)
     base = np.asarray(toe) + sum(rotated(angles[..., j], model.span[j]) for j in range(3))
     base = base + rotated(angles[..., 3], model.base)
-    q = np.broadcast_to(pin.neutral(robot.model), (*angles.shape[:-1], robot.model.nq)).copy()
+    q = np.broadcast_to(pin.neutral(full), (*angles.shape[:-1], full.nq)).copy()
     q[..., 0], q[..., 2] = base[..., 0], base[..., 1]
     q[..., 3:7] = 0.0
     q[..., 4], q[..., 6] = np.sin(angles[..., 3] / 2), np.cos(angles[..., 3] / 2)
     joints = model.joint_angles(angles)
     for name, row, sign in robot.role_signs():
-        q[..., robot.model.idx_qs[robot.model.getJointId(name)]] = sign * joints[..., row]
+        q[..., full.idx_qs[full.getJointId(name)]] = sign * joints[..., row]
     return q
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.robot import Robot
+from jumplab.robot.changes import MOMENTS, scale
 
 FRICTION = 0.8  # rubber sole on dry floor; the ground has 1, and the engine multiplies the two
 LIGHT_KG = 0.01  # links below this are the massless dummies of multi-axis joints and are left alone
@@ -105,10 +106,9 @@ class Perturbation:
             if inertial is None:
                 continue
             factor = self.mass.get(name, 1.0)
-            _scale(inertial.find("mass"), ("value",), factor)
+            scale(inertial.find("mass"), ("value",), factor)
             # a heavier link of the same shape has more inertia too; the further factor is a change of shape
-            moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-            _scale(inertial.find("inertia"), moments, factor * self.inertia.get(name, 1.0))
+            scale(inertial.find("inertia"), MOMENTS, factor * self.inertia.get(name, 1.0))
             origin = inertial.find("origin")
             xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
             origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
@@ -117,8 +117,3 @@ class Perturbation:
     def to_json(self) -> dict:
         """All numbers as plain data."""
         return asdict(self)
-
-
-def _scale(element: ET.Element, attributes: tuple[str, ...], factor: float) -> None:
-    for key in attributes:
-        element.set(key, f"{float(element.get(key)) * factor:.12g}")
