@@ -23,9 +23,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.api import simulate as simulate
     from jumplab.api import view as view
     from jumplab.ocp import Term as Term
-    from jumplab.robot import Robot as Robot
-    from jumplab.sim import Perturbation as Perturbation
-    from jumplab.sim import Scene as Scene
+    from jumplab.robot.description import Robot as Robot
+    from jumplab.sim.perturbation import Perturbation as Perturbation
+    from jumplab.sim.scene import Scene as Scene
     from jumplab.stages.plan import JumpPlan as JumpPlan
     from jumplab.stages.planner import Planner as Planner
     from jumplab.studies.chain import run_chain as run_chain

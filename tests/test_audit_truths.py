@@ -13,10 +13,10 @@ import pytest
 from fixtures_audit import KNEE, LEFT, ROBOT, edit, good_tape, robot_with, with_forces
 
 from jumplab.auditing import AuditReport, Check, audit, contact, write_audit
-from jumplab.auditing.joints import available_torque
-from jumplab.auditing.limits import Limit
+from jumplab.auditing.dynamics import available_torque
 from jumplab.auditing.motion import foot_turn, mirror
 from jumplab.auditing.replay import open_tape, replay
+from jumplab.auditing.report import Limit
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot.stance import com_from_toe, stance_angles, stance_configuration

@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from paper.benchmark import goals
 
+from jumplab.cli.main import main
 from jumplab.errors import InputError
 from jumplab.stages.whole_body import Mesh
 from jumplab.studies import bench as benchmark
-from jumplab.studies.bench import Stopwatch, line_error, report, text
+from jumplab.studies.bench import Stopwatch, line_error, report
 from jumplab.task import JumpTask
 
 TIMES = {"plan": [0.5, 0.6], "re-plan": [0.2, 0.2], "direct, at once": [1.0, 1.0], "direct, build": [0.5, 0.5],
@@ -42,7 +44,7 @@ def test_the_report_is_plain_and_complete(found):
     assert again["warm_over_direct"] == pytest.approx(steps / cpu[again["peer"]][0])
     assert again["tape_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
     assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
-    assert again["cold_over_direct"] is None and again["goals"]["cold_over_direct"]["reached"] is None
+    assert again["cold_over_direct"] is None and again["peak_memory_gib"] is None
     assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
     (other,) = again["growth"]["spread"]
     assert (other["distance_m"], other["height_m"]) == (0.2, 0.3) and other["ratio"] > 0
@@ -62,16 +64,29 @@ def test_the_faster_way_is_the_peer():
 
 def test_what_is_not_reached_is_said():
     slow = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
-    said = text(slow)
-    assert slow["goals"]["cold_over_direct"] == dict(value=3.0, limit=1.5, aim=None, reached=False)
-    assert slow["cold_kept_over_direct"] == pytest.approx(2.0)
-    assert "3.000  (limit 1.5): not reached" in said and "0.500  (limit 0.6, aim 0.25): reached" in said
-    assert "where the time of the three steps goes" in said and "3 whole body" in said
-    assert "plans that were timed and are clean in the audit: plan 1 of 2" in said
-    assert "not measured" in text(made())
-    assert "over 3 other targets" in said and "0.500  (median; 0.40 to 0.70), 3 clean" in said
-    assert slow["warm_over_approached"] == pytest.approx(1.0) and "Gauss-Newton steps" in said and "1.000" in said
-    assert slow["tape_over_direct"] == pytest.approx(0.55) and "1 kHz tape" in said and "0.550" in said
+    said = {row["number"].partition(" /")[0]: (row["value"], row["limit"], row["aim"], row["verdict"])
+            for row in goals(slow)}  # fmt: skip
+    assert len(said) == 5 and said["new process to finished plan"] == (3.0, 1.5, None, "not reached")
+    assert said["three steps, warm"] == (0.5, 0.6, 0.25, "reached")
+    assert [row["verdict"] for row in goals(made())].count("not measured here") == 2
+    ratios = ("cold_kept_over_direct", "warm_over_approached", "tape_over_direct")
+    assert [slow[name] for name in ratios] == pytest.approx([2.0, 1.0, 0.55])
+    assert slow["audits"] == {"plan": {"clean": 1, "of": 2}}
+
+
+def test_the_command_prints_a_short_table_and_writes_the_numbers(monkeypatch, capsys, tmp_path):
+    times = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
+    monkeypatch.setattr(benchmark, "bench", lambda *asked, say: times)
+    assert main(["bench", "--json", str(tmp_path / "b.json")]) == 0
+    head, _, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["what", "CPU", "[s]", "ratio"]
+    rows = {row["what"]: (row["CPU [s]"], row["ratio"]) for row in benchmark.rows(times)}
+    assert rows["three steps"] == pytest.approx((0.5, 0.5)) and rows["plan"] == pytest.approx((0.55, 0.55))
+    assert rows["direct, at once"] == (1.0, 1.0) and rows["cold"] == pytest.approx((4.5, 3.0))
+    assert rows["plan: 1 SRMP"] == (0.1, None)
+    assert [line.partition("  ")[0] for line in lines[: len(rows)]] == [*rows]
+    assert "audited clean: plan 1 of 2" in lines
+    assert json.loads((tmp_path / "b.json").read_text()) == json.loads(json.dumps(times))
 
 
 def test_growth_is_the_distance_from_a_line():

@@ -126,7 +126,7 @@ def test_figures_are_legible_in_print(name, solve_s):
     result, more = chain(solve_s), ()
     if name == "chain_errors":
         more = ((ChainTrial.of(0, result),),)
-    fig = getattr(experiments if name in ("chain_path", "chain_errors") else studies, name)(result, *more)
+    fig = getattr(experiments if name != "chain_strobe" else studies, name)(result, *more)
     fig.canvas.draw()
     texts = [t for t in fig.findobj(Text) if t.get_text().strip() and t.get_visible()]
     assert fig.get_size_inches()[0] == PAGE_IN and min(t.get_fontsize() for t in texts) >= MIN_FONT_PT

@@ -4,6 +4,7 @@ import inspect
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import jumplab as jl
 
 ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("robot", "io", "models", "stages", "sim", "studies", "show")  # those that load their names lazily
 HEAVY = ("numpy", "casadi", "pinocchio", "pybullet", "matplotlib", "scipy", "cvxpy")
 
 
@@ -29,6 +31,13 @@ def test_importing_the_package_imports_nothing_else():
 def test_planning_needs_neither_engine_nor_pictures():
     code = "import jumplab as jl; jl.Planner, jl.JumpTask, jl.Robot, jl.Term"
     assert not loaded_by(code) & {"pybullet", "matplotlib"}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_is_light_and_has_what_it_lists(room):
+    assert not loaded_by(f"import jumplab.{room}") & set(HEAVY)
+    module = import_module(f"jumplab.{room}")
+    assert module.__all__ and all(hasattr(module, name) for name in module.__all__)
 
 
 def test_scenes_and_perturbations_need_no_engine():

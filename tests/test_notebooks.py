@@ -285,6 +285,48 @@ def test_source_notebook_keeps_the_house_rules(stem):
         assert not any(isinstance(node, ast.ClassDef) for node in ast.walk(ast.parse(plain))), cell.source
 
 
+def imported(paths):
+    """What the notebooks import of jumplab, ``import jumplab as jl`` apart: pairs of a module and a name from it.
+
+    Of a room that is imported whole, the module is the room: ("jumplab.stages", "stages").
+    """
+    cells = [c for p in paths for c in nbformat.read(p, as_version=4).cells if c.cell_type == "code"]
+    found = set()
+    for node in (n for c in cells for n in ast.walk(ast.parse(c.source))):
+        if isinstance(node, ast.Import):
+            found |= {(a.name, a.asname or a.name) for a in node.names if (a.name, a.asname) != ("jumplab", "jl")}
+        if isinstance(node, ast.ImportFrom):
+            whole = node.module == "jumplab"
+            found |= {(f"jumplab.{a.name}" if whole else node.module, a.name) for a in node.names}
+    return {(module, name) for module, name in found if module.partition(".")[0] == "jumplab"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.stem)
+def test_a_notebook_enters_by_the_front_door(path):
+    """``import jumplab as jl``, and at most three rooms more."""
+    assert any("import jumplab as jl" in c.source for c in nbformat.read(path, as_version=4).cells)
+    rooms = {module.split(".")[1] for module, _ in imported([path])}
+    assert len(rooms) <= 3, rooms
+
+
+def test_all_notebooks_import_few_names_from_few_modules():
+    found = imported(SOURCES)
+    names, modules = {"jl"} | {name for _, name in found}, {"jumplab"} | {module for module, _ in found}
+    assert len(names) <= 35, sorted(names)
+    assert len(modules) <= 12, sorted(modules)
+
+
+def test_imports_are_found_wherever_they_stand(tmp_path):
+    cell = """import numpy, jumplab as jl
+def f():
+    from jumplab import sim, io as files
+    import jumplab.robot.reach as reach
+    from jumplab.cli import check_parameters; from paper import jumplab"""
+    modules = {"sim": "sim", "io": "io", "reach": "robot.reach", "check_parameters": "cli"}
+    found = imported([make_notebook(tmp_path, "00_x", cell)]) - {("jumplab.cli.notebooks", "check_parameters")}
+    assert found == {(f"jumplab.{module}", name) for name, module in modules.items()}
+
+
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
     """The whole chain once, from another folder, into a path with a space and letters beyond ASCII."""

@@ -8,9 +8,9 @@ from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from paper import experiments as pictures
+from paper import render
 from paper.measurement import measure
 
-from jumplab.show import render
 from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
 from jumplab.sim import Scene, SensorNoise, simulate_jump
 from jumplab.studies.basin import BasinGrid, BasinReport

@@ -5,8 +5,10 @@ import pytest
 from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, RobotError
 from jumplab.robot import Robot
-from jumplab.robot.checkup import check, draft, reduction_error
+from jumplab.robot.checkup import check
 from jumplab.robot.description import SHIPPED
+from jumplab.robot.reduction import reduction_error
+from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import Scene, simulate_jump
 from jumplab.stages.planner import Planner

@@ -25,8 +25,8 @@ from fixtures_robots import (
 from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.checkup import reduction_error
 from jumplab.robot.description import Robot as Described
+from jumplab.robot.reduction import reduction_error
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
@@ -193,7 +193,14 @@ def prismatic() -> str:
     return text(robot)
 
 
+STONE = """<link name="stone"><inertial><mass value="2.5"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+<joint name="free" type="floating"><parent link="trunk"/><child link="stone"/></joint></robot>"""
+
+
 REFUSED = [
+    (text(root()).replace("</robot>", STONE), config("x"),
+     "my.urdf: 2.500 kg do not hang on the trunk ('stone'); they are joined to it by no joint of a robot"),
     (text(root()), config("x", trunk="pelvis"),
      "my.urdf: the configuration names the link 'pelvis', which the URDF lacks"),
     (text(root()), config("x", forward="ahead"),

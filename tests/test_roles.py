@@ -8,10 +8,9 @@ import pytest
 from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 
 from jumplab.errors import RobotError
-from jumplab.robot.checkup import check, draft
-from jumplab.robot_import.roles import find_roles
-from jumplab.robot_import.starter import find_sole, starter
-from jumplab.robot_import.tree import Tree, repaired
+from jumplab.robot.checkup import check
+from jumplab.robot_import.roles import draft, find_roles, find_sole, starter
+from jumplab.robot_import.urdf import Tree, repaired
 
 LEGS = {
     "hip_pitch": ("left_hip_pitch", "right_hip_pitch"),

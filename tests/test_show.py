@@ -181,7 +181,7 @@ def test_sources_neither_show_nor_print(path):
 def test_every_public_name_is_there():
     """They are loaded when they are first used; another name is refused."""
     assert all(hasattr(plotting, name) for name in plotting.__all__) and set(dir(plotting)) == set(plotting.__all__)
-    with pytest.raises(AttributeError, match="No jumplab.show attribute jump_strobes"):
+    with pytest.raises(AttributeError, match=r"No jumplab\.show attribute jump_strobes"):
         plotting.jump_strobes  # noqa: B018
 
 

@@ -7,14 +7,12 @@ import pytest
 from fixtures_core import jump
 from matplotlib.path import Path
 from matplotlib.text import Text
-from paper import diagrams
+from paper import diagrams, experiments, render
 from scipy.ndimage import binary_dilation
 
 from jumplab import show as plotting
 from jumplab.errors import RobotError
 from jumplab.robot.stance import stance_configuration
-from jumplab.show import render
-from jumplab.show import simulations as pictures
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
 from jumplab.task import JumpTask
@@ -40,7 +38,7 @@ def smallest_font(fig) -> float:
 
 
 def test_frames_show_each_phase_and_its_turning_points(result):
-    rows = pictures.frame_rows(result)
+    rows = render.frame_rows(result)
     assert len(rows) == 12 and (np.diff(rows) > 0).all()
     assert [str(p) for p in result.phase[rows]] == ["launch"] * 4 + ["flight"] * 4 + ["landing"] * 4
     flight = np.flatnonzero(result.phase == "flight")
@@ -55,7 +53,7 @@ def test_frames_show_each_phase_and_its_turning_points(result):
 def test_frames_of_half_a_jump_are_evenly_spaced(result, end):
     cut = int(np.argmax(result.phase == "flight")) + (0 if end == "before take-off" else 300)
     short = replace(result, **{k: getattr(result, k)[:cut] for k in ("t", "q", "com", "phase")})
-    rows = pictures.frame_rows(short)
+    rows = render.frame_rows(short)
     assert len(rows) == 12 and rows[0] == 0 and rows[-1] == cut - 1
     assert np.ptp(np.diff(rows)) <= 1
 
@@ -64,7 +62,7 @@ def test_frames_of_a_fall(result):
     """The CoM ends lower than in the deepest knee bend: half-way up does not exist, half of the time does."""
     com = result.com.copy()
     com[-1, 2] = 0.1
-    rows = pictures.frame_rows(replace(result, com=com))
+    rows = render.frame_rows(replace(result, com=com))
     assert rows[10] == (rows[9] + rows[11]) // 2
 
 
@@ -74,26 +72,26 @@ def test_frames_of_a_fall(result):
 def test_smoothing_keeps_the_impulse():
     force = np.zeros(200)
     force[100], force[0] = 3000.0, 0.0
-    mean = pictures.smooth(force, 0.001)
+    mean = experiments.smooth(force, 0.001)
     assert len(mean) == 200 and mean.sum() == pytest.approx(force.sum())
     assert mean[99] == 0 and mean[100] == pytest.approx(150.0) and mean[119] == pytest.approx(150.0)
     assert mean[120] == pytest.approx(0.0, abs=1e-9)
-    assert pictures.smooth(np.full(5, 7.0), 0.001) == pytest.approx(7.0)
-    assert len(pictures.smooth(np.zeros(0), 0.001)) == 0
+    assert experiments.smooth(np.full(5, 7.0), 0.001) == pytest.approx(7.0)
+    assert len(experiments.smooth(np.zeros(0), 0.001)) == 0
 
 
 def test_trunk_pitch_counts_full_turns():
     angle = np.linspace(0.3, -6.0, 60)
     q = np.zeros((60, 21))
     q[:, 4], q[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
-    assert pictures.trunk_pitch(q) == pytest.approx(angle)
+    assert experiments.trunk_pitch(q) == pytest.approx(angle)
 
 
 def test_landing_figure_tells_what_the_log_says(result, tape, bhr):
-    fig = pictures.landing_loads(result, tape, bhr)
+    fig = experiments.landing_loads(result, tape, bhr)
     pitch, force, bars = fig.axes
     launch = result.phase == "launch"
-    assert pitch.lines[0].get_ydata() == pytest.approx(np.degrees(pictures.trunk_pitch(result.q))[launch])
+    assert pitch.lines[0].get_ydata() == pytest.approx(np.degrees(experiments.trunk_pitch(result.q))[launch])
     impulse = np.trapezoid(force.lines[0].get_ydata() * 1000, result.t[launch])
     assert impulse == pytest.approx(result.metrics.launch_impulse[1], rel=0.06)  # 20 ms of it show up in the flight
     worst = {}
@@ -143,7 +141,7 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
     with render.Renderer(bhr, scene=Scene("empty", ())) as studio:
-        for row in pictures.frame_rows(result)[[0, 1, 5, 9]]:
+        for row in render.frame_rows(result)[[0, 1, 5, 9]]:
             q = result.q[row]
             seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
             places = np.column_stack([x.ravel() + q[0], z.ravel()])

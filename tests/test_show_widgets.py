@@ -7,9 +7,9 @@ import types
 
 import pytest
 from paper import explore
+from paper import widgets as live
 
 from jumplab.errors import JumplabError
-from jumplab.show import widgets as live
 from jumplab.show.style import Picture
 from jumplab.task import JumpTask
 

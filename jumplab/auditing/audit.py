@@ -6,7 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
-from jumplab.auditing import contact, dynamics, joints, motion
+from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import AuditReport
 from jumplab.errors import InputError, as_path, quoted, require_type
@@ -21,10 +21,10 @@ GROUPS = (
     motion.checks,
     dynamics.checks,
     contact.checks,
-    joints.checks,
+    dynamics.joints,
     motion.target,
     contact.collisions,
-    joints.description,
+    dynamics.description,
 )
 
 
@@ -32,21 +32,16 @@ def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: flo
     """Audit a finished plan with nothing but its tape and the robot's URDF.
 
     Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid. A tape with numbers that are not finite,
-    or with phases out of order, gets a report with these two checks alone.
+    or with phases out of order, gets a report with these two checks alone. Raises :class:`InputError` if the tape
+    belongs to another robot (joints, sizes or contact frames differ).
 
     Parameters
     ----------
-    tape : launch and flight of the full robot.
-    robot : its URDF and configuration.
+    tape, robot : launch and flight of the full robot, its URDF and configuration.
     task : what was asked; without it the checks of distance, rise, turns and start are left out, g is 9.8 and the
         landing surface is where the soles are at the end.
     edge_m : where the landing surface of another height begins, ahead of the toes' first place [m]; by default 5 cm
         behind the landing soles if it is higher, 5 cm ahead of the toes if it is lower.
-
-    Raises
-    ------
-    InputError
-        If the tape belongs to another robot (joints, sizes or contact frames differ).
     """
     require_type(tape, Tape, "the tape to audit")
     require_type(robot, Robot, "its robot")
@@ -74,18 +69,9 @@ def write_audit(folder: str | Path, task: JumpTask | None = None, *, into: str |
     """Audit the plan in a result folder and write ``passport.json`` beside it (or into another folder).
 
     Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest, ``summary.json`` if it is
-    there; takes no lock, since the folder may be one that is being written.
-
-    Parameters
-    ----------
-    folder : result folder of a plan.
-    task : what was asked; by default the target in ``summary.json``.
-    into : where the file goes; the folder itself if None.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged, or the folder cannot be written to.
+    there; takes no lock, since the folder may be one that is being written. ``task`` is what was asked instead of the
+    target in ``summary.json``. Raises :class:`InputError` if a file is missing or damaged, or the folder cannot be
+    written to.
     """
     folder = as_path(folder, "a result folder")
     tape = Tape.load(folder / PLAN)

@@ -8,14 +8,13 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.limits import LIMITS, METHOD
 from jumplab.auditing.replay import Replay
-from jumplab.auditing.report import Check
+from jumplab.auditing.report import LIMITS, METHOD, Check
 
 
 def checks(r: Replay) -> list[Check]:
     """All checks of the group "contact"."""
-    return [*_geometry(r), *_pressure(r), *_force(r)]
+    return [*_geometry(r), *_pressure(r)]
 
 
 def _geometry(r: Replay) -> list[Check]:
@@ -47,7 +46,8 @@ def _pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pressure(r: Replay) -> list[Check]:
-    t, feet, load, friction = r.tape.t, r.tape.contact_frames, r.tape.f[..., 2], LIMITS["friction used"].limit
+    t, feet, force, friction = r.tape.t, r.tape.contact_frames, r.tape.f, LIMITS["friction used"].limit
+    load = force[..., 2]
     cop, torsion = _pressure_points(r)
     heading = r.foot_rotation[..., :2, 0]
     heading = heading / np.maximum(np.linalg.norm(heading, axis=-1, keepdims=True), 1e-9)  # (N, K, 2) heel to toe
@@ -61,18 +61,15 @@ def _pressure(r: Replay) -> list[Check]:
     loaded = load > METHOD.cop_force_n
     some = loaded.any(axis=1)  # rows with something to check
     beyond, tipped = np.where(loaded, outside, -np.inf), np.where(loaded & raised, np.abs(ahead), 0.0)
+    used = np.linalg.norm(force[..., :2], axis=-1) / np.maximum(load, METHOD.friction_force_n)
     twist = np.abs(torsion) / (friction * METHOD.torsion_arm_m * np.where(loaded, load, 1.0))
     return [
         LIMITS["CoP in the sole"].worst(1e3 * beyond[some], t[some], feet),
         LIMITS["CoP at the toe"].worst(1e3 * tipped, t, feet),
         LIMITS["torsional friction"].worst(100 * np.where(loaded, twist, 0.0), t, feet, friction=friction),
+        LIMITS["friction used"].worst(used, t, feet),
+        LIMITS["ground only pushes"].worst(-load, t, feet),
     ]
-
-
-def _force(r: Replay) -> list[Check]:
-    t, feet, force = r.tape.t, r.tape.contact_frames, r.tape.f
-    used = np.linalg.norm(force[..., :2], axis=-1) / np.maximum(force[..., 2], METHOD.friction_force_n)
-    return [LIMITS["friction used"].worst(used, t, feet), LIMITS["ground only pushes"].worst(-force[..., 2], t, feet)]
 
 
 def collisions(r: Replay) -> list[Check]:

@@ -1,12 +1,13 @@
-"""Newton, Euler and energy on the tape: inverse dynamics, impulses, flight, take-off, mass."""
+"""Newton, Euler and energy on the tape; joints against their limits; the files of the robot against each other."""
 
 from __future__ import annotations
 
+from xml.etree import ElementTree as ET
+
 import numpy as np
 
-from jumplab.auditing.limits import LIMITS
 from jumplab.auditing.replay import Replay
-from jumplab.auditing.report import Check
+from jumplab.auditing.report import LIMITS, METHOD, Check
 
 
 def _norm(x: np.ndarray) -> np.ndarray:
@@ -15,7 +16,7 @@ def _norm(x: np.ndarray) -> np.ndarray:
 
 def checks(r: Replay) -> list[Check]:
     """All checks of the group "dynamics"."""
-    return [*_inverse(r), *_impulses(r), *_flight(r), *_takeoff(r), _energy(r), _mass(r)]
+    return [*_inverse(r), *_impulses(r), *_flight(r), *_takeoff(r), *_balances(r)]
 
 
 def _inverse(r: Replay) -> list[Check]:
@@ -72,15 +73,54 @@ def _takeoff(r: Replay) -> list[Check]:
     ]
 
 
-def _energy(r: Replay) -> Check:
+def _balances(r: Replay) -> list[Check]:
     power = (r.tape.tau * r.tape.v[:, 6:]).sum(axis=1)
     missing = r.energy - r.energy[0] - r.integral(power)
-    span = max(float(np.ptp(r.energy)), 1e-9)
-    return LIMITS["energy balance"].worst(100 * np.abs(missing) / span, r.tape.t, span=span)
-
-
-def _mass(r: Replay) -> Check:
-    s = r.launch
+    span, s = max(float(np.ptp(r.energy)), 1e-9), r.launch
     push, accelerated = r.tape.f[s][..., 2].sum(axis=1), r.com_acceleration[s][:, 2] + r.gravity
     moved = float(push @ accelerated / max(accelerated @ accelerated, 1e-9))
-    return LIMITS["mass"].check(100 * abs(moved / r.mass - 1), moved=moved, mass=r.mass)
+    return [
+        LIMITS["energy balance"].worst(100 * np.abs(missing) / span, r.tape.t, span=span),
+        LIMITS["mass"].check(100 * abs(moved / r.mass - 1), moved=moved, mass=r.mass),
+    ]
+
+
+def available_torque(r: Replay) -> np.ndarray:
+    """(N, nv - 6) torque that each motor has left at its speed [N m].
+
+    Full torque up to the corner speed, then a line to zero at the speed limit, where torque and speed have the same
+    sign (motoring); full torque where the joint brakes.
+    """
+    peak, top, speed = r.model.upperEffortLimit[6:], r.model.upperVelocityLimit[6:], r.tape.v[:, 6:]
+    fall = (top - np.abs(speed)) / np.maximum(top - r.robot.corner_speed_ratio * top, 1e-9)
+    motoring = r.tape.tau * speed > 0
+    return peak * np.where(motoring, np.clip(fall, METHOD.torque_floor, 1.0), 1.0)
+
+
+def joints(r: Replay) -> list[Check]:
+    """All checks of the group "joints": range, speed, torque, torque at speed."""
+    t, names, m = r.tape.t, r.tape.joint_names, r.model
+    angle, speed, torque = r.tape.q[:, 7:], np.abs(r.tape.v[:, 6:]), np.abs(r.tape.tau)
+    beyond = np.maximum(angle - m.upperPositionLimit[7:], m.lowerPositionLimit[7:] - angle)
+    return [
+        LIMITS["joint range"].worst(1e3 * beyond, t, names),
+        LIMITS["joint speed"].worst(100 * speed / m.upperVelocityLimit[6:], t, names),
+        LIMITS["joint torque"].worst(100 * torque / m.upperEffortLimit[6:], t, names),
+        LIMITS["torque at speed"].worst(100 * torque / available_torque(r), t, names),
+    ]
+
+
+def description(r: Replay) -> list[Check]:
+    """All checks of the group "robot": disagreements that make every engine simulate another robot."""
+    f = r.robot.foot
+    said = np.array([f.heel, f.toe, -f.half_width, f.half_width, f.sole_z])
+    off = [1e3 * np.abs(np.array([s.heel, s.toe, s.right, s.left, s.z]) - said).max() for s in r.soles]
+    bare = []
+    for link in ET.fromstring(r.robot.urdf).iter("link"):
+        mass = link.find("inertial/mass")
+        if mass is None or not float(mass.get("value", "0")) > 0:
+            bare.append(link.get("name", "unnamed"))
+    return [
+        LIMITS["sole as in the URDF"].check(float(max(off))),
+        LIMITS["links have mass"].check(len(bare), bare=", ".join(bare) or "none"),
+    ]

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.limits import LIMITS, METHOD
 from jumplab.auditing.replay import Replay
-from jumplab.auditing.report import Check
+from jumplab.auditing.report import LIMITS, METHOD, Check
 from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
 

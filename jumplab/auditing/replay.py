@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.integrate import cumulative_trapezoid
 
-from jumplab.auditing.limits import METHOD
+from jumplab.auditing.report import METHOD
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -57,41 +57,13 @@ class Replay:
     foot_rotation: np.ndarray  # (N, K, 3, 3)
     base_residual: np.ndarray  # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
     tau: np.ndarray  # (N, nv - 6) joint torques that the motion and the contact wrenches need [N m]
-
-    @property
-    def coordinates(self) -> tuple[str, ...]:
-        """(nv,) names of the columns of v."""
-        return (*BASE, *map(str, self.tape.joint_names))
-
-    @property
-    def gravity(self) -> float:
-        """Gravity of the replayed model, positive [m/s^2]."""
-        return float(-self.model.gravity.linear[2])
-
-    @cached_property
-    def mass(self) -> float:
-        """Mass of the URDF [kg]."""
-        return float(pin.computeTotalMass(self.model))
-
-    @property
-    def weight(self) -> float:
-        """m g [N]."""
-        return self.mass * self.gravity
-
-    @cached_property
-    def launch(self) -> slice:
-        """Rows of the launch."""
-        return slice(0, self.tape.takeoff_index)
-
-    @cached_property
-    def flight(self) -> slice:
-        """Rows of the flight."""
-        return slice(self.tape.takeoff_index, len(self.tape.t))
-
-    @cached_property
-    def step(self) -> np.ndarray:
-        """(N - 1,) time steps [s]; zero across take-off."""
-        return np.diff(self.tape.t)
+    coordinates: tuple[str, ...]  # (nv,) names of the columns of v
+    gravity: float  # of the replayed model, positive [m/s^2]
+    mass: float  # of the URDF [kg]
+    weight: float  # m g [N]
+    launch: slice  # rows
+    flight: slice
+    step: np.ndarray  # (N - 1,) time steps [s]; zero across take-off
 
     @cached_property
     def sole_points(self) -> np.ndarray:
@@ -178,8 +150,14 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
         raise RobotError(f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}") from e
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
     motion = _motion(tape, model, frames)
-    residual, tau = _inverse_dynamics(tape, model, frames, motion)
-    return Replay(tape, robot, task, edge_m, model, geometry, soles, base_residual=residual, tau=tau, **motion)
+    need = dict(zip(("base_residual", "tau"), _inverse_dynamics(tape, model, frames, motion), strict=True))
+    gravity, mass = float(-model.gravity.linear[2]), float(pin.computeTotalMass(model))
+    rows = {"launch": slice(0, tape.takeoff_index), "flight": slice(tape.takeoff_index, len(tape.t))}
+    told = {"gravity": gravity, "mass": mass, "weight": mass * gravity, "step": np.diff(tape.t)}
+    names = (*BASE, *map(str, tape.joint_names))
+    return Replay(
+        tape, robot, task, edge_m, model, geometry, soles, coordinates=names, **motion, **need, **rows, **told
+    )
 
 
 def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: int) -> Sole:

@@ -5,3 +5,4 @@ what a notebook was given, and runs them.
 """
 
 from jumplab.cli.notebooks import check_parameters as check_parameters
+from jumplab.cli.notebooks import find_notebooks as find_notebooks

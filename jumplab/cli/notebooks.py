@@ -37,13 +37,8 @@ def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> Non
     """Refuse (:class:`InputError`) injected parameters that a notebook does not know, and values that cannot be meant.
 
     papermill merely warns of an unknown name and then runs with the default. Call this in the cell after the
-    parameters: ``check_parameters(globals(), samples=range(1, 10_001), fast=bool)``.
-
-    Parameters
-    ----------
-    namespace : the notebook's ``globals()``.
-    extra : further parameters of this notebook: a type, or a range for a whole number within it; those of
-        ``STANDARD`` are always known.
+    parameters: ``check_parameters(globals(), samples=range(1, 10_001), fast=bool)``. ``extra`` are parameters beside
+    the ``STANDARD`` ones: a type, or a range for a whole number within it.
     """
     known = {**STANDARD, **extra}
     cells = [source for source in namespace.get("In", []) if source.startswith("# Parameters\n")]  # what papermill adds
@@ -139,23 +134,19 @@ def run_notebooks(
     notebooks: list[Path] | None = None,
     progress: bool = True,
 ) -> RunReport:
-    """Execute the notebooks in order; each gets those parameters that it declares.
+    """Execute the notebooks in order, all of the package's if None; each gets those parameters that it declares.
+
+    Raises :class:`InputError`, before anything has run, if a parameter is unknown to all notebooks or cannot be meant,
+    or a folder cannot be written; a :class:`JumplabError` if a cell fails, of the class that the cell raised if that is
+    one of the package's.
 
     Parameters
     ----------
     parameters : name -> value, for instance ``{"distance_m": 0.8}``.
     out : result folder; ``executed`` in the checkout if None.
-    figures : folder of the figures; if None, ``figures`` in ``out`` if that is given, else in the checkout (or in its
-        result folder where the checkout is read-only).
-    notebooks : which ones; all of the package's if None.
+    figures : their folder; if None, ``figures`` in ``out`` if that is given, else in the checkout (or in its result
+        folder where the checkout is read-only).
     progress : show a bar per notebook on stderr.
-
-    Raises
-    ------
-    InputError
-        If a parameter is unknown to all notebooks or cannot be meant, or a folder cannot be written. Nothing has run.
-    JumplabError
-        If a cell fails: of the class that the cell raised, if that is one of the package's.
     """
     start = time.perf_counter()
     if parameters is not None:

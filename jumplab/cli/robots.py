@@ -8,11 +8,9 @@ from jumplab.cli.common import Late, command, folder, opt
 from jumplab.errors import InputError, JumplabError, RobotError
 
 robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
-store, jumper, configs = (
-    Late("jumplab.io.folder"),
-    Late("jumplab.robot_import.jumper"),
-    Late("jumplab.robot_import.config"),
-)
+store, jumper = Late("jumplab.io.folder"), Late("jumplab.robot_import.jumper")
+configs = Late("jumplab.robot_import.config")
+starters = Late("jumplab.robot_import.roles")
 tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
 
 
@@ -76,7 +74,7 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None) -> str:
     if first:
         print("".join(f"{sentence}\n" for sentence in others), end="")
         raise RobotError(first + (f" ({len(others)} further faults are printed above)" if others else ""))
-    found = checkup.draft(urdf, repair)
+    found = starters.draft(urdf, repair)
     for note in found.roles.notes:
         print(f"note: {note}")
     print(f"sole: {found.sole.source}")

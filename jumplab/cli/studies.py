@@ -16,7 +16,8 @@ from jumplab.task import JumpTask
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
-pages, pictures, style = Late("jumplab.show.viewer"), Late("jumplab.show.studies"), Late("jumplab.show.style")
+pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.studies")
+tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
 
 MOST, RUNS = 100_000, whole(1, 10_000)  # trials: two days of one core; chains: a day of two; more must be a typo
 JOBS = needing("be a number of processes, or -1 for all processors", {"-1", *map(str, range(1, 4097))}.__contains__)
@@ -234,7 +235,8 @@ def bench(args: Namespace) -> None:
     """How long planning takes, against one direct NLP."""
     task = JumpTask(args.distance_m, args.height_m)
     found = benchmark.bench(args.robot, task, int(args.repeats), say=lambda word: print(word, file=sys.stderr))
-    print(benchmark.text(found))
+    print(tables.table(benchmark.rows(found), digits=3))
+    print("audited clean: " + ", ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items()))
     if args.json is not None:
         store.write_file(args.json, json.dumps(found, indent=1).encode())
         print(f"raw times in {args.json}")

@@ -6,7 +6,4 @@ In come tapes, simulations and reports; out go result folders, exports and logs,
 
 import lazy_loader as lazy
 
-__getattr__, __dir__, __all__ = lazy.attach(
-    __name__,
-    submodules=["export", "files", "folder", "motion", "tape"],
-)
+__getattr__, __dir__, __all__ = lazy.attach(__name__, submodules=["export", "files", "folder", "motion", "tape"])

@@ -32,15 +32,10 @@ def default_name(format_name: str, source: str) -> str:
 def write(
     format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float = CLIP_FPS, order: str = ORDERS[0]
 ) -> Path:
-    """Write a motion in one of :data:`FORMATS`.
+    """Write a motion in one of :data:`FORMATS` to a file, or to a folder with "urdf-replay".
 
-    Raises :class:`InputError` if the format is unknown, an option cannot be meant, or the path cannot be written;
-    nothing is left behind then.
-
-    Parameters
-    ----------
-    path : file to write, or folder with "urdf-replay".
-    fps, order : of a motion clip, see :func:`motion_clip`.
+    ``fps`` and ``order`` are those of a :func:`motion_clip`. Raises :class:`InputError`, and leaves nothing behind, if
+    the format is unknown, an option cannot be meant, or the path cannot be written.
     """
     path = Path(path)
     if format_name not in FORMATS:
@@ -53,9 +48,8 @@ def write(
     if format_name == "csv":
         return write_file(path, joint_table(motion, robot).encode())
     clip = format_name == "motion-clip"
-    return write_file(
-        path, _npz(motion_clip(motion, robot, fps=fps, order=order) if clip else plain_arrays(motion, robot))
-    )
+    arrays = motion_clip(motion, robot, fps=fps, order=order) if clip else plain_arrays(motion, robot)
+    return write_file(path, _npz(arrays))
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -104,10 +98,8 @@ def motion_clip(
 ) -> dict[str, np.ndarray]:
     """F frames under the names that motion trackers read: J joints and B links, 32-bit floats, all in world axes.
 
-    Base and joints are interpolated (the attitude along the arc), links follow from them by Pinocchio, so that every
-    frame is a state that the robot can have.
-
-    ``fps`` are whole frames a second, ``order`` of joints and links is one of :data:`ORDERS`; raises
+    Base and joints are interpolated, links follow from them by Pinocchio, so that every frame is a state that the robot
+    can have. ``fps`` are whole frames a second, ``order`` of joints and links is one of :data:`ORDERS`; raises
     :class:`InputError` if they cannot be meant.
 
     Returns

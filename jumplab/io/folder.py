@@ -33,19 +33,7 @@ from jumplab.robot import Robot
 T = TypeVar("T")
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
-PACKAGES = (
-    "jumplab",
-    "casadi",
-    "pin",
-    "coal",
-    "cvxpy",
-    "clarabel",
-    "proxsuite",
-    "pybullet",
-    "numpy",
-    "scipy",
-    "matplotlib",
-)
+PACKAGES = tuple("jumplab casadi pin coal cvxpy clarabel proxsuite pybullet numpy scipy matplotlib".split())
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")

@@ -33,37 +33,24 @@ def skew(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FullMotion:
-    """What feedback needs to know of the robot at one (q, v); feet are ordered left, right.
+    """What feedback needs to know of the robot at one (q, v); feet are ordered left, right, vectors in world axes."""
 
-    Attributes
-    ----------
-    q, v : configuration (nq,) and rates (nv,).
-    base_rotation : of the base link (3, 3).
-    com, com_velocity : c and its rate (3,) [m, m/s].
-    momentum : linear then centroidal angular momentum (6,) [kg m/s, kg m^2/s]; ``momentum[4]`` is L.
-    rho, rho_rate : pitch inertia about the CoM, rho_total [kg m^2], and its rate [kg m^2/s].
-    toe, heel, sole : places of the middles of the soles' front edge, rear edge, and of the sole itself (2, 3) [m].
-    toe_velocity, heel_velocity, sole_velocity : (2, 3) [m/s].
-    foot_rotation : rotation matrices of the feet (2, 3, 3).
-    foot_spin : angular velocity of the feet, world axes (2, 3) [rad/s].
-    """
-
-    q: np.ndarray
-    v: np.ndarray
-    base_rotation: np.ndarray
-    com: np.ndarray
-    com_velocity: np.ndarray
-    momentum: np.ndarray
-    rho: float
-    rho_rate: float
-    toe: np.ndarray
-    heel: np.ndarray
-    sole: np.ndarray
-    toe_velocity: np.ndarray
+    q: np.ndarray  # (nq,) configuration
+    v: np.ndarray  # (nv,) rates
+    base_rotation: np.ndarray  # (3, 3) of the base link
+    com: np.ndarray  # c (3,) [m]
+    com_velocity: np.ndarray  # (3,) [m/s]
+    momentum: np.ndarray  # (6,) linear [kg m/s], then centroidal angular [kg m^2/s]; ``momentum[4]`` is L
+    rho: float  # pitch inertia about the CoM, rho_total [kg m^2]
+    rho_rate: float  # [kg m^2/s]
+    toe: np.ndarray  # (2, 3) middles of the soles' front edges [m]
+    heel: np.ndarray  # (2, 3) of their rear edges [m]
+    sole: np.ndarray  # (2, 3) of the soles themselves [m]
+    toe_velocity: np.ndarray  # (2, 3) [m/s], as the next two
     heel_velocity: np.ndarray
     sole_velocity: np.ndarray
-    foot_rotation: np.ndarray
-    foot_spin: np.ndarray
+    foot_rotation: np.ndarray  # (2, 3, 3)
+    foot_spin: np.ndarray  # (2, 3) angular velocity of the feet [rad/s]
 
     @property
     def foot_com(self) -> np.ndarray:
@@ -86,32 +73,22 @@ class FullTerms(FullMotion):
     """Every quantity of the nine-link robot that the QPs need, at one (q, v).
 
     A "drift" is the acceleration of theta'' = 0, so ``x'' = J_x theta'' + drift``.
-
-    Attributes
-    ----------
-    M, H : inertia matrix M^js (nv, nv) and bias force H^js (nv,), gravity included [SI].
-    A_c, B_c : Jacobian (3, nv) and drift (3,) of the CoM.
-    A_h, B_h : centroidal momentum matrix (6, nv) and drift (6,).
-    J_rho, drift_rho : Jacobian (nv,) and drift of rho [kg m^2/s^2].
-    J_toe, drift_toe : Jacobian (2, 6, nv), linear then angular, and drift (2, 6) of the tiptoes; J^js of the paper.
-    J_heel, drift_heel : linear Jacobian (2, 3, nv) and drift (2, 3) of the heels.
-    J_rd, drift_rd : Jacobian (2, 3, nv) and drift (2, 3) of p_rd.
     """
 
-    M: np.ndarray
-    H: np.ndarray
-    A_c: np.ndarray
-    B_c: np.ndarray
-    A_h: np.ndarray
-    B_h: np.ndarray
-    J_rho: np.ndarray
-    drift_rho: float
-    J_toe: np.ndarray
-    drift_toe: np.ndarray
-    J_heel: np.ndarray
-    drift_heel: np.ndarray
-    J_rd: np.ndarray
-    drift_rd: np.ndarray
+    M: np.ndarray  # inertia matrix M^js (nv, nv)
+    H: np.ndarray  # bias force H^js (nv,), gravity included
+    A_c: np.ndarray  # Jacobian (3, nv) of the CoM
+    B_c: np.ndarray  # its drift (3,)
+    A_h: np.ndarray  # centroidal momentum matrix (6, nv)
+    B_h: np.ndarray  # its drift (6,)
+    J_rho: np.ndarray  # Jacobian (nv,) of rho
+    drift_rho: float  # [kg m^2/s^2]
+    J_toe: np.ndarray  # Jacobian (2, 6, nv) of the tiptoes, linear then angular; J^js of the paper
+    drift_toe: np.ndarray  # (2, 6)
+    J_heel: np.ndarray  # linear Jacobian (2, 3, nv) of the heels
+    drift_heel: np.ndarray  # (2, 3)
+    J_rd: np.ndarray  # Jacobian (2, 3, nv) of p_rd
+    drift_rd: np.ndarray  # (2, 3)
 
     @property
     def J(self) -> np.ndarray:
@@ -136,16 +113,9 @@ def force_target(mass: float, gravity: float, com_acceleration: np.ndarray, mome
 class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
 
-    Parameters
-    ----------
-    robot : the robot.  gravity : [m/s^2], positive; the robot's own 9.8 by default.
-
-    Attributes
-    ----------
-    robot, model : the robot and its Pinocchio model.
-    nq, nv, mass, gravity : sizes [-], kg, m/s^2 (positive).
-    pairs : (left column, right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
-    foot_joints, foot_points : joints that carry the feet; tiptoe, heel and sole in their frames (2, 3, 3) [m].
+    ``gravity`` is positive, the robot's own 9.8 by default [m/s^2]; ``mass`` is in kg; ``pairs`` are (left column,
+    right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`; ``foot_joints`` carry the feet,
+    ``foot_points`` are tiptoe, heel and sole in their frames (2, 3, 3) [m].
     """
 
     def __init__(self, robot: Robot, gravity: float | None = None):

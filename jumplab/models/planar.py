@@ -4,7 +4,7 @@ Configuration: absolute angles of foot, shank, thigh, trunk and arm, positive ab
 vector per angle, so the toe can be fixed (launch) or follow from the ballistic CoM (flight) without any contact
 equation. Moments, momentum and inertia sum m_i times products of two such vectors; the sum over the links is taken
 once, in numbers, and what is left are ten differences of angles. Derivatives of that form are cheap, the second ones
-above all. :func:`lagrangian` is an independent derivation that tests compare with.
+above all. Tests compare it with an independent derivation.
 """
 
 from __future__ import annotations
@@ -34,20 +34,13 @@ def _turned(arms: np.ndarray, turns) -> list:
 
 @dataclass(frozen=True)
 class PlanarState:
-    """All planar quantities at one instant, as CasADi expressions; positions are relative to the toe.
-
-    Parameters
-    ----------
-    model : the sagittal robot.
-    angles, rates, accels : (5,) absolute link angles and derivatives [rad, rad/s, rad/s^2].
-    gravity : [m/s^2].
-    """
+    """All planar quantities at one instant, as CasADi expressions; positions are relative to the toe."""
 
     model: SagittalModel
-    angles: ca.SX
-    rates: ca.SX
-    accels: ca.SX
-    gravity: float = GRAVITY
+    angles: ca.SX  # (5,) absolute link angles [rad]
+    rates: ca.SX  # (5,) [rad/s]
+    accels: ca.SX  # (5,) [rad/s^2]
+    gravity: float = GRAVITY  # [m/s^2]
 
     @cached_property
     def _turns(self):

@@ -5,20 +5,13 @@ Out: a :class:`Solution`, or a :class:`~jumplab.errors.SolverError` that names t
 Start reading in :mod:`jumplab.ocp.problem`; then ``nlp.py``, which solves what ``assembly.py`` makes of it.
 """
 
-from jumplab.ocp.nlp import Nlp
-from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
-from jumplab.ocp.solution import Near, PhaseGuess, PhaseSolution, Solution, Statistics
+import lazy_loader as lazy
 
-__all__ = [
-    "Bound",
-    "Near",
-    "Nlp",
-    "Phase",
-    "PhaseGuess",
-    "PhaseSolution",
-    "Point",
-    "Problem",
-    "Solution",
-    "Statistics",
-    "Term",
-]
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__,
+    submod_attrs={
+        "nlp": ["Nlp"],
+        "problem": ["Bound", "Phase", "Point", "Problem", "Term"],
+        "solution": ["Near", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"],
+    },
+)

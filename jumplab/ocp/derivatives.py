@@ -91,21 +91,14 @@ class Formulas:
 
 @dataclass
 class Element:
-    """One small function, repeated: its terms, and what is made of them for all meshes.
+    """One small function, repeated: its terms, and what is made of them for all meshes."""
 
-    Attributes
-    ----------
-    owner, place : phase and where in it, as in :class:`~jumplab.ocp.problem.Term`.
-    costs, rows : its cost terms, and its constraint terms, each with its number of rows.
-    formulas : None if all functions are already ``made``: name -> (function, rows, columns), see :class:`Formulas`.
-    """
-
-    owner: str
-    place: str
+    owner: str  # phase
+    place: str  # where in it, as in :class:`~jumplab.ocp.problem.Term`
     costs: list[Term]
-    rows: list[tuple[Term, int]]
-    formulas: Formulas | None = None
-    made: dict = field(default_factory=dict)
+    rows: list[tuple[Term, int]]  # constraint terms, each with its number of rows
+    formulas: Formulas | None = None  # None if all functions are already made
+    made: dict = field(default_factory=dict)  # name -> (function, rows, columns), see :class:`Formulas`
 
     def function(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS`, made when it is first asked for."""
@@ -227,20 +220,13 @@ def gather(entries: Sequence[tuple], shape: tuple[int, int]) -> ca.MX:
 
 @dataclass
 class Block:
-    """What one element contributes to the NLP: its small functions, called for all repetitions.
-
-    Attributes
-    ----------
-    e : the element.  index : its variables (n, ny).
-    keep : which of its rows, over all repetitions, are in the NLP; there they begin at ``first_row``.
-    inputs, weights : MX columns for every repetition.
-    """
+    """What one element contributes to the NLP: its small functions, called for all repetitions."""
 
     e: Element
-    index: np.ndarray
-    keep: np.ndarray
-    first_row: int
-    inputs: tuple
+    index: np.ndarray  # (n, ny) its variables
+    keep: np.ndarray  # which of its rows, over all repetitions, are in the NLP
+    first_row: int  # where they begin there
+    inputs: tuple  # MX columns for every repetition, as the weights
     weights: ca.MX
 
     def __post_init__(self):

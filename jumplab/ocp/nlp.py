@@ -1,4 +1,8 @@
-"""Solving an assembled problem, with ipopt or by a few Gauss-Newton steps, and saying what came out."""
+"""Solving an assembled problem, with ipopt or by a few Gauss-Newton steps, and saying what came out.
+
+Where no plan comes out, it says why: terms that are no number, or terms that cannot be met together, by an elastic
+re-solve.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from jumplab.ocp.assembly import Posed, pack_multipliers, pose, unpack, unpack_multipliers
+from jumplab.errors import SolverError
+from jumplab.ocp.assembly import Assembled, Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
-from jumplab.ocp.derivatives import JERK_CHAIN
-from jumplab.ocp.diagnosis import failure
+from jumplab.ocp.derivatives import JERK_CHAIN, scatter
 from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
 from jumplab.ocp.sqp import GaussNewton
@@ -40,6 +44,12 @@ IPOPT = {
 # to begin from a solution close by with its multipliers: the start is not pushed away from its limits
 PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 WARM = {"warm_start_init_point": "yes"} | {f"warm_start_{push}": 1e-6 for push in PUSHES}
+# of the diagnosis
+NAMED = 4  # so many terms are named at most
+CONFLICT_LIMIT = 1e-3  # scaled row error that is worth a word
+COST_SHARE = 1e-4  # enough of the cost to keep the motion sane, too little to buy violations
+ELASTIC = {"tol": 1e-4, "acceptable_tol": 1e-3, "max_iter": 200, "max_wall_time": 15.0}  # [s]
+ELASTIC |= {"mu_strategy": "adaptive", "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"}
 
 
 class Nlp:
@@ -89,10 +99,7 @@ class Nlp:
     def gauss_newton_steps(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], **how: Any) -> Near:
         """Come near a solution in a few steps; ``how`` are references, weights, off as of :meth:`solve`.
 
-        Raises
-        ------
-        SolverError
-            If a step is no number.
+        Raises :class:`SolverError` if a step is no number.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
         method, began = self._gauss_newton, time.perf_counter()
@@ -115,6 +122,9 @@ class Nlp:
     ) -> Solution:
         """Solve for one target.
 
+        Raises :class:`SolverError` if ipopt stops without an acceptable point or the re-evaluated rows contradict it;
+        it says which terms are violated, where and by how much.
+
         Parameters
         ----------
         parameters : name -> number or column, exactly those of the problem.
@@ -124,12 +134,6 @@ class Nlp:
         off : names of terms and bounds to leave out.
         multipliers : of a solution close by, on any mesh; used if ipopt's option ``warm_start_init_point`` is "yes".
         explain : look for the terms in conflict if there is no solution; it costs about as much as the solve.
-
-        Raises
-        ------
-        SolverError
-            If ipopt stops without an acceptable point or the re-evaluated rows contradict it; says which terms are
-            violated, where and by how much.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, references, weights, off)
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}
@@ -142,7 +146,7 @@ class Nlp:
         status, iterations = stats["return_status"], int(stats["iter_count"])
         residual = float(np.max(posed.beyond(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            raise failure(a, posed, x, status, iterations, explain)
+            raise _failure(a, posed, x, status, iterations, explain)
         sizes, cost = (len(x), len(g)), float(answer["f"])
         functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
         statistics = Statistics(iterations, status, self.build_s, solve_s, *sizes, cost, residual, functions_s)
@@ -172,3 +176,91 @@ class Nlp:
             about = dict(phase=owner, name=term.name, equation=term.equation, unit=term.unit, kind=kind)
             out.append(about | dict(node=rows[row].node, value=value, slack=least))
         return tuple(out)
+
+
+# why there is no plan -----------------------------------------------------------------------------------------
+def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iterations: int, explain: bool) -> SolverError:
+    """What to say of a solve that ended at ``last`` (n,); to ``explain`` a conflict costs about as much as a solve."""
+    name = a.problem.name
+    said, violations = f"{name}: no plan ({status} after {iterations} iterations)", ()
+    for where, x in {"initial guess": posed.x0, "last iterate": last}.items():
+        violations = _without_number(a, x, posed.p)
+        if violations:
+            said += f": no finite value or slope at the {where} has {' or '.join(violations[:NAMED])}"
+            said += "; keep its arguments where it is defined, or start from another guess"
+            break
+    if explain and not violations:
+        violations = _conflicts(a, posed)
+        if violations:
+            said += f": the best compromise still violates {'; '.join(violations)}"
+            said += "; ask for less, or give these terms more room"
+        else:
+            said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
+    return SolverError(said, stage=name, status=status, violations=violations)
+
+
+def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> tuple[str, ...]:
+    """Terms with a value or slope at ``x`` that is not finite; ipopt says only that some are."""
+    phases, named = unpack(a, x), {}
+    slope = a.jac_g(x, p)[1]
+    bad = ~np.isfinite(a.nlp(x, p)[1].full().ravel())
+    bad[np.array(slope.sparsity().row(), int)[~np.isfinite(np.array(slope.nonzeros()))]] = True
+    for row in (a.rows[i] for i in np.flatnonzero(bad)):
+        when = f", t = {phases[row.owner].t[row.node]:.3f} s of the phase" if row.owner in phases else ""
+        named.setdefault(f"{row.owner}/{row.term.name}", f" at node {row.node}{when}")
+    lost = ~np.isfinite(a.cost_parts(x, p).full().ravel())
+    if not lost.any():  # slopes only then: a value that is no number spoils the slopes of its neighbours
+        lost = ~np.isfinite(a.cost_parts.jacobian()(x, p, 0)[0].full()).all(axis=1)
+    for owner, term in (a.cost_terms[i] for i in np.flatnonzero(lost)):
+        named.setdefault(f"{owner}/{term.name}", "")
+    return tuple(name + place for name, place in named.items())
+
+
+def _conflicts(a: Assembled, posed: Posed) -> tuple[str, ...]:
+    """The terms that the least violating motion violates most, where and by how much, in their units."""
+    x, beyond = _least_violation(a, posed)
+    phases, worst = unpack(a, x), {}
+    for row, amount in zip(a.rows, beyond, strict=True):
+        name = f"{row.owner}/{row.term.name}"
+        if amount > max(CONFLICT_LIMIT, worst.get(name, (0.0,))[0]):
+            when = f" at t = {phases[row.owner].t[row.node]:.3f} s of the phase" if row.owner in phases else ""
+            worst[name] = amount, f"{name} by {amount * row.term.scale:.3g} {row.term.unit}{when}"
+    ranked = sorted(worst.values(), key=lambda found: -found[0])
+    return tuple(text for _, text in ranked[:NAMED])
+
+
+def _least_violation(a: Assembled, posed: Posed) -> tuple[np.ndarray, np.ndarray]:
+    """The motion (n,) with the least sum of row violations plus a trace of the cost, and its violations (n_rows,).
+
+    Identities, which say only that the motion is one motion, stay hard.
+    """
+    index = np.flatnonzero([not row.term.identity for row in a.rows])
+    n, m, place = a.size, len(index), scatter(index, a.n_rows)
+    w, p = ca.MX.sym("w", n + 2 * m), ca.MX.sym("p", a.p_size)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", a.n_rows)
+    x, over, under = w[:n], w[n : n + m], w[n + m :]
+    f, g = a.nlp(x, p)
+    cost = COST_SHARE * f + ca.sum1(over) + ca.sum1(under)
+    relaxed = g - place @ over + place @ under
+    gradient = ca.vertcat(COST_SHARE * a.grad_f(x, p)[1], ca.DM.ones(2 * m))
+    jacobian = ca.horzcat(a.jac_g(x, p)[1], -place, place)
+    hessian = ca.diagcat(a.hess_lag(x, p, COST_SHARE * lam_f, lam_g), ca.MX(2 * m, 2 * m))
+    names, of_hessian = ["x", "p"], ["x", "p", "lam_f", "lam_g"]
+    options = {
+        "ipopt": ELASTIC,
+        "print_time": False,
+        "error_on_fail": False,
+        "grad_f": ca.Function("nlp_grad_f", [w, p], [cost, gradient], names, ["f", "grad_f_x"]),
+        "jac_g": ca.Function("nlp_jac_g", [w, p], [relaxed, jacobian], names, ["g", "jac_g_x"]),
+        "hess_lag": ca.Function("nlp_hess_l", [w, p, lam_f, lam_g], [hessian], of_hessian, ["triu_hess_gamma_x_x"]),
+    }
+    nlp = ca.Function("nlp", [w, p], [cost, relaxed], names, ["f", "g"])
+    solver = ca.nlpsol("elastic", "ipopt", nlp, options)
+    g0 = a.nlp(posed.x0, posed.p)[1].full().ravel()[index]
+    (low, high), (row_low, row_high) = posed.box, posed.rows
+    start = np.concatenate([posed.x0, np.maximum(g0 - row_high[index], 0.0), np.maximum(row_low[index] - g0, 0.0)])
+    lbx, ubx = np.concatenate([low, np.zeros(2 * m)]), np.concatenate([high, np.full(2 * m, np.inf)])
+    answer = solver(x0=np.nan_to_num(start), p=posed.p, lbx=lbx, ubx=ubx, lbg=row_low, ubg=row_high)
+    best = answer["x"].full().ravel()[:n]
+    beyond = posed.beyond(a.nlp(best, posed.p)[1].full().ravel())
+    return best, np.nan_to_num(beyond, nan=np.inf)

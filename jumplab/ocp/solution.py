@@ -48,22 +48,16 @@ class PhaseGuess:
 
 @dataclass(frozen=True)
 class PhaseSolution:
-    """One phase at its nodes, and between them.
+    """One phase at its nodes, and between them."""
 
-    Attributes
-    ----------
-    t : (N + 1,) from the start of the phase [s];  q, v, a : (N + 1, nq);  j : (N, nq);  z : (N + 1, nz).
-    duration : [s];  constants : the phase's further constants.
-    """
-
-    t: np.ndarray
-    q: np.ndarray
+    t: np.ndarray  # (N + 1,) from the start of the phase [s]
+    q: np.ndarray  # (N + 1, nq), as v and a
     v: np.ndarray
     a: np.ndarray
-    j: np.ndarray
-    z: np.ndarray
-    duration: float
-    constants: dict
+    j: np.ndarray  # (N, nq)
+    z: np.ndarray  # (N + 1, nz)
+    duration: float  # [s]
+    constants: dict  # the phase's further ones
 
     def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
@@ -83,13 +77,11 @@ class PhaseSolution:
 class Multipliers:
     """Lagrange multipliers of a solution, free of its mesh: what each limit is worth.
 
-    Attributes
-    ----------
-    rows : (owner, term name) -> shares of the phase (K,), values (K, C); of limits along a phase per unit of share.
-        Box bounds stand there as (phase, "bounds of nodes") and (phase, "bounds of constants").
+    Of limits along a phase they are per unit of its share. Box bounds have the names (phase, "bounds of nodes") and
+    (phase, "bounds of constants").
     """
 
-    rows: dict
+    rows: dict  # (owner, term name) -> shares of the phase (K,), values (K, C)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,15 @@ In: a shipped name, a TOML or a URDF. Out: an immutable :class:`Robot` and its :
 Begin with :mod:`description`; stage 1's view of what the robot can do is in :mod:`reach`.
 """
 
-from jumplab.robot.description import Robot
-from jumplab.robot.sagittal import SAGITTAL_JOINTS, SAGITTAL_LINKS, SagittalModel
+import lazy_loader as lazy
 
-__all__ = ["SAGITTAL_JOINTS", "SAGITTAL_LINKS", "Robot", "SagittalModel"]
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__,
+    submodules=["checkup", "description", "reach", "sagittal", "stance"],
+    submod_attrs={
+        "description": ["SHIPPED", "Robot"],
+        "reach": ["postures"],
+        "sagittal": ["JOINT_OF_ANGLES", "SAGITTAL_JOINTS", "SAGITTAL_LINKS", "SagittalModel"],
+        "stance": ["configuration"],
+    },
+)

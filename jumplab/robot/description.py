@@ -14,8 +14,12 @@ import pinocchio as pin
 import tomlkit
 
 from jumplab.errors import RobotError, quoted
+from jumplab.robot.reduction import check_reduction
 from jumplab.robot.sagittal import SagittalModel, reduce
+from jumplab.robot.stance import check_stance
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
+from jumplab.robot_import.jumper import Jumper, make_jumper
+from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import locate, read_urdf
 from jumplab.task import GRAVITY
 
@@ -92,9 +96,23 @@ class Robot:
         path, config = files_of(name_or_path)
         if config is not None and "source" not in read_toml(config, str(path)):
             return cls.from_text(read_urdf(path), config)
-        from jumplab.robot.checkup import check, draft  # they build on this class
+        robot = cls.imported(path, draft(path, repair).text if config is None else config)[1]
+        check_reduction(robot)
+        check_stance(robot)
+        return robot
 
-        return check(path, draft(path, repair).text if config is None else config).robot
+    @classmethod
+    def imported(cls, path: Path, config_text: str) -> tuple[Jumper, Robot]:
+        """A published URDF as a jumper and as a robot, by a configuration that has a table [source]; not yet measured.
+
+        Raises :class:`RobotError` if they do not make one.
+        """
+        config = read_toml(config_text, "robot configuration")
+        if "source" not in config:
+            missing = "the table [source] is missing: it names trunk, forward, up and repair"
+            raise RobotError(f"robot configuration: {missing}")
+        jumper = make_jumper(read_urdf(path), config, path.name, path)
+        return jumper, cls.from_text(jumper.urdf, jumper.config_text)
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, rotated
+
+if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
+    from jumplab.robot.description import Robot
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways

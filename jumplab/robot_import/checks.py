@@ -14,8 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.tree import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix
-from jumplab.robot_import.urdf import numbers
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix, numbers
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 
@@ -111,24 +110,24 @@ def _joint_faults(joint: ET.Element, links: set, where: str) -> Iterator[str]:
             yield f"{at}: axis xyz = {axis.get('xyz')!r} has no direction; give a unit vector"
 
 
-def _end(joint: ET.Element, end: str) -> str:
-    """Name of a joint's "parent" or "child" link."""
-    return joint.find(end).get("link")
-
-
 def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[str]:
     known = {j.get("name") for j in joints}
+    ends = [(j.find("child").get("link"), j.find("parent").get("link"), j.get("name")) for j in joints]
     for joint in joints:
-        mimic = joint.find("mimic")
-        if mimic is not None and mimic.get("joint") not in known:
-            leader = mimic.get("joint")
-            yield f"{where}: joint {joint.get('name')!r} mimics {leader!r}, which does not exist; correct the name"
-    for link, times in Counter(_end(j, "child") for j in joints).items():
+        mimic, at = joint.find("mimic"), f"{where}: joint {joint.get('name')!r}"
+        if mimic is None:
+            continue
+        if mimic.get("joint") not in known:
+            yield f"{at} mimics {mimic.get('joint')!r}, which does not exist; correct the name"
+        for key in ("multiplier", "offset"):
+            if numbers(mimic.get(key, "0"), 1) is None:
+                yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
+    for link, times in Counter(child for child, _, _ in ends).items():
         if times > 1:
-            above = ", ".join(repr(j.get("name")) for j in joints if _end(j, "child") == link)
+            above = ", ".join(repr(name) for child, _, name in ends if child == link)
             yield f"{where}: link {link!r} hangs on {times} joints ({above}): a closed loop; cut it to leave a tree"
             return
-    parent = {_end(j, "child"): _end(j, "parent") for j in joints}
+    parent = {child: above for child, above, _ in ends}
     roots = sorted(names - set(parent))
     if not roots:
         yield f"{where}: no link is the root: the joints form a cycle; each robot needs one link without a parent"
@@ -145,29 +144,26 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
 
 
 # inertials ------------------------------------------------------------------------------------------------------
-def _inertial_faults(link: ET.Element, at: str, strict: bool) -> Iterator[str]:
+def _inertial_faults(link: ET.Element, at: str, strict: bool) -> list[str]:
     inertial, mass, tensor = (link.find(path) for path in ("inertial", "inertial/mass", "inertial/inertia"))
     if inertial is None:
-        return
+        return []
     if mass is None:
-        yield f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"
-        return
+        return [f"{at}: <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"]
     value = numbers(mass.get("value"), 1)
     if value is None:
-        yield f"{at}: mass = {mass.get('value')!r} must be a finite number of kg"
-        return
+        return [f"{at}: mass = {mass.get('value')!r} must be a finite number of kg"]
     if value[0] < 0:
-        yield f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"
-        return
-    yield from _triple_faults(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")
+        return [f"{at}: mass = {value[0]:g} kg must not be negative; correct <mass>"]
+    found = [*_triple_faults(inertial.find("origin"), f"{at}: inertial origin", "xyz", "rpy")]
     if tensor is None:
-        yield f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"
-        return
+        return [*found, f"{at}: <inertial> has no <inertia>; add the six numbers in kg m^2"]
     wrong = next((key for key in TENSOR if numbers(tensor.get(key), 1) is None), None)
     if wrong:
-        yield f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2"
+        found.append(f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2")
     elif strict and value[0] >= FRAME_KG:
-        yield from _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
+        found += _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
+    return found
 
 
 def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
@@ -218,20 +214,15 @@ def _shape_faults(root: ET.Element, where: str) -> Iterator[str]:
         at = f"{where}: link {link.get('name')!r}"
         for collision in link.findall("collision"):
             yield from _triple_faults(collision.find("origin"), f"{at}: collision origin", "xyz", "rpy")
-            for shape in collision.findall("geometry/*"):
-                yield from _size_faults(shape, at)
-
-
-def _size_faults(shape: ET.Element, at: str) -> Iterator[str]:
-    for key, count in SIZES.get(shape.tag, {}).items():
-        values = numbers(shape.get(key), count)
-        if values is None or np.any(values <= 0):
-            wanted = "three positive numbers" if count == 3 else "a positive number"
-            yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
-    if shape.tag == "mesh":
-        if not shape.get("filename"):
-            yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
-        yield from _triple_faults(shape, f"{at}: mesh", "scale")
+        for shape in link.findall("collision/geometry/*"):
+            for key, count in SIZES.get(shape.tag, {}).items():
+                values = numbers(shape.get(key), count)
+                if values is None or np.any(values <= 0):
+                    wanted = "three positive numbers" if count == 3 else "a positive number"
+                    yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
+            if shape.tag == "mesh" and not shape.get("filename"):
+                yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
+            yield from _triple_faults(shape if shape.tag == "mesh" else None, f"{at}: mesh", "scale")
 
 
 # limits ---------------------------------------------------------------------------------------------------------

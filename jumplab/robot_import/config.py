@@ -1,8 +1,11 @@
-"""Reading the entries of a robot's TOML file, each checked, each refused in one sentence."""
+"""A robot's TOML file: its entries read, each checked, each refused in one sentence; and a new one from a template."""
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,3 +63,13 @@ def roles_table(config: dict) -> dict[str, tuple[str, ...]]:
         held = role == "shoulder_pitch" and table(config, "joints").get(role) == []
         joints[role] = () if held else tuple(entry(config, "joints", role, kind=str, count=2))
     return joints
+
+
+def filled(template: str, **values: Any) -> str:
+    """A template of this folder with its fields filled in."""
+    return Path(__file__).with_name(template).read_text(encoding="utf-8").format(**values)
+
+
+def texts(values: Sequence[str]) -> str:
+    """An array of texts, the same in TOML as in JSON."""
+    return json.dumps(values, ensure_ascii=False)

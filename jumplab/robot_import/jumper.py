@@ -7,7 +7,6 @@ so is the configuration. Both results stand on their own, so a result folder can
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -17,10 +16,9 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
-from jumplab.robot_import.config import entry, roles_table, table
+from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
-from jumplab.robot_import.tree import Tree
-from jumplab.robot_import.urdf import parse
+from jumplab.robot_import.urdf import Tree, parse
 
 REPAIRS = ("inertia", "massless", "symmetry")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
@@ -103,14 +101,12 @@ def _cut_hips(lumped: Lumped, roles: RoleJoints, urdf: str) -> Lumped:
     if cut == 0.0:
         return lumped
     mirrored = (low, high) if left.axis @ right.axis > 0 else (-high, -low)
-    new = {left.name: _within(left, low, high), right.name: _within(right, *mirrored)}
+    new = {}
+    for body, (least, most) in ((left, (low, high)), (right, mirrored)):
+        limits = {"lower": max(body.limits["lower"], least), "upper": min(body.limits["upper"], most)}
+        new[body.name] = replace(body, limits=body.limits | limits)
     changed = lumped.changed | {"hip range cut, thigh meets trunk": (cut, "rad")}
     return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
-
-
-def _within(body: Body, low: float, high: float) -> Body:
-    limits = {"lower": max(body.limits["lower"], low), "upper": min(body.limits["upper"], high)}
-    return replace(body, limits=body.limits | limits)
 
 
 def _free_range(lumped: Lumped, roles: RoleJoints, urdf: str) -> tuple[float, float]:
@@ -266,23 +262,15 @@ def _is_box(row: object) -> bool:
 
 
 # the configuration ----------------------------------------------------------------------------------------------
-def _list(values: Sequence[str | float]) -> str:
-    return "[" + ", ".join(f'"{v}"' if isinstance(v, str) else f"{v:.12g}" for v in values) + "]"
-
-
 def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped) -> str:
-    return (
-        Path(__file__)
-        .with_suffix(".toml.in")
-        .read_text(encoding="utf-8")
-        .format(
-            name=entry(config, "name", kind=str),
-            sha256=hashlib.sha256(urdf.encode()).hexdigest(),
-            held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
-            joints="\n".join(f"{role} = {_list(pair)}" for role, pair in roles.items()),
-            links=_list(feet),
-            sole=sole,
-            stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
-            corner=entry(config, "actuators", "corner_speed_ratio"),
-        )
+    return filled(
+        "jumper.toml.in",
+        name=entry(config, "name", kind=str),
+        sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+        held=", ".join(f"{k} = {v:g}" for k, v in sorted(lumped.held.items())) or "all at 0",
+        joints="\n".join(f"{role} = {texts(pair)}" for role, pair in roles.items()),
+        links=texts(feet),
+        sole=sole,
+        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
+        corner=entry(config, "actuators", "corner_speed_ratio"),
     )

@@ -16,7 +16,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.config import entry, table
 from jumplab.robot_import.roles import LEG, robot_axes
-from jumplab.robot_import.tree import LIMITS, Tree
+from jumplab.robot_import.urdf import LIMITS, Tree
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -100,22 +100,18 @@ def _moving_joints(tree: Tree, roles: RoleJoints, trunk: str, feet: Sequence[str
             said = f"{tree.where}: joint {name!r} has a role, but is {'a mimic' if joint.mimic else joint.kind}"
             raise RobotError(f"{said}; it must be revolute with a motor of its own")
     for side, foot in enumerate(feet):
-        path = tree.path_between(trunk, foot)
-        _check_order(tree.where, [j.name for j in path], [roles[role][side] for role in LEG], trunk, foot)
+        path, leg = tree.path_between(trunk, foot), [roles[role][side] for role in LEG]
+        names = [j.name for j in path]
+        missing = next((name for name in leg if name not in names), None)
+        if missing:
+            said = f"{tree.where}: the role joint {missing!r} is not between {trunk!r} and the foot {foot!r}"
+            raise RobotError(f"{said}; correct [joints], [feet] links or their order left, right")
+        found = sorted(leg, key=names.index)
+        if found != leg or len(set(leg)) < 3:
+            said = f"{tree.where}: between {trunk!r} and {foot!r} come {', '.join(found)}"
+            raise RobotError(f"{said}; hip, knee and ankle must follow in this order; correct [joints]")
         moving += [j.name for j in path if j.driven and j.name not in moving]
     return moving
-
-
-def _check_order(where: str, path: list[str], leg: list[str], trunk: str, foot: str) -> None:
-    """Hip, knee and ankle must follow each other between trunk and foot."""
-    missing = next((name for name in leg if name not in path), None)
-    if missing:
-        said = f"{where}: the role joint {missing!r} is not between {trunk!r} and the foot {foot!r}"
-        raise RobotError(f"{said}; correct [joints], [feet] links or their order left, right")
-    found = sorted(leg, key=path.index)
-    if found != leg or len(set(leg)) < 3:
-        said = f"{where}: between {trunk!r} and {foot!r} come {', '.join(found)}"
-        raise RobotError(f"{said}; hip, knee and ankle must follow in this order; correct [joints]")
 
 
 def _held_angles(tree: Tree, config: dict) -> dict[str, float]:

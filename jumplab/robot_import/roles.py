@@ -1,16 +1,23 @@
-"""Which joint is which, found from how it moves its links, never from its name."""
+"""What can be found in a URDF that nobody has described yet: roles, soles, and a first TOML file to look through.
+
+Which joint is which is found from how it moves its links, never from its name.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.config import ROLES
-from jumplab.robot_import.tree import MOVING, Joint, Tree
+from jumplab.robot_import import checks as urdf_checks
+from jumplab.robot_import.config import ROLES, filled, texts
+from jumplab.robot_import.urdf import MOVING, Joint, Tree, parse, read_urdf
 
 # None of these numbers is printed by the paper.
 PARALLEL = 0.999  # cosine: axes canted by less than 2.6 deg count as pitch
@@ -18,6 +25,12 @@ SAME_M = 0.02  # how far from mirror images two limbs may stand
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
 ARM_SHARE = 0.5  # a joint that swings less than half of the arm's mass is no shoulder
+SOLE_M = 0.012  # points this near the lowest one belong to the sole
+SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
+# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to ankle
+GUESS_X, GUESS_Y, GUESS_Z = (-0.143, 0.2), (-0.071, 0.071), -0.107
+STANCE_KNEE_RAD, STANCE_TRUNK_RAD = 0.5, 0.05  # as the default robot stands
+STANCE_ROOM_RAD = 0.15  # from the joint stops
 AXES = dict(zip("xyz", np.eye(3), strict=True))
 LEG = ROLES[:3]
 
@@ -205,3 +218,97 @@ def _explain(finder: _Finder) -> NoReturn:
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
     said = f"{where}: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was found"
     raise RobotError(f"{said}; the most on one chain about +-y are {len(best)} ({shown})")
+
+
+# the first description ------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Sole:
+    """Rectangle along the robot's axes, from the origin of the foot link [m]; ``source`` says where it comes from."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    z: float
+    source: str
+
+
+def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
+    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that are at hand.
+
+    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip to ankle, a sole is
+    guessed if the link ``foot`` has no shape.
+    """
+    pose, found, kinds = tree.poses(), [], set()
+    for link in tree.fixed_to(foot):
+        points = tree.points(link)
+        if len(points):
+            found.append((points @ pose[link].rotation.T + pose[link].translation - pose[foot].translation) @ turn.T)
+            kinds |= {shape.tag for _, shape in tree.links[link].shapes}
+    if found:
+        points = np.concatenate(found)
+        low = points[points[:, 2] < points[:, 2].min() + SOLE_M]
+        (x0, y0, z), (x1, y1, _) = low.min(axis=0).tolist(), low.max(axis=0).tolist()
+        if x1 - x0 > SMALLEST_M and y1 - y0 > SMALLEST_M:
+            return Sole((x0, x1), (y0, y1), z, f"from its {' and '.join(sorted(kinds))}")
+    x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
+    return Sole(x, y, leg_m * GUESS_Z, "GUESSED from the leg's length: the foot has no shape that is at hand")
+
+
+def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> tuple[str, Roles, Sole]:
+    """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are written into it.
+
+    ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person allows to be
+    repaired. Raises :class:`RobotError` if the URDF has no two legs.
+    """
+    roles, pose = find_roles(tree), tree.poses()
+    turn = robot_axes(pose[roles.trunk].rotation, roles.forward, roles.up)
+    hip, ankle = (pose[tree.joints[roles.joints[role][0]].child].translation for role in ("hip_pitch", "ankle_pitch"))
+    sole = find_sole(tree, roles.feet[0], turn, float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]])))
+    text = filled(
+        "starter.toml.in",
+        notes="".join(f"# note: {note}\n" for note in roles.notes),
+        name=name,
+        urdf=texts([Path(urdf).as_posix()])[1:-1],
+        roles=roles,
+        repair=texts(repair),
+        joints="\n".join(f"{role} = {texts(roles.joints[role])}" for role in ROLES),
+        feet=texts(roles.feet),
+        sole=sole,
+        knee=_inside(tree, pose, turn, roles.joints["knee"], STANCE_KNEE_RAD),
+        trunk=STANCE_TRUNK_RAD,
+        shoulder=_inside(tree, pose, turn, roles.joints["shoulder_pitch"], 0.0),
+    )
+    return text, roles, sole
+
+
+def _inside(tree: Tree, pose: dict[str, pin.SE3], turn: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
+    """The angle about the robot's left that is nearest to ``wish`` and well inside the range of both joints [rad]."""
+    low, high = -np.inf, np.inf
+    for joint in map(tree.joints.get, pair):
+        sign = float(np.sign((turn @ pose[joint.child].rotation @ joint.axis)[1]))
+        ends = sorted(sign * joint.limits.get(k, d) for k, d in (("lower", -np.pi), ("upper", np.pi)))
+        low, high = max(low, ends[0]), min(high, ends[1])
+    room = min(STANCE_ROOM_RAD, (high - low) / 3)
+    return float(np.clip(wish, low + room, high - room)) if low < high else wish
+
+
+def safe_name(text: str) -> str:
+    """A short name of letters, digits, - and _."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:40] or "robot"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found."""
+
+    text: str
+    roles: Roles
+    sole: Sole
+
+
+def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
+    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`."""
+    path = Path(path)
+    root = parse(read_urdf(path), path.name)
+    urdf_checks.check(root, path.name, repair)
+    tree = Tree(root, path.name, path, "inertia" in repair)
+    return Draft(*starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair))

@@ -10,7 +10,7 @@ launch blue, flight orange, landing green; the reference is dashed, a limit thin
 A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide)
 and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what was asked for; :class:`Silhouette` with
 :func:`draw_robot`, :func:`strobe` or :func:`film_strip` draws bodies; :func:`legend_above` takes :func:`phase_handles`.
-The 3-D page is :func:`page`; tables are :func:`table`, progress bars :func:`progress`.
+The 3-D page is :func:`page`; tables are :func:`table`.
 """
 
 import lazy_loader as lazy
@@ -19,19 +19,17 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # for plans
     "plans": "joint_trajectories inertia_and_momentum margins ground_reaction",
     # for simulations
-    "simulations": "jump_strobe momentum landing_loads frame_rows",
-    "render": "frame_strip draw_frames Renderer Camera",
+    "simulations": "jump_strobe momentum",
     # for studies
-    "studies": "trials envelope_map chain_strobe chain_timeline draw_scene",
-    # the jump in 3-D, tables, progress bars
+    "studies": "trials envelope_map chain_strobe draw_scene",
+    # the jump in 3-D, tables
     "viewer": "Page page",
     "tables": "Table table versions",
-    "widgets": "progress watched",
     # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "
     "draw_path draw_com equal_scales",
     "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
     "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
-    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE",
+    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE MIN_FONT_PT",
 }
 __getattr__, __dir__, __all__ = lazy.attach(__name__, submod_attrs={k: names.split() for k, names in _NAMES.items()})

@@ -97,9 +97,8 @@ def draw_robot(
     for role, pair in body.robot.joints.items():
         radius = 0.042 if role in ("hip_pitch", "knee") else 0.032
         for name in pair[:1] if body.view == "side" else pair:
-            ax.add_patch(
-                Circle(np.add(places[name], [shift, 0.0]), radius, facecolor=tint(color, 0.9 * strength), **look)
-            )
+            place = np.add(places[name], [shift, 0.0])
+            ax.add_patch(Circle(place, radius, facecolor=tint(color, 0.9 * strength), **look))
 
 
 def strobe(

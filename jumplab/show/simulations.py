@@ -1,14 +1,10 @@
-"""Pictures of one simulated jump: in one frame (Fig. 1), against its plan (Fig. 12), and how it lands.
-
-Rendered pictures (Fig. 11) are in :mod:`jumplab.show.render`.
-"""
+"""Pictures of one simulated jump: in one frame (Fig. 1), and against its plan (Fig. 12)."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jumplab.io.tape import Tape
@@ -16,14 +12,11 @@ from jumplab.robot import Robot
 from jumplab.show import style
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, compare, legend_above, new_figure, phase_handles, styled
-from jumplab.task import GRAVITY
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
 
 AFTER_TOUCHDOWN_S = 0.25  # how much of the landing is shown
-STANDING_UP_S = 1.0  # how much is shown where the landing itself is the subject
-SMOOTHING_S = 0.02  # longer than an impact's ringing, shorter than the landing's push of 0.2 s
 FLIGHT_SHARES = (0.25, 0.5, 0.75)  # when frames of the flight are shown
 STRIP_M = 0.72  # from frame to frame, just more than a robot with its arms stretched out
 
@@ -65,29 +58,6 @@ def _strip_rows(result: SimulationResult) -> np.ndarray:
     return np.array(rows)
 
 
-def frame_rows(result: SimulationResult) -> np.ndarray:
-    """Twelve rows of a log worth a picture, four per phase; of a jump without flight or landing, twelve evenly spaced.
-
-    Launch: start, crouch, half-way up, lift-off; flight: evenly; landing: touchdown, deepest, half-way up, the end.
-    """
-    count, flight = len(result.t), np.flatnonzero(result.phase == "flight")
-    if not len(flight) or flight[0] == 0 or flight[-1] + 1 == count:
-        return np.linspace(0, count - 1, 12).astype(int)
-    z, off, on = result.com[:, 2], int(flight[0]), int(flight[-1]) + 1
-    crouch = int(np.argmin(z[:off]))
-    deepest = on + int(np.argmin(z[on : on + round(AFTER_TOUCHDOWN_S / (result.t[1] - result.t[0]))]))
-    launch = [0, crouch, _halfway(z, crouch, off - 1), off - 1]
-    air = [off + (on - off) * share for share in (0.125, 0.375, 0.625, 0.875)]
-    return np.array([*launch, *air, on, deepest, _halfway(z, deepest, count - 1), count - 1]).astype(int)
-
-
-def _halfway(z: np.ndarray, start: int, end: int) -> int:
-    """First row after ``start`` that is half of the way up to the height at ``end``; in a fall, half of the time."""
-    if z[end] <= z[start]:
-        return (start + end) // 2
-    return start + int(np.argmax(z[start : end + 1] >= (z[start] + z[end]) / 2))
-
-
 @styled
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation."""
@@ -116,69 +86,3 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     fig.align_ylabels()
     legend_above(fig, phase_handles(*PHASE_COLORS, reference="plan"))
     return fig
-
-
-# landing --------------------------------------------------------------------------------------------------------
-@styled
-def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
-    """Trunk pitch, vertical ground force and share of the torque limits used, through the whole jump.
-
-    Forces are means over the last :data:`SMOOTHING_S`, which keeps their impulse: the bare peak of an impact says more
-    about the simulation's step than about the robot. Bars are such means too, the largest per phase, left or right; the
-    tick beside a bar is the largest single step.
-    """
-    fig = new_figure(PAGE_IN, 2.5)
-    pitch, force, bars = fig.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    step, weight = float(result.t[1] - result.t[0]), robot.total_mass * GRAVITY / 1000
-    seen = result.t <= tape.t[-1] + STANDING_UP_S
-    angles = [np.degrees(trunk_pitch(q)) for q in (result.q, tape.q)]
-    pushes = [smooth(f[:, :, 2].sum(axis=1), step) / 1000 for f in (result.foot_wrench, tape.f)]
-    panels = ((pitch, angles, "trunk pitch [deg]"), (force, pushes, "mean vertical force [kN]"))
-    for ax, (actual, planned), label in panels:
-        compare(ax, (result.t[seen], actual[seen], result.phase[seen]), (tape.t, planned), label=label)
-        ax.set_xlabel("time [s]")
-    style.limits(force, weight)
-    force.annotate("weight", (result.t[seen][-1], weight), xytext=(0, 2), ha="right", **style.NOTE_STYLE)
-    _torque_shares(bars, result, robot)
-    style.panel_letters((pitch, force, bars))
-    legend_above(fig, phase_handles(*PHASE_COLORS, reference="plan", limit="weight, torque limit"))
-    return fig
-
-
-def _torque_shares(ax: Axes, result: SimulationResult, robot: Robot) -> None:
-    """Bars: largest mean of |torque| / limit within a phase, the worse of left and right; ticks: largest step."""
-    step = float(result.t[1] - result.t[0])
-    window = round(SMOOTHING_S / step)
-    names = [name.removeprefix("left_").removeprefix("right_") for name in result.joint_names]
-    groups = list(dict.fromkeys(names))
-    step_peak, mean_peak = np.zeros((2, len(PHASE_COLORS), len(groups)))
-    for name, group, tau in zip(result.joint_names, names, result.tau.T, strict=True):
-        share = np.abs(tau) / robot.actuators[name]["effort"]  # (N,)
-        g = groups.index(group)
-        for k, p in enumerate(PHASE_COLORS):
-            part = share[result.phase == p]
-            step_peak[k, g] = max(step_peak[k, g], part.max(initial=0.0))
-            mean = smooth(part, step)[window - 1 :]  # from the first whole window of the phase on
-            mean_peak[k, g] = max(mean_peak[k, g], mean.max(initial=0.0))
-    for k, color in enumerate(PHASE_COLORS.values()):
-        at = np.arange(len(groups)) + 0.26 * (k - 1)
-        ax.barh(at, mean_peak[k], 0.24, color=color)
-        ax.plot(step_peak[k], at, linestyle="none", marker="|", markersize=5, markeredgewidth=1.2, color=color)
-    ax.axvline(1.0, **style.LIMIT_STYLE)
-    ax.set_yticks(range(len(groups)), [g.replace("_", " ") for g in groups])
-    ax.invert_yaxis()
-    ax.set(xlabel="largest torque / limit", xlim=(0, 1.05))
-    ax.grid(False, axis="y")
-
-
-def smooth(values: np.ndarray, step_s: float) -> np.ndarray:
-    """Mean (N,) over the last :data:`SMOOTHING_S` of samples ``step_s`` apart; at first over those that there are."""
-    width = max(1, round(SMOOTHING_S / step_s))
-    total = np.concatenate([np.zeros(width), np.cumsum(values)])
-    return (total[width:] - total[:-width]) / np.minimum(np.arange(len(values)) + 1, width)
-
-
-def trunk_pitch(q: np.ndarray) -> np.ndarray:
-    """Pitch (N,) of the trunk [rad] from configurations (N, nq), continuous through full turns."""
-    x, y, z, w = q[:, 3:7].T
-    return np.unwrap(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from jumplab.show import style
@@ -33,8 +31,6 @@ MOST_TICKS = 14  # more would touch
 AROUND_M, BELOW_M = 0.45, 0.05  # what is shown of the ground beyond the soles of a chain, and below it
 WAITING = 0.55  # strength of a robot between jumps
 LEGEND_IN, TALLEST_IN = 0.3, 4.2
-CORRECTION = 0.5  # strength of what is planned on the ground
-BAR = 0.62  # height of a bar of the timeline
 
 
 @style.styled
@@ -150,34 +146,3 @@ def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float)
             if left < x < right:
                 below = max((b.top for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to), default=bottom)
                 ax.plot([x, x], [max(below, bottom), block.top], **line)
-
-
-@style.styled
-def chain_timeline(result: ChainResult) -> Figure:
-    """What the robot does above, when its plans are made below; a tick where it was ready for the plan."""
-    fig = new_figure(PAGE_IN, 1.5)
-    ax = fig.subplots()
-    starts = [0, *(np.flatnonzero(result.phase[1:] != result.phase[:-1]) + 1), len(result.phase)]
-    for first, after in itertools.pairwise(starts):
-        width = result.t[after - 1] - result.t[first]
-        ax.barh(1, width, BAR, left=result.t[first], color=PHASE_COLORS[str(result.phase[first])])
-    colors = {"planned in the air": style.PURPLE, "standing": tint(style.PURPLE, CORRECTION), "late": style.VERMILION}
-    for jump in result.jumps:
-        for plan in jump.plans:
-            late = jump.number and not plan.in_time
-            kind = "late" if late else "planned in the air" if plan.air else "standing"
-            ax.barh(0, plan.solve_s, BAR, left=plan.looked_s, color=colors[kind])
-            ax.text(plan.looked_s, -0.36, f"{1000 * plan.solve_s:.0f}", va="top", fontsize=6.5)
-            if plan.needed_s is not None and jump.number:
-                ax.plot([plan.needed_s] * 2, [-BAR / 2, 1.5], color=INK, linewidth=0.7)
-            if plan.began_s is not None:
-                ax.text(plan.began_s + 0.03, 1.38, str(jump.number + 1), ha="left", va="bottom", fontsize=6.5)
-    ax.set_yticks([0, 1], ["planning [ms]", "robot"])
-    ax.set(xlabel="time [s]", ylim=(-0.75, 1.75), xlim=(0.0, float(result.t[-1])))
-    ax.grid(False, axis="y")
-    bars = [Patch(color=color, label=kind) for kind, color in colors.items()]
-    if result.in_time == len(result.replans):
-        bars.pop()
-    bars.insert(2, Line2D([], [], color=INK, linewidth=0.7, label="still enough"))
-    legend_above(fig, [*phase_handles(*PHASE_COLORS), *bars])
-    return fig

@@ -146,12 +146,8 @@ def save_figure(
     """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
 
     The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
-    It is laid out once, for the PNG; the PDF and what a notebook shows keep that layout. Returns the figure.
-
-    Raises
-    ------
-    InputError
-        If ``name`` is not a plain file name, or the folder cannot be written.
+    It is laid out once, for the PNG; the PDF and what a notebook shows keep that layout. Returns the figure. Raises
+    :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
         raise InputError(f"figure name {name!r}: must be a plain file name without ending, such as 'f08_joints'")

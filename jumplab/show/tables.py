@@ -44,14 +44,10 @@ class Table:
 def table(
     rows: Iterable[Mapping], columns: Iterable[str] | None = None, *, digits: int = 4, decimals: int | None = None
 ) -> Table:
-    """Rows of named values as a :class:`Table`.
+    """Rows of named values as a :class:`Table`; a missing value is left blank.
 
-    Parameters
-    ----------
-    rows : mappings with the same keys (a missing one is left blank).
-    columns : which keys, in which order, those of the first row if None; a mapping renames them ("key": "heading").
-    digits : significant digits of numbers.
-    decimals : places after the point instead, for numbers that are not whole by type: 1.000 beside 0.997, not 1.
+    ``columns`` says which keys, in which order, those of the first row if None; a mapping renames them. Numbers have
+    ``digits`` significant digits, or ``decimals`` places after the point if they are not whole by type.
     """
     rows = list(rows)
     if columns is None:

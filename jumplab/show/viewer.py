@@ -86,16 +86,10 @@ def page(
 ) -> Page:
     """The page of one jump: to play, to scrub, to look at from all sides.
 
-    Parameters
-    ----------
-    plan, simulation : at least one of them; with both, the page offers each alone and both together.
-    task : what was asked, for the title and the line where the toes should land.
-    scene : ground; flat if None.
-    marks_m : further places where the toes should land, from where they start [m].
-    title : instead of the task's.
-    fps : frames a second.
-
-    Raises :class:`InputError` if there is nothing to show, or ``fps`` cannot be meant.
+    It shows ``plan``, ``simulation``, or each alone and both together; the title is that of the ``task``, whose toes'
+    goal is marked, unless ``title`` says otherwise. ``marks_m`` are further places where the toes should land, from
+    where they start [m]; the ``scene`` is flat if None. Raises :class:`InputError` if there is nothing to show, or
+    ``fps``, frames a second, cannot be meant.
     """
     given = {name: record for name, record in (("simulation", simulation), ("plan", plan)) if record is not None}
     if not given:
@@ -122,9 +116,7 @@ def page(
         "clips": clips,
         "ruler": _ruler(scene, span, toe),
         "view": {"x": span, "z": _heights(scene, span, motions), "width": 2 * TRACK_HALF_WIDTH_M},
-        "colors": {
-            p: {"trunk": tint(c, 1.0), "limb": tint(c, LIMB_SHARE), "rest": rest} for p, c in PHASE_COLORS.items()
-        },
+        "colors": {p: dict(trunk=tint(c, 1.0), limb=tint(c, LIMB_SHARE), rest=rest) for p, c in PHASE_COLORS.items()},
         "css": PHASE_COLORS,
         "ghost": GHOST_ALPHA,
     }
@@ -163,11 +155,9 @@ def _assemble(title: str, facts: Mapping[str, Any], commands: list[str]) -> str:
     engine = (resources.files("meshcat") / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
     if "</script" in engine:
         raise InputError("this version of meshcat cannot be put into a page; install another one")
-
     form = dict(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    data = {
-        name: json.dumps(x, **form).replace("<", "\\u003c") for name, x in (("FACTS", facts), ("COMMANDS", commands))
-    }
+    data = {"FACTS": facts, "COMMANDS": commands}
+    data = {name: json.dumps(x, **form).replace("<", "\\u003c") for name, x in data.items()}
     texts = {name: (files / file).read_text(encoding="utf-8") for name, file in FILES.items()}
     return Template(texts.pop("PAGE")).substitute(TITLE=html.escape(title), ENGINE=engine, **data, **texts)
 
@@ -233,12 +223,10 @@ def _lay_ground(vis: meshcat.Visualizer, scene: Scene, span: tuple[float, float]
     across = 2 * TRACK_HALF_WIDTH_M
     for number, block in enumerate(seen):
         start, end = max(block.x_from, span[0]), min(block.x_to, span[1])
-        node, length, middle = vis[f"{ROOT}/ground/{number}"], float(end - start), (start + end) / 2
+        node, size, middle = vis[f"{ROOT}/ground/{number}"], [float(end - start), across], (start + end) / 2
         depth = float(block.top - min(b.top for b in seen) + TRACK_DEPTH_M - TOP_M)
-        _put(
-            node["side"], shapes.Box([length, across, depth]), (middle, 0.0, block.top - TOP_M - depth / 2), TRACK_SIDE
-        )
-        _put(node["top"], shapes.Box([length, across, TOP_M]), (middle, 0.0, block.top - TOP_M / 2), TRACK_COLOR)
+        _put(node["side"], shapes.Box([*size, depth]), (middle, 0.0, block.top - TOP_M - depth / 2), TRACK_SIDE)
+        _put(node["top"], shapes.Box([*size, TOP_M]), (middle, 0.0, block.top - TOP_M / 2), TRACK_COLOR)
         for name, (step, lift, color) in GRIDS.items():
             _grid(node[name], start, end, block.top + LINE_LIFT_M * lift, step, color)
     for number, x in enumerate(marks):
@@ -259,9 +247,7 @@ def _grid(node: meshcat.Visualizer, start: float, end: float, top: float, step: 
 def _add_robot(vis: meshcat.Visualizer, robot: Robot, name: str) -> dict[str, list[str]]:
     """Shapes of the URDF and the skeleton between the pitch joints, below one node per joint.
 
-    Returns
-    -------
-    Paths to paint: "trunk" and "limb", whose colour tells the phase, and the "rest".
+    Returns the paths to paint: "trunk" and "limb", whose colour tells the phase, and the "rest".
     """
     geometry, root = _visuals(robot), f"{ROOT}/{name}"
     feet = {robot.model.getFrameId(frame) for frame in robot.foot.frames}

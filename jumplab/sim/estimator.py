@@ -79,7 +79,7 @@ LEG_M = 0.7  # turns an encoder's error into one of the foot
 FLOOR = SensorNoise(joint_rad=3e-4, gyro=1e-3, accel=0.05, gyro_bias=1e-5, accel_bias=1e-4, tilt_rad=1e-4)
 
 # parts of the error: attitude (world axes), velocity, place, gyro bias, accelerometer bias, left foot, right foot
-TURN, SPEED, PLACE, GYRO, ACCEL, FEET = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
+TURN, SPEED, PLACE, GYRO, ACCEL, *FEET = (slice(i, i + 3) for i in range(0, 21, 3))
 SIZE = 21
 
 
@@ -128,7 +128,7 @@ class Estimator:
         self._drive[TURN], self._drive[SPEED] = (n.gyro * STEP_S) ** 2, (n.accel * STEP_S) ** 2
         for side in (0, 1):
             walk = SETTLE_WALK if self._standing[side] * STEP_S < SETTLE_S else FOOT_WALK
-            self._drive[_foot(side)] = walk**2 * STEP_S
+            self._drive[FEET[side]] = walk**2 * STEP_S
         self._cov = step @ self._cov @ step.T
         self._cov[np.diag_indices(SIZE)] += self._drive
 
@@ -156,8 +156,7 @@ class Estimator:
     def _plant(self, side: int, arm: np.ndarray) -> None:
         """The foot stands at the trunk's place plus ``arm``, and is as uncertain as that."""
         self._foot[side] = self._place + arm
-        here = _foot(side)
-        sense = np.zeros((3, SIZE))
+        here, sense = FEET[side], np.zeros((3, SIZE))
         sense[:, PLACE], sense[:, TURN] = np.eye(3), -pin.skew(arm)
         self._cov[here, :] = sense @ self._cov
         self._cov[:, here] = self._cov[here, :].T
@@ -166,7 +165,7 @@ class Estimator:
     def _correct(self, side: int, arm: np.ndarray) -> None:
         """The foot has not moved: what the leg says against where it should be."""
         sense = np.zeros((3, SIZE))
-        sense[:, TURN], sense[:, PLACE], sense[:, _foot(side)] = pin.skew(arm), -np.eye(3), np.eye(3)
+        sense[:, TURN], sense[:, PLACE], sense[:, FEET[side]] = pin.skew(arm), -np.eye(3), np.eye(3)
         missed = arm - (self._foot[side] - self._place)
         seen = self._cov @ sense.T  # (SIZE, 3)
         gain = np.linalg.solve(sense @ seen + (self._noise.joint_rad * LEG_M) ** 2 * np.eye(3), seen.T).T
@@ -176,11 +175,7 @@ class Estimator:
         self._attitude = pin.exp3(error[TURN]) @ self._attitude
         self._velocity, self._place = self._velocity + error[SPEED], self._place + error[PLACE]
         self._gyro_bias, self._accel_bias = self._gyro_bias + error[GYRO], self._accel_bias + error[ACCEL]
-        self._foot += error[FEET:].reshape(2, 3)
-
-
-def _foot(side: int) -> slice:
-    return slice(FEET + 3 * side, FEET + 3 * side + 3)
+        self._foot += error[FEET[0].start :].reshape(2, 3)
 
 
 class Perception:

@@ -280,12 +280,8 @@ def _corner_rows(robot: Robot) -> np.ndarray:
     """(20, nx) rows r with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
     foot, mu, spin = robot.foot, PLANNED_FRICTION / np.sqrt(2), SPIN_FRICTION
     half_length, half_width = SOLE_SHARE[0] * (foot.toe - foot.heel) / 2, SOLE_SHARE[1] * foot.half_width
-    one = []
-    for column, reach in ((0, mu), (1, mu), (3, half_width), (4, half_length), (5, spin)):
-        for sign in (1.0, -1.0):
-            row = np.zeros(6)
-            row[2], row[column] = reach, sign
-            one.append(row)
-    rows = np.zeros((20, robot.model.nv + 12))
+    one, rows = np.zeros((10, 6)), np.zeros((20, robot.model.nv + 12))
+    one[:, 2] = np.repeat([mu, mu, half_width, half_length, spin], 2)
+    one[range(10), np.repeat([0, 1, 3, 4, 5], 2)] = np.tile([1.0, -1.0], 5)
     rows[:10, -12:-6] = rows[10:, -6:] = one
     return rows

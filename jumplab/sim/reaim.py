@@ -123,7 +123,7 @@ class Tuck:
         flight = slice(tape.takeoff_index, None)
         self._t, (self._inertia, self._carried) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
         self._pitch = planned_pitch(tape.q[flight])
-        self._size = self._shift = self._speed = 0.0
+        self._size = self._shift = 0.0
         self._turned: float | None = None
         self.miss = 0.0
 
@@ -148,10 +148,8 @@ class Tuck:
             most = SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
             self.miss = self._turned + self._left(self._size, now, time_left, momentum) - self._pitch[-1]
-        before = self._shift
-        self._shift = float(self._place(self._size, now, now, time_left)) - now
-        self._speed = (self._shift - before) / STEP_S
-        return self._shift, self._speed
+        before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
+        return self._shift, (self._shift - before) / STEP_S
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""

@@ -35,25 +35,16 @@ LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot
 
 @dataclass(frozen=True)
 class LandingReference:
-    """A landing to follow, sampled: CoM from the middle between the soles; what is None is not fed forward."""
+    """A landing to follow, sampled; CoM from the middle between the soles. What is None is not fed forward."""
 
     t: np.ndarray  # (N,) time since touchdown [s]; the last sample holds for ever
     com: np.ndarray  # (N, 2) x and z [m]
     com_velocity: np.ndarray  # (N, 2) [m/s]
     L: np.ndarray  # (N,) angular momentum about the pitch axis [kg m^2/s]
-    com_acceleration: np.ndarray | None = None  # (N, 2) [m/s^2]
+    com_acceleration: np.ndarray | None = None  # (N, 2) [m/s^2]; given with the next, or not at all
     L_rate: np.ndarray | None = None  # (N,) [N m]
 
-    at = LandingPlan.at
-
-    def feed_forward(self, time: float) -> tuple[np.ndarray, float]:
-        """CoM acceleration (2,) and rate of L at ``time`` since touchdown, zero after the last sample."""
-        push, twist = np.zeros(2), 0.0
-        if time < self.t[-1] and self.com_acceleration is not None:
-            push = np.array([np.interp(time, self.t, column) for column in self.com_acceleration.T])
-        if time < self.t[-1] and self.L_rate is not None:
-            twist = float(np.interp(time, self.t, self.L_rate))
-        return push, twist
+    at, feed_forward = LandingPlan.at, LandingPlan.feed_forward
 
 
 @dataclass(frozen=True)
@@ -84,6 +75,16 @@ def landing_planner(robot: Robot) -> LandingPlanner:
             del _planners[next(iter(_planners))]
         _planners[robot.hash] = LandingPlanner(robot)
     return _planners[robot.hash]
+
+
+def _landing(robot: Robot, touchdown: Touchdown) -> tuple[LandingPlan | None, str | None, float]:
+    """Stage 1's landing, or None and the reason why there is none; and the time of the solve [s]."""
+    planner, began = landing_planner(robot), thread_time()
+    try:
+        plan, reason = planner.plan(touchdown), None
+    except JumplabError as e:
+        plan, reason = None, str(e)
+    return plan, reason, thread_time() - began
 
 
 class Forecast:
@@ -146,15 +147,9 @@ class LandingAhead:
 
     def plan(self, robot: Robot, q: np.ndarray, v: np.ndarray, time: float, time_left: float) -> LandingPlan | None:
         """Stage 1's landing from the forecast touchdown (q, v), None if there is none."""
-        planner = landing_planner(robot)
-        self.planned_s, self.time_left_s, began = time, time_left, thread_time()
-        try:
-            plan = planner.plan(touchdown_of_state(robot, q, v))
-        except JumplabError as e:
-            self.followed, self.reason, plan = "spring", str(e), None
-        else:
-            self.followed = "planned"
-        self.solve_s = thread_time() - began
+        self.planned_s, self.time_left_s = time, time_left
+        plan, self.reason, self.solve_s = _landing(robot, touchdown_of_state(robot, q, v))
+        self.followed = "spring" if plan is None else "planned"
         return plan
 
     def to_json(self) -> dict:
@@ -182,25 +177,17 @@ class Replan:
         if self._due - STEP_S / 2 <= time <= UNTIL_S:
             self._due += EVERY_S
             now = touchdown_of_state(self._robot, q, v, impact=False)
-            if abs(_off(now, *reference.at(time)[:2])) > OFF_M:
-                self._plan(now, time)
+            com, velocity, _ = reference.at(time)
+            rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))  # the capture point is x + v_x / rate
+            if abs(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate) > OFF_M:
+                plan, _, spent_s = _landing(self._robot, now)
+                if plan is None:  # from here stage 1 knows no landing; the older one is the best there is
+                    self.refused += 1
+                else:
+                    self._next, self.made = Rest(plan, time), self.made + 1
+                self.slowest_s = max(self.slowest_s, spent_s)
         return reference
-
-    def _plan(self, now: Touchdown, time: float) -> None:
-        began = thread_time()
-        try:
-            self._next = Rest(landing_planner(self._robot).plan(now), time)
-            self.made += 1
-        except JumplabError:  # from here stage 1 knows no landing; the older one is the best there is
-            self.refused += 1
-        self.slowest_s = max(self.slowest_s, thread_time() - began)
 
     def to_json(self) -> dict:
         """What the settings of a result say."""
         return {"made": self.made, "refused": self.refused, "slowest_s": self.slowest_s}
-
-
-def _off(now: Touchdown, com: np.ndarray, velocity: np.ndarray) -> float:
-    """Distance between the capture points x + v_x / sqrt(g / z) of a state and of a plan [m]."""
-    rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))
-    return float(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate)

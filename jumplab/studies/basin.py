@@ -74,15 +74,9 @@ def landing_basin(
 ) -> BasinReport:
     """Drop the robot of the plan in ``folder`` from every state of ``grid``; write ``trials.jsonl`` and ``basin.json``.
 
-    The robot is as planned, but for the friction. States that the folder already has are not run again.
-    Raises as :func:`jumplab.studies.trials.run_trials`, and if ``n`` is more than the grid has.
-
-    Parameters
-    ----------
-    folder : result folder of a plan.
-    n : how many states of the grid, in their random order; all if None.
-    settings : ``ranges`` is not used.
-    jobs, progress : see :func:`jumplab.studies.trials.run_trials`.
+    The robot is as planned, but for the friction; ``settings.ranges`` is not used. ``n`` states are tried in their
+    random order, all if None. The rest is as in :func:`jumplab.studies.trials.run_trials`, which also says what is
+    raised; so is an ``n`` of more than the grid has.
     """
     states = grid.states
     count = len(states) if n is None else n

@@ -32,14 +32,6 @@ from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, guess_
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 from jumplab.task import JumpTask
 
-# name -> (words, limit, aim); ratios of CPU times
-GOALS = {
-    "warm_over_direct": ("three steps, warm / direct NLP's solve", 0.6, 0.25),
-    "replan_over_direct": ("re-plan of a neighbouring target / direct NLP's solve", 0.3, 0.1),
-    "cold_over_direct": ("new process to finished plan / direct NLP's build and solve", 1.5, None),
-    "peak_memory_gib": ("peak memory of a new process [GiB]", 1.0, None),
-    "node_growth_error": ("cost of an iteration: largest distance from a straight line over the nodes", 0.2, None),
-}
 AT_ONCE, OVER_COARSE, APPROACHED = "direct, at once", "direct, over a coarse mesh", "direct, Gauss-Newton first"
 DIRECT = (AT_ONCE, OVER_COARSE)  # by ipopt alone, from a cold start
 WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
@@ -53,13 +45,11 @@ def report(
 
     Returns
     -------
-    dict of plain types: ``head``; the numbers of :data:`GOALS` (None if not measured), ``cold_kept_over_direct`` (as
-    ``cold_over_direct``, but the new process found its functions on file), ``tape_over_direct`` (as
-    ``warm_over_direct``, with the plan's 1 kHz tape, of which the direct solve has none), ``warm_over_approached`` (as
-    ``warm_over_direct``, but the direct NLP is begun with Gauss-Newton steps too), ``goals`` (name -> value, limit,
-    aim, reached), ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s`` and
-    ``raw_s`` (name -> CPU and wall times), ``where`` (stage -> share of the three steps' time), ``growth``,
-    ``machine`` (what it ran on, and with which packages).
+    dict of plain types: ``head``; ratios of CPU times, None if not measured: three steps (``warm``), plan with its tape
+    (``tape``), re-plan, and new process (``cold``, ``cold_kept`` with functions on file; over build and solve) over the
+    direct solve, three steps over the approached one; ``node_growth_error``, see :func:`line_error`;
+    ``peak_memory_gib``; ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s``
+    and ``raw_s`` (CPU and wall times), ``where`` (stage -> share of a plan's time), ``growth``, ``machine``.
     """
     cpu, known = watch.cpu, versions()
     peer = min(DIRECT, key=lambda name: np.median(cpu[name]))
@@ -68,43 +58,32 @@ def report(
     raw = {"cpu": cpu, "wall": watch.wall}
     medians = {kind: {n: float(np.median(x)) for n, x in times.items()} for kind, times in raw.items()}
     stages = {name: t for name, t in medians["cpu"].items() if name.startswith("plan: ")}
-    numbers = {
+    packages = {name: known[name] for name in ("jumplab", "casadi", "pin", "proxsuite", "numpy")}
+    machine = {"processor": platform.machine(), "system": platform.system(), "cpus": joblib.cpu_count()}
+    machine |= {"load": os.getloadavg()[0], "python": known["python"], "versions": packages}
+    return {
         "warm_over_direct": _ratio(steps, cpu[peer]),
         "replan_over_direct": _ratio(cpu["re-plan"], cpu[peer]),
-        "cold_over_direct": _ratio(cpu["cold"], whole) if "cold" in cpu else None,
+        "cold_over_direct": _ratio(cpu.get("cold"), whole),
         "peak_memory_gib": max(peaks, default=None),
         "node_growth_error": line_error(growth["nodes"]),
-    }
-    goals = {}
-    for (name, value), (_, limit, aim) in zip(numbers.items(), GOALS.values(), strict=True):
-        goals[name] = dict(value=value, limit=limit, aim=aim, reached=None if value is None else bool(value <= limit))
-    return {
-        **numbers,
-        "goals": goals,
         "peer": peer,
         "tape_over_direct": _ratio(cpu["plan"], cpu[peer]),
         "warm_over_approached": _ratio(steps, cpu[APPROACHED]),
-        "cold_kept_over_direct": _ratio(cpu["cold, functions kept"], whole) if "cold" in cpu else None,
+        "cold_kept_over_direct": _ratio(cpu.get("cold, functions kept"), whole),
         "audits": {name: {"clean": sum(found), "of": len(found)} for name, found in audits.items()},
         **head,
         "median_s": medians,
         "where": {name: t / sum(stages.values()) for name, t in stages.items()},
         "growth": growth,
         "raw_s": raw,
-        "machine": {
-            "processor": platform.machine(),
-            "system": platform.system(),
-            "cpus": joblib.cpu_count(),
-            "load": os.getloadavg()[0],
-            "python": known["python"],
-            "versions": {name: known[name] for name in ("jumplab", "casadi", "pin", "proxsuite", "numpy")},
-        },
+        "machine": machine,
     }
 
 
-def _ratio(times: Sequence[float], base: Sequence[float]) -> float:
+def _ratio(times: Sequence[float] | None, base: Sequence[float]) -> float | None:
     """Median over the repeats of the ratio within one repeat."""
-    return float(np.median(np.divide(times, base)))
+    return None if times is None else float(np.median(np.divide(times, base)))
 
 
 def line_error(rows: list[dict[str, float]]) -> float | None:
@@ -116,57 +95,21 @@ def line_error(rows: list[dict[str, float]]) -> float | None:
     return float(np.max(np.abs(t / line - 1)))
 
 
-def text(found: Mapping[str, Any]) -> str:
-    """The report for people."""
-    lines = [f"direct NLP, the peer: {found['peer']} (ipopt from a cold start, the faster of two ways)", ""]
-    ratios = [(GOALS[name][0], _goal(goal)) for name, goal in found["goals"].items()]
-    if found["cold_kept_over_direct"] is not None:
-        ratios += [("the same with functions kept from an earlier process", f"{found['cold_kept_over_direct']:.3f}")]
-    begun = "three steps, warm / direct NLP begun with stage 3's Gauss-Newton steps"
-    ratios += [("three steps and the 1 kHz tape, warm / direct NLP's solve", f"{found['tape_over_direct']:.3f}")]
-    ratios += [(begun, f"{found['warm_over_approached']:.3f}")]
-    spread = found["growth"]["spread"]
-    for key, peer in (("ratio", "direct NLP at once"), ("ratio_approached", APPROACHED)) if spread else ():
-        values = [row[key] for row in spread]
-        said = f"{np.median(values):.3f}  (median; {min(values):.2f} to {max(values):.2f})"
-        clean = f"{sum(row['clean'] for row in spread)} clean"
-        ratios += [(f"plan / {peer}, over {len(spread)} other targets", f"{said}, {clean}")]
-    lines += ["ratios and limits", *(f"  {words:<76} {said}" for words, said in ratios)]
-    lines += ["", f"medians of {found['repeats']} repeats [s]" + " " * 24 + "CPU      wall"]
-    wall = {name: f"{t:>10.3f}" for name, t in found["median_s"]["wall"].items()}
-    lines += [f"  {name:<38}{t:>10.3f}{wall.get(name, '')}" for name, t in found["median_s"]["cpu"].items()]
-    lines += ["", "iterations"]
-    for name, row in found["iterations"].items():
-        lines.append(f"  {name}: " + ", ".join(f"{stage} {n}" for stage, n in row.items()))
-    lines += ["", "growth of stage 3 with its mesh", "  intervals  iterations   solve [s]   per iteration [ms]"]
-    for r in found["growth"]["nodes"]:
-        n, count, solve_s, each_s = (r[key] for key in ("intervals", "iterations", "solve_s", "iteration_s"))
-        lines.append(f"  {n:>9}{count:>12}{solve_s:>12.3f}{1e3 * each_s:>14.2f}")
-    targets = ", ".join(f"{n}: {t:.2f} s" for n, t in found["growth"]["targets_cpu_s"].items())
-    audits = "; ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items())
-    timed = f"plans that were timed and are clean in the audit: {audits}"
-    lines += [f"  CPU time by number of targets: {targets}", "", timed]
-    if not all(goal["reached"] for goal in found["goals"].values()):
-        lines += ["", "where the time of the three steps goes"]
-        lines += [f"  {name.removeprefix('plan: '):<16}{share:>6.0%}" for name, share in found["where"].items()]
-        own = f"{found['functions_s']['plan']:.3f} s of CPU time are function evaluations"
-        lines += [f"  of the solve on the fine mesh, {own}, the rest is ipopt's and its linear solver's"]
-    return "\n".join(lines)
+def rows(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A short table of a :func:`report`: median CPU time of each piece [s], and its ratio to the direct NLP's."""
+    cpu = found["median_s"]["cpu"]
+    steps_s = sum(t for name, t in cpu.items() if name.startswith("plan: ") and name != TAPE)
+    ratios = {"three steps": "warm", "plan": "tape", "re-plan": "replan", "cold": "cold"}
+    ratios = {name: found[f"{key}_over_direct"] for name, key in ratios.items()}
+    ratios |= {"cold, functions kept": found["cold_kept_over_direct"], found["peer"]: 1.0}
+    return [{"what": n, "CPU [s]": t, "ratio": ratios.get(n)} for n, t in {"three steps": steps_s, **cpu}.items()]
 
 
-def _goal(goal: Mapping[str, Any]) -> str:
-    if goal["value"] is None:
-        return "not measured"
-    aim = f", aim {goal['aim']:g}" if goal["aim"] else ""
-    return f"{goal['value']:.3f}  (limit {goal['limit']:g}{aim}): {'reached' if goal['reached'] else 'not reached'}"
-
-
-# measure ------------------------------------------------------------------------------------------
 TASK, MESH = JumpTask(1.0, 0.5), Mesh()  # the paper's target, the usual mesh
 NEIGHBOUR_M = 0.05  # how much farther the re-planned target is
 NODES = (20, 40, 60, 80, 100, 120)  # intervals of the three phases together
 NODE_REPEATS = 3  # the growth is a fit over many meshes
-TARGETS = (1, 2, 4, 8)
+TARGETS = (1, 2, 4, 8)  # numbers of targets for the growth with targets
 # shares of the target's distance and rise; how many iterations one target takes is a matter of luck
 SPREAD = ((0.0, 0.8), (0.2, 0.6), (0.3, 1.0), (0.4, 0.4), (0.6, 1.0), (0.8, 0.6), (1.0, 0.6), (1.1, 0.8))
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
@@ -219,18 +162,12 @@ def bench(
     cold: bool = True,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Measure everything; returns plain types, see :func:`report`.
+    """Measure everything ``repeats`` times; returns plain types, see :func:`report`.
 
-    Raises :class:`InputError` for fewer repeats than 1, another :class:`JumplabError` if the target has no plan.
-
-    Parameters
-    ----------
-    robot_name : shipped robot, or path of a TOML file.  task : the target.
-    repeats : how often each thing is done; at least 1.
-    mesh : of stage 3 and of the direct NLP; ``cold`` processes know only the default.
-    nodes : numbers of intervals for the growth with nodes.
-    spread : further targets, as shares of the target's distance and rise, planned once in both ways.
-    cold : also time new processes.  say : is told what goes on.
+    ``mesh`` is that of stage 3 and of the direct NLP (new processes, timed if ``cold``, know only the default),
+    ``nodes`` are numbers of intervals for the growth with nodes, ``spread`` further targets, as shares of the target's
+    distance and rise; ``say`` is told what goes on. Raises :class:`InputError` for fewer repeats than 1, another
+    :class:`JumplabError` if the target has no plan.
     """
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
@@ -253,8 +190,11 @@ def bench(
             if cold:
                 peaks.append(_cold(watch, robot_name, task, audits, kept))
     say("growth with nodes and targets")
-    growth = {"nodes": _nodes(planner, task, nodes), "targets_cpu_s": _targets(planner, task)}
-    growth["spread"] = _spread(planner, ways, task, spread)
+    each = Stopwatch()
+    for k in range(TARGETS[-1]):  # different targets with one planner
+        each("plan", planner.plan, replace(task, distance_m=task.distance_m - 0.02 * k))
+    growth = {"nodes": _nodes(planner, task, nodes), "spread": _spread(planner, ways, task, spread)}
+    growth["targets_cpu_s"] = {str(n): sum(each.cpu["plan"][:n]) for n in TARGETS}
     head = {"robot": robot.name, "target": vars(task), "mesh": mesh.intervals(), "repeats": repeats}
     head["iterations"] = {name: {r.stage: r.iterations for r in plan.statistics} for name, plan in plans.items()}
     # CPU time of function evaluations in the solve on the fine mesh
@@ -282,9 +222,8 @@ def _once(
 
 
 def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, list[bool]], kept: str) -> float:
-    """One plan in a new process that builds everything, and one in another that finds the functions of an earlier one
-    in the folder ``kept``; returns the larger peak of memory [GiB]. Python's own bytecode is on file for both, as it is
-    after any first run."""
+    """One plan in a new process that builds everything, one in another that finds functions on file in ``kept``; both
+    find Python's bytecode there. Returns the larger peak of memory [GiB]."""
     peak = 0.0
     environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -322,8 +261,8 @@ def _nodes(planner: Planner, task: JumpTask, nodes: Sequence[int]) -> list[dict[
 def _spread(
     planner: Planner, ways: Mapping[str, Callable], task: JumpTask, spread: Sequence[tuple[float, float]]
 ) -> list[dict[str, Any]]:
-    """Other targets, each planned once by three steps and directly, by ipopt at once and begun with Gauss-Newton steps:
-    CPU times [s] (the peers' of their solves alone, as everywhere), and the ratios; not those without a plan."""
+    """Other targets, each planned once by three steps, by ipopt at once and begun with Gauss-Newton steps: CPU times
+    [s] and their ratios; not those without a plan."""
     rows = []
     for distance, height in spread:
         place = {"distance_m": distance * task.distance_m, "height_m": height * task.height_m}
@@ -339,11 +278,3 @@ def _spread(
         times |= {"approached_s": begun_s, "ratio_approached": plan_s / begun_s}
         rows.append(place | times | {"clean": audit(plan.tape, planner.robot, other).passed})
     return rows
-
-
-def _targets(planner: Planner, task: JumpTask) -> dict[str, float]:
-    """CPU time [s] of planning so many different targets with one planner."""
-    watch = Stopwatch()
-    for k in range(TARGETS[-1]):
-        watch("plan", planner.plan, replace(task, distance_m=task.distance_m - 0.02 * k))
-    return {str(n): sum(watch.cpu["plan"][:n]) for n in TARGETS}

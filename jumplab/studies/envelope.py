@@ -107,16 +107,11 @@ def envelope(
     workers: int = 1,
     tell: Callable[[str], None] | None = None,
 ) -> Envelope:
-    """Solve the whole map.
+    """Solve the whole map: ``distances`` and ``heights`` of its cells [m], rising.
 
-    Raises :class:`InputError` if the grid is empty or too large, or the folder holds cells of another robot.
-
-    Parameters
-    ----------
-    distances, heights : of the cells [m], rising.
-    folder : where finished cells are kept; cells found there are not solved again.
-    workers : processes that share the rows.
-    tell : called with a line per finished row.
+    Finished cells are kept in ``folder``, and not solved again. ``workers`` are processes that share the rows; ``tell``
+    is called with a line per finished row. Raises :class:`InputError` if the grid is empty or too large, or the folder
+    holds cells of another robot.
     """
     if not 0 < len(distances) * len(heights) <= MAX_CELLS:
         raise InputError(f"the map has {len(distances)} x {len(heights)} cells, must be 1 to {MAX_CELLS}")
@@ -144,9 +139,8 @@ def _row(
     for i, distance in enumerate(distances):
         cell = done.get((distance, height_m))
         if cell is None:
-            if failed >= GIVE_UP:
-                cell = Cell(distance, height_m, False, BEYOND, math.nan)
-            else:
+            cell = Cell(distance, height_m, False, BEYOND, math.nan)
+            if failed < GIVE_UP:
                 cell, guess = _solve(robot, JumpTask(distance, height_m), guess, cold=True)
                 guesses[i] = guess if cell.solved else None
             _keep(cell, robot, path)

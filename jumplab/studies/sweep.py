@@ -121,17 +121,12 @@ def run_case(case: Case) -> dict[str, Any]:
 def run(
     cases: list[Case], out: str | Path, *, jobs: int = -1, cluster: str | None = None, progress: bool | None = None
 ) -> list[dict[str, Any]]:
-    """Plan all cases that have no line in ``out`` yet, and write the table.
+    """Plan all ``cases`` of a :func:`grid` that have no line in the folder ``out`` yet, and write the table.
 
-    Returns one row per case, in their order, with the columns of :data:`COLUMNS`. Raises :class:`InputError` if a robot
-    cannot be read, the folder holds another sweep, or there is no such cluster.
-
-    Parameters
-    ----------
-    cases : from :func:`grid`.  out : folder; made if it is not there.
-    jobs : processes; -1 for as many as there are processors.
-    cluster : address of a Dask scheduler that does the work instead, for instance "tcp://host:8786".
-    progress : a bar; by default on a terminal only.
+    ``jobs`` are processes, -1 for one per processor; a ``cluster``, the address of a Dask scheduler such as
+    "tcp://host:8786", does the work instead. ``progress`` is a bar; by default on a terminal only. Returns one row per
+    case, in their order, with the :data:`COLUMNS`. Raises :class:`InputError` if a robot cannot be read, the folder
+    holds another sweep, or there is no such cluster.
     """
     _check_weights(cases)
     hashes = {name: Robot.load(name).hash for name in sorted({case.robot for case in cases})}

@@ -214,8 +214,11 @@ class TrialReport:
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``trials.json``; depends on the trials alone, not on how or when they were run."""
-        measured = {name: self.values(name) for name in ("foot_distance_m", "com_rise_m")}
         kinds = {"least": np.min, "median": np.median, "largest": np.max}
+        measured = {
+            name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x := self.values(name)) else None
+            for name in ("foot_distance_m", "com_rise_m")
+        }
         return {
             "schema": SCHEMA,
             "success_rate": self.success_rate,
@@ -225,10 +228,7 @@ class TrialReport:
             "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed},
             "reasons": self.reasons,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
-            "landed_metrics": {
-                name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x) else None
-                for name, x in measured.items()
-            },
+            "landed_metrics": measured,
             "target": self.target,
             "seed": self.seed,
             "settings": {**asdict(self.settings), "hash": self.trials[0].key.settings},
@@ -254,14 +254,9 @@ def run_trials(
 ) -> TrialReport:
     """Let ``n`` perturbed robots jump the plan in ``folder``; write ``trials.jsonl`` and ``trials.json`` there.
 
-    Raises :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
-
-    Parameters
-    ----------
-    folder : result folder of a plan; trials that it already has are not run again.
-    n : number of trials; the first ones of a larger number are the same.  seed : of the whole series.
-    jobs : processes; one per core if None.
-    progress : a bar on stderr; only on a terminal if None.
+    Trials that the folder already has are not run again; the first ones of a larger ``n`` are the same. ``jobs`` are
+    processes, one per core if None; ``progress`` is a bar on stderr, only on a terminal if None. Raises
+    :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
     """
     check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)

@@ -12,7 +12,6 @@ from matplotlib.patches import Arc, Circle, Ellipse, FancyArrowPatch, FancyBboxP
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.show.bodies import BODY, Silhouette, draw_com, draw_five_link, draw_ground, draw_robot
-from jumplab.show.render import Camera, Renderer
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -29,6 +28,7 @@ from jumplab.show.style import (
     styled,
     tint,
 )
+from paper.render import Camera, Renderer
 
 ARROW = dict(arrowstyle="-|>", mutation_scale=7, linewidth=0.9, shrinkA=0, shrinkB=0)
 

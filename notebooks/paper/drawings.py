@@ -15,7 +15,6 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, equal_scales, film_strip, strobe
 from jumplab.show.simulations import AFTER_TOUCHDOWN_S
-from jumplab.show.simulations import trunk_pitch as trunk_angle  # of a flip: whole turns count
 from jumplab.show.style import (
     BAND,
     COLUMN_IN,
@@ -48,6 +47,7 @@ from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.srmp.landing import LandingPlan
 from jumplab.task import GRAVITY
 from paper.diagrams import arrow, ellipse
+from paper.experiments import trunk_pitch as trunk_angle  # of a flip: whole turns count
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult

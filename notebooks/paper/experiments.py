@@ -1,7 +1,8 @@
-"""One-off figures of many jumps: the three experiments (Figs. 13 and 14), robots that fall, wrong states, chains."""
+"""One-off figures of simulations: the experiments (Figs. 13, 14), landing, robots that fall, wrong states, chains."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,13 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, Silhouette, draw_path, strobe
-from jumplab.show.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames
-from jumplab.show.simulations import frame_rows
 from jumplab.show.studies import LEGEND_IN, draw_goals, draw_scene, span
 from jumplab.show.style import (
     COLUMN_IN,
@@ -23,6 +23,7 @@ from jumplab.show.style import (
     INK,
     LANDING,
     LIMIT_STYLE,
+    NOTE_STYLE,
     PAGE_IN,
     PHASE_COLORS,
     PURPLE,
@@ -41,6 +42,8 @@ from jumplab.show.style import (
     tint,
 )
 from jumplab.studies.trials import wilson
+from jumplab.task import GRAVITY
+from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame_rows
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Scene, SimulationResult
@@ -63,6 +66,10 @@ BASIN_SINGLE_IN, BASIN_ROW_IN = 2.4, 1.55  # height of a single map, of each of 
 PER_BIN = 10  # robots per bin of the map; fewer would make its intervals meaningless
 MAX_BINS = 5
 TOLERANCE_M = 0.03  # what a jump of a chain may miss by
+STANDING_UP_S = 1.0  # how much of a landing is shown
+SMOOTHING_S = 0.02  # longer than an impact's ringing, shorter than the landing's push of 0.2 s
+CORRECTION = 0.5  # strength of what is planned on the ground
+BAR = 0.62  # height of a bar of the timeline
 # feature, label, factor to the label's unit
 FEATURES = (
     ("friction", "friction of the soles", 1.0),
@@ -176,6 +183,72 @@ def measured_jump(measured: Measurement, tape: Tape, robot: Robot) -> Figure:
     panel_letters(axes)
     legend_above(fig, phase_handles("launch", "flight", reference="plan"))
     return fig
+
+
+# Landing -------------------------------------------------------------------------------------------------------
+@styled
+def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
+    """Trunk pitch, vertical ground force and share of the torque limits used, through the whole jump.
+
+    Forces are means over the last :data:`SMOOTHING_S`, which keeps their impulse: the bare peak of an impact says more
+    about the simulation's step than about the robot. Bars are such means too, the largest per phase, left or right; the
+    tick beside a bar is the largest single step.
+    """
+    fig = new_figure(PAGE_IN, 2.5)
+    pitch, force, bars = fig.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
+    step, weight = float(result.t[1] - result.t[0]), robot.total_mass * GRAVITY / 1000
+    seen = result.t <= tape.t[-1] + STANDING_UP_S
+    angles = [np.degrees(trunk_pitch(q)) for q in (result.q, tape.q)]
+    pushes = [smooth(f[:, :, 2].sum(axis=1), step) / 1000 for f in (result.foot_wrench, tape.f)]
+    panels = ((pitch, angles, "trunk pitch [deg]"), (force, pushes, "mean vertical force [kN]"))
+    for ax, (actual, planned), label in panels:
+        compare(ax, (result.t[seen], actual[seen], result.phase[seen]), (tape.t, planned), label=label)
+        ax.set_xlabel("time [s]")
+    limits(force, weight)
+    force.annotate("weight", (result.t[seen][-1], weight), xytext=(0, 2), ha="right", **NOTE_STYLE)
+    _torque_shares(bars, result, robot)
+    panel_letters((pitch, force, bars))
+    legend_above(fig, phase_handles(*PHASE_COLORS, reference="plan", limit="weight, torque limit"))
+    return fig
+
+
+def _torque_shares(ax: Axes, result: SimulationResult, robot: Robot) -> None:
+    """Bars: largest mean of |torque| / limit within a phase, the worse of left and right; ticks: largest step."""
+    step = float(result.t[1] - result.t[0])
+    window = round(SMOOTHING_S / step)
+    names = [name.removeprefix("left_").removeprefix("right_") for name in result.joint_names]
+    groups = list(dict.fromkeys(names))
+    step_peak, mean_peak = np.zeros((2, len(PHASE_COLORS), len(groups)))
+    for name, group, tau in zip(result.joint_names, names, result.tau.T, strict=True):
+        share = np.abs(tau) / robot.actuators[name]["effort"]  # (N,)
+        g = groups.index(group)
+        for k, p in enumerate(PHASE_COLORS):
+            part = share[result.phase == p]
+            step_peak[k, g] = max(step_peak[k, g], part.max(initial=0.0))
+            mean = smooth(part, step)[window - 1 :]  # from the first whole window of the phase on
+            mean_peak[k, g] = max(mean_peak[k, g], mean.max(initial=0.0))
+    for k, color in enumerate(PHASE_COLORS.values()):
+        at = np.arange(len(groups)) + 0.26 * (k - 1)
+        ax.barh(at, mean_peak[k], 0.24, color=color)
+        ax.plot(step_peak[k], at, linestyle="none", marker="|", markersize=5, markeredgewidth=1.2, color=color)
+    ax.axvline(1.0, **LIMIT_STYLE)
+    ax.set_yticks(range(len(groups)), [g.replace("_", " ") for g in groups])
+    ax.invert_yaxis()
+    ax.set(xlabel="largest torque / limit", xlim=(0, 1.05))
+    ax.grid(False, axis="y")
+
+
+def smooth(values: np.ndarray, step_s: float) -> np.ndarray:
+    """Mean (N,) over the last :data:`SMOOTHING_S` of samples ``step_s`` apart; at first over those that there are."""
+    width = max(1, round(SMOOTHING_S / step_s))
+    total = np.concatenate([np.zeros(width), np.cumsum(values)])
+    return (total[width:] - total[:-width]) / np.minimum(np.arange(len(values)) + 1, width)
+
+
+def trunk_pitch(q: np.ndarray) -> np.ndarray:
+    """Pitch (N,) of the trunk [rad] from configurations (N, nq), continuous through full turns."""
+    x, y, z, w = q[:, 3:7].T
+    return np.unwrap(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
 
 
 # Many robots -----------------------------------------------------------------------------------------------------
@@ -323,4 +396,35 @@ def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figu
     panel_letters((error, clock))
     handles, _ = clock.get_legend_handles_labels()
     legend_above(fig, [*handles, Line2D([], [], **LIMIT_STYLE, label=f"{100 * TOLERANCE_M:g} cm")])
+    return fig
+
+
+@styled
+def chain_timeline(result: ChainResult) -> Figure:
+    """What the robot does above, when its plans are made below; a tick where it was ready for the plan."""
+    fig = new_figure(PAGE_IN, 1.5)
+    ax = fig.subplots()
+    starts = [0, *(np.flatnonzero(result.phase[1:] != result.phase[:-1]) + 1), len(result.phase)]
+    for first, after in itertools.pairwise(starts):
+        width = result.t[after - 1] - result.t[first]
+        ax.barh(1, width, BAR, left=result.t[first], color=PHASE_COLORS[str(result.phase[first])])
+    colors = {"planned in the air": PURPLE, "standing": tint(PURPLE, CORRECTION), "late": VERMILION}
+    for jump in result.jumps:
+        for plan in jump.plans:
+            late = jump.number and not plan.in_time
+            kind = "late" if late else "planned in the air" if plan.air else "standing"
+            ax.barh(0, plan.solve_s, BAR, left=plan.looked_s, color=colors[kind])
+            ax.text(plan.looked_s, -0.36, f"{1000 * plan.solve_s:.0f}", va="top", fontsize=6.5)
+            if plan.needed_s is not None and jump.number:
+                ax.plot([plan.needed_s] * 2, [-BAR / 2, 1.5], color=INK, linewidth=0.7)
+            if plan.began_s is not None:
+                ax.text(plan.began_s + 0.03, 1.38, str(jump.number + 1), ha="left", va="bottom", fontsize=6.5)
+    ax.set_yticks([0, 1], ["planning [ms]", "robot"])
+    ax.set(xlabel="time [s]", ylim=(-0.75, 1.75), xlim=(0.0, float(result.t[-1])))
+    ax.grid(False, axis="y")
+    bars = [Patch(color=color, label=kind) for kind, color in colors.items()]
+    if result.in_time == len(result.replans):
+        bars.pop()
+    bars.insert(2, Line2D([], [], color=INK, linewidth=0.7, label="still enough"))
+    legend_above(fig, [*phase_handles(*PHASE_COLORS), *bars])
     return fig

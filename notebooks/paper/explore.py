@@ -7,10 +7,10 @@ from typing import Any
 
 from jumplab.errors import JumplabError
 from jumplab.show.style import Picture
-from jumplab.show.widgets import watched
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.task import JumpTask
 from paper import drawings
+from paper.widgets import watched
 
 DISTANCE_M, HEIGHT_M, STEP_M = (-0.4, 1.2), (0.1, 0.6), 0.05  # what the sliders offer, mostly within reach
 WIDE = {"description_width": "initial"}  # names are shown in full

@@ -4,8 +4,18 @@ In: a target. Out: a :class:`SrmpPlan` of launch and flight, one nonlinear progr
 printed ties the launch's final angular momentum to the rotation that the flight needs. Begin with :mod:`problem`.
 """
 
+from jumplab.stages.srmp.landing import LandingPlanner
 from jumplab.stages.srmp.planner import SrmpPlan, SrmpPlanner, naive_guess, parameters
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.stages.srmp.settings import SrmpSettings
 
-__all__ = ["SYMMETRY_OFF", "SrmpPlan", "SrmpPlanner", "SrmpSettings", "build_problem", "naive_guess", "parameters"]
+__all__ = [
+    "SYMMETRY_OFF",
+    "LandingPlanner",
+    "SrmpPlan",
+    "SrmpPlanner",
+    "SrmpSettings",
+    "build_problem",
+    "naive_guess",
+    "parameters",
+]

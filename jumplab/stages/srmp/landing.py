@@ -114,7 +114,7 @@ class LandingPlan(SrmpStance):
 
         A controller that follows only :meth:`at` pushes with little more than the weight until it lags behind.
         """
-        if time >= self.duration_s:
+        if time >= self.t[-1] or self.com_acceleration is None:
             return np.zeros(2), 0.0
         x, z, rate = (np.interp(time, self.t, column) for column in (*self.com_acceleration.T, self.L_rate))
         return np.array([x, z]), float(rate)

@@ -20,10 +20,8 @@ from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
-# posture ------------------------------------------------------------------------------------------
-# our choice: half-way between the stance and the bottom of a landing; a jump from there needs 0.70 s instead of 0.86 s,
-# and the robot is in it sooner after touchdown
-CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}
+CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}  # half-way to the bottom of a landing: soon reached, quick to launch
+MOST_JUMPS = 50  # two minutes of simulated time; more is surely a typo
 
 
 def crouched(robot: Robot) -> Robot:
@@ -37,9 +35,6 @@ def crouched(robot: Robot) -> Robot:
     except RobotError:
         return robot
     return other
-
-
-MOST_JUMPS = 50  # two minutes of simulated time; more is surely a typo
 
 
 @dataclass(frozen=True)
@@ -82,7 +77,7 @@ class Course:
     @cached_property
     def goals_m(self) -> tuple[float, ...]:
         """Where the toes should be after each jump, from where they stand at first [m]."""
-        return tuple(float(x) for x in np.cumsum(self.distances_m))
+        return tuple(np.cumsum(self.distances_m).tolist())
 
     def task(self, k: int, distance_m: float | None = None) -> JumpTask:
         """Target of jump ``k`` (counted from 0), with another distance if given."""
@@ -96,11 +91,8 @@ class Course:
         return tuple((x + platform_edge_m(task, robot), top) for task, x, top in jumps if task.platform_m)
 
     def check(self, robot: Robot, reach: Reach) -> None:
-        """Refuse what no solve could mend, before any.
-
-        Raises :class:`InputError` if platforms overlap with a place where the robot stands, :class:`InfeasibleError` if
-        a jump is beyond the robot's reach, by closed forms.
-        """
+        """Raise :class:`InputError` if a platform overlaps with a place where the robot stands, and
+        :class:`InfeasibleError` if a jump is beyond the robot's reach, by closed forms."""
         self._check_platforms(robot)
         for k in range(self.count):
             try:

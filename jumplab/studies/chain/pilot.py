@@ -23,8 +23,7 @@ from jumplab.stages.planner import JumpPlan, Planner, to_link_angles
 from jumplab.studies.chain.course import Course
 
 FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
-# still enough to begin: the tape begins at rest, and what is left fades within BLEND_S
-STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25
+STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25  # still enough to begin: what is left fades within BLEND_S
 STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
 BLEND_S = 0.25  # a third of the launch, over before the push begins
 PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
@@ -61,10 +60,7 @@ class Rehearsal:
 
 @dataclass
 class Ahead:
-    """One plan of a chain, from the measurement it is made of to the instant at which the robot begins it.
-
-    All times are simulated [s], since the chain began; places count from where the toes stood then.
-    """
+    """One plan of a chain; times are simulated [s], since the chain began, places from where the toes stood then."""
 
     number: int  # of the jump, from 0
     looked_s: float  # when the state was measured
@@ -87,15 +83,20 @@ class Ahead:
         return self.looked_s + self.solve_s
 
     @property
+    def spare_s(self) -> float | None:
+        """How long before it was needed it was there [s]; negative if late, None if it was never needed."""
+        return None if self.needed_s is None else self.needed_s - self.ready_s
+
+    @property
     def in_time(self) -> bool:
         """Whether the plan was there when the robot was ready for it."""
-        return self.plan is not None and self.needed_s is not None and self.ready_s <= self.needed_s
+        return self.plan is not None and self.spare_s is not None and self.spare_s >= 0
 
 
 class Foresight:
     """Plans the next jump of a course from measurements, and remembers what the robot's jumps taught.
 
-    Each plan is charged ``solve_s`` [s]; its own wall clock if None.
+    ``solve_s`` is what a plan is charged [s], see :func:`jumplab.studies.chain.run_chain`.
     """
 
     def __init__(
@@ -115,17 +116,11 @@ class Foresight:
         self._crouch = planner.stage("whole body" if method == "three-step" else "direct").stance
 
     def learn_posture(self, q: np.ndarray) -> None:
-        """The robot stands still in ``q``: plans begin as far off the crouch as it is there.
-
-        A robot that is heavier or leans sags, and the standing controller brings it to that same posture again.
-        """
+        """Plans begin as far off the crouch as the robot, heavier perhaps, stands still in ``q``."""
         self._offset = np.clip(posture(self.robot, q) - self._crouch, -LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD)
 
     def learn_place(self, last: Ahead, began_x: float, plans: list[Ahead], toe: np.ndarray) -> None:
-        """Jump ``last`` began with the toes at ``began_x`` of the world and has brought them to ``toe``.
-
-        ``plans`` are those of the next jump: what they foretold in the air can now be compared.
-        """
+        """Jump ``last`` brought the toes from ``began_x`` of the world to ``toe``, as the next ``plans`` foretold."""
         self._missed[last.number] = last.plan.task.distance_m - (float(toe[0]) - began_x)
         self._misjudged += [p.foretold_m - (float(toe[0]) - self._zero) for p in plans if p.air]
 
@@ -165,14 +160,7 @@ class Foresight:
 
 class ChainPilot:
     """Commands of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` and ``revise_s`` are those
-    of :func:`jumplab.studies.chain.run_chain`.
-
-    Attributes
-    ----------
-    plans : plans made for each jump, in the order in which they were made.
-    used, pilots, began : plan, pilot and first step of each jump that began.
-    reason : why the chain goes on no more; empty while it does.
-    """
+    of :func:`jumplab.studies.chain.run_chain`."""
 
     def __init__(self, foresight: Foresight, scene: Scene, landing: str, look_s: float, revise_s: float | None):
         self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
@@ -180,21 +168,21 @@ class ChainPilot:
         self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
         self._tau = np.zeros(len(self._robot.joint_names))
         self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
-        self.plans: list[list[Ahead]] = []
-        self.used: list[Ahead] = []
+        self.plans: list[list[Ahead]] = []  # made for each jump, in their order
+        self.used: list[Ahead] = []  # plan of each jump that began, and its pilot and first step
         self.pilots: list[Pilot] = []
         self.began: list[int] = []
-        self.reason = ""
-
-    @property
-    def current(self) -> int:
-        """Number of the jump that is under way, -1 before the first."""
-        return len(self.began) - 1
+        self.reason = ""  # why the chain goes on no more
 
     @property
     def part(self) -> int:
         """The part of the log that this is: one per jump; the stand before the first jump belongs to it."""
-        return max(self.current, 0)
+        return max(len(self.began) - 1, 0)
+
+    @property
+    def _further(self) -> bool:
+        """Whether the course has a jump after the one that is under way."""
+        return len(self.began) < self._foresight.course.count
 
     @property
     def goal(self) -> np.ndarray:
@@ -218,12 +206,11 @@ class ChainPilot:
         """Whether something has ended the chain, or its last landing has been watched."""
         if fallen_s > AFTER_FALL_S:
             self.reason = f"the robot fell in jump {self.part + 1}"
-        last = self.current + 1 == self._foresight.course.count
-        return bool(self.reason) or (last and self.since_touchdown(step) >= STAND_S + EXTRA_S)
+        return bool(self.reason) or (not self._further and self.since_touchdown(step) >= STAND_S + EXTRA_S)
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` of the chain from measured state and vertical foot forces."""
-        if self.current + 1 < self._foresight.course.count and not self.reason:
+        if self._further and not self.reason:
             self._think(step, q, v)
         if not self.pilots:
             if step % PERIOD_STEPS == 0:
@@ -232,12 +219,12 @@ class ChainPilot:
         now, pilot = step - self.began[-1], self.pilots[-1]
         command = pilot.command(now, q, v, force)
         if pilot.touchdown is None and now > pilot.last_step:
-            self.reason = self.reason or f"jump {self.current + 1} never touched down"
+            self.reason = self.reason or f"jump {len(self.began)} never touched down"
         return command if command.q is None else self._blended(command, now * STEP_S)
 
     def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
-        number = self.current + 1
+        number = len(self.began)
         if len(self.plans) == number:
             self.plans.append([])
         plans = self.plans[number]
@@ -257,10 +244,9 @@ class ChainPilot:
     def _begun(self, plans: list[Ahead], step: int, q: np.ndarray, v: np.ndarray) -> bool:
         """Begin with the latest plan that is there, if the robot is still enough; notes when it was."""
         now, still = step * STEP_S, self._still(plans[0], q, v)
+        needed = now if still and plans[0].needed_s is None else plans[0].needed_s
         for plan in plans:
-            plan.needed_s = plans[0].needed_s
-            if still and plan.needed_s is None:
-                plan.needed_s = now
+            plan.needed_s = needed
         there = [p for p in plans if p.plan is not None and now >= p.ready_s - STEP_S / 2]
         if still and there:
             self._begin(there[-1], step, q, v)

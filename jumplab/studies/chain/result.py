@@ -82,10 +82,7 @@ class ChainResult:
 
     @cached_property
     def places_m(self) -> np.ndarray:
-        """(K + 1, 3) middle between the toes before the first jump and after each one, from the first [m].
-
-        "After" is the end of the jump's log: the last step before the next jump, or of all.
-        """
+        """(K + 1, 3) middle between the toes at first, and at the end of each jump's log, from the first [m]."""
         gauge = Gauge(self.robot)
         first = gauge.toe(self.jumps[0].simulation.q[0])
         return np.array([np.zeros(3), *(gauge.toe(j.simulation.q[-1]) - first for j in self.jumps)])
@@ -97,10 +94,7 @@ class ChainResult:
 
     @property
     def errors_m(self) -> np.ndarray:
-        """(K,) distance error of each jump: where the toes stand after it less where the course wants them [m].
-
-        A jump that makes good what the one before has missed travels more or less than the course says.
-        """
+        """(K,) where the toes stand after each jump less where the course wants them [m]."""
         return self.places_m[1:, 0] - np.array(self.course.goals_m[: len(self.jumps)])
 
     @property
@@ -166,24 +160,19 @@ class ChainResult:
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``chain.json``."""
-        robot, counts = dict(name=self.robot.name, hash=self.robot.hash), dict(replans=len(self.replans))
+        robot = dict(name=self.robot.name, hash=self.robot.hash)
         said = dict(schema=SCHEMA, target=asdict(self.course), robot=robot, stood=self.stood, reason=self.reason)
-        return (
-            said | counts | {n: getattr(self, n) for n in ("in_time", "waits_s", "settings")} | {"jumps": self.rows()}
-        )
+        said |= dict(replans=len(self.replans), in_time=self.in_time, waits_s=self.waits_s, settings=self.settings)
+        return said | {"jumps": self.rows()}
 
 
 def write_chain(
-    folder: str | Path,
-    result: ChainResult,
-    further: Mapping[str, str] | None = None,
-    *,
-    series: Mapping | None = None,
+    folder: str | Path, result: ChainResult, further: Mapping[str, str] | None = None, *, series: Mapping | None = None
 ) -> tuple[AuditReport, ...]:
     """Write a chain, whole or not at all, in the place of an older one; returns the audits of its plans.
 
-    ``jumps/1``, ``jumps/2`` and so on are folders of plans like any other, each with its audit. ``further`` are names
-    and texts of further files (the 3-D page); ``series``, a report on many robots, becomes an entry of ``chain.json``.
+    ``jumps/1`` and so on are folders of plans like any other. ``further`` are names and texts of further files (the 3-D
+    page); ``series``, a report on many robots, becomes an entry of ``chain.json``.
     """
     audits = []
     with transaction(folder) as staging:

@@ -41,34 +41,24 @@ def run_chain(
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.
 
-    The robot waits in a crouch. Once it has measured its own posture there, the first jump is planned; each further
-    one is planned while the robot flies (or lands, see ``look_s``). What planning takes is charged as simulated time:
-    the plan is there so much later, and the robot holds its crouch if that is late.
+    The robot waits in a crouch, where it measures its own posture. Planning is charged as simulated time: a plan is
+    there so much later, and the robot holds its crouch if that is late. A chain that fails is a result too. Raises
+    :class:`InputError` or :class:`InfeasibleError`, before anything moves, if the course cannot be jumped, or the robot
+    or a setting makes no sense.
 
     Parameters
     ----------
     robot : as planned; the simulated one differs from it by ``perturbation``.
     planner : of :func:`jumplab.studies.chain.crouched` ``(robot)``; a new one if None.
-    perturbation : of the simulated robot. With its sensors' noise, where the feet stand is odometry through impacts,
-        which drifts by centimetres in every jump; without, it is the truth.
-    rehearsal : the course's plans from the crouch, with which re-plans begin; made now if None and ``rehearse``, which
-        also refuses jumps that have no plan before anything moves. Without, every plan begins from nothing.
+    rehearsal : the course's plans from the crouch, with which re-plans begin; made now if None and ``rehearse``.
+        Without, every plan begins from nothing.
+    perturbation : of the simulated robot. With noise, where the feet stand is odometry, which drifts in every impact.
     solve_s : what each plan is charged [s]; its own wall clock if None.
     look_s : when the next jump is planned, after touchdown [s]; negative: so long before the touchdown that is due.
-    revise_s : when a plan made in the air is made again from where the feet really are, after touchdown [s]; never if
-        None. The robot waits for neither: it begins with the latest plan that is there.
+    revise_s : when a plan made in the air is made again, after touchdown [s]; never if None. The robot waits for
+        neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
-
-    Returns
-    -------
-    ChainResult
-        Also of a chain that fails: see its ``stood`` and ``reason``.
-
-    Raises
-    ------
-    InputError, InfeasibleError
-        If the course cannot be jumped, or the robot or a setting makes no sense; nothing has moved then.
     """
     _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
     waiting = crouched(robot)
@@ -108,7 +98,6 @@ def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise
     for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
         if not isinstance(value, str) or value not in known:
             raise InputError(f"{name} {quoted(value)}: choose one of {', '.join(known)}")
-
     solve_s, revise_s = (0.0 if x is None else x for x in (solve_s, revise_s))
     rows = ("solve_s", solve_s, 0.0, 60.0), ("look_s", look_s, EARLIEST_LOOK_S, 2.0), ("revise_s", revise_s, 0.0, 2.0)
     for name, value, low, high in rows:
@@ -131,19 +120,17 @@ class ChainTrial:
     travels_m: tuple[float, ...] = ()
     air_s: tuple[float | None, ...] = ()  # None where it never touched down
     waits_s: tuple[float, ...] = ()  # for its plan, before each jump but the first
-    # made on the way: of which jump (from 0), in the air or not, what each took by the clock and of a processor, and
-    # how long before it was needed it was there (negative if late, None if never needed) [s]
+    # made on the way: jump (from 0), air, solve_s, cpu_s, and spare_s from being there to being needed (None: never)
     plans: tuple[dict[str, Any], ...] = ()
 
     @classmethod
     def of(cls, seed: int, result: ChainResult) -> ChainTrial:
         """What is kept of a chain."""
-        plans = [dict(jump=p.number, air=p.air, solve_s=p.solve_s, cpu_s=p.cpu_s) for p in result.replans]
-        for kept, p in zip(plans, result.replans, strict=True):
-            kept["spare_s"] = None if p.needed_s is None else p.needed_s - p.ready_s
+        names = ("air", "solve_s", "cpu_s", "spare_s")
+        plans = tuple({"jump": p.number} | {n: getattr(p, n) for n in names} for p in result.replans)
         numbers = (tuple(map(float, x)) for x in (result.errors_m, result.travels_m))
         air = tuple(j.air_s for j in result.jumps)
-        return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, tuple(plans))
+        return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, plans)
 
 
 @dataclass(frozen=True)
@@ -205,22 +192,18 @@ def run_chains(
 ) -> ChainReport:
     """Let ``n`` robots jump the course, drawn by the seeds ``seed``, ``seed + 1``, and so on.
 
-    Parameters
-    ----------
-    ranges, noise : of the draws, see :meth:`jumplab.sim.Perturbation.draw`.
-    jobs : processes; one per core if None. With more than one, what planning takes is measured beside the others' work.
-    how : further arguments of :func:`run_chain`.
+    ``ranges`` and ``noise`` are those of :meth:`jumplab.sim.Perturbation.draw`, ``how`` further arguments of
+    :func:`run_chain`. With more than one of ``jobs`` processes (one per core if None), what planning takes is measured
+    beside the others' work.
     """
     check_numbers(n, seed, jobs)
-    work = [
-        joblib.delayed(_trial)(course, robot, s, ranges, noise or SensorNoise(), how) for s in range(seed, seed + n)
-    ]
-    return ChainReport(course, tuple(in_parallel(work, min(jobs or joblib.cpu_count(), n), "list")))
+    drawn = [Perturbation.draw(robot, seed + k, ranges, noise or SensorNoise()) for k in range(n)]
+    work = [joblib.delayed(_trial)(course, robot, seed + k, one, how) for k, one in enumerate(drawn)]
+    return ChainReport(course, tuple(in_parallel(work, jobs, "list")))
 
 
-def _trial(course: Course, robot: Robot, seed: int, ranges: Ranges, noise: SensorNoise, how: dict) -> ChainTrial:
+def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: dict) -> ChainTrial:
     planner, rehearsal = _prepared(course, robot, how)
-    drawn = Perturbation.draw(robot, seed, ranges, noise)
     try:
         result = run_chain(course, robot, planner=planner, rehearsal=rehearsal, perturbation=drawn, **how)
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one

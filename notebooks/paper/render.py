@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, JOINT_RADIUS_M, LIMB_SHARE, ROD_RADIUS_M, skeleton
-from jumplab.show.simulations import frame_rows
+from jumplab.show.simulations import AFTER_TOUCHDOWN_S
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
 from jumplab.sim.scene import Scene
 from jumplab.sim.world import base_to_bullet, bullet, load_urdf
@@ -159,6 +159,29 @@ class Renderer(AbstractContextManager):
         for shape, joint, at in self._marks:
             pose = pin.SE3ToXYZQUAT(self._data.oMi[joint] * at)
             bullet.resetBasePositionAndOrientation(shape, pose[:3], pose[3:], **self._here)
+
+
+def frame_rows(result: SimulationResult) -> np.ndarray:
+    """Twelve rows of a log worth a picture, four per phase; of a jump without flight or landing, twelve evenly spaced.
+
+    Launch: start, crouch, half-way up, lift-off; flight: evenly; landing: touchdown, deepest, half-way up, the end.
+    """
+    count, flight = len(result.t), np.flatnonzero(result.phase == "flight")
+    if not len(flight) or flight[0] == 0 or flight[-1] + 1 == count:
+        return np.linspace(0, count - 1, 12).astype(int)
+    z, off, on = result.com[:, 2], int(flight[0]), int(flight[-1]) + 1
+    crouch = int(np.argmin(z[:off]))
+    deepest = on + int(np.argmin(z[on : on + round(AFTER_TOUCHDOWN_S / (result.t[1] - result.t[0]))]))
+    launch = [0, crouch, _halfway(z, crouch, off - 1), off - 1]
+    air = [off + (on - off) * share for share in (0.125, 0.375, 0.625, 0.875)]
+    return np.array([*launch, *air, on, deepest, _halfway(z, deepest, count - 1), count - 1]).astype(int)
+
+
+def _halfway(z: np.ndarray, start: int, end: int) -> int:
+    """First row after ``start`` that is half of the way up to the height at ``end``; in a fall, half of the time."""
+    if z[end] <= z[start]:
+        return (start + end) // 2
+    return start + int(np.argmax(z[start : end + 1] >= (z[start] + z[end]) / 2))
 
 
 def draw_frames(
