@@ -114,7 +114,8 @@ class FullBody:
     """The nine-link robot as a source of :class:`FullTerms`. One per user: it owns Pinocchio's scratch data.
 
     ``gravity`` is positive, the robot's own 9.8 by default [m/s^2]; ``mass`` is in kg; ``pairs`` are (left column,
-    right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`.
+    right column, sign) of every joint pair in the tangent, see :meth:`symmetry_rows`; ``foot_joints`` carry the feet,
+    ``foot_points`` are tiptoe, heel and sole in their frames (2, 3, 3) [m].
     """
 
     def __init__(self, robot: Robot, gravity: float | None = None):
@@ -151,11 +152,11 @@ class FullBody:
     def _read_feet(self):
         model, foot, data = self.model, self.robot.foot, self.data
         frames = [model.frames[model.getFrameId(name)] for name in foot.frames]
-        self._foot_joints = [f.parentJoint for f in frames]
+        self.foot_joints = [f.parentJoint for f in frames]
         middles = [foot.toe, 0.0, foot.sole_z], [foot.heel, 0.0, foot.sole_z], foot.center  # tiptoe, heel, sole
-        self._points = np.array([[f.placement.act(np.array(x, float)) for x in middles] for f in frames])
+        self.foot_points = np.array([[f.placement.act(np.array(x, float)) for x in middles] for f in frames])
         self._foot_turn = np.array([f.placement.rotation for f in frames])
-        self._foot_bodies = [j - 1 for j in self._foot_joints]
+        self._foot_bodies = [j - 1 for j in self.foot_joints]
         self._foot_carries = self._carries[self._foot_bodies]  # (2, nv)
         pin.framesForwardKinematics(model, data, pin.neutral(model))
         for name in foot.frames:
@@ -174,7 +175,7 @@ class FullBody:
         model, data, roles = self.model, self.data, self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
         shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
-        legs = [self._chain(j) for j in self._foot_joints]
+        legs = [self._chain(j) for j in self.foot_joints]
         hip = self._chain(model.getJointId(roles["hip_pitch"][0]))
         pairs, groups = [], {"hip": [], "knee": [], "ankle": [], "shoulder": []}
         for chains, arm in ((legs, False), (shoulders, True)):
@@ -281,7 +282,7 @@ class FullBody:
         """Rotations of the feet (2, 3, 3), and places of tiptoes, heels and soles (2, 3 points, 3)."""
         at = place[self._foot_bodies, :3]  # (2, 3, 4)
         turn = at[..., :3]
-        return turn @ self._foot_turn, self._points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]
+        return turn @ self._foot_turn, self.foot_points @ turn.transpose(0, 2, 1) + at[:, None, :, 3]
 
 
 def _half_second(D, twist) -> float:

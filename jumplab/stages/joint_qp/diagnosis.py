@@ -109,10 +109,11 @@ def lines(found: Conflict, phase: str) -> tuple[str, ...]:
     groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
     for block, row, amount in found.gives:
         groups.setdefault((block, _unit(block, row, phase)), []).append((amount, row))
-    return tuple(
-        f"'{_words(block, phase)[0]}' by {max(rows)[0]:.3g} {unit} ({', '.join(sorted(row for _, row in rows))})"
-        for (block, unit), rows in groups.items()
-    )
+    said = []
+    for (block, unit), rows in groups.items():
+        amount, names = f"{max(rows)[0]:.3g} {unit}".strip(), ", ".join(sorted(row for _, row in rows))
+        said.append(f"'{_words(block, phase)[0]}' by {amount} ({names})")
+    return tuple(said)
 
 
 def sentence(found: Conflict, phase: str, t: float) -> str:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
-from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
+from jumplab.stages.joint_qp.own import SIDES
+from jumplab.stages.joint_qp.problem import AXES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import FOOT_BLEND_S, INERTIA_BLEND_S, FlightReference, Track
 from jumplab.stages.joint_qp.settings import Options
 
@@ -24,6 +25,7 @@ class FlightTarget:
     joints: np.ndarray  # towards the posture (nv - 6,)
     trunk: np.ndarray  # the same (3,)
     symmetry: np.ndarray  # right side of the symmetry rows (k,), zero but for the drift control
+    began: float  # start of the step, since the flight began [s]
 
 
 class FlightQp(PhaseQp):
@@ -68,7 +70,7 @@ class FlightQp(PhaseQp):
         joints, trunk = self._towards(terms, turned(self.nominal, turn))
         trunk[1] += gain.trunk.damping * turn_rate
         own = foot, rho, self._drift(k, terms), level, self._floor(k, terms)
-        return FlightTarget(*own, joints, trunk, self._mirror(terms))
+        return FlightTarget(*own, joints, trunk, self._mirror(terms), float(self.t[k]))
 
     def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what integration lost."""
@@ -94,7 +96,7 @@ class FlightQp(PhaseQp):
     def matrices(self, terms: FullTerms, target: FlightTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
         lay, w = self.layout, self.options.flight
-        A, E, G, R, b, e, h = self._begun(target)
+        A, E, G, _, b, e, h = parts = self._begun(target)
         root = np.sqrt(w.foot)
         A[:6] = root * terms.J_rd.reshape(6, -1)
         b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
@@ -108,8 +110,8 @@ class FlightQp(PhaseQp):
         if on.any():
             vertical = np.stack([terms.J_toe[:, 2], terms.J_heel[:, 2]], 1).reshape(4, -1)
             drift = np.stack([terms.drift_toe[:, 2], terms.drift_heel[:, 2]], 1).ravel()
-            G[on], h[on] = -vertical[on], (drift - target.floor)[on]
-        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, self.step), lay)
+            G[:4][on], h[:4][on] = -vertical[on], (drift - target.floor)[on]
+        return self._finished(parts, terms, start, self.step, target.began)
 
 
 def turned(q: np.ndarray, angle: float) -> np.ndarray:

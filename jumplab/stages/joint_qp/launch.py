@@ -8,7 +8,8 @@ import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, force_target
 from jumplab.robot import SAGITTAL_JOINTS
-from jumplab.stages.joint_qp.problem import AXES, SIDES, JointRows, PhaseQp, State, StepQp
+from jumplab.stages.joint_qp.own import SIDES
+from jumplab.stages.joint_qp.problem import AXES, JointRows, PhaseQp, State, StepQp
 from jumplab.stages.joint_qp.reference import LaunchReference
 from jumplab.stages.joint_qp.settings import Options
 
@@ -33,6 +34,7 @@ class LaunchTarget:
     on_toes: bool  # heel up, CoP at the toe
     inertia_weight: float  # of the inertia's term at this step, see LaunchWeights
     step: float  # its length [s]
+    began: float  # its start, since the launch began [s]
 
 
 class LaunchQp(PhaseQp):
@@ -114,7 +116,7 @@ class LaunchQp(PhaseQp):
         speed = np.concatenate([terms.toe_velocity, terms.foot_spin], 1)
         contact = -gain.contact.stiffness * error - gain.contact.damping * speed
         posture, on_toes, floor = self._towards(terms, self.nominal), bool(self.on_toes[k]), self._heel_floor(terms, k)
-        now = on_toes, float(self.inertia_weights[k]), float(self.steps[k])
+        now = on_toes, float(self.inertia_weights[k]), float(self.steps[k]), float(self.t[k])
         return LaunchTarget(com, turn, rho, contact, floor, *posture, self._mirror(terms), *now)
 
     def _heel_floor(self, terms: FullMotion, k: int) -> np.ndarray:
@@ -128,7 +130,7 @@ class LaunchQp(PhaseQp):
 
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: ``terms`` in its middle, ``target`` and ``start`` from its start."""
-        A, E, G, R, b, e, h = self._begun(target)
+        A, E, G, _, b, e, h = parts = self._begun(target)
         com, force = self.roots[target.on_toes]
         A[:3, WRENCH:] = com[:, None] * terms.A_c
         b[:3] = com * (target.com_acceleration - terms.B_c)
@@ -140,10 +142,11 @@ class LaunchQp(PhaseQp):
         E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
         self._contact(E, e, terms, target)
         G[: 2 * len(FOOT_ROWS), :WRENCH] = self._ground[target.on_toes]
+        heel = self.layout.at("heel").start
         for side in np.flatnonzero(np.isfinite(target.heel_floor)):
-            G[side - 2, WRENCH:] = -terms.J_heel[side, 2]
-            h[side - 2] = terms.drift_heel[side, 2] - target.heel_floor[side]
-        return StepQp(A, b, E, e, G, h, R, *self.joints.fill(R, terms, start, target.step), self.layout)
+            G[heel + side, WRENCH:] = -terms.J_heel[side, 2]
+            h[heel + side] = terms.drift_heel[side, 2] - target.heel_floor[side]
+        return self._finished(parts, terms, start, target.step, target.began)
 
     def _contact(self, E, e, terms, target):
         """Tiptoe rows; then per foot either no pitch acceleration (flat) or no moment about the toe (heel up)."""

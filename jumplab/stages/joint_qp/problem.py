@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from jumplab.models.full import FullBody, FullMotion, FullTerms, skew
+from jumplab.stages.joint_qp.own import OwnRows, StepPoint
 from jumplab.stages.joint_qp.settings import Limits, Options
 
 OFF_TORQUE, OFF_SPEED = 1e5, 1e3  # [N m], [rad/s] bounds of a row that is switched off, beyond all motion
-SIDES, AXES = ("left", "right"), ("x", "y", "z", "rx", "ry", "rz")
+AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -157,12 +159,17 @@ class PhaseQp:
         self.t, self.steps, self.S = reference.t, np.diff(reference.t), body.symmetry_rows(self.pairs)
         names, self._weights = body.robot.joint_names, weights
         rows["E"] = [*rows["E"], ("symmetry", body.pair_names(self.pairs))]
+        seen = body.terms(nominal, np.zeros(body.nv))
+        self.own = OwnRows(self.name, options.own(self.name), partial(StepPoint, body, self.first), seen)
+        rows = {matrix: [*own, *self.own.blocks[matrix]] for matrix, own in rows.items()}
         self.layout = lay = Layout.of(**rows, R=[("torque", names), ("speed and range", names)])
         first, nv = self.first, body.nv
         self._fixed = A, E, _, R = [np.zeros((len(lay.labels[k]), first + nv)) for k in "AEGR"]
         A[lay.at("joints"), first + 6 :] = np.sqrt(weights.posture) * np.eye(nv - 6)
         A[lay.at("trunk turn"), first + 3 : first + 6] = np.sqrt(weights.trunk) * np.eye(3)
         A[lay.at("acceleration"), first:] = np.sqrt(weights.acceleration) * np.eye(nv)
+        off = [name.split("/") for name in options.off]
+        self._off = [lay.blocks[name] for phase, name in off if phase == self.name and name in lay.blocks]
         E[lay.at("symmetry"), first:], R[nv - 6 :, first + 6 :] = self.S, np.eye(nv - 6)
 
     def _begun(self, target: Any) -> list[np.ndarray]:
@@ -173,6 +180,17 @@ class PhaseQp:
         b[self.layout.at("trunk turn")] = np.sqrt(self._weights.trunk) * target.trunk
         e[self.layout.at("symmetry")] = target.symmetry
         return [A, E, G, R, b, e, h]
+
+    def _finished(self, parts: list[np.ndarray], terms: FullTerms, start: State, step: float, began: float) -> StepQp:
+        """The step's QP from A, E, G, R, b, e and h: own rows and the joints' filled in, others switched off."""
+        A, E, G, R, b, e, h = parts
+        low, high = self.joints.fill(R, terms, start, step)
+        sides = {"A": (A, b), "E": (E, e), "G": (G, h), "R": (R, low, high)}
+        self.own.fill(sides, self.layout, terms, began + step / 2)
+        for matrix, rows in self._off:
+            for x in sides[matrix]:
+                x[rows] = 0.0  # a row of zeros: 0 = 0, 0 <= 0
+        return StepQp(A, b, E, e, G, h, R, low, high, self.layout)
 
     def _mirror(self, terms: FullMotion) -> np.ndarray:
         """Right side of the symmetry rows (k,): zero but for the drift control."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +12,10 @@ import pinocchio as pin
 
 from jumplab.errors import InputError, SolverError
 from jumplab.models.full import FullBody, FullMotion, FullTerms
+from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
+from jumplab.stages.joint_qp.changes import changed
 from jumplab.stages.joint_qp.flight import FlightQp
 from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
 from jumplab.stages.joint_qp.problem import State, StepQp
@@ -120,6 +122,7 @@ class JointMapper:
     srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
     step_s : step of the roll-out [s], at most, or one each for flat feet, toes and flight; each is divided evenly.
     options : gains, weights, limits.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
+    terms, weights, off : own terms, factors on weights, blocks left out, see :func:`.changes.changed`.
     """
 
     launch_qp: Callable[..., LaunchQp] = LaunchQp
@@ -132,17 +135,23 @@ class JointMapper:
         step_s: float | tuple[float, float, float] = 0.01,
         options: Options | None = None,
         q0: np.ndarray | None = None,
+        *,
+        terms: Mapping[str, Iterable[Term]] | None = None,
+        weights: Mapping[str, float] | None = None,
+        off: Sequence[str] = (),
     ):
         parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s, step_s, step_s)
         for step in parts:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
-        self.options = options or Options()
         self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
+        self.options = options or Options()
+        if terms or weights or off:
+            self.options = changed(self.options, self.body, self.q0, terms, weights, off)
         self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
         toe_s = getattr(srmp_plan, "toe_s", None)
         toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
@@ -274,6 +283,10 @@ def map_to_joints(
     method: str = "cvxpy",
     options: Options | None = None,
     q0: np.ndarray | None = None,
+    *,
+    terms: Mapping[str, Iterable[Term]] | None = None,
+    weights: Mapping[str, float] | None = None,
+    off: Sequence[str] = (),
 ) -> JointPlan:
     """Map stage 1's momentum and inertia trajectories to the joints of the full robot (Sec. IV).
 
@@ -284,18 +297,21 @@ def map_to_joints(
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
     options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
     q0 : (nq,) start at rest; the robot's stance by default.
+    terms : "launch" or "flight" -> own terms, costs or constraints on a :class:`.own.StepPoint`.
+    weights : "block" or "phase/block" -> factor on its weight.  off : "block" or "phase/block" to leave out.
 
     Raises
     ------
-    InputError : the reference has gaps, NaN or wrong lengths, or an option is unknown.
+    InputError : the reference has gaps, NaN or wrong lengths, an option is unknown, or a term does not fit.
     SolverError : a QP has no trustworthy answer; names phase, time and the rows that conflict.
     """
+    changes: dict[str, Any] = {"q0": q0, "terms": terms, "weights": weights, "off": off}
     if options is not None:
-        return JointMapper(srmp_plan, robot, step_s, options, q0).run(method)
+        return JointMapper(srmp_plan, robot, step_s, options, **changes).run(method)
     try:
-        return JointMapper(srmp_plan, robot, step_s, Options(), q0).run(method)
+        return JointMapper(srmp_plan, robot, step_s, Options(), **changes).run(method)
     except SolverError as firm:
         try:
-            return JointMapper(srmp_plan, robot, step_s, GENTLE, q0).run(method)
+            return JointMapper(srmp_plan, robot, step_s, GENTLE, **changes).run(method)
         except SolverError:
             raise firm from None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from jumplab.ocp import Term
+
 
 @dataclass(frozen=True)
 class Gain:
@@ -81,13 +83,19 @@ class Limits:
 
 @dataclass(frozen=True)
 class Options:
-    """Everything adjustable about stage 2."""
+    """Everything adjustable about stage 2; own terms, and blocks left out, are set by :func:`.changes.changed`."""
 
     gains: Gains = Gains()
     launch: LaunchWeights = LaunchWeights()
     flight: FlightWeights = FlightWeights()
     limits: Limits = Limits()
     arm_rad: float = -1.5  # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
+    terms: tuple[tuple[str, Term], ...] = ()  # (phase, own term)
+    off: tuple[str, ...] = ()  # "phase/block" of what is left out
+
+    def own(self, phase: str) -> tuple[Term, ...]:
+        """Own terms of a phase that are not left out."""
+        return tuple(term for p, term in self.terms if p == phase and f"{p}/{term.name}" not in self.off)
 
 
 # For a stage 1 that asks for more than the joints can give: followed firmly, it drives them into their stops. This
