@@ -5,6 +5,7 @@ Out: a :class:`Solution`, or a :class:`~jumplab.errors.SolverError` that names t
 Start reading in :mod:`jumplab.ocp.problem`; then ``nlp.py``, which solves what ``assembly.py`` makes of it.
 """
 
+from jumplab.ocp.changes import changed
 from jumplab.ocp.nlp import Nlp
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.ocp.solution import Near, PhaseGuess, PhaseSolution, Solution, Statistics
@@ -21,4 +22,5 @@ __all__ = [
     "Solution",
     "Statistics",
     "Term",
+    "changed",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import SolverError
+from jumplab.errors import InputError, SolverError
 from jumplab.ocp.assembly import Assembled, Posed, unpack
 from jumplab.ocp.derivatives import scatter
 
@@ -34,6 +34,25 @@ def failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteration
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
     return SolverError(said, stage=name, status=status, violations=violations)
+
+
+def check_start(a: Assembled, posed: Posed) -> None:
+    """Refuse (:class:`InputError`) an own term without a finite value or slope where a solve would begin."""
+    if not a.problem.own or _all_finite(a, posed):
+        return
+    own = {f"{owner}/{name}" for owner, name in a.problem.own}
+    lost = [x for x in _without_number(a, posed.x0, posed.p) if x.partition(" at node ")[0] in own]
+    if lost:
+        raise InputError(
+            f"term {lost[0]}: no finite value or slope at the start of the solve; keep its arguments where it is "
+            f"defined, for instance x + 1e-6 under a root"
+        )
+
+
+def _all_finite(a: Assembled, posed: Posed) -> bool:
+    """Whether all values and slopes at the start are numbers; cheap."""
+    found = *a.grad_f(posed.x0, posed.p), *a.jac_g(posed.x0, posed.p)
+    return all(np.all(np.isfinite(np.array(x.nonzeros()))) for x in found)
 
 
 def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> tuple[str, ...]:

@@ -11,10 +11,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from jumplab.errors import SolverError
 from jumplab.ocp.assembly import Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
 from jumplab.ocp.derivatives import JERK_CHAIN
-from jumplab.ocp.diagnosis import failure
+from jumplab.ocp.diagnosis import check_start, failure
 from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
 from jumplab.ocp.sqp import GaussNewton
@@ -95,7 +96,11 @@ class Nlp:
             If a step is no number.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
-        method, began = self._gauss_newton, time.perf_counter()
+        check_start(a, posed)
+        try:
+            method, began = self._gauss_newton, time.perf_counter()
+        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
+            raise SolverError(str(e), stage=a.problem.name, status="approach") from e
         x, count = method.steps(posed)
         f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
         spent, residual = time.perf_counter() - began, float(np.max(posed.beyond(g), initial=0.0))
@@ -132,6 +137,7 @@ class Nlp:
             violated, where and by how much.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, references, weights, off)
+        check_start(a, posed)
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}
         if multipliers is not None:
             start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, multipliers), strict=True))

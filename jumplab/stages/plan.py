@@ -115,7 +115,7 @@ class JumpPlan:
             "planned_rise_m": self.planned_rise_m,
             "launch_s": self.whole_body.launch_s,
             "flight_s": self.whole_body.flight_s,
-            "platform_edge_m": platform_edge_m(self.task, self.robot),
+            "platform_edge_m": platform_edge_m(self.task, self.robot, self.whole_body.limits),
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],

@@ -47,7 +47,7 @@ class WholeBodyTerms:
     def __init__(self, robot: Robot, limits: Limits, weights: Weights, contact: Contact):
         self.model, self.limits, self.weights, self.contact = robot.sagittal, limits, weights, contact
         self.flying = contact is Contact.FLIGHT
-        self.mg = self.model.total_mass * GRAVITY
+        self.mg = self.model.total_mass * GRAVITY  # nominal size of forces
 
     # model on a point -------------------------------------------------------------------------------------------
     def links(self, x: ca.SX) -> ca.SX:
