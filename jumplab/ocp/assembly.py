@@ -223,7 +223,7 @@ def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.n
                     side[index] = _resolve(bound, parameters, index.shape[1]) / term.scale
                 except ValueError:
                     many = f"its expression has {index.shape[1]} rows, a bound that fits neither them nor one"
-                    raise InputError(f"term {term.name!r} of {owner!r}: {many}") from None
+                    raise InputError(f"term {term.name!r} of {a.problem.place(owner)!r}: {many}") from None
     return low, high
 
 

@@ -82,7 +82,7 @@ def _check_weight(name: str, weight: Any) -> None:
 
 def _with(problem: Problem, owner: str, term: Term) -> Problem:
     """The problem with one further term, checked."""
-    require_type(term, Term, f"an own term of {owner!r}")
+    require_type(term, Term, f"an own term of {problem.place(owner)!r}")
     names = [p.name for p in problem.phases]
     joining = owner == problem.name
     if not joining and owner not in names:
@@ -92,12 +92,12 @@ def _with(problem: Problem, owner: str, term: Term) -> Problem:
         )
     if joining != (term.at == "problem"):
         where = f"at = 'problem' belongs to {problem.name!r} itself" if not joining else "it needs at = 'problem'"
-        raise InputError(f"term {term.name!r} of {owner!r}: {where}")
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: {where}")
     taken = {x.name for o, x in (*problem.terms(), *problem.bounds()) if o == owner} | {JERK_CHAIN}
     if term.name in taken:
-        raise InputError(f"term {term.name!r} of {owner!r}: the name is taken; give it one of its own")
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: the name is taken; give it one of its own")
     if "/" in term.name:
-        raise InputError(f"term {term.name!r} of {owner!r}: a name must not hold a '/'")
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: a name must not hold a '/'")
     if term.is_cost:
         _check_weight(term.name, term.weight)
     digest = _digest(problem, owner, term)
@@ -117,16 +117,18 @@ def _digest(problem: Problem, owner: str, term: Term) -> str:
     made = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
     if made.has_free():
         free = ", ".join(made.get_free()[:3])
-        raise InputError(f"term {term.name!r} of {owner!r}: it uses symbols that are not its point's ({free})")
+        raise InputError(
+            f"term {term.name!r} of {problem.place(owner)!r}: it uses symbols that are not its point's ({free})"
+        )
     for t, rows in e.rows:
         if t is term:
-            _check_bounds(owner, term, rows)
+            _check_bounds(problem.place(owner), term, rows)
     return hashlib.sha256(made.serialize().encode()).hexdigest()
 
 
-def _check_bounds(owner: str, term: Term, rows: int) -> None:
+def _check_bounds(place: str, term: Term, rows: int) -> None:
     """Refuse bounds that are no numbers, do not fit the rows of the expression, or exclude each other."""
-    who, values = f"term {term.name!r} of {owner!r}", []
+    who, values = f"term {term.name!r} of {place!r}", []
     for side in ("lower", "upper"):
         bound = getattr(term, side)
         if callable(bound):

@@ -187,7 +187,7 @@ class ElementBuilder:
         """Terms evaluated on the points that they see; costs count for the share of the phase that they span."""
         costs, rows, counts = [], [], []
         for t in terms:
-            y = _column(owner, t, seen[t.at])
+            y = _column(self.problem.place(owner), t, seen[t.at])
             if t.is_cost:
                 costs.append((spans.get(t.at, 1.0), y))
             else:
@@ -197,9 +197,9 @@ class ElementBuilder:
         return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
 
 
-def _column(owner: str, term: Term, seen: Sequence) -> ca.SX:
+def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
     """What a term makes of the points that it sees, as a column; refuses whatever is none, by the term's name."""
-    who = f"term {term.name!r} of {owner!r}"
+    who = f"term {term.name!r} of {place!r}"
     try:
         y = term.expression(*seen)
         y = ca.SX(ca.vertcat(*y) if isinstance(y, list | tuple) else y)

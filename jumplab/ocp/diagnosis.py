@@ -40,12 +40,13 @@ def check_start(a: Assembled, posed: Posed) -> None:
     """Refuse (:class:`InputError`) an own term without a finite value or slope where a solve would begin."""
     if not a.problem.own or _all_finite(a, posed):
         return
-    own = {f"{owner}/{name}" for owner, name in a.problem.own}
-    lost = [x for x in _without_number(a, posed.x0, posed.p) if x.partition(" at node ")[0] in own]
-    if lost:
+    lost = {x.partition(" at node ")[0] for x in _without_number(a, posed.x0, posed.p)}
+    own = [(owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost]
+    if own:
+        owner, name = own[0]
         raise InputError(
-            f"term {lost[0]}: no finite value or slope at the start of the solve; keep its arguments where it is "
-            f"defined, for instance x + 1e-6 under a root"
+            f"term {name!r} of {a.problem.place(owner)!r}: no finite value or slope at the start of the solve; keep "
+            f"its arguments where it is defined, for instance x + 1e-6 under a root"
         )
 
 

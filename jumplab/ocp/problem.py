@@ -208,6 +208,10 @@ class Problem:
         """(phase name, bound) of every bound, in order."""
         return [(p.name, b) for p in self.phases for b in p.bounds]
 
+    def place(self, owner: str) -> str:
+        """A phase as sentences name it, "problem/phase"; the problem's name for terms that join phases."""
+        return self.name if owner == self.name else f"{self.name}/{owner}"
+
     def check_names(self, names: Iterable[str], what: str) -> None:
         """Raise :class:`InputError` if a name, "name" or "phase/name", is no term or bound of this problem."""
         owned = [(owner, x.name) for owner, x in (*self.terms(), *self.bounds())]

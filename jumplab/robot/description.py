@@ -165,9 +165,14 @@ class Robot:
         model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
         return model
 
+    @property
+    def gravity(self) -> float:
+        """What the robot's model feels, downward [m/s^2]: 9.8, but see :meth:`under_gravity`."""
+        return -float(self.model.gravity.linear[2])
+
     def under_gravity(self, gravity: float) -> Robot:
-        """The same robot whose :attr:`model` feels another gravity [m/s^2]; itself at 9.8."""
-        if gravity == GRAVITY:
+        """The same robot whose :attr:`model` feels that gravity [m/s^2]; itself if it does already."""
+        if gravity == self.gravity:
             return self
         other = replace(self)
         model = self.model.copy()

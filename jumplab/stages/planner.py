@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from jumplab.task import JumpTask
 METHODS = ("three-step", "direct")
 OWN_ARMS, NAIVE_ARMS = 0.25, 0.75  # shares of the arms' swing in stage 3's guess: stage 2's arms swing too far
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
+_COUNT = count()
 SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
@@ -42,12 +45,12 @@ class Planner:
     Parameters
     ----------
     robot : who jumps.
-    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`, with stage "srmp" (phases flat, toe,
-        launch for both, flight), "joint qp" (launch, flight) or "whole body" (as srmp); by "srmp" or "whole body" alone
-        those at "problem". An expression sees a point with joints, joint_rates, torques, com, com_velocity, L, inertia,
-        wrench, posture, point("hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and in stage 1 com,
-        com_velocity, L, inertia, wrench, lean, posture, time, see :class:`jumplab.stages.srmp.view.RodView`. The direct
-        planner takes those of "whole body".
+    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body"
+        have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight; "srmp" or "whole body" alone
+        takes those at "problem". An expression sees a point with joints, joint_rates, torques, com, com_velocity, L,
+        inertia, wrench, posture, point("hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and in
+        stage 1 com, com_velocity, L, inertia, wrench, lean, posture, time, see
+        :class:`jumplab.stages.srmp.view.RodView`. The direct planner takes those of "whole body".
     weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's.
     off : names of the same sort: terms and bounds to leave out.
     limits : of stage 3: :class:`jumplab.stages.whole_body.Limits`, or a mapping of some of its fields.
@@ -82,6 +85,7 @@ class Planner:
         self.limits, self.mesh = settled(Limits, limits), self._mesh()
         settled(SrmpSettings, settings)  # refuses what does not fit
         self._stages: dict[str, Any] = {}
+        self.token = os.getpid(), next(_COUNT)  # the same in copies that other processes get
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_stages": {}}  # another process builds its own
@@ -108,21 +112,28 @@ class Planner:
             return FlipPlanner(self.robot, self._mesh(True), limits, **how)
         return WholeBodyPlanner(self.robot, self.mesh, limits, keep=self.keep, **how)
 
-    def _prepared(self, method: str, task: JumpTask, weights: Mapping[str, float] | None) -> dict[str, StageChanges]:
-        """Weights of one plan by stage; refuses what its method has no place for, and builds the stages, all of them
-        before the first solves.
+    def prepared(
+        self, method: str = "three-step", weights: Mapping[str, float] | None = None, *, flip: bool = False
+    ) -> dict[str, StageChanges]:
+        """Build the stages of a method, so that nothing is refused after the first has solved.
+
+        Returns the ``weights`` of one plan by stage. Raises :class:`InputError` for own terms, weights or settings that
+        the method has no place for, and for names that do not exist.
         """
-        asked, flip = sorted_out(weights=weights), " flip" if task.rotation_rad else ""
+        asked, turn = sorted_out(weights=weights), " flip" * flip
         if method == "direct":
-            ignored = [s for s in ("srmp", "joint qp") if self.changes[s] or asked[s]]
-            ignored += ["settings (stage 1's)"] * (self._given[1] is not None)
-            if ignored:
+            ignored = [f"{s!r}" for s in ("srmp", "joint qp") if self.changes[s] or asked[s]]
+            if ignored := ignored + ["the settings of 'srmp'"] * (self._given[1] is not None):
                 raise InputError(
-                    f"the method 'direct' has no place for {', '.join(ignored)}; it has the terms of 'whole body', "
-                    f"limits and mesh; ask for 'three-step', or leave them out"
+                    f"the method 'direct' has no place for {' and '.join(ignored)}: it takes limits, mesh and the "
+                    f"terms of 'whole body'; choose 'three-step', or leave that out"
                 )
-        for stage in ("reach", "direct" + flip) if method == "direct" else ("srmp" + flip, "whole body" + flip):
-            self.stage(stage)
+            stages = {"reach": None, "direct" + turn: asked["whole body"]}
+        else:
+            stages = {f"{name}{turn}": asked[name] for name in ("srmp", "whole body")}
+        for name, changes in stages.items():
+            if (stage := self.stage(name)) and changes:
+                changes.applied(stage.nlp.problem)
         return asked
 
     def terms(self, *, flip: bool = False, method: str = "three-step") -> list[dict[str, Any]]:
@@ -164,7 +175,8 @@ class Planner:
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
-        asked, where = self._prepared(method, task, weights), {} if start is None else {"start": start}
+        asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
+        where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
@@ -191,7 +203,9 @@ class Planner:
             rows = (_row("1 SRMP", srmp.solution.statistics), *rows)
         rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
         tape = make_tape(body, self.robot, srmp)
-        return JumpPlan(body.task, self.robot, method, tape, srmp, joints, body, rows, skipped)
+        return JumpPlan(
+            body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
+        )
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
@@ -277,7 +291,7 @@ class Planner:
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         check_platform(task, self.robot, self.limits)
-        self._prepared(previous.method, task, None)
+        self.prepared(previous.method)
         srmp, last = None, "direct"
         if previous.method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)

@@ -222,7 +222,8 @@ def _trial(course: Course, robot: Robot, seed: int, ranges: Ranges, noise: Senso
     planner, rehearsal = _prepared(course, robot, how)
     drawn = Perturbation.draw(robot, seed, ranges, noise)
     try:
-        result = run_chain(course, robot, planner=planner, rehearsal=rehearsal, perturbation=drawn, **how)
+        own = how | dict(planner=planner, rehearsal=rehearsal, perturbation=drawn)
+        result = run_chain(course, robot, **own)
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
         return ChainTrial(seed, False, str(e))
     return ChainTrial.of(seed, result)
@@ -231,10 +232,11 @@ def _trial(course: Course, robot: Robot, seed: int, ranges: Ranges, noise: Senso
 def _prepared(course: Course, robot: Robot, how: dict) -> tuple[Planner, Rehearsal | None]:
     """Planner and rehearsal of this process, made by its first trial."""
     method, rehearse = how.get("method", "three-step"), how.get("rehearse", True)
-    key = robot.hash, course, method, rehearse
+    planner = how.get("planner")
+    key = robot.hash, course, method, rehearse, planner and planner.token
     if key not in _ready:
         _ready.clear()
-        planner = Planner(crouched(robot), keep=True)
+        planner = planner or Planner(crouched(robot), keep=True)
         course.check(planner.robot, planner.stage("reach"))
         _ready[key] = planner, Rehearsal.of(course, planner, method) if rehearse else None
     return _ready[key]
