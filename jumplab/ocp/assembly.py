@@ -222,8 +222,8 @@ def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.n
                 try:
                     side[index] = _resolve(bound, parameters, index.shape[1]) / term.scale
                 except ValueError:
-                    many = f"its expression has {index.shape[1]} rows, a bound that fits neither them nor one"
-                    raise InputError(f"term {term.name!r} of {a.problem.place(owner)!r}: {many}") from None
+                    rows, who = index.shape[1], f"term {term.name!r} of {a.problem.place(owner)!r}"
+                    raise InputError(f"{who}: a bound does not fit its expression, whose size is {rows}") from None
     return low, high
 
 

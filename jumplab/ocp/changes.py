@@ -138,7 +138,9 @@ def _check_bounds(place: str, term: Term, rows: int) -> None:
         except (TypeError, ValueError):
             raise InputError(f"{who}: {side} = {quoted(bound)} is no number") from None
         if value.size not in (1, rows) or np.any(np.isnan(value)):
-            raise InputError(f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {rows} rows")
+            raise InputError(
+                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {rows} row{'s' * (rows > 1)}"
+            )
         values.append(value)
     if np.any(values[0] > values[1]):
         raise InputError(f"{who}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}")
