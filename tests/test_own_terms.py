@@ -1,9 +1,15 @@
 """Own terms, weights, switches, limits, settings and mesh: they reach every solve, and what does not fit is refused."""
 
+import os
 import re
+import subprocess
+import sys
+from functools import cache
+from itertools import pairwise
 from types import MappingProxyType
 
 import casadi as ca
+import numpy as np
 import pytest
 from fixtures_core import planner
 from test_solver import flat_guess, move
@@ -143,7 +149,7 @@ def test_no_number_at_the_start_is_refused_before_the_solve(expression):
     nlp = Nlp(changed(move(), {"go": [cost(expression)]}))
     for solve in (nlp.solve, nlp.gauss_newton_steps):
         refused(
-            "term 'x' of 'move/go': no finite value or slope at the start of the solve; keep its arguments where it is "
+            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where it is "
             "defined, for instance x + 1e-6 under a root",
             solve, {"goal": 2.0}, flat_guess(),
         )  # fmt: skip
@@ -313,7 +319,7 @@ def armed(weight: float, **how) -> jl.Planner:
 
 
 def falls(values: list[float]) -> bool:
-    return all(b <= a * (1 + SLACK) for a, b in zip(values, values[1:], strict=False)) and values[-1] < values[0]
+    return all(b <= a * (1 + SLACK) for a, b in pairwise(values)) and values[-1] < values[0]
 
 
 def same(one: jl.JumpPlan, other: jl.JumpPlan) -> None:

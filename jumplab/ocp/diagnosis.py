@@ -37,22 +37,23 @@ def failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteration
 
 
 def check_start(a: Assembled, posed: Posed) -> None:
-    """Refuse (:class:`InputError`) an own term without a finite value or slope where a solve would begin."""
+    """Refuse (:class:`InputError`) own terms without a finite value or derivative where a solve would begin."""
     if not a.problem.own or _all_finite(a, posed):
         return
     lost = {x.partition(" at node ")[0] for x in _without_number(a, posed.x0, posed.p)}
-    own = [(owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost]
+    own = [(owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost or not lost]
     if own:
-        owner, name = own[0]
+        who = " or ".join(f"{name!r} of {a.problem.place(owner)!r}" for owner, name in own)
         raise InputError(
-            f"term {name!r} of {a.problem.place(owner)!r}: no finite value or slope at the start of the solve; keep "
-            f"its arguments where it is defined, for instance x + 1e-6 under a root"
+            f"term {who}: no finite value or derivative at the start of the solve; keep its arguments where it is "
+            f"defined, for instance x + 1e-6 under a root"
         )
 
 
 def _all_finite(a: Assembled, posed: Posed) -> bool:
-    """Whether all values and slopes at the start are numbers; cheap."""
+    """Whether values, slopes and curvature at the start are numbers; cheap."""
     found = *a.grad_f(posed.x0, posed.p), *a.jac_g(posed.x0, posed.p)
+    found = *found, a.hess_lag(posed.x0, posed.p, 1.0, np.ones(a.n_rows))
     return all(np.all(np.isfinite(np.array(x.nonzeros()))) for x in found)
 
 
