@@ -149,8 +149,8 @@ def test_no_number_at_the_start_is_refused_before_the_solve(expression):
     nlp = Nlp(changed(move(), {"go": [cost(expression)]}))
     for solve in (nlp.solve, nlp.gauss_newton_steps):
         refused(
-            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where it is "
-            "defined, for instance x + 1e-6 under a root",
+            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where it "
+            "is defined, for instance x + 1e-6 under a root",
             solve, {"goal": 2.0}, flat_guess(),
         )  # fmt: skip
 
