@@ -149,8 +149,8 @@ def test_no_number_at_the_start_is_refused_before_the_solve(expression):
     nlp = Nlp(changed(move(), {"go": [cost(expression)]}))
     for solve in (nlp.solve, nlp.gauss_newton_steps):
         refused(
-            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where it "
-            "is defined, for instance x + 1e-6 under a root",
+            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where "
+            "it is defined, for instance x + 1e-6 under a root",
             solve, {"goal": 2.0}, flat_guess(),
         )  # fmt: skip
 
@@ -426,7 +426,7 @@ def test_chains_plan_with_own_terms():
     robot = jl.Robot.load()
     one = jl.Planner(crouched(robot), terms={"whole body/flight": [calm(1.0)]})
     run = run_chain(Course.of([0.4], 0.3), robot, planner=one, solve_s=0.3)
-    used = run.jumps[0].used.plan
+    used = run.jumps[0].ahead.plan
     assert ("flight", "calm arms") in used.whole_body.solution.problem.own
     assert run_chains(Course.of([0.4], 0.3), robot, 1, planner=one, solve_s=0.3, jobs=1).stood == 1
 
