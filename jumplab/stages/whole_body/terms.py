@@ -180,7 +180,7 @@ class WholeBodyTerms:
         least = self.limits.least_push if self.contact is Contact.FLAT else 0.0
 
         def push(p):
-            return self.wrench(p)[1] - least * self.mg if least else self.wrench(p)[1]
+            return self.wrench(p)[1] - least * self.model.total_mass * p.p.gravity if least else self.wrench(p)[1]
 
         def cone(p):
             f = self.wrench(p)

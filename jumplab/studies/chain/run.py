@@ -48,7 +48,7 @@ def run_chain(
     Parameters
     ----------
     robot : as planned; the simulated one differs from it by ``perturbation``.
-    planner : of :func:`jumplab.studies.chain.crouched` ``(robot)``; a new one if None.
+    planner : of :func:`jumplab.studies.chain.crouched` ``(robot)``, with own terms or not; a new one if None.
     perturbation : of the simulated robot. With its sensors' noise, where the feet stand is odometry through impacts,
         which drifts by centimetres in every jump; without, it is the truth.
     rehearsal : the course's plans from the crouch, with which re-plans begin; made now if None and ``rehearse``, which
@@ -57,8 +57,7 @@ def run_chain(
     look_s : when the next jump is planned, after touchdown [s]; negative: so long before the touchdown that is due.
     revise_s : when a plan made in the air is made again from where the feet really are, after touchdown [s]; never if
         None. The robot waits for neither: it begins with the latest plan that is there.
-    landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
-    method : "three-step" or "direct".
+    landing, method : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`; "three-step" or "direct".
 
     Returns
     -------
