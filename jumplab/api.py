@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,7 +30,7 @@ def plan(
     robot: Robot | str | Path = "bhr",
     *,
     method: str = "three-step",
-    weights: Mapping[str, float] | None = None,
+    **changes: Any,
 ) -> JumpPlan:
     """Plan one jump: three optimisations, then the 1 kHz tape (Sec. III to V of the paper).
 
@@ -40,7 +39,8 @@ def plan(
     task : what to reach.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, from a crouch).
-    weights : of stage 3's cost terms, instead of their own; "term" or "phase/term" -> weight.
+    changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
+        :class:`jumplab.Planner`, which plans many targets with them.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def plan(
         If a stage refuses the target or finds no motion; the sentence says which, and what to ask for instead.
     """
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
-    return Planner(robot, keep=True).plan(task, method, weights=weights)
+    return Planner(robot, keep=True, **changes).plan(task, method)
 
 
 def audit(plan: JumpPlan) -> AuditReport:

@@ -10,6 +10,7 @@ from fixtures_core import srmp_planner
 from scipy.sparse import csc_matrix
 
 from jumplab.errors import InputError
+from jumplab.ocp import changed
 from jumplab.ocp import problem as problem_words
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import chain
@@ -297,13 +298,13 @@ def test_table_lists_every_term_and_bound():
 
 
 def test_terms_can_be_added_and_must_have_their_own_name():
-    problem = toy().with_terms("two", Term("wall", "-", "m", "node", lambda p: p.q, lower=-1.0, upper=1.0))
+    problem = changed(toy(), {"two": [Term("wall", "-", "m", "node", lambda p: p.q, lower=-1.0, upper=1.0)]})
     assert Assembled(problem).n_rows == Assembled(toy()).n_rows + 4
     with pytest.raises(InputError, match="nowhere"):
-        toy().with_terms("nowhere", Term("wall", "-", "m", "node", lambda p: p.q))
+        changed(toy(), {"nowhere": [Term("wall", "-", "m", "node", lambda p: p.q)]})
     twin = Term("wall", "-", "m", "node", lambda p: p.v, lower=-5.0, upper=5.0)
     with pytest.raises(InputError, match="wall"):  # bounds are found by name: a second one would get the first one's
-        Assembled(problem.with_terms("two", twin))
+        changed(problem, {"two": [twin]})
 
 
 def test_skip_is_for_constraints_at_nodes():

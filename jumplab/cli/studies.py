@@ -208,7 +208,7 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     opt("--height-m M", f"{VALUES} [m] (default 0.1:0.6:11)", "0.1:0.6:11", values_of),
     opt("--platform-m M", f"{VALUES} [m] (default 0)", "0", values_of),
     opt("--robot NAME...", "robot; may be repeated (default bhr)"),
-    opt("--weight TERM=VALUES...", "weights of a term of stage 3, as TERM=A,B,...; may be repeated", []),
+    opt("--weight TERM=VALUES...", "weights of a term, as TERM=A,B,... or STAGE/TERM=A,B,...; may be repeated", []),
     opt("--method METHOD", "three-step (default) or direct", "three-step"),
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
     opt("--jobs N", "processes (default: one per processor)", "-1", JOBS),

@@ -29,6 +29,7 @@ from jumplab.errors import InputError, as_path, require_type
 from jumplab.io.files import ensure_writable, locked, made, write_file  # noqa: F401 - two of them for users of a result
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.task import GRAVITY
 
 T = TypeVar("T")
 Summary = Mapping[str, Any]
@@ -213,7 +214,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
-    """Read a plan's folder: the tape, the robot it was planned for, and the summary.
+    """Read a plan's folder: the tape, the robot it was planned for, under the target's gravity, and the summary.
 
     Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the one that the
     summary speaks of.
@@ -231,7 +232,8 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
                 if sha256(folder / name) != summary["manifest"]["files"][name]:
                     raise InputError(f"{folder / name}: changed or damaged since it was written; plan the jump again")
             urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
-            return Tape.load(folder / PLAN), Robot.from_text(urdf, config), summary
+            robot = Robot.from_text(urdf, config).under_gravity(summary["target"].get("gravity", GRAVITY))
+            return Tape.load(folder / PLAN), robot, summary
     except (OSError, ValueError) as e:
         reason = (e.strerror if isinstance(e, OSError) else str(e)) or type(e).__name__
         raise InputError(f"the plan in {str(folder)!r} cannot be read ({reason})") from e

@@ -10,6 +10,7 @@ import lazy_loader as lazy
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submod_attrs={
+        "changes": ["changed"],
         "nlp": ["Nlp"],
         "problem": ["Bound", "Phase", "Point", "Problem", "Term"],
         "solution": ["Near", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"],

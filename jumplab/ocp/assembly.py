@@ -218,8 +218,12 @@ def row_bounds(a: Assembled, parameters: Any, off: Container[str]) -> tuple[np.n
     low, high = np.full(a.n_rows, -np.inf), np.full(a.n_rows, np.inf)
     for owner, term, index in a.groups:
         if not _is_off(owner, term.name, off):
-            low[index] = _resolve(term.lower, parameters, index.shape[1]) / term.scale
-            high[index] = _resolve(term.upper, parameters, index.shape[1]) / term.scale
+            for side, bound in ((low, term.lower), (high, term.upper)):
+                try:
+                    side[index] = _resolve(bound, parameters, index.shape[1]) / term.scale
+                except ValueError:
+                    rows, who = index.shape[1], f"term {term.name!r} of {a.problem.place(owner)!r}"
+                    raise InputError(f"{who}: a bound does not fit its expression, whose size is {rows}") from None
     return low, high
 
 
@@ -331,5 +335,7 @@ def pack_multipliers(a: Assembled, given: Multipliers) -> tuple[np.ndarray, np.n
     """(lam_x, lam_g) for this mesh from multipliers of the same problem on any mesh."""
     lam = np.zeros(a.size), np.zeros(a.n_rows)
     for name, which, index, share, density in _along(a):
-        lam[which][index] = resampled(*given.rows[name], share) / density
+        known = given.rows.get(name)  # a problem with further terms, or wider ones, begins them with zero
+        if known is not None and known[1].shape[1:] == index.shape[1:]:
+            lam[which][index] = resampled(*known, share) / density
     return lam

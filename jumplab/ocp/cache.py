@@ -24,7 +24,7 @@ from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import FUNCTIONS, JERK_CHAIN, Element, chain_term
 from jumplab.ocp.problem import Problem
 
-HOME = ("jumplab.",)  # a problem with terms from elsewhere is not kept: no key would know a change of them
+HOME = ("jumplab.",)  # a problem with terms from elsewhere is not kept, unless it knows the hashes of their expressions
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
 BUILT_BY = ("errors", "task", "ocp", "models", "robot", "robot_import", "stages.srmp", "stages.whole_body")
 
@@ -50,13 +50,14 @@ def _sources() -> str:
 
 def _words(problem: Problem) -> list:
     """What a problem says of itself, but for its mesh and the values of bounds and weights, which are data."""
+    own = [(*name, digest) for name, digest in problem.own.items()]
     phases = [
         (p.name, p.coordinates, p.states, {name: c[2] for name, c in p.constants.items()}, p.references, p.scales)
         for p in problem.phases
     ]
     terms = [(owner, t.name, t.equation, t.at, t.is_cost, t.scale) for owner, t in problem.terms()]
     bounds = [(owner, b.name, b.equation, b.on, b.where) for owner, b in problem.bounds()]
-    return [problem.name, problem.parameters, phases, terms, bounds]
+    return [problem.name, problem.parameters, phases, terms, bounds, own]
 
 
 def assembled(problem: Problem, key: str | None = None) -> Assembled:
@@ -64,7 +65,8 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
 
     ``key`` says what the problem was made of besides its words; None keeps nothing.
     """
-    place, modules = folder(), {str(t.expression.__module__) for _, t in problem.terms()}
+    shipped = [t for owner, t in problem.terms() if (owner, t.name) not in problem.own]
+    place, modules = folder(), {str(t.expression.__module__) for t in shipped}
     if key is None or place is None or not all(module.startswith(HOME) for module in modules):
         return Assembled(problem)
     made_of = [_sources(), ca.CasadiMeta.version(), _words(problem), key]

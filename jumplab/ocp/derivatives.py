@@ -10,12 +10,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from jumplab.errors import InputError
 from jumplab.ocp.problem import Phase, PhaseLayout, Point, Problem, Term
 
 JERK_CHAIN = "jerk chain"  # the term that every phase has
 END_OF_PHASE = 1e-9  # share of a phase, far below one interval
 MATRICES = ("jacobian", "hessian", "gauss_newton")  # of the symmetric ones the upper triangle
 FUNCTIONS = ("costs", "gradient", "rows", *MATRICES)  # that an element may be asked for
+SAID = 300  # characters of another error that a sentence quotes
 RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
@@ -139,7 +141,7 @@ class ElementBuilder:
         ref = SimpleNamespace(**{n: refs[ends[i] : ends[i + 1]] for i, n in enumerate(phase.references)})
         j = jerk * ca.DM(phase.scale("j")) if jerk is not None else None
         q, v, a, z = x[:nq], x[nq : 2 * nq], x[2 * nq : 3 * nq], x[3 * nq :]
-        return Point(q, v, a, j, z, const[0], s, names, self.parameters, ref)
+        return Point(q, v, a, j, z, const[0], s, names, self.parameters, ref, view=phase.view)
 
     def _phase(self, layout):
         phase, nx, nref = layout.phase, layout.nx, sum(layout.phase.references.values())
@@ -178,8 +180,7 @@ class ElementBuilder:
         """Terms evaluated on the points that they see; costs count for the share of the phase that they span."""
         costs, rows, counts = [], [], []
         for t in terms:
-            y = t.expression(*seen[t.at])
-            y = ca.vertcat(*y) if isinstance(y, (list, tuple)) else ca.SX(y)
+            y = _column(self.problem.place(owner), t, seen[t.at])
             if t.is_cost:
                 costs.append((spans.get(t.at, 1.0), y))
             else:
@@ -187,6 +188,20 @@ class ElementBuilder:
                 counts.append((t, y.numel()))
         formulas = Formulas(local, data, self.parameter_vector, costs, rows)
         return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
+
+
+def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
+    """What a term makes of the points that it sees, as a column; refuses whatever is none, by the term's name."""
+    who = f"term {term.name!r} of {place!r}"
+    try:
+        y = term.expression(*seen)
+        y = ca.SX(ca.vertcat(*y) if isinstance(y, list | tuple) else y)
+    except Exception as e:  # whatever a user's function may raise
+        what = " ".join(str(e).split()) or type(e).__name__
+        raise InputError(f"{who}: its expression cannot be evaluated ({type(e).__name__}: {what[:SAID]})") from e
+    if y.shape[1] != 1 or y.shape[0] == 0:
+        raise InputError(f"{who}: its expression has the shape {y.shape}; it must return a column of one row or more")
+    return y
 
 
 def chain_term(phase: Phase) -> Term:

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import SolverError
+from jumplab.errors import InputError, SolverError
 from jumplab.ocp.assembly import Assembled, Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
 from jumplab.ocp.derivatives import JERK_CHAIN, scatter
@@ -102,7 +102,11 @@ class Nlp:
         Raises :class:`SolverError` if a step is no number.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
-        method, began = self._gauss_newton, time.perf_counter()
+        check_start(a, posed)
+        try:
+            method, began = self._gauss_newton, time.perf_counter()
+        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
+            raise SolverError(str(e), stage=a.problem.name, status="approach") from e
         x, count = method.steps(posed)
         f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
         spent, residual = time.perf_counter() - began, float(np.max(posed.beyond(g), initial=0.0))
@@ -136,6 +140,7 @@ class Nlp:
         explain : look for the terms in conflict if there is no solution; it costs about as much as the solve.
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, references, weights, off)
+        check_start(a, posed)
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}
         if multipliers is not None:
             start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, multipliers), strict=True))
@@ -197,6 +202,27 @@ def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteratio
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
     return SolverError(said, stage=name, status=status, violations=violations)
+
+
+def check_start(a: Assembled, posed: Posed) -> None:
+    """Refuse (:class:`InputError`) own terms without a finite value or derivative where a solve would begin."""
+    if not a.problem.own or _all_finite(a, posed):
+        return
+    lost = {x.partition(" at node ")[0] for x in _without_number(a, posed.x0, posed.p)}
+    own = [(owner, name) for owner, name in a.problem.own if f"{owner}/{name}" in lost or not lost]
+    if own:
+        who = " or ".join(f"{name!r} of {a.problem.place(owner)!r}" for owner, name in own)
+        raise InputError(
+            f"term {who}: no finite value or derivative at the start of the solve; keep its arguments where it is "
+            f"defined, for instance x + 1e-6 under a root"
+        )
+
+
+def _all_finite(a: Assembled, posed: Posed) -> bool:
+    """Whether values, slopes and curvature at the start are numbers; cheap."""
+    found = *a.grad_f(posed.x0, posed.p), *a.jac_g(posed.x0, posed.p)
+    found = *found, a.hess_lag(posed.x0, posed.p, 1.0, np.ones(a.n_rows))
+    return all(np.all(np.isfinite(np.array(x.nonzeros()))) for x in found)
 
 
 def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> tuple[str, ...]:

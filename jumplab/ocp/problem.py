@@ -17,7 +17,7 @@ From rest to a goal with the least jerk:
 >>> print(f"{solution.phases['go'].q[-1, 0]:.3f} m")
 2.000 m
 
-A further wish is a further term: ``problem.with_terms("go", Term(...))``.
+A further wish is a further term: :func:`jumplab.ocp.changed`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -46,6 +47,7 @@ class Point:
     c, p : by name, the phase's further constants, and the problem's parameters.
     ref : this node's references by name; at "mid" and "interval" those of the left node, zero at "problem" points.
     memo : scratch space, so that several terms can share one model evaluation.
+    view : of the phase, see :class:`Phase`; what it knows by name is an attribute of the point.
     """
 
     q: ca.SX
@@ -59,11 +61,24 @@ class Point:
     p: SimpleNamespace
     ref: SimpleNamespace
     memo: dict = field(default_factory=dict)
+    view: Callable[[Point], Any] | None = None
 
     @property
     def time(self) -> ca.SX:
         """Time since the phase began [s]."""
         return self.s * self.duration
+
+    def __getattr__(self, name: str) -> Any:
+        view = self.__dict__.get("view")
+        if view is None or name.startswith("_"):
+            raise AttributeError(f"a point has no {name!r}")
+        if "view" not in self.memo:
+            self.memo["view"] = view(self)
+        seen = self.memo["view"]
+        names = [n for n in dir(type(seen)) if not n.startswith("_")]
+        if name not in names:
+            raise AttributeError(f"a point of this phase has no {name!r}; it has {', '.join(names)}, time, duration")
+        return getattr(seen, name)
 
 
 @dataclass(frozen=True)
@@ -145,6 +160,7 @@ class Phase:
     constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration.
     references : name -> size, data given per node when solving.
     scales : nominal sizes of q, v, a, j and z; 1 where not given.
+    view : makes of a :class:`Point` an object with the quantities that people think in, one attribute each.
     """
 
     name: str
@@ -157,6 +173,7 @@ class Phase:
     constants: dict = field(default_factory=dict)
     references: dict = field(default_factory=dict)
     scales: dict = field(default_factory=dict)
+    view: Callable[[Point], Any] | None = None
 
     def __post_init__(self):
         names = [x.name for x in (*self.terms, *self.bounds)]
@@ -172,12 +189,16 @@ class Phase:
 
 @dataclass(frozen=True)
 class Problem:
-    """Phases, the terms at "problem" that join them, and the names and sizes of the parameters."""
+    """Phases, the terms at "problem" that join them, and the names and sizes of the parameters.
+
+    ``own`` are the terms that :func:`jumplab.ocp.changed` added: (phase, name) -> hash of the expression.
+    """
 
     name: str
     phases: tuple[Phase, ...]
     joints: tuple[Term, ...] = ()
     parameters: dict = field(default_factory=dict)
+    own: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def terms(self) -> list[tuple[str, Term]]:
         """(phase name, term) of every term, in order; joining terms carry the problem's name."""
@@ -186,6 +207,10 @@ class Problem:
     def bounds(self) -> list[tuple[str, Bound]]:
         """(phase name, bound) of every bound, in order."""
         return [(p.name, b) for p in self.phases for b in p.bounds]
+
+    def place(self, owner: str) -> str:
+        """A phase as sentences name it, "problem/phase"; the problem's name for terms that join phases."""
+        return self.name if owner == self.name else f"{self.name}/{owner}"
 
     def check_names(self, names: Iterable[str], what: str) -> None:
         """Raise :class:`InputError` if a name, "name" or "phase/name", is no term or bound of this problem."""
@@ -196,26 +221,19 @@ class Problem:
                 listed = ", ".join(sorted(short))
                 raise InputError(f"{what} {name!r}: the problem {self.name!r} has no such term; it has {listed}")
 
-    def with_terms(self, phase: str, *extra: Term) -> Problem:
-        """A copy with further terms in one phase; :class:`InputError` if there is no such phase."""
-        if phase not in {p.name for p in self.phases}:
-            raise InputError(f"{self.name}: no phase {phase!r}; it has {', '.join(p.name for p in self.phases)}")
-        phases = tuple(replace(p, terms=p.terms + extra) if p.name == phase else p for p in self.phases)
-        return replace(self, phases=phases)
-
     def on_mesh(self, intervals: Mapping[str, int]) -> Problem:
         """A copy with other numbers of steps, phase name -> intervals; the terms are the same objects."""
         return replace(self, phases=tuple(replace(p, intervals=intervals[p.name]) for p in self.phases))
 
     def table(self) -> list[dict]:
-        """One row per term and bound: phase, name, kind, at, unit, equation, value (weight or bounds)."""
+        """One row per term and bound: stage, phase, name, kind, at, unit, equation, value (weight or bounds)."""
         rows = []
         for owner, x in (*self.terms(), *self.bounds()):
             kind = "bound" if isinstance(x, Bound) else "cost" if x.is_cost else "constraint"
             at = f"{x.on} {x.where}" if kind == "bound" else x.at
             value = f"weight {x.weight:g}" if kind == "cost" else f"{_text(x.lower)} ... {_text(x.upper)}"
-            row = dict(phase=owner, name=x.name, kind=kind, at=at, unit=x.unit, equation=x.equation, value=value)
-            rows.append(row)
+            row = dict(stage=self.name, phase=owner, name=x.name, kind=kind, at=at, unit=x.unit)
+            rows.append(row | dict(equation=x.equation, value=value))
         return rows
 
 

@@ -18,8 +18,6 @@ from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.perturbation import SensorNoise
 from jumplab.task import GRAVITY
 
-GRAVITY_VECTOR = np.array([0.0, 0.0, -GRAVITY])
-
 
 @dataclass(frozen=True)
 class Reading:
@@ -39,11 +37,12 @@ class Sensors:
     the foot's own weight and inertia; the accelerometer has no end of its range.
     """
 
-    def __init__(self, noise: SensorNoise, seed: int):
+    def __init__(self, noise: SensorNoise, seed: int, gravity: float = GRAVITY):
         self.noise, self._rng = noise, np.random.default_rng([seed, 1])  # a stream of its own beside the robot's draw
         self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
         self._accel_bias = noise.accel_bias * self._rng.standard_normal(3)
         self._last_velocity: np.ndarray | None = None
+        self._gravity = np.array([0.0, 0.0, -gravity])
 
     def initial(self, q: np.ndarray) -> np.ndarray:
         """Configuration (nq,) as it is believed to be before the jump: roll and pitch a little off."""
@@ -57,7 +56,7 @@ class Sensors:
         velocity = attitude @ v[:3]
         gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
         self._last_velocity = velocity
-        force = attitude.T @ (gained / STEP_S - GRAVITY_VECTOR)
+        force = attitude.T @ (gained / STEP_S - self._gravity)
         joints = q[7:] + n.joint_rad * draw(len(q) - 7)
         if n.encoder_step_rad:
             joints = n.encoder_step_rad * np.round(joints / n.encoder_step_rad)
@@ -91,7 +90,7 @@ class Estimator:
     """
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise):
-        self._gauge, foot = Gauge(robot), robot.foot
+        self._gauge, foot, self._gravity = Gauge(robot), robot.foot, np.array([0.0, 0.0, -robot.gravity])
         self._ends = [np.array([x, foot.center[1], foot.sole_z]) for x in (foot.toe, foot.heel)]
         self._attitude = rotation(q[3:7])
         self._place, self._velocity = q[:3].copy(), self._attitude @ v[:3]
@@ -119,7 +118,7 @@ class Estimator:
         """One step of the inertial unit."""
         self._attitude = self._attitude @ pin.exp3(rate * STEP_S)
         push = self._attitude @ force
-        self._velocity = self._velocity + (push + GRAVITY_VECTOR) * STEP_S
+        self._velocity = self._velocity + (push + self._gravity) * STEP_S
         self._place = self._place + self._velocity * STEP_S
         step, n = self._step, self._noise
         step[SPEED, TURN] = -STEP_S * pin.skew(push)
@@ -182,7 +181,7 @@ class Perception:
     """What the controllers are told: the truth if no sensor errs, otherwise the estimate, see :class:`Estimator`."""
 
     def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
-        self._sensors, self._tilt, self._speed = Sensors(noise, seed), 0.0, 0.0
+        self._sensors, self._tilt, self._speed = Sensors(noise, seed, robot.gravity), 0.0, 0.0
         exact = noise == SensorNoise()  # then the true state stands for its estimate
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 

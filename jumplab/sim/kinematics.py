@@ -6,7 +6,6 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.robot import Robot
-from jumplab.task import GRAVITY
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
@@ -69,4 +68,4 @@ class Gauge:
     def com_ahead(self, q: np.ndarray, v: np.ndarray, left_s: float) -> np.ndarray:
         """CoM (3,) in ``left_s`` of free flight [m]."""
         speed = self.com_velocity(q, v)
-        return self.com(q) + speed * left_s - np.array([0.0, 0.0, GRAVITY * left_s**2 / 2])
+        return self.com(q) + speed * left_s - np.array([0.0, 0.0, self.robot.gravity * left_s**2 / 2])

@@ -112,7 +112,8 @@ class Perturbation:
             origin = inertial.find("origin")
             xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
             origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
-        return Robot.from_text(ET.tostring(root, encoding="unicode"), robot.config_text)
+        real = Robot.from_text(ET.tostring(root, encoding="unicode"), robot.config_text)
+        return real.under_gravity(robot.gravity)
 
     def to_json(self) -> dict:
         """All numbers as plain data."""

@@ -15,7 +15,6 @@ from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of, pitched, planned_pitch
 from jumplab.sim.scene import Scene
-from jumplab.task import GRAVITY
 
 # The paper prints none of these numbers.
 START_HEIGHT_M = 0.30  # soles this far above the ground; earlier, the correction fights the swing itself
@@ -96,7 +95,9 @@ class Reaim:
         guess = pitched(self._end, pitch_error)
         for _ in range(NEWTON_STEPS):
             here = self._aim(guess)
-            fall = np.sqrt(max(speed[2] ** 2 + 2 * GRAVITY * (com[2] - here[2] - top), FASTEST_FALL**2))
+            fall = np.sqrt(
+                max(speed[2] ** 2 + 2 * self._gauge.robot.gravity * (com[2] - here[2] - top), FASTEST_FALL**2)
+            )
             goal = np.array([(momentum / self._mass + here[2] * speed[0] - self._moment) / fall, self._tilt])
             slope = np.empty((2, 2))
             for column, (rows, signs) in enumerate(zip(self._rows, self._signs, strict=True)):

@@ -20,7 +20,6 @@ from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitched, rotation
 from jumplab.sim.scene import Scene
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
-from jumplab.task import GRAVITY
 
 # The paper prints none of these numbers.
 LEAD_S = 0.15  # before touchdown a landing is planned: three times what the solve takes on one core of a laptop
@@ -65,16 +64,17 @@ class Rest:
 
 Reference = LandingReference | LandingPlan | Rest  # or whatever knows ``at`` and ``feed_forward``
 LandingSource = Reference | Callable[[np.ndarray, np.ndarray], Reference | None]
-_planners: dict[str, LandingPlanner] = {}
+_planners: dict[tuple[str, float], LandingPlanner] = {}
 
 
 def landing_planner(robot: Robot) -> LandingPlanner:
     """The landing planner of ``robot``, built once (0.3 s)."""
-    if robot.hash not in _planners:
+    key = robot.hash, robot.gravity
+    if key not in _planners:
         while len(_planners) >= KEPT_PLANNERS:
             del _planners[next(iter(_planners))]
-        _planners[robot.hash] = LandingPlanner(robot)
-    return _planners[robot.hash]
+        _planners[key] = LandingPlanner(robot)
+    return _planners[key]
 
 
 def _landing(robot: Robot, touchdown: Touchdown) -> tuple[LandingPlan | None, str | None, float]:
@@ -101,13 +101,13 @@ class Forecast:
         data = self._gauge.data
         pin.centerOfMass(self._gauge.model, data, q, v)
         (x, _, z), (vx, _, vz) = data.com[0], data.vcom[0]
-        left = 0.0
+        left, gravity = 0.0, self._gauge.robot.gravity
         for _ in range(2):  # the ground's height depends on where, and so on when
             drop = z - self._above - self._scene.top_at(x + vx * left + self._ahead)
-            root = vz**2 + 2 * GRAVITY * drop
+            root = vz**2 + 2 * gravity * drop
             if root < 0:
                 return np.inf
-            left = (vz + np.sqrt(root)) / GRAVITY
+            left = (vz + np.sqrt(root)) / gravity
         return float(left)
 
     def state(
@@ -120,7 +120,7 @@ class Forecast:
         model, data = self._gauge.model, self._gauge.data
         pin.ccrba(model, data, q, v)
         speed, momentum = data.vcom[0].copy(), data.hg.angular[1]
-        speed[2] -= GRAVITY * self.time_left(q, v)
+        speed[2] -= self._gauge.robot.gravity * self.time_left(q, v)
         end, rates = pitched(self._q, pitch_error), self._v.copy()
         if correction is not None:
             end[7:] += correction
@@ -178,7 +178,7 @@ class Replan:
             self._due += EVERY_S
             now = touchdown_of_state(self._robot, q, v, impact=False)
             com, velocity, _ = reference.at(time)
-            rate = np.sqrt(GRAVITY / max(now.com[1], LEAST_HEIGHT_M))  # the capture point is x + v_x / rate
+            rate = np.sqrt(self._robot.gravity / max(now.com[1], LEAST_HEIGHT_M))  # the capture point is x + v_x / rate
             if abs(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate) > OFF_M:
                 plan, _, spent_s = _landing(self._robot, now)
                 if plan is None:  # from here stage 1 knows no landing; the older one is the best there is

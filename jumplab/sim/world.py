@@ -23,7 +23,6 @@ from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import REACH_M, Block, Contacts, Scene
-from jumplab.task import GRAVITY
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ class World:
         s = SETTINGS
         contact = dict(contactERP=s.contact_erp, contactSlop=s.contact_slop_m, deterministicOverlappingPairs=1)
         steps = dict(fixedTimeStep=STEP_S, numSubSteps=0, numSolverIterations=s.solver_iterations)
-        self._bullet.setGravity(0, 0, -GRAVITY)
+        self._bullet.setGravity(0, 0, -self.robot.gravity)
         self._bullet.setPhysicsEngineParameter(**steps, **contact)
 
     def _add_block(self, block: Block) -> int:

@@ -36,7 +36,7 @@ class JumpPlan:
 
     Attributes
     ----------
-    task, robot, method : what was asked, of whom, and how it was planned.
+    task, robot, method : what was asked, of whom (under the task's gravity), and how it was planned.
     tape : the 1 kHz tape of the full robot.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner; None if the plan was read from a result folder.
@@ -89,6 +89,17 @@ class JumpPlan:
             found = {"SRMP": _weights(self.srmp.solution), **found}
         return found
 
+    def terms(self) -> list[dict[str, Any]]:
+        """All terms and bounds of the stages as solved; ``jl.plots.table`` shows them.
+
+        Returns
+        -------
+        rows as of :meth:`jumplab.Planner.terms`, of costs also their ``share`` of the stage's cost, of constraints the
+        ``node`` where they are tightest and the ``slack`` there [unit]. Empty for a plan that was read from a folder.
+        """
+        solved = [s.solution for s in (self.srmp, self.whole_body) if s is not None]
+        return [row for solution in solved for row in _terms(solution)]
+
     @property
     def solvers(self) -> dict[str, dict]:
         """What the solvers said: stage -> status, iterations, size, cost, worst re-evaluated residual (scaled)."""
@@ -115,7 +126,7 @@ class JumpPlan:
             "planned_rise_m": self.planned_rise_m,
             "launch_s": self.whole_body.launch_s,
             "flight_s": self.whole_body.flight_s,
-            "platform_edge_m": platform_edge_m(self.task, self.robot),
+            "platform_edge_m": platform_edge_m(self.task, self.robot, self.whole_body.limits),
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],
@@ -127,6 +138,18 @@ class JumpPlan:
 def _solver(s: Statistics) -> dict:
     times = ("build_s", "solve_s")  # these stand in the table of stages
     return {"solver": "ipopt", **{k: v for k, v in vars(s).items() if k not in times}}
+
+
+def _terms(solution: Solution) -> list[dict[str, Any]]:
+    costs = {(r["phase"], r["name"]): r for r in solution.cost_shares}
+    tight = {(r["phase"], r["name"]): r for r in solution.constraint_report}
+    rows = []
+    for row in solution.problem.table():
+        cost, limit = (found.get((row["phase"], row["name"]), {}) for found in (costs, tight))
+        value = f"weight {cost['weight']:g}" if cost else row["value"]
+        found = dict(share=cost.get("share"), node=limit.get("node"), slack=limit.get("slack"))
+        rows.append(row | {"value": value} | found)
+    return rows
 
 
 def _weights(solution: Solution) -> dict[str, float]:

@@ -2,60 +2,149 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import PhaseGuess, Statistics
+from jumplab.ocp import PhaseGuess, Statistics, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach, rod_of
 from jumplab.robot.stance import configuration
+from jumplab.stages.changes import StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.whole_body import FlipPlanner, Mesh, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS = ("three-step", "direct")
 OWN_ARMS, NAIVE_ARMS = 0.25, 0.75  # shares of the arms' swing in stage 3's guess: stage 2's arms swing too far
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
+_COUNT = count()
 SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
 
 class Planner:
-    """All stages for one robot, built on first use and kept for further targets; ``mesh`` is that of stage 3.
+    """All stages for one robot, built on first use and kept for further targets.
 
-    ``keep`` keeps the built problems for later processes, see :mod:`jumplab.ocp.cache`.
+    Whatever is changed here holds in every solve of every path: coarse and fine mesh, re-solves, re-plans, flips, the
+    direct planner, chains. What would be ignored is refused.
+
+    Parameters
+    ----------
+    robot : who jumps.
+    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body"
+        have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight; "srmp" or "whole body" alone
+        takes those at "problem". An expression sees a point with joints, joint_rates, torques, com, com_velocity, L,
+        inertia, wrench, posture, point("hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and in
+        stage 1 com, com_velocity, L, inertia, wrench, lean, posture, time, see
+        :class:`jumplab.stages.srmp.view.RodView`. The direct planner takes those of "whole body".
+    weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's.
+    off : names of the same sort: terms and bounds to leave out.
+    limits : of stage 3: :class:`jumplab.stages.whole_body.Limits`, or a mapping of some of its fields.
+    settings : of stage 1: :class:`jumplab.stages.srmp.SrmpSettings`, or a mapping of some of its fields.
+    mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
+    keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
+
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too.
+
+    Raises
+    ------
+    InputError
+        In one sentence, with the names that exist, for whatever does not fit; terms are looked at when their stage is
+        built, before anything is solved.
     """
 
-    def __init__(self, robot: Robot, mesh: Mesh = Mesh(), *, keep: bool = False):
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        terms: Mapping[str, Iterable[Term]] | None = None,
+        weights: Mapping[str, float] | None = None,
+        off: Iterable[str] = (),
+        limits: Limits | Mapping[str, Any] | None = None,
+        settings: SrmpSettings | Mapping[str, Any] | None = None,
+        mesh: Mesh | Mapping[str, int] | None = None,
+        keep: bool = False,
+    ):
         require_type(robot, Robot, "the robot to plan for")
-        self.robot, self.mesh, self.keep = robot, mesh, keep
+        self.robot, self.keep, self.changes = robot, keep, sorted_out(terms, weights, off)
+        self._given = limits, settings, mesh
+        self.limits, self.mesh = settled(Limits, limits), self._mesh()
+        settled(SrmpSettings, settings)  # refuses what does not fit
         self._stages: dict[str, Any] = {}
+        self.token = os.getpid(), next(_COUNT)  # the same in copies that other processes get
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_stages": {}}  # another process builds its own
+
+    def _mesh(self, flip: bool = False) -> Mesh:
+        given = self._given[2]
+        return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
     def stage(self, name: str) -> Any:
         """A stage's planner: "reach", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
         if name not in self._stages:
-            build = {
-                "reach": lambda: reach(self.robot),
-                "srmp": lambda: SrmpPlanner(self.robot, keep=self.keep),
-                "srmp flip": lambda: SrmpPlanner(self.robot, SrmpSettings().of_flip(), keep=self.keep),
-                "whole body": lambda: WholeBodyPlanner(self.robot, self.mesh, keep=self.keep),
-                "whole body flip": lambda: FlipPlanner(self.robot),
-                "direct": lambda: WholeBodyPlanner(self.robot, self.mesh, tracking=False, keep=self.keep),
-                "direct flip": lambda: FlipPlanner(self.robot, tracking=False),
-            }
-            self._stages[name] = build[name]()
+            kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
+            build = {"reach": lambda flip: reach(self.robot), "srmp": self._srmp}
+            self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
+
+    def _srmp(self, flip: bool) -> SrmpPlanner:
+        settings = settled(SrmpSettings, self._given[1], flip)
+        return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
+
+    def _body(self, flip: bool, tracking: bool) -> WholeBodyPlanner:
+        limits, how = settled(Limits, self._given[0], flip), dict(tracking=tracking, changes=self.changes["whole body"])
+        if flip:
+            return FlipPlanner(self.robot, self._mesh(True), limits, **how)
+        return WholeBodyPlanner(self.robot, self.mesh, limits, keep=self.keep, **how)
+
+    def prepared(
+        self, method: str = "three-step", weights: Mapping[str, float] | None = None, *, flip: bool = False
+    ) -> dict[str, StageChanges]:
+        """Build the stages of a method, so that nothing is refused after the first has solved.
+
+        Returns the ``weights`` of one plan by stage. Raises :class:`InputError` for own terms, weights or settings that
+        the method has no place for, and for names that do not exist.
+        """
+        asked, turn = sorted_out(weights=weights), " flip" * flip
+        if method == "direct":
+            ignored = [f"{s!r}" for s in ("srmp", "joint qp") if self.changes[s] or asked[s]]
+            if ignored := ignored + ["the settings of 'srmp'"] * (self._given[1] is not None):
+                raise InputError(
+                    f"the method 'direct' has no place for {' and '.join(ignored)}: it takes limits, mesh and the "
+                    f"terms of 'whole body'; choose 'three-step', or leave that out"
+                )
+            stages = {"reach": None, "direct" + turn: asked["whole body"]}
+        else:
+            stages = {f"{name}{turn}": asked[name] for name in ("srmp", "whole body")}
+        for name, changes in stages.items():
+            if (stage := self.stage(name)) and changes:
+                changes.applied(stage.nlp.problem)
+        return asked
+
+    def terms(self, *, flip: bool = False, method: str = "three-step") -> list[dict[str, Any]]:
+        """All terms and bounds of the stages as they are now, own ones included; ``jl.plots.table`` shows them.
+
+        Returns
+        -------
+        rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
+        """
+        stages = ("direct",) if method == "direct" else ("srmp", "whole body")
+        return [row for s in stages for row in self.stage(s + " flip" * flip).nlp.problem.table()]
 
     def plan(
         self,
@@ -71,7 +160,7 @@ class Planner:
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
-        weights : of stage 3's cost terms, instead of their own; name -> weight.
+        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
             None. Not for flips.
 
@@ -83,20 +172,21 @@ class Planner:
         require_type(task, JumpTask, "the target")
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
-        check_platform(task, self.robot)
+        check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
+        asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
         where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
-            return self._finished(method, planner.plan(task, weights=weights, **where))
+            return self._finished(method, planner.plan(task, weights=asked["whole body"].weights, **where))
         if task.rotation_rad:
-            return self._flip(task)
-        srmp, joints = self._first_two(task, start)
+            return self._flip(task, asked)
+        srmp, joints = self._first_two(task, start, asked)
         last = self.stage("whole body")
         guess = guess_from_joints(joints, last, task, srmp.toe_s)
-        body = last.plan(task, srmp, guess=guess, weights=weights, **where)
+        body = last.plan(task, srmp, guess=guess, weights=asked["whole body"].weights, **where)
         return self._finished(method, body, srmp, joints, (_joint_row(joints),))
 
     def _finished(
@@ -113,55 +203,70 @@ class Planner:
             rows = (_row("1 SRMP", srmp.solution.statistics), *rows)
         rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
         tape = make_tape(body, self.robot, srmp)
-        return JumpPlan(body.task, self.robot, method, tape, srmp, joints, body, rows, skipped)
+        return JumpPlan(
+            body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
+        )
 
-    def _flip(self, task: JumpTask) -> JumpPlan:
+    def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
-        first, last = self.stage("srmp flip"), self.stage("whole body flip")
-        srmp, joints, body, skipped, rows = first.plan(task), None, None, None, ()
+        last, weights = self.stage("whole body flip"), asked["whole body"].weights
+        first = partial(self.stage("srmp flip").plan, weights=asked["srmp"].weights)
+        srmp, joints, body, skipped, rows = first(task), None, None, None, ()
         try:
-            joints = map_to_joints(srmp, self.robot.under_gravity(task.gravity), method="direct")
+            joints = self._joints(srmp, asked)
             rows = (_joint_row(joints),)
         except SolverError as e:
             skipped = f"{e}; {OTHERWISE}"
         if joints is not None:
             try:
-                body = last.plan(task, srmp, guess=guess_from_joints(joints, last, task, srmp.toe_s))
+                guess = guess_from_joints(joints, last, task, srmp.toe_s)
+                body = last.plan(task, srmp, guess=guess, weights=weights)
             except SolverError as e:
                 skipped, joints = f"stage 2: its motion led nowhere ({e}); {OTHERWISE}", None
-        body = body or last.plan(task, srmp, stage1=first.plan)
+        body = body or last.plan(task, srmp, weights=weights, stage1=first)
         return self._finished("three-step", body, srmp, joints, rows, skipped)
 
-    def _first_two(self, task: JumpTask, start: np.ndarray | None) -> tuple[SrmpPlan, JointPlan]:
+    def _first_two(
+        self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
+    ) -> tuple[SrmpPlan, JointPlan]:
         """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
         try:
-            return self._pass(task, start)
+            return self._pass(task, start, asked)
         except SolverError as e:
-            nearest = self._nearest(task) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
+            nearest = self._nearest(task, asked) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
             if not nearest:
                 raise
             raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
 
-    def _pass(self, task: JumpTask, start: np.ndarray | None = None) -> tuple[SrmpPlan, JointPlan]:
+    def _pass(
+        self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
+    ) -> tuple[SrmpPlan, JointPlan]:
         q0 = None if start is None else configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
-        srmp, robot = self._pendulum(task, start), self.robot.under_gravity(task.gravity)
+        srmp = self._pendulum(task, start, weights=asked["srmp"].weights)
         try:
-            return srmp, map_to_joints(srmp, robot, STEPS_S, "direct", q0=q0)
+            return srmp, self._joints(srmp, asked, step_s=STEPS_S, q0=q0)
         except SolverError:  # at its limits a jump needs more of them
-            return srmp, map_to_joints(srmp, robot, method="direct", q0=q0)
+            return srmp, self._joints(srmp, asked, q0=q0)
 
-    def _pendulum(self, task: JumpTask, start: np.ndarray | None, **near: SrmpPlan) -> SrmpPlan:
+    def _joints(self, srmp: SrmpPlan, asked: Mapping[str, StageChanges], **how: Any) -> JointPlan:
+        """Stage 2 with its own rows, weights and switches. All its roll-outs pass here."""
+        own, now = self.changes["joint qp"], asked["joint qp"]
+        changes = {"terms": own.terms, "weights": {**own.weights, **now.weights}, "off": own.off}
+        how |= {name: value for name, value in changes.items() if value}
+        return map_to_joints(srmp, self.robot.under_gravity(srmp.task.gravity), method="direct", **how)
+
+    def _pendulum(self, task: JumpTask, start: np.ndarray | None, **how: Any) -> SrmpPlan:
         """Stage 1, from the rod of a posture in which the robot waits."""
-        return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **near)
+        return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **how)
 
-    def _nearest(self, task: JumpTask) -> str:
+    def _nearest(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> str:
         """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
         for share in SHORTER if task.distance_m else ():
             less = replace(task, distance_m=round(share * task.distance_m, 2))
             try:
-                self._pass(less)
+                self._pass(less, None, asked)
             except InfeasibleError:
                 continue
             except SolverError as e:
@@ -185,7 +290,8 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
-        check_platform(task, self.robot)
+        check_platform(task, self.robot, self.limits)
+        self.prepared(previous.method)
         srmp, last = None, "direct"
         if previous.method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)

@@ -172,7 +172,7 @@ def bench(
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
     robot, watch = Robot.load(robot_name), Stopwatch()
-    planner = Planner(robot, mesh)
+    planner = Planner(robot, mesh=mesh)
     ways = {name: WholeBodyPlanner(robot, mesh, tracking=False, **how).plan for name, how in WAYS.items()}
     audits: dict[str, list[bool]] = {}
     near = planner.plan(replace(task, distance_m=task.distance_m - NEIGHBOUR_M))

@@ -28,7 +28,6 @@ from jumplab.errors import InputError, JumplabError
 from jumplab.io.files import Log, ensure_writable, locked, open_log, write_file
 from jumplab.robot import Robot
 from jumplab.stages.planner import METHODS, Planner
-from jumplab.stages.whole_body import build_problem
 from jumplab.task import JumpTask
 
 CASES, TABLE = "cases.jsonl", "table.csv"
@@ -43,7 +42,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Case:
-    """One plan of a sweep; ``weights`` are those of stage 3 that differ from the usual, name -> value."""
+    """One plan of a sweep; ``weights`` are those that differ from the usual, named as in :class:`jumplab.Planner`."""
 
     distance_m: float
     height_m: float
@@ -85,8 +84,7 @@ def grid(
 def _planner(robot: str, method: str) -> Planner:
     """A planner with its stages built, once per process."""
     planner = Planner(Robot.load(robot), keep=True)
-    for stage in ("reach", "direct") if method == "direct" else ("srmp", "whole body"):
-        planner.stage(stage)
+    planner.prepared(method)
     return planner
 
 
@@ -151,17 +149,10 @@ def _keyed(case: Case) -> tuple[str, dict[str, Any]]:
 
 
 def _check_weights(cases: list[Case]) -> None:
-    """Refuse weights of terms that stage 3 does not have, or that are no number, before anything is planned."""
-    for case in cases:
-        if not case.weights:
-            continue
-        problem = build_problem(Robot.load(case.robot), tracking=case.method == "three-step")
-        known = {t.name for _, t in problem.terms() if t.is_cost}
-        for name, value in case.weights.items():
-            if name not in known:
-                raise InputError(f"weight {name!r}: stage 3 has no such cost; it has {', '.join(sorted(known))}")
-            if not 0 <= value < math.inf:
-                raise InputError(f"weight {name!r} = {value:g}: it must be a number of 0 or more")
+    """Refuse weights of terms that a stage does not have, or that are no number, before anything is planned."""
+    for robot, method, weights in dict.fromkeys((c.robot, c.method, tuple(c.weights.items())) for c in cases):
+        if weights:
+            _planner(robot, method).prepared(method, dict(weights))
 
 
 def _backend(cluster: str | None) -> AbstractContextManager:

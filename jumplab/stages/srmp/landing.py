@@ -22,7 +22,6 @@ from jumplab.robot.reach import SETTINGS, Reach, reach
 from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
 from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, srmp_state
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.task import GRAVITY
 
 # touchdown ------------------------------------------------------------------------------------------
 
@@ -128,7 +127,7 @@ def _own_terms(mass: float, envelope: Reach, s: LandingSettings) -> list[Term]:
         return ca.vertcat(speed - p.v[1], speed + p.v[1])
 
     def cop(p: Point):
-        return -srmp_state(p, mass).pivot_torque / (mass * GRAVITY)
+        return -srmp_state(p, mass).pivot_torque / (mass * p.p.gravity)
 
     def acceleration(p: Point):
         return srmp_state(p, mass).com_acceleration
@@ -155,7 +154,7 @@ def _shared_terms(mass: float, envelope: Reach, s: LandingSettings, base: SrmpSe
     # what is measured at touchdown is a fact: constraints that its fixed part alone decides begin one node later
     changes = {name: {"skip": (1, 0)} for name in ("trunk range", "inertia envelope", "L range")}
     changes |= {"jerk": {"weight": s.w_jerk}, "L rate": {"weight": s.w_momentum_rate}, "friction": {}, "leg force": {}}
-    changes["unilateral"] = {"lower": s.press_share * mass * GRAVITY}
+    changes["unilateral"] = {"lower": lambda parameters: s.press_share * mass * parameters["gravity"]}
     strong = replace(envelope, force_fit=s.force_gain * envelope.force_fit)
     return [replace(t, **changes[t.name]) for t in launch_terms(mass, strong, base) if t.name in changes]
 
@@ -195,7 +194,7 @@ class LandingPlanner:
         self._mass, self._margin = robot.sagittal.total_mass, SrmpSettings().inertia_margin
         self.nlp = Nlp(build_landing(robot, settings, self.reach))
 
-    def plan(self, touchdown: Touchdown, *, gravity: float = GRAVITY, guess: PhaseGuess | None = None) -> LandingPlan:
+    def plan(self, touchdown: Touchdown, *, guess: PhaseGuess | None = None) -> LandingPlan:
         """Plan from ``touchdown`` to standing.
 
         Parameters
@@ -208,7 +207,7 @@ class LandingPlanner:
         SolverError
             If there is no such landing: the message names what would have to give (CoP, friction, leg force).
         """
-        data = self._parameters(touchdown)
+        data, gravity = self._parameters(touchdown), self.robot.gravity
         solution = self.nlp.solve({**data, "gravity": gravity}, {"landing": guess or self._guess(data)})
         phase = solution.phases["landing"]
         t = grid(phase.duration)

@@ -15,6 +15,7 @@ from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
+from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.stages.srmp.reachable import check_reachable, nearest
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -141,12 +142,22 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
 
 
 class SrmpPlanner:
-    """Stage 1 for one robot: built once, solved for any target; ``keep`` keeps what was built for later processes."""
+    """Stage 1 for one robot: built once, solved for any target.
 
-    def __init__(self, robot: Robot, settings: SrmpSettings = SrmpSettings(), *, keep: bool = False):
-        self.robot, self.settings, self.reach = robot, settings, reach(robot)
+    ``keep`` keeps what was built for later processes; ``changes`` are own terms, other weights, and terms left out.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        settings: SrmpSettings = SrmpSettings(),
+        *,
+        keep: bool = False,
+        changes: StageChanges = StageChanges(),
+    ):
+        self.robot, self.settings, self.reach, self.changes = robot, settings, reach(robot), changes
         key = f"{robot.hash} {settings}" if keep else None
-        self.nlp = Nlp(build_problem(robot, settings, self.reach), OPTIONS, key)
+        self.nlp = Nlp(changes.applied(build_problem(robot, settings, self.reach)), OPTIONS, key)
         self._warm = self.nlp.with_options(WARM | OPTIONS)
 
     def plan(
@@ -184,6 +195,7 @@ class SrmpPlanner:
 
     def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
+        weights, off = self.changes.spread(self.nlp.problem, weights), self.changes.still_there(self.nlp.problem, off)
         nlp, data = self.nlp if multipliers is None else self._warm, parameters(task, self.reach, start)
         solution = nlp.solve(data, guess, weights=weights, off=off, explain=explain, multipliers=multipliers)
         return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)

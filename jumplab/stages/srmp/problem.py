@@ -4,18 +4,20 @@ take-off (Sec. III of the paper); pure, nothing here solves.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from jumplab.models.srmp import COORDINATES, SrmpState
+from jumplab.models.srmp import COORDINATES
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
 from jumplab.stages.srmp.settings import SrmpSettings
+from jumplab.stages.srmp.view import RodFlightView, RodView, srmp_state
 from jumplab.task import GRAVITY
 
 QUARTERS = (0.25, 0.5, 0.75)
@@ -28,13 +30,6 @@ SYMMETRY_OFF = ("symmetric landing",)  # about the pivot it lands too far ahead 
 def limit(name: str, equation: str, unit: str, at: str, of: Any, low: Any, high: Any = np.inf, **more: Any) -> Term:
     """A constraint low <= of <= high."""
     return Term(name, equation, unit, at, of, lower=low, upper=high, **more)
-
-
-def srmp_state(p: Point, mass: float) -> SrmpState:
-    """The pendulum at one instant; evaluated once for all terms that look there."""
-    if "srmp" not in p.memo:
-        p.memo["srmp"] = SrmpState(mass, p.q, p.v, p.a, p.p.gravity)
-    return p.memo["srmp"]
 
 
 def trunk(p: Point) -> ca.SX:
@@ -295,6 +290,7 @@ def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
 def build_problem(robot: Robot, settings: SrmpSettings = SrmpSettings(), envelope: Reach | None = None) -> Problem:
     """Stage 1 as one problem over launch and flight."""
     envelope, mass = envelope or reach(robot), robot.sagittal.total_mass
-    phases = (*_launch_phases(mass, envelope, settings), _flight_phase(envelope, settings))
+    launch, flight = _launch_phases(mass, envelope, settings), _flight_phase(envelope, settings)
+    phases = (*(replace(p, view=partial(RodView, mass)) for p in launch), replace(flight, view=RodFlightView))
     sizes = {"start": 4, "distance": 1, "platform": 1, "takeoff_speed": 1, "rotation": 1, "gravity": 1}
     return Problem("SRMP", phases, tuple(joining_terms(mass, settings)), sizes)

@@ -12,6 +12,7 @@ from jumplab.errors import SolverError
 from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe
+from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.planner import COARSE, Asked, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.problem import build_problem
@@ -46,24 +47,30 @@ LOW_M = 0.03  # the CoM touches down this much above its take-off height
 class FlipPlanner(WholeBodyPlanner):
     """Stage 3 (or, without ``tracking``, the direct planner) for jumps with rotation: built once, solved for any.
 
-    A jump without rotation is another planner's and stays the same problem whatever flips need.
+    A jump without rotation is another planner's and stays the same problem whatever flips need. Mesh, limits and
+    weights are by default those of a flip (``of_flip``).
     """
 
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = Mesh(),
-        limits: Limits = Limits(),
-        weights: Weights = Weights(),
+        mesh: Mesh | None = None,
+        limits: Limits | None = None,
+        weights: Weights | None = None,
         *,
         tracking: bool = True,
         options: Mapping | None = None,
+        changes: StageChanges = StageChanges(),
     ):
-        settings, options = (mesh.of_flip(), limits.of_flip(), weights.of_flip()), {**EFFORT, **(options or {})}
-        super().__init__(robot, *settings, tracking=tracking, options=options, refine=False)
+        settings = mesh or Mesh().of_flip(), limits or Limits().of_flip(), weights or Weights().of_flip()
+        options = {**EFFORT, **(options or {})}
+        super().__init__(robot, *settings, tracking=tracking, options=options, refine=False, changes=changes)
         # the first idea of the motion may be rough: its jerks jump as they like
         self.rough, loose = self.mesh.coarse(), replace(self.limits, jerk_step=None)
-        first = Nlp(build_problem(robot, self.rough, loose, self.weights, tracking=tracking), {**COARSE, **options})
+        rough = changes.applied(
+            build_problem(robot, self.rough, loose, self.weights, tracking=tracking), like=self.nlp.problem
+        )
+        first = Nlp(rough, {**COARSE, **options})
         self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
 
     def plan(
@@ -101,7 +108,7 @@ class FlipPlanner(WholeBodyPlanner):
             text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
             remedy = "limits, ask for another height or distance"
             raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status) from e
-        return WholeBodyPlan(task, solution, first)
+        return WholeBodyPlan(task, solution, first, self.limits)
 
     def _search(self, asked: Asked, guess, searches) -> tuple[Solution, Statistics]:
         """The fine solution from a guess, and what the coarse one before it cost."""
@@ -121,7 +128,7 @@ class FlipPlanner(WholeBodyPlanner):
             jerk = np.diff(guess.a, axis=0) * (len(guess.a) - 1) / guess.duration
             before = np.vstack([np.zeros(jerk.shape[1]), jerk])
             links = np.pad(before, ((0, 0), (5 - before.shape[1], 0)))  # a flat foot has none
-            out[name] = replace(guess, z=relative(links.T).T)
+            out[name] = guess if self.limits.jerk_step is None else replace(guess, z=relative(links.T).T)
         return out
 
     def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:

@@ -12,6 +12,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
+from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.problem import build_problem
 from jumplab.stages.whole_body.settings import FOLLOWED_JERK_STEP, Limits, Mesh, Weights
@@ -57,6 +58,7 @@ class WholeBodyPlan:
     task: JumpTask
     solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
     coarse: Statistics | None = None  # of the coarse mesh before it; None if there was none, or it found nothing
+    limits: Limits = Limits()  # that it was made with
     # of the solves before it whose jerk jumped farther than a tape can follow; after each, the jerk's weight was raised
     uneven: tuple[Statistics, ...] = ()
 
@@ -106,7 +108,8 @@ class WholeBodyPlanner:
 
     With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
     With ``approach`` the coarse mesh only takes the few steps of ``Nlp.gauss_newton_steps``; where they lead
-    nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes.
+    nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes. ``changes`` are own
+    terms, other weights, and terms left out.
     """
 
     def __init__(
@@ -121,11 +124,12 @@ class WholeBodyPlanner:
         refine: bool = True,
         approach: bool = True,
         keep: bool = False,
+        changes: StageChanges = StageChanges(),
     ):
         self.robot, self.mesh, self.limits, self.weights, self.tracking = robot, mesh, limits, weights, tracking
-        self.stance, self._steps, self._coarse = stance_angles(robot), approach, None
+        self.stance, self._steps, self._coarse, self.changes = stance_angles(robot), approach, None, changes
         options = dict(options or {})
-        problem = build_problem(robot, mesh, limits, weights, tracking=tracking)
+        problem = changes.applied(build_problem(robot, mesh, limits, weights, tracking=tracking))
         key = f"{robot.hash} {limits} {weights} {tracking}" if keep else None
         self.nlp = Nlp(problem, {**FINE, **options}, key)
         if refine:
@@ -162,7 +166,7 @@ class WholeBodyPlanner:
         """
         guess = guess or self.naive_guess(task)
         asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
-        return self._evened(self._begun(asked, guess, near), asked)
+        return replace(self._evened(self._begun(asked, guess, near), asked), limits=self.limits)
 
     def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
         """Call an NLP's ``solve`` or ``approach`` with start values, or with a solution on any mesh.
@@ -175,12 +179,14 @@ class WholeBodyPlanner:
             guess = start.guess(mesh.intervals())
         else:
             guess = {name: start[name].resampled(n) for name, n in mesh.intervals().items()}
-        how |= {"references": self.references(asked.srmp, mesh), "weights": asked.weights, "off": asked.off}
+        weights = self.changes.spread(self.nlp.problem, asked.weights)
+        how |= {"references": self.references(asked.srmp, mesh), "weights": weights, "off": asked.off}
         return solve(asked.parameters, guess, **how)
 
     def _evened(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
         """The plan, with a dearer jerk if it jumps too far. Whoever sets the jerk's weight or drops it is obeyed."""
-        if any(name.rpartition("/")[2] == "jerk" for name in (*asked.weights, *asked.off)):
+        set_by_hand = *asked.weights, *asked.off, *self.changes.weights, *self.changes.off
+        if any(name.rpartition("/")[2] == "jerk" for name in set_by_hand):
             return found
         for factor in EVENING:
             if found.jerk_step <= FOLLOWED_JERK_STEP:

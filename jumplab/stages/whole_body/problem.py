@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 
@@ -11,6 +12,7 @@ from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot import SAGITTAL_LINKS as LINKS
 from jumplab.stages.whole_body.settings import JERK_SCALE, Contact, Limits, Mesh, Weights
 from jumplab.stages.whole_body.terms import WholeBodyTerms
+from jumplab.stages.whole_body.view import BodyView
 
 SCALES = {"q": 1.0, "v": 10.0, "a": 100.0, "j": JERK_SCALE, "z": JERK_SCALE}  # peaks of solutions, for conditioning
 TRACKED_IN_FLIGHT = {"rho": 1, "rho_rate": 1}  # references and their sizes
@@ -99,6 +101,7 @@ def build_problem(
     """Flat foot, toe and flight in one problem: stage 3 with ``tracking``, the direct planner without."""
     terms = flat, toe, flight = [WholeBodyTerms(robot, limits, weights, contact) for contact in Contact]
     phases = [_flat_phase(flat, mesh, limits), _toe_phase(toe, mesh, limits), _flight_phase(flight, mesh)]
+    phases = [replace(p, view=partial(BodyView, b)) for b, p in zip(terms, phases, strict=True)]
     if limits.jerk_step is not None:
         phases = [_even_jerk(b, phase) for b, phase in zip(terms, phases, strict=True)]
     joints = (_continuity(flat, toe), _continuity(toe, flight), _ballistic(toe))

@@ -7,6 +7,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from jumplab.errors import InputError, quoted
+
 JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
 # [rad/s^3] by how much the jerk of a joint may jump from interval to interval: half a sample of 1 kHz later a tape then
@@ -115,6 +117,11 @@ class Mesh:
     flat: int = 25
     toe: int = 20
     flight: int = 30
+
+    def __post_init__(self):
+        for name, n in self.intervals().items():
+            if isinstance(n, bool) or not isinstance(n, int) or n < 2:
+                raise InputError(f"mesh: {name} = {quoted(n)} intervals, must be a whole number of 2 or more")
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over, twice as fine: it winds up longer, and the wrench changes faster."""

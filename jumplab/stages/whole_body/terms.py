@@ -47,7 +47,7 @@ class WholeBodyTerms:
     def __init__(self, robot: Robot, limits: Limits, weights: Weights, contact: Contact):
         self.model, self.limits, self.weights, self.contact = robot.sagittal, limits, weights, contact
         self.flying = contact is Contact.FLIGHT
-        self.mg = self.model.total_mass * GRAVITY
+        self.mg = self.model.total_mass * GRAVITY  # nominal size of forces
 
     # model on a point -------------------------------------------------------------------------------------------
     def links(self, x: ca.SX) -> ca.SX:
@@ -180,7 +180,7 @@ class WholeBodyTerms:
         least = self.limits.least_push if self.contact is Contact.FLAT else 0.0
 
         def push(p):
-            return self.wrench(p)[1] - least * self.mg if least else self.wrench(p)[1]
+            return self.wrench(p)[1] - least * self.model.total_mass * p.p.gravity if least else self.wrench(p)[1]
 
         def cone(p):
             f = self.wrench(p)

@@ -49,7 +49,7 @@ def run_chain(
     Parameters
     ----------
     robot : as planned; the simulated one differs from it by ``perturbation``.
-    planner : of :func:`jumplab.studies.chain.crouched` ``(robot)``; a new one if None.
+    planner : of :func:`jumplab.studies.chain.crouched` ``(robot)``, with own terms or not; a new one if None.
     rehearsal : the course's plans from the crouch, with which re-plans begin; made now if None and ``rehearse``.
         Without, every plan begins from nothing.
     perturbation : of the simulated robot. With noise, where the feet stand is odometry, which drifts in every impact.
@@ -205,7 +205,8 @@ def run_chains(
 def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: dict) -> ChainTrial:
     planner, rehearsal = _prepared(course, robot, how)
     try:
-        result = run_chain(course, robot, planner=planner, rehearsal=rehearsal, perturbation=drawn, **how)
+        own = how | dict(planner=planner, rehearsal=rehearsal, perturbation=drawn)
+        result = run_chain(course, robot, **own)
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
         return ChainTrial(seed, False, str(e))
     return ChainTrial.of(seed, result)
@@ -214,10 +215,11 @@ def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: di
 def _prepared(course: Course, robot: Robot, how: dict) -> tuple[Planner, Rehearsal | None]:
     """Planner and rehearsal of this process, made by its first trial."""
     method, rehearse = how.get("method", "three-step"), how.get("rehearse", True)
-    key = robot.hash, course, method, rehearse
+    planner = how.get("planner")
+    key = robot.hash, course, method, rehearse, planner and planner.token
     if key not in _ready:
         _ready.clear()
-        planner = Planner(crouched(robot), keep=True)
+        planner = planner or Planner(crouched(robot), keep=True)
         course.check(planner.robot, planner.stage("reach"))
         _ready[key] = planner, Rehearsal.of(course, planner, method) if rehearse else None
     return _ready[key]

@@ -1,0 +1,146 @@
+"""A problem with own terms, other weights, and some terms left out; what does not fit is refused before any solve."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from numbers import Real
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from jumplab.errors import InputError, quoted, require_type
+from jumplab.ocp.derivatives import JERK_CHAIN, ElementBuilder
+from jumplab.ocp.problem import PhaseLayout, Problem, Term
+
+
+def changed(
+    problem: Problem,
+    terms: Mapping[str, Iterable[Term]] | None = None,
+    weights: Mapping[str, float] | None = None,
+    off: Iterable[str] = (),
+) -> Problem:
+    """The problem with own terms, other weights, and terms and bounds left out; itself if nothing is asked for.
+
+    Parameters
+    ----------
+    terms : phase name -> further terms; by the problem's own name those at "problem", which join phases.
+    weights : "term" or "phase/term" of a cost, own ones too -> weight.
+    off : "term" or "phase/term" to leave out.
+
+    An own cost of weight 0 is left out as well, so that it changes nothing, not even a digit.
+
+    Raises
+    ------
+    InputError
+        In one sentence with the term's name: an unknown phase or name; a name taken twice; a weight that is no number
+        of 0 or more, or is a constraint's; an expression that fails, is no column, or uses symbols that are not its
+        point's; bounds that do not fit; a link of the motion that is switched off.
+    """
+    terms, weights, off = {k: tuple(v) for k, v in (terms or {}).items()}, dict(weights or {}), tuple(off)
+    for owner, extra in terms.items():
+        for term in extra:
+            problem = _with(problem, owner, term)
+    problem.check_names([*weights, *off], "weight or switch")
+    for name, weight in weights.items():
+        problem = _weighted(problem, name, weight)
+    if identities := [t.name for owner, t in problem.terms() if t.identity and {t.name, f"{owner}/{t.name}"} & {*off}]:
+        raise InputError(f"term {identities[0]!r} links the motion to one; it cannot be switched off")
+    gone = {x for x in problem.own if any(t.weight == 0 for o, t in problem.terms() if (o, t.name) == x)}
+    gone |= {(o, x.name) for o, x in (*problem.terms(), *problem.bounds()) if {x.name, f"{o}/{x.name}"} & {*off}}
+    return _mapped(problem, lambda owner, x: None if (owner, x.name) in gone else x) if gone else problem
+
+
+def _mapped(problem: Problem, change: Any) -> Problem:
+    """The problem with ``change(owner, term or bound)`` for each; left out where that is None."""
+
+    def each(owner, items):
+        return tuple(new for x in items if (new := change(owner, x)) is not None)
+
+    phases = tuple(replace(p, terms=each(p.name, p.terms), bounds=each(p.name, p.bounds)) for p in problem.phases)
+    out = replace(problem, phases=phases, joints=each(problem.name, problem.joints))
+    left = {(owner, t.name) for owner, t in out.terms()}
+    return replace(out, own={name: digest for name, digest in problem.own.items() if name in left})
+
+
+def _weighted(problem: Problem, name: str, weight: Any) -> Problem:
+    """The problem with another weight of a cost."""
+    found = [(o, x) for o, x in (*problem.terms(), *problem.bounds()) if name in (x.name, f"{o}/{x.name}")]
+    costs = {(o, x.name) for o, x in found if isinstance(x, Term) and x.is_cost}
+    if not costs:
+        raise InputError(f"{problem.name}: {name!r} is a constraint and has no weight; switch it off instead")
+    _check_weight(name, weight)
+    return _mapped(problem, lambda o, x: replace(x, weight=float(weight)) if (o, x.name) in costs else x)
+
+
+def _check_weight(name: str, weight: Any) -> None:
+    if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 <= weight < np.inf:
+        raise InputError(f"weight {name!r} = {quoted(weight)}: it must be a number of 0 or more")
+
+
+def _with(problem: Problem, owner: str, term: Term) -> Problem:
+    """The problem with one further term, checked."""
+    require_type(term, Term, f"an own term of {problem.place(owner)!r}")
+    names = [p.name for p in problem.phases]
+    joining = owner == problem.name
+    if not joining and owner not in names:
+        raise InputError(
+            f"term {term.name!r}: {problem.name!r} has no phase {owner!r}; it has {', '.join(names)}, and "
+            f"{problem.name!r} for terms that join them"
+        )
+    if joining != (term.at == "problem"):
+        where = f"at = 'problem' belongs to {problem.name!r} itself" if not joining else "it needs at = 'problem'"
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: {where}")
+    taken = {x.name for o, x in (*problem.terms(), *problem.bounds()) if o == owner} | {JERK_CHAIN}
+    if term.name in taken:
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: the name is taken; give it one of its own")
+    if "/" in term.name:
+        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: a name must not hold a '/'")
+    if term.is_cost:
+        _check_weight(term.name, term.weight)
+    digest = _digest(problem, owner, term)
+    phases = tuple(replace(p, terms=(*p.terms, term)) if p.name == owner else p for p in problem.phases)
+    joints = (*problem.joints, term) if joining else problem.joints
+    return replace(problem, phases=phases, joints=joints, own={**problem.own, (owner, term.name): digest})
+
+
+def _digest(problem: Problem, owner: str, term: Term) -> str:
+    """Hash of the term's expression in the symbols of its points, the same in every process."""
+    alone = tuple(replace(p, terms=(term,) if p.name == owner else (), bounds=(), intervals=1) for p in problem.phases)
+    alone = replace(problem, phases=alone, joints=(term,) if owner == problem.name else ())
+    elements = ElementBuilder(alone, {p.name: PhaseLayout.of(p, 0) for p in alone.phases}).elements
+    (e,) = (e for e in elements if term in [*e.costs, *(t for t, _ in e.rows)])
+    f = e.formulas
+    columns = [y for _, y in f.costs] + f.rows
+    made = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
+    if made.has_free():
+        free = ", ".join(made.get_free()[:3])
+        raise InputError(
+            f"term {term.name!r} of {problem.place(owner)!r}: it uses symbols that are not its point's ({free})"
+        )
+    for t, rows in e.rows:
+        if t is term:
+            _check_bounds(problem.place(owner), term, rows)
+    return hashlib.sha256(made.serialize().encode()).hexdigest()
+
+
+def _check_bounds(place: str, term: Term, rows: int) -> None:
+    """Refuse bounds that are no numbers, do not fit the rows of the expression, or exclude each other."""
+    who, values = f"term {term.name!r} of {place!r}", []
+    for side in ("lower", "upper"):
+        bound = getattr(term, side)
+        if callable(bound):
+            return  # read when solving
+        try:
+            value = np.asarray(bound, float).ravel()
+        except (TypeError, ValueError):
+            raise InputError(f"{who}: {side} = {quoted(bound)} is no number") from None
+        if value.size not in (1, rows) or np.any(np.isnan(value)):
+            raise InputError(
+                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {rows} row{'s' * (rows > 1)}"
+            )
+        values.append(value)
+    if np.any(values[0] > values[1]):
+        raise InputError(f"{who}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}")

@@ -1,0 +1,440 @@
+"""Own terms, weights, switches, limits, settings and mesh: they reach every solve, and what does not fit is refused."""
+
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from itertools import pairwise
+from types import MappingProxyType
+
+import casadi as ca
+import numpy as np
+import pytest
+from fixtures_core import planner
+from test_solver import flat_guess, move
+from test_transcription import toy
+
+import jumplab as jl
+from jumplab.errors import InputError
+from jumplab.ocp import Nlp, Term, changed
+from jumplab.ocp import cache as kept
+from jumplab.stages.changes import settled, sorted_out
+from jumplab.stages.srmp import SrmpSettings
+from jumplab.stages.srmp import build_problem as srmp_problem
+from jumplab.stages.whole_body import Limits, Mesh, build_problem
+
+SMALL = Mesh(6, 4, 6)
+STAGES = (
+    "srmp/flat, srmp/toe, srmp/launch, srmp/flight, joint qp/launch, joint qp/flight, whole body/flat, whole body/toe, "
+    "whole body/launch, whole body/flight"
+)
+
+
+def calm(weight: float = 0.1, name: str = "calm arms") -> Term:
+    """A cost on the arms' rate against the trunk."""
+    return Term(name, "ours", "rad/s", "node", lambda p: p.joint_rates.shoulder, weight=weight)
+
+
+def cost(expression, name="x", at="node", **how) -> Term:
+    return Term(name, "ours", "1", at, expression, **({"weight": 1.0} | how))
+
+
+def refused(sentence: str, call, *arguments, **how) -> None:
+    with pytest.raises(InputError) as e:
+        call(*arguments, **how)
+    assert str(e.value) == sentence
+
+
+# problems -------------------------------------------------------------------------------------------------------
+def test_nothing_asked_nothing_changed():
+    problem = toy()
+    assert changed(problem) is problem
+
+
+def test_a_weight_of_zero_is_no_term():
+    problem = changed(toy(), {"two": [cost(lambda p: p.q, weight=0.0)]})
+    assert problem == changed(problem) and [t.name for _, t in problem.terms()] == [t.name for _, t in toy().terms()]
+    assert not problem.own
+
+
+def test_terms_weights_and_switches_of_a_problem():
+    problem = changed(toy(), {"two": [cost(lambda p: p.q)]}, {"two/x": 3.0, "one/node cost": 7}, ["end row"])
+    terms = {(owner, t.name): t for owner, t in problem.terms()}
+    assert terms["two", "x"].weight == 3.0 and terms["one", "node cost"].weight == 7.0
+    assert ("one", "end row") not in terms and set(problem.own) == {("two", "x")}
+    assert len(problem.terms()) == len(toy().terms())
+
+
+def test_a_problem_without_a_bound():
+    assert [b.name for _, b in changed(toy(), off=["rest"]).bounds()] == []
+
+
+@pytest.mark.parametrize(
+    ("term", "sentence"),
+    [
+        (cost(lambda p: p.q, "jerk"), "term 'jerk' of 'toy/two': the name is taken; give it one of its own"),
+        (
+            cost(lambda p: p.q, "jerk chain"),
+            "term 'jerk chain' of 'toy/two': the name is taken; give it one of its own",
+        ),
+        (cost(lambda p: p.q, "a/b"), "term 'a/b' of 'toy/two': a name must not hold a '/'"),
+        (cost(lambda p: p.q, at="problem"), "term 'x' of 'toy/two': at = 'problem' belongs to 'toy' itself"),
+        (cost(lambda p: p.q, weight=-1.0), "weight 'x' = -1.0: it must be a number of 0 or more"),
+        (cost(lambda p: p.q, weight=float("nan")), "weight 'x' = nan: it must be a number of 0 or more"),
+        (
+            cost(lambda p: 1 / 0),
+            "term 'x' of 'toy/two': its expression cannot be evaluated (ZeroDivisionError: division by zero)",
+        ),
+        (
+            cost(lambda p: p.joints),
+            "term 'x' of 'toy/two': its expression cannot be evaluated (AttributeError: a point has no 'joints')",
+        ),
+        (
+            cost(lambda p: ca.horzcat(p.q, p.q)),
+            "term 'x' of 'toy/two': its expression has the shape (1, 2); it must return a column of one row or more",
+        ),
+        (
+            cost(lambda p: []),
+            "term 'x' of 'toy/two': its expression has the shape (0, 1); it must return a column of one row or more",
+        ),
+        (
+            cost(lambda p: ca.SX.sym("stray") * p.q),
+            "term 'x' of 'toy/two': it uses symbols that are not its point's (stray)",
+        ),
+        (
+            cost(lambda p: p.q, weight=None, lower=[1.0, 2.0, 3.0], upper=9.0),
+            "term 'x' of 'toy/two': lower = [1.0, 2.0, 3.0] does not fit its expression, which has 1 row",
+        ),
+        (
+            cost(lambda p: p.q, weight=None, lower=2.0, upper=1.0),
+            "term 'x' of 'toy/two': lower = 2.0 is above upper = 1.0",
+        ),
+        (cost(lambda p: p.q, weight=None, upper="high"), "term 'x' of 'toy/two': upper = 'high' is no number"),
+    ],
+)
+def test_own_terms_that_are_refused(term, sentence):
+    refused(sentence, changed, toy(), {"two": [term]})
+
+
+def test_names_that_are_refused():
+    x = cost(lambda p: p.q)
+    refused(
+        "term 'x': 'toy' has no phase 'three'; it has one, two, and 'toy' for terms that join them",
+        changed, toy(), {"three": [x]},
+    )  # fmt: skip
+    refused("term 'x' of 'toy/two': the name is taken; give it one of its own", changed, toy(), {"two": [x, x]})
+    refused("term 'x' of 'toy': it needs at = 'problem'", changed, toy(), {"toy": [x]})
+    refused("an own term of 'toy/two' must be a Term, got 3", changed, toy(), {"two": [3]})
+    refused("toy: 'end row' is a constraint and has no weight; switch it off instead",
+            changed, toy(), weights={"end row": 1.0})  # fmt: skip
+    with pytest.raises(InputError, match=re.escape("weight or switch 'jrk': the problem 'toy' has no such term; it")):
+        changed(toy(), off=["jrk"])
+    refused(
+        "term 'flat to toe' links the motion to one; it cannot be switched off",
+        changed, build_problem(jl.Robot.load()), off=["flat to toe"],
+    )  # fmt: skip
+
+
+def test_symbols_of_another_phase_are_refused():
+    seen = []
+    first = cost(lambda p: seen.append(p.q) or p.q, "first")
+    problem = changed(toy(), {"one": [first]})
+    with pytest.raises(InputError, match=r"^term 'x' of 'toy/two': it uses symbols that are not its point's \(x_"):
+        changed(problem, {"two": [cost(lambda p: seen[0][0])]})
+
+
+@pytest.mark.parametrize("expression", [lambda p: 1 / (p.q - p.q), lambda p: ca.sqrt(p.q), lambda p: ca.log(p.q - 1)])
+def test_no_number_at_the_start_is_refused_before_the_solve(expression):
+    nlp = Nlp(changed(move(), {"go": [cost(expression)]}))
+    for solve in (nlp.solve, nlp.gauss_newton_steps):
+        refused(
+            "term 'x' of 'move/go': no finite value or derivative at the start of the solve; keep its arguments where "
+            "it is defined, for instance x + 1e-6 under a root",
+            solve, {"goal": 2.0}, flat_guess(),
+        )  # fmt: skip
+
+
+def test_a_bound_of_the_target_that_does_not_fit_is_refused():
+    wide = cost(lambda p: p.q, weight=None, lower=lambda p: [0.0, 0.0, 0.0], upper=9.0)
+    refused(
+        "term 'x' of 'move/go': a bound does not fit its expression, whose size is 1",
+        Nlp(changed(move(), {"go": [wide]})).solve, {"goal": 2.0}, flat_guess(),
+    )  # fmt: skip
+
+
+def test_another_expression_is_another_file(tmp_path, monkeypatch):
+    """Of own terms the expression counts, not the Python object; of others from elsewhere nothing is kept."""
+    monkeypatch.setenv("JUMPLAB_CACHE", str(tmp_path))
+    monkeypatch.setattr(kept, "HOME", (*kept.HOME, "test_transcription"))
+    for factor in (1.0, 2.0, 1.0):
+        kept.assembled(changed(toy(), {"two": [cost(lambda p, factor=factor: factor * p.q)]}), "k")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+# stages and phases ----------------------------------------------------------------------------------------------
+def test_changes_are_sorted_by_stage():
+    found = sorted_out(
+        {"SRMP/Launch": [calm()], "whole body/flight": calm(), "joint qp/launch": (calm(),)},
+        {"srmp/flat/turn": 1.0, "jerk": 2.0, "flight/jerk": 3.0, "Whole Body/Toe/torque": 4.0, "joint qp/com": 5.0},
+        ["srmp/friction"],
+    )
+    assert list(found["srmp"].terms) == ["launch"] and list(found["whole body"].terms) == ["flight"]
+    assert found["srmp"].weights == {"flat/turn": 1.0} and found["joint qp"].weights == {"com": 5.0}
+    assert found["whole body"].weights == {"jerk": 2.0, "flight/jerk": 3.0, "toe/torque": 4.0}
+    assert found["srmp"].off == ("friction",) and list(found["joint qp"].terms) == ["launch"]
+
+
+def test_the_launch_is_flat_foot_and_toe(bhr):
+    start, end = cost(lambda p: p.L, "s", "start"), cost(lambda p: p.L, "e", "end")
+    row = cost(lambda p: p.L, "r", weight=None, lower=-9.0, upper=9.0, skip=(1, 2))
+    found = sorted_out({"srmp/launch": [start, end, row]}, {"srmp/launch/crouch depth": 1.0, "srmp/launch/turn": 2.0})
+    problem = found["srmp"].applied(srmp_problem(bhr))
+    terms = {(owner, t.name): t for owner, t in problem.terms()}
+    assert {k for k in terms if k[1] in "ser"} == {("flat", "s"), ("toe", "e"), ("flat", "r"), ("toe", "r")}
+    assert terms["flat", "r"].skip == (1, 0) and terms["toe", "r"].skip == (0, 2)
+    assert terms["flat", "turn"].weight == terms["toe", "turn"].weight == 2.0
+    assert terms["flat", "crouch depth"].weight == 1.0
+
+
+def test_names_of_stages_that_are_refused(bhr):
+    refused(
+        f"own terms of 'whole body/flght': there is no such stage and phase; there are {STAGES}",
+        jl.Planner, bhr, terms={"whole body/flght": [calm()]},
+    )  # fmt: skip
+    refused("own terms of 'srmp/flat' must be a list of terms, got 3", jl.Planner, bhr, terms={"srmp/flat": 3})
+    refused("an own term of 'srmp/flat' must be a Term, got 3", jl.Planner, bhr, terms={"srmp/flat": [3]})
+    refused("off must be a list of names, got 'jerk'", jl.Planner, bhr, off="jerk")
+    refused("a weight or switch is named by a text, got 3", jl.Planner, bhr, off=[3])
+
+
+def test_settings_that_are_refused(bhr):
+    known = ", ".join(vars(Limits()))
+    refused(f"Limits has no 'torque'; it has {known}", jl.Planner, bhr, limits={"torque": 1.0})
+    refused("Limits: friction = 'ice' must be like 0.45", jl.Planner, bhr, limits={"friction": "ice"})
+    refused("Limits or a mapping of its fields is needed, got 3", jl.Planner, bhr, limits=3)
+    refused("SrmpSettings: toe_s = 0.1 must be like (0.12, 0.12)", jl.Planner, bhr, settings={"toe_s": 0.1})
+    refused("mesh: toe = 1 intervals, must be a whole number of 2 or more", jl.Planner, bhr, mesh={"toe": 1})
+
+
+def test_what_a_method_would_ignore_is_refused(bhr):
+    task, start = jl.JumpTask(0.4, 0.3), "the method 'direct' has no place for "
+    end = ": it takes limits, mesh and the terms of 'whole body'; choose 'three-step', or leave that out"
+    for how, what in (
+        (dict(terms={"srmp/flat": [calm()]}), "'srmp'"),
+        (dict(off=["joint qp/friction"], weights={"srmp/turn": 1.0}), "'srmp' and 'joint qp'"),
+        (dict(settings={"friction": 0.3}), "the settings of 'srmp'"),
+    ):
+        refused(start + what + end, jl.Planner(bhr, **how).plan, task, "direct")
+    refused(start + "'srmp'" + end, planner().plan, task, "direct", weights={"srmp/turn": 1.0})
+    with pytest.raises(InputError, match="'track inertia': the problem 'direct' has no such term"):
+        jl.Planner(bhr, weights={"track inertia": 1.0}, mesh=SMALL).plan(task, "direct")
+
+
+def test_nothing_solves_before_all_is_checked(bhr, monkeypatch):
+    monkeypatch.setattr(Nlp, "solve", lambda *a, **k: pytest.fail("a stage was solved"))
+    one = jl.Planner(bhr, mesh=SMALL, terms={"whole body/flight": [cost(lambda p: p.joints.elbow)]})
+    refused(
+        "term 'x' of 'whole body/flight': its expression cannot be evaluated (AttributeError: there is no joint "
+        "'elbow'; there are hip, knee, ankle, shoulder)",
+        one.plan, jl.JumpTask(0.4, 0.3),
+    )  # fmt: skip
+    with pytest.raises(InputError, match="weight or switch 'jrk': the problem 'whole body' has no such term"):
+        planner().plan(jl.JumpTask(0.4, 0.3), weights={"jrk": 1.0})
+
+
+def test_what_is_given_wins_over_what_a_flip_needs():
+    assert settled(Limits, None, True) == Limits().of_flip() and settled(Limits, None) == Limits()
+    given = settled(Limits, {"torque_share": 0.7, "touchdown_trunk_rate": 1.0}, True)
+    assert (given.torque_share, given.touchdown_trunk_rate, given.least_push) == (0.7, 1.0, 0.04)
+    assert settled(Limits, Limits(torque_share=0.7), True).capture_moment == (6.0, 10.0)
+    assert settled(SrmpSettings, MappingProxyType({"momentum": (-20.0, 20.0)}), True).momentum == (-20.0, 20.0)
+    assert settled(Limits, {"touchdown_foot_rate": None}).touchdown_foot_rate is None
+
+
+def test_flips_and_direct_have_it_all(bhr):
+    one = jl.Planner(
+        bhr, mesh=SMALL, limits={"torque_share": 0.7}, terms={"whole body/flight": [calm()]},
+        weights={"jerk": 1e-6}, off=["body clearance"],
+    )  # fmt: skip
+    for name in ("whole body", "direct", "whole body flip", "direct flip"):
+        stage = one.stage(name)
+        nlps = [stage.nlp, *(getattr(stage, "_searches", ())), *([stage._coarse] if stage._coarse else [])]
+        assert stage.mesh == SMALL and stage.limits.torque_share == 0.7 and len(nlps) >= 2
+        for nlp in nlps:
+            terms = {(owner, t.name): t for owner, t in nlp.problem.terms()}
+            assert terms["flight", "calm arms"].weight == 0.1 and terms["toe", "jerk"].weight == 1e-6
+            assert not any(term == "body clearance" for _, term in terms)
+            assert ("flight", "calm arms") in [(owner, t.name) for owner, t in nlp.assembled.cost_terms]
+    friction = jl.Planner(bhr, settings={"friction": 0.3}, weights={"srmp/turn": 1.0}).stage("srmp flip")
+    assert friction.settings.friction == 0.3 and friction.settings.momentum == (-32.0, 32.0)
+
+
+# what a term sees -----------------------------------------------------------------------------------------------
+def test_what_is_seen_is_named(bhr):
+    with pytest.raises(InputError, match="a point of this phase has no 'joint'; it has L, com, com_velocity, inertia"):
+        changed(build_problem(bhr), {"flight": [cost(lambda p: p.joint.knee)]})
+    with pytest.raises(InputError, match="a point of this phase has no 'posture'; it has L, com, com_velocity"):
+        changed(srmp_problem(bhr), {"flight": [cost(lambda p: p.posture)]})
+    with pytest.raises(InputError, match="the robot has no point 'nose'; it has toe, knee, hip, shoulder, heel, hand"):
+        changed(build_problem(bhr), {"flight": [cost(lambda p: p.point("nose"))]})
+
+
+def test_terms_are_listed():
+    one = jl.Planner(jl.Robot.load(), mesh=SMALL, terms={"whole body/flight": [calm()]}, off=["srmp/friction"])
+    rows = one.terms()
+    assert {r["stage"] for r in rows} >= {"SRMP", "whole body"}
+    (own,) = (r for r in rows if r["name"] == "calm arms")
+    assert own == dict(stage="whole body", phase="flight", name="calm arms", kind="cost", at="node", unit="rad/s",
+                       equation="ours", value="weight 0.1")  # fmt: skip
+    assert not [r for r in rows if r["stage"] == "SRMP" and r["name"] == "friction"]
+    assert "calm arms" in repr(jl.plots.table(rows))
+
+
+# solved ---------------------------------------------------------------------------------------------------------
+TARGETS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.3), (0.6, 0.4), (0.8, 0.3), (1.0, 0.5))
+GROWING = (0.0, 0.01, 0.1, 1.0, 10.0)
+SLACK = 1e-3  # share of the value by which a solve's tolerance may miss
+
+
+def swing(phases) -> float:
+    """Integral of the square of the arms' rate against the trunk over the flight, as the cost has it [rad^2/s]."""
+    flight = phases["flight"]
+    rate = (flight.v[:, 4] - flight.v[:, 3]) ** 2
+    return float((rate.sum() - (rate[0] + rate[-1]) / 2) * flight.duration / (len(rate) - 1))
+
+
+def turning(phases) -> float:
+    """Integral of the square of the trunk's pitch of the rod over the launch [rad^2 s]."""
+    total = 0.0
+    for phase in (phases["flat"], phases["toe"]):
+        square = (phase.q[:, 0] + phase.q[:, 2]) ** 2
+        total += (square.sum() - (square[0] + square[-1]) / 2) * phase.duration / (len(square) - 1)
+    return float(total)
+
+
+@cache
+def armed(weight: float, **how) -> jl.Planner:
+    return jl.Planner(jl.Robot.load(), terms={"whole body/flight": [calm(weight)]}, **how)
+
+
+def falls(values: list[float]) -> bool:
+    return all(b <= a * (1 + SLACK) for a, b in pairwise(values)) and values[-1] < values[0]
+
+
+def same(one: jl.JumpPlan, other: jl.JumpPlan) -> None:
+    for name in ("t", "q", "v", "a", "tau", "f"):
+        np.testing.assert_array_equal(getattr(one.tape, name), getattr(other.tape, name))
+
+
+@pytest.mark.parametrize("method", ["three-step", "direct"])
+def test_a_weight_of_zero_changes_no_digit(method):
+    task = jl.JumpTask(0.4, 0.3)
+    same(armed(0.0).plan(task, method), planner().plan(task, method))
+
+
+def test_a_solved_plan_lists_its_terms():
+    plan = armed(0.1).plan(jl.JumpTask(0.4, 0.3))
+    rows = {(r["stage"], r["phase"], r["name"]): r for r in plan.terms()}
+    own, place = rows["whole body", "flight", "calm arms"], rows["whole body", "flight", "touchdown place"]
+    assert 0 < own["share"] < 1 and own["node"] is None and own["value"] == "weight 0.1"
+    assert place["share"] is None and place["node"] == 30 and abs(place["slack"]) < 1e-4
+    for stage in ("SRMP", "whole body"):
+        assert sum(r["share"] or 0 for r in plan.terms() if r["stage"] == stage) == pytest.approx(1)
+    assert plan.weights["whole body"]["flight/calm arms"] == 0.1
+    with pytest.raises(InputError):  # a name of this plan's own is nobody else's
+        planner().plan(jl.JumpTask(0.4, 0.3), weights={"calm arms": 1.0})
+
+
+def test_a_weight_of_one_plan_is_that_of_a_planner():
+    task = jl.JumpTask(0.4, 0.3)
+    one = armed(0.1).plan(task, weights={"calm arms": 1.0, "srmp/launch/turn": 9.0})
+    other = jl.plan(task, terms={"whole body/flight": [calm(1.0)]}, weights={"srmp/turn": 9.0})
+    same(one, other)
+    assert one.weights["SRMP"]["toe/turn"] == 9.0
+
+
+SCRIPT = """
+import sys
+import numpy as np
+import jumplab as jl
+term = jl.Term("calm arms", "ours", "rad/s", "node", lambda p: p.joint_rates.shoulder, weight=0.3)
+rod = jl.Term("upright", "ours", "rad", "node", lambda p: p.posture, weight=1.0)
+if sys.argv[2] == "other":  # the same names, other expressions
+    term = jl.Term("calm arms", "ours", "rad/s", "node", lambda p: 2 * p.joint_rates.shoulder, weight=0.3)
+robot, task = jl.Robot.load(), jl.JumpTask(0.4, 0.3)
+planner = jl.Planner(robot, terms={"whole body/flight": [term], "srmp/launch": [rod]}, keep=True)
+np.savez(sys.argv[1], q=planner.plan(task).tape.q)
+"""
+
+
+@pytest.mark.slow
+def test_cached_and_uncached_processes_plan_the_same(tmp_path):
+    found, runs = {}, (("fresh", "this"), ("again", "this"), ("other", "other"), ("none", "this"))
+    for name, which in runs:
+        env = os.environ | {"JUMPLAB_CACHE": "" if name == "none" else str(tmp_path / "cache")}
+        subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path / f"{name}.npz"), which], env=env, check=True)
+        found[name] = np.load(tmp_path / f"{name}.npz")["q"]
+    np.testing.assert_array_equal(found["fresh"], found["again"])
+    np.testing.assert_array_equal(found["fresh"], found["none"])
+    assert found["other"].shape != found["fresh"].shape or np.abs(found["other"] - found["fresh"]).max() > 1e-3
+    assert len(list((tmp_path / "cache").iterdir())) == 3  # stage 1 once, stage 3 with either expression
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_growing_weight_calms_the_arms_in_every_path(target):
+    task, near = jl.JumpTask(*target), jl.JumpTask(target[0] + 0.02, target[1])
+    plans = {w: armed(w).plan(task) for w in GROWING}
+    assert falls([swing(plans[w].whole_body.solution.phases) for w in GROWING])
+    again = {w: armed(w).replan(plans[w], near) for w in GROWING}
+    assert falls([swing(again[w].whole_body.solution.phases) for w in GROWING])
+    direct = [armed(w).plan(task, "direct") for w in GROWING]
+    assert falls([swing(plan.whole_body.solution.phases) for plan in direct])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_growing_weight_straightens_stage_one(target):
+    rods = [jl.Term("upright", "ours", "rad", "node", lambda p: p.posture, weight=w) for w in GROWING]
+    how = [jl.Planner(jl.Robot.load(), terms={"srmp/launch": [rod]}).stage("srmp") for rod in rods]
+    assert falls([turning(stage.plan(jl.JumpTask(*target)).solution.phases) for stage in how])
+
+
+@pytest.mark.slow
+def test_a_growing_weight_calms_the_arms_of_flips():
+    task = jl.JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi)
+    for method in ("three-step", "direct"):
+        found = [armed(w).plan(task, method) for w in (0.0, 0.1, 1.0)]
+        assert falls([swing(plan.whole_body.solution.phases) for plan in found])
+
+
+@pytest.mark.slow
+def test_the_resolve_for_jerk_keeps_own_terms():
+    """A robot whose jerk jumps too far is solved again with a dearer jerk: with the same terms."""
+    found = [jl.Planner(jl.Robot.load("g1"), terms={"whole body/flight": [calm(w)]}) for w in (0.0, 0.05)]
+    plans = [one.plan(jl.JumpTask(0.4, 0.2)) for one in found]
+    assert any(plan.whole_body.uneven for plan in plans)
+    assert ("flight", "calm arms") in plans[1].whole_body.solution.problem.own
+    assert swing(plans[1].whole_body.solution.phases) < swing(plans[0].whole_body.solution.phases)
+
+
+@pytest.mark.slow
+def test_chains_plan_with_own_terms():
+    from jumplab.studies.chain import Course, crouched, run_chain, run_chains
+
+    robot = jl.Robot.load()
+    one = jl.Planner(crouched(robot), terms={"whole body/flight": [calm(1.0)]})
+    run = run_chain(Course.of([0.4], 0.3), robot, planner=one, solve_s=0.3)
+    used = run.jumps[0].ahead.plan
+    assert ("flight", "calm arms") in used.whole_body.solution.problem.own
+    assert run_chains(Course.of([0.4], 0.3), robot, 1, planner=one, solve_s=0.3, jobs=1).stood == 1
+
+
+@pytest.mark.slow
+def test_a_jump_under_another_gravity_is_planned_audited_and_lands():
+    for method in ("three-step", "direct"):
+        plan = jl.plan(jl.JumpTask(0.6, 0.5, gravity=3.7), method=method)
+        run = jl.simulate(plan)
+        assert plan.robot.gravity == 3.7 and jl.audit(plan).passed and run.landed
+        assert abs(run.metrics.foot_distance_m - 0.6) < 0.02 and abs(run.metrics.com_rise_m - 0.5) < 0.01

@@ -1,0 +1,84 @@
+"""All terms and bounds of the stages as numbers and words, against the file beside this one.
+
+A weight, a bound, a scale or an equation that changes is a decision: after it, ``python tests/test_terms_table.py``
+writes the file anew, and the change is read in the diff.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from difflib import unified_diff
+from pathlib import Path
+
+import numpy as np
+
+from jumplab.ocp import Bound, Problem
+from jumplab.robot import Robot
+from jumplab.robot.reach import reach
+from jumplab.robot.stance import stance_angles
+from jumplab.stages import srmp, whole_body
+from jumplab.stages.joint_qp.settings import GENTLE, Options
+from jumplab.stages.srmp import SrmpSettings
+from jumplab.stages.whole_body import Limits, Weights
+from jumplab.task import JumpTask
+
+TABLE = Path(__file__).with_name("terms.txt")
+TARGET = JumpTask(0.6, 0.4, 0.3)  # for which the bounds that depend on the target are told
+
+
+def number(x) -> str:
+    values = np.atleast_1d(np.asarray(x, float))
+    return " ".join(f"{v:.5g}" for v in (values[:1] if np.all(values == values[0]) else values))
+
+
+def lines(problem: Problem, parameters: dict) -> Iterator[str]:
+    """One line per term, bound, duration and constant."""
+
+    def told(low, high):
+        low, high = (x(parameters) if callable(x) else x for x in (low, high))
+        return f"{number(low)} ... {number(high)}"
+
+    for phase in problem.phases:
+        yield f"{problem.name}/{phase.name} | duration | {told(*phase.duration)} s | {phase.intervals} intervals"
+        for name, (low, high, scale) in phase.constants.items():
+            yield f"{problem.name}/{phase.name} | constant {name} | {told(low, high)} | scale {number(scale)}"
+    for owner, x in (*problem.terms(), *problem.bounds()):
+        head = f"{problem.place(owner)} | {x.name} | {x.equation}"
+        if isinstance(x, Bound):
+            yield f"{head} | {x.on} {x.where} | {told(x.lower, x.upper)} {x.unit}"
+        elif x.is_cost:
+            yield f"{head} | {x.at} | weight {number(x.weight)} | {x.unit}"
+        else:
+            how = f" | scale {number(x.scale)}" + f" | skip {x.skip}" * (x.skip != (0, 0)) + " | link" * x.identity
+            yield f"{head} | {x.at} | {told(x.lower, x.upper)} {x.unit}{how}"
+
+
+def table() -> str:
+    """The file's text."""
+    robot = Robot.load()
+    values = dict(stance=stance_angles(robot), distance=TARGET.distance_m, platform=TARGET.platform_m, edge=0.4)
+    values |= dict(takeoff_speed=TARGET.takeoff_speed, rotation=0.0, gravity=TARGET.gravity, momentum=1.0, launch_s=1.0)
+    rod = srmp.parameters(TARGET, reach(robot))
+    found = [*lines(srmp.build_problem(robot), rod), *lines(whole_body.build_problem(robot), values)]
+    flips = [*lines(srmp.build_problem(robot, SrmpSettings().of_flip()), rod)]
+    flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
+    found += [f"of a flip: {line}" for line in flips if line not in found]
+    for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
+        for part, fields in asdict(options).items():
+            rows = fields.items() if isinstance(fields, dict) else [("", fields)]
+            found += [f"{name}/{part} | {key} | {value}" for key, value in rows]
+    return "\n".join(found) + "\n"
+
+
+def test_every_term_is_as_the_table_says():
+    text = table()
+    changes = unified_diff(TABLE.read_text().splitlines(), text.splitlines(), lineterm="", n=0)
+    assert not "\n".join(changes)
+
+
+def test_the_table_is_whole():
+    stages = [line.partition("/")[0] for line in TABLE.read_text().splitlines()]
+    assert stages.count("SRMP") > 60 and stages.count("whole body") > 60 and stages.count("joint qp") > 30
+
+
+if __name__ == "__main__":
+    TABLE.write_text(table())
