@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from importlib import import_module
+from pathlib import Path
 
+import grimp
 import numpy as np
 import pinocchio as pin
 
@@ -166,3 +169,14 @@ class Replay:
 def replay(distance_m: float, height_m: float, platform_m: float = 0.0, method: str = "three-step") -> Replay:
     """A plan, looked at again."""
     return Replay(jump(distance_m, height_m, platform_m, method))
+
+
+def import_graph():
+    """Who imports whom in the package; a room that loads its modules lazily counts as importing all of them."""
+    graph = grimp.build_graph("jumplab", cache_dir=None)
+    for room in [m for m in graph.modules if m.count(".") == 1]:
+        below = graph.find_children(room)
+        if below and "lazy.attach(" in Path(import_module(room).__file__).read_text():
+            for module in below:
+                graph.add_import(importer=room, imported=module)
+    return graph

@@ -4,9 +4,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import grimp
 import numpy as np
 import pytest
+from fixtures_core import import_graph
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
@@ -98,7 +98,7 @@ def test_other_words_are_other_files(place, counted):
 
 def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
     """Whatever the modules of the problems import, at any depth, is in the key; and every name listed is there."""
-    graph, package = grimp.build_graph("jumplab", cache_dir=None), Path(cache.__file__).parent.parent
+    graph, package = import_graph(), Path(cache.__file__).parent.parent
     planners = SrmpPlanner(bhr, keep=True), WholeBodyPlanner(bhr, Mesh(3, 2, 4), refine=False, keep=True)
     assert len(list(place.iterdir())) == 2
     roots = {Assembled.__module__} | {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}

@@ -11,10 +11,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import grimp
 import numpy as np
 import pytest
-from fixtures_core import jump
+from fixtures_core import import_graph, jump
 from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
@@ -118,7 +117,7 @@ def test_keys_differ_in_everything_that_matters(folder, monkeypatch):
 
 def test_the_code_that_decides_a_trial_is_all_listed(tmp_path):
     """Whatever a trial imports, at any depth, and nothing else; a changed line there is another code."""
-    graph = grimp.build_graph("jumplab", cache_dir=None)
+    graph = import_graph()
     used = {f"jumplab.studies.{name}" for name in ("trials", "basin")}
     used |= set().union(*(graph.find_upstream_modules(name) for name in used))
     listed = {"jumplab." + part.removesuffix(".py").replace("/", ".") for part in monte_carlo.SOURCES}

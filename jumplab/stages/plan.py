@@ -12,6 +12,7 @@ from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
+from jumplab.stages.joint_qp.changes import terms_table
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
@@ -94,11 +95,13 @@ class JumpPlan:
 
         Returns
         -------
-        rows as of :meth:`jumplab.Planner.terms`, of costs also their ``share`` of the stage's cost, of constraints the
-        ``node`` where they are tightest and the ``slack`` there [unit]. Empty for a plan that was read from a folder.
+        rows as of :meth:`jumplab.Planner.terms`, of costs of stages 1 and 3 also their ``share`` of the cost, of
+        constraints the ``node`` where they are tightest and the ``slack`` there [unit]. Empty for a plan that was read
+        from a folder.
         """
-        solved = [s.solution for s in (self.srmp, self.whole_body) if s is not None]
-        return [row for solution in solved for row in _terms(solution)]
+        first = [] if self.srmp is None else _terms(self.srmp.solution)
+        second = [] if self.joints is None else terms_table(self.joints.options)
+        return [*first, *second, *([] if self.whole_body is None else _terms(self.whole_body.solution))]
 
     @property
     def solvers(self) -> dict[str, dict]:

@@ -7,18 +7,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
+from jumplab.models.full import FullBody
 from jumplab.ocp import PhaseGuess, Statistics, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach, rod_of
-from jumplab.robot.stance import configuration
+from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.stages.changes import StageChanges, settled, sorted_out
-from jumplab.stages.joint_qp import JointPlan, map_to_joints
+from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
+from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
@@ -51,7 +54,8 @@ class Planner:
         inertia, wrench, posture, point("hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and in
         stage 1 com, com_velocity, L, inertia, wrench, lean, posture, time, see
         :class:`jumplab.stages.srmp.view.RodView`. The direct planner takes those of "whole body".
-    weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's.
+    weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's. For
+        "joint qp" it is a factor on the block's own weights.
     off : names of the same sort: terms and bounds to leave out.
     limits : of stage 3: :class:`jumplab.stages.whole_body.Limits`, or a mapping of some of its fields.
     settings : of stage 1: :class:`jumplab.stages.srmp.SrmpSettings`, or a mapping of some of its fields.
@@ -131,10 +135,19 @@ class Planner:
             stages = {"reach": None, "direct" + turn: asked["whole body"]}
         else:
             stages = {f"{name}{turn}": asked[name] for name in ("srmp", "whole body")}
+            self._joint_options(asked["joint qp"].weights)
         for name, changes in stages.items():
             if (stage := self.stage(name)) and changes:
                 changes.applied(stage.nlp.problem)
         return asked
+
+    def _joint_options(self, weights: Mapping[str, float] = MappingProxyType({})) -> Options:
+        """Stage 2's options with what is changed about it; refuses what does not fit."""
+        own = self.changes["joint qp"]
+        if not (own or weights):
+            return Options()
+        body, stance = FullBody(self.robot), stance_configuration(self.robot)
+        return changed(Options(), body, stance, own.terms, {**own.weights, **weights}, own.off)
 
     def terms(self, *, flip: bool = False, method: str = "three-step") -> list[dict[str, Any]]:
         """All terms and bounds of the stages as they are now, own ones included; ``jl.plots.table`` shows them.
@@ -143,8 +156,10 @@ class Planner:
         -------
         rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
         """
-        stages = ("direct",) if method == "direct" else ("srmp", "whole body")
-        return [row for s in stages for row in self.stage(s + " flip" * flip).nlp.problem.table()]
+        if method == "direct":
+            return self.stage("direct" + " flip" * flip).nlp.problem.table()
+        first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
+        return [*first, *terms_table(self._joint_options()), *last]
 
     def plan(
         self,
