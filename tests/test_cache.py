@@ -13,7 +13,10 @@ from test_transcription import random_point, toy
 from jumplab.ocp import cache
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
+from jumplab.robot.reach import reach
 from jumplab.stages.srmp import SrmpPlanner
+from jumplab.stages.srmp import planner as srmp_planner
+from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 
 
@@ -100,7 +103,7 @@ def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
     """Whatever the modules of the problems import, at any depth, is in the key; and every name listed is there."""
     graph, package = import_graph(), Path(cache.__file__).parent.parent
     planners = SrmpPlanner(bhr, keep=True), WholeBodyPlanner(bhr, Mesh(3, 2, 4), refine=False, keep=True)
-    assert len(list(place.iterdir())) == 2
+    assert len(list(place.glob("*.casadi"))) == 2
     roots = {Assembled.__module__} | {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}
     roots |= {t.expression.__module__ for p in planners for _, t in p.nlp.problem.terms()}
     found = roots.union(*(graph.find_upstream_modules(root) for root in roots))
@@ -137,3 +140,17 @@ def test_terms_from_elsewhere_are_not_kept(place, counted, monkeypatch):
 def test_a_folder_that_cannot_be_written_is_no_failure(place, monkeypatch, counted):
     monkeypatch.setenv("JUMPLAB_CACHE", "/dev/null/x")
     assert cache.assembled(toy(), "a").n_rows > 0 and counted == ["toy"]
+
+
+def test_reach_comes_back_to_the_last_bit(bhr, place, monkeypatch):
+    """And from the file, not sampled again; a damaged file is passed over."""
+    made = reach_of(bhr, keep=True)
+    sampled = []
+    monkeypatch.setattr(srmp_planner, "reach", lambda robot: sampled.append(robot) or reach(robot))
+    for name, value in vars(reach_of(bhr, keep=True)).items():
+        np.testing.assert_array_equal(value, getattr(made, name))
+        assert type(value) is type(getattr(made, name)) is type(getattr(reach(bhr), name))
+    assert not sampled
+    (file,) = place.glob("*.json")
+    file.write_bytes(file.read_bytes()[:-5])
+    assert reach_of(bhr, keep=True).to_json() == made.to_json() and len(sampled) == 1

@@ -11,8 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -76,11 +79,31 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
     if known is not None:
         return Assembled(problem, known)
     fresh = Assembled(problem)
-    try:
+    with suppress(InputError):  # a folder that cannot be written is no reason to fail
         _write(path, fresh.elements)
-    except InputError:
-        pass  # a folder that cannot be written is no reason to fail
     return fresh
+
+
+def remembered(name: str, key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Plain data that takes long to compute, from its file if there is a sound one, else made and kept.
+
+    ``key`` says what it was made of besides :data:`BUILT_BY`; numbers come back to the last bit.
+    """
+    if (place := folder()) is None:
+        return make()
+    digest = hashlib.sha256(json.dumps([_sources(), name, key]).encode()).hexdigest()
+    path = place / f"{digest[:32]}.json"
+    try:
+        total, _, body = path.read_bytes().partition(b"\n")
+        if hashlib.sha256(body).hexdigest().encode() == total:
+            return json.loads(body)
+    except (OSError, ValueError):
+        pass
+    found = make()
+    body = json.dumps(found).encode()
+    with suppress(InputError):  # a folder that cannot be written is no reason to fail
+        write_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+    return found
 
 
 def _write(path: Path, elements: list[Element]) -> None:

@@ -6,8 +6,9 @@ ranges are dropped, and the extremes over each CoM distance phi give smooth enve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -69,6 +70,16 @@ class Reach:
     start: np.ndarray  # lean, length, turn, radius of the stance (theta_l, phi, theta_pl, varphi)
     mass: float  # of the whole robot [kg]
     weakest: dict[str, str]  # "force", "speed" -> leg joint that saturates first where the leg extends best, its limit
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in vars(self).items()}
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Reach:
+        """The envelopes that :meth:`to_json` told."""
+        kinds = {"np.ndarray": np.array, "tuple[float, float]": tuple}
+        return cls(**{f.name: kinds.get(str(f.type), lambda x: x)(data[f.name]) for f in fields(cls)})
 
 
 def postures(

@@ -17,7 +17,7 @@ from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
 from jumplab.ocp import PhaseGuess, Statistics, Term
 from jumplab.robot import Robot
-from jumplab.robot.reach import reach, rod_of
+from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.stages.changes import StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
@@ -25,6 +25,7 @@ from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
+from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
@@ -102,7 +103,7 @@ class Planner:
         """A stage's planner: "reach", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
-            build = {"reach": lambda flip: reach(self.robot), "srmp": self._srmp}
+            build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 

@@ -12,6 +12,7 @@ import numpy as np
 from jumplab.errors import SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
+from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
@@ -141,6 +142,12 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
     }
 
 
+def reach_of(robot: Robot, *, keep: bool = False) -> Reach:
+    """What the robot can do, see :func:`jumplab.robot.reach.reach`; with ``keep`` from a file, if an earlier process
+    left one."""
+    return Reach.from_json(remembered("reach", robot.hash, lambda: reach(robot).to_json())) if keep else reach(robot)
+
+
 class SrmpPlanner:
     """Stage 1 for one robot: built once, solved for any target.
 
@@ -155,7 +162,8 @@ class SrmpPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.settings, self.reach, self.changes = robot, settings, reach(robot), changes
+        self.robot, self.settings, self.changes = robot, settings, changes
+        self.reach = reach_of(robot, keep=keep)
         key = f"{robot.hash} {settings}" if keep else None
         self.nlp = Nlp(changes.applied(build_problem(robot, settings, self.reach)), OPTIONS, key)
         self._warm = self.nlp.with_options(WARM | OPTIONS)
