@@ -9,14 +9,16 @@ from typing import Any
 STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
 
 _PLACES = {
+    "bullet": "BulletEngine base_from_bullet base_to_bullet",
+    "engine": "ENGINES Engine engine_class",
     "estimator": "Estimator",
     "landing": "LandingController LandingGains",
     "loop": "Disturbance simulate_jump simulate_landing",
+    "mujoco": "MujocoEngine",
     "perturbation": "SLIGHT Perturbation Ranges SensorNoise",
     "reference": "LandingReference",
     "result": "Finding Metrics SimulationResult",
     "scene": "Block Scene",
-    "world": "World base_from_bullet base_to_bullet",
 }
 _MODULE_OF = {name: module for module, names in _PLACES.items() for name in names.split()}
 
