@@ -8,7 +8,7 @@ import pybullet as bullet
 import pytest
 
 from jumplab.cli.common import print_simulation
-from jumplab.sim import BulletEngine, Disturbance, Perturbation, simulate_jump, simulate_landing
+from jumplab.sim import BulletEngine, Disturbance, MujocoEngine, Perturbation, simulate_jump, simulate_landing
 from jumplab.sim import bullet as engines
 from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
@@ -51,7 +51,7 @@ def test_the_flight_is_where_the_cheats_expect_it(tape):
 LATE = Perturbation(friction=0.5, delay_s=0.003)
 
 
-@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}])
+@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}, {"engine": "mujoco"}])
 def test_an_honest_jump_passes(bhr, tape, options, capsys):
     result = simulate_jump(tape, bhr, **options)
     assert result.landed and result.checks_passed and failed(result) == set()
@@ -106,6 +106,28 @@ def test_a_helping_hand(bhr, tape, monkeypatch):
         "unexplained force on the body",
         "unexplained moment on the body",
     }
+
+
+@pytest.mark.parametrize(
+    ("cheat", "caught"),
+    [
+        (lambda data: data.xfrc_applied.__setitem__((1, 2), 20.6), "unexplained force on the body"),
+        (lambda data: data.qpos.__setitem__(2, data.qpos[2] + 0.01), "largest jump of the state"),
+        (lambda data: data.qvel.__setitem__(0, data.qvel[0] + 0.1), "unexplained force on the body"),
+    ],
+)
+def test_hands_in_mujoco(bhr, tape, monkeypatch, cheat, caught):
+    """5 % of the weight from mid-flight on; a place set; a velocity set."""
+    honest, count = MujocoEngine.step, [0]
+
+    def step(world):
+        if count[0] == IN_FLIGHT:
+            cheat(world._data)
+        count[0] += 1
+        honest(world)
+
+    monkeypatch.setattr(MujocoEngine, "step", step)
+    assert caught in failed(simulate_jump(tape, bhr, engine="mujoco", stand_s=SHORT_S))
 
 
 def test_unlimited_torque(bhr, tape, monkeypatch):
