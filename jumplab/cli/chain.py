@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jumplab.cli.common import common_options, folder_of, number, robot_option
+from jumplab.cli.common import common_options, engine_option, folder_of, number, robot_option
 from jumplab.errors import InfeasibleError, InputError
 
 MOST_RUNS = 10_000  # our choice: a day of two cores; more is surely a typo
@@ -16,7 +16,7 @@ MOST_RUNS = 10_000  # our choice: a day of two cores; more is surely a typo
 def add(commands: argparse._SubParsersAction) -> None:
     """Declare ``jumplab chain``."""
     chain = commands.add_parser("chain", help="several jumps in a row, each planned while the one before lands",
-                                parents=[common_options(), robot_option()])  # fmt: skip
+                                parents=[common_options(), robot_option(), engine_option()])  # fmt: skip
     chain.add_argument("--distances-m", nargs="+", required=True, metavar="M", help="travel of the feet, per jump [m]")
     chain.add_argument("--height-m", nargs="+", default=["0.3"], metavar="M",
                        help="rise of the CoM in flight [m], for all jumps or per jump (default 0.3)")  # fmt: skip
@@ -54,7 +54,7 @@ def _chain(args: argparse.Namespace) -> None:
     revise = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     how = {"look_s": number("--look-s", args.look_s), "revise_s": revise, "landing": args.landing,
            "solve_s": None if args.solve_s is None else number("--solve-s", args.solve_s),
-           "method": args.method}  # fmt: skip
+           "method": args.method, "engine": args.engine}  # fmt: skip
     runs = _whole("--runs", args.runs, 1, MOST_RUNS)
     jobs = None if args.jobs is None else _whole("--jobs", args.jobs, 1, 4096)
     seed = None if args.seed is None and runs == 1 else _whole("--seed", args.seed or "0", 0, 2**31 - 1)

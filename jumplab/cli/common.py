@@ -35,6 +35,16 @@ def target_options() -> argparse.ArgumentParser:
     return target
 
 
+def engine_option() -> argparse.ArgumentParser:
+    """The option ``--engine``."""
+    from jumplab.sim import DEFAULT_ENGINE, ENGINES
+
+    engine = argparse.ArgumentParser(add_help=False)
+    engine.add_argument("--engine", choices=tuple(ENGINES), default=DEFAULT_ENGINE,
+                        help=f"whose physics it is (default {DEFAULT_ENGINE})")  # fmt: skip
+    return engine
+
+
 def number(option: str, text: str) -> float:
     """The number that an option was given."""
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from jumplab.cli.common import common_options
+from jumplab.cli.common import common_options, engine_option
 from jumplab.errors import InputError
 
 DEFAULT_N = "200"  # the interval of a success rate near 95 % is then 3 % wide on either side
@@ -15,7 +15,8 @@ INTERRUPTED = "interrupted; finished trials are kept, and the same command goes 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Declare ``jumplab trials``."""
-    trials = commands.add_parser("trials", help="let many perturbed robots jump a plan", parents=[common_options()])
+    trials = commands.add_parser("trials", help="let many perturbed robots jump a plan",
+                                 parents=[common_options(), engine_option()])  # fmt: skip
     trials.add_argument("dir", metavar="DIR", help="folder of a plan; trials.jsonl and trials.json are written there")
     trials.add_argument(
         "--n", metavar="N", help="number of robots (default 200), or of the basin's states (default: all)"
@@ -51,7 +52,7 @@ def _trials(args: argparse.Namespace) -> None:
     from jumplab.studies.trials import TrialSettings, run_trials
 
     noise = SensorNoise.typical() if args.noise else SensorNoise()
-    settings = TrialSettings(args.mode, args.reaim, noise)
+    settings = TrialSettings(args.mode, args.reaim, noise, engine=args.engine)
     try:
         if args.basin:
             report = landing_basin(args.dir, n, settings, jobs=jobs)

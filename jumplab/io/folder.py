@@ -38,7 +38,8 @@ from jumplab.robot import Robot
 
 T = TypeVar("T")
 SCHEMA = "jumplab-result-1"
-PACKAGES = ("jumplab", "casadi", "pin", "cvxpy", "clarabel", "proxsuite", "pybullet", "numpy", "scipy", "matplotlib")
+PLANNING = ("casadi", "pin", "cvxpy", "clarabel", "proxsuite")
+PACKAGES = ("jumplab", *PLANNING, "pybullet", "mujoco", "numpy", "scipy", "matplotlib")
 
 
 def versions() -> dict[str, str]:

@@ -7,10 +7,16 @@ from importlib import import_module
 from typing import Any
 
 STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
+# name -> (module here, class, what to install); the first is the default
+ENGINES = {
+    "bullet": ("bullet", "BulletEngine", "pybullet"),
+    "mujoco": ("mujoco", "MujocoEngine", "mujoco"),
+}
+DEFAULT_ENGINE = next(iter(ENGINES))
 
 _PLACES = {
     "bullet": "BulletEngine base_from_bullet base_to_bullet",
-    "engine": "ENGINES Engine engine_class",
+    "engine": "Engine engine_class",
     "estimator": "Estimator",
     "landing": "LandingController LandingGains",
     "loop": "Disturbance simulate_jump simulate_landing",

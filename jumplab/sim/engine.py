@@ -1,7 +1,7 @@
 """What the simulation wants of a physics engine, and which ones there are.
 
 Servo law, delay, motors, sensors, perturbations, log and checks are written once and know no engine. A further engine
-is a class with :class:`Engine`'s methods, a line in :data:`ENGINES`, and the tests of ``tests/test_sim_world.py``.
+is a class with :class:`Engine`'s methods, a line in :data:`jumplab.sim.ENGINES`, and passes ``test_sim_world.py``.
 """
 
 from __future__ import annotations
@@ -14,15 +14,10 @@ import numpy as np
 
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
+from jumplab.sim import DEFAULT_ENGINE, ENGINES
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import Contacts, Scene
 
-# name -> (module here, class, what to install); the first is the default
-ENGINES = {
-    "bullet": ("bullet", "BulletEngine", "pybullet"),
-    "mujoco": ("mujoco", "MujocoEngine", "mujoco"),
-}
-DEFAULT = next(iter(ENGINES))
 MASS_KG, ROUNDING = 1e-6, 1e-9  # by how much an engine's mass, and its friction, may differ from what was asked for
 
 
@@ -39,7 +34,8 @@ class Engine(ABC):
 
     Attributes
     ----------
-    name : as in :data:`ENGINES`.  title : as in sentences.  links : names of the robot's links, the base first.
+    name : as in :data:`jumplab.sim.ENGINES`.  title : as in sentences.
+    links : names of the robot's links, the base first.
     substeps : semi-implicit steps that the engine takes within one of the simulation.
 
     Raises
@@ -152,7 +148,7 @@ class Engine(ABC):
         self.beyond_sole_m = max(self.beyond_sole_m, float(beyond))
 
 
-def engine_class(name: str = DEFAULT) -> type[Engine]:
+def engine_class(name: str = DEFAULT_ENGINE) -> type[Engine]:
     """The class of an engine, imported now; raises :class:`InputError` if it is unknown or not installed."""
     if not isinstance(name, str) or name not in ENGINES:
         raise InputError(f"engine {quoted(name)}: must be one of {', '.join(ENGINES)}")

@@ -11,9 +11,9 @@ import pinocchio as pin
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import STEP_S
+from jumplab.sim import DEFAULT_ENGINE, STEP_S
 from jumplab.sim.checks import check
-from jumplab.sim.engine import DEFAULT, engine_class
+from jumplab.sim.engine import engine_class
 from jumplab.sim.estimator import Perception
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import Perturbation
@@ -46,7 +46,7 @@ class Run:
         robot: Robot,
         perturbation: Perturbation | None = None,
         scene: Scene | None = None,
-        engine: str = DEFAULT,
+        engine: str = DEFAULT_ENGINE,
     ):
         self._open = engine_class(engine)
         self.robot, self.perturbation = robot, perturbation or Perturbation()
@@ -120,7 +120,7 @@ def simulate_jump(
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
     disturbance: Disturbance | None = None,
-    engine: str = DEFAULT,
+    engine: str = DEFAULT_ENGINE,
 ) -> SimulationResult:
     """Play ``tape`` on a simulated robot, catch it, and watch it stand.
 

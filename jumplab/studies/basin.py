@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -145,7 +145,7 @@ def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), g
 
 def _keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
     """Each state's name in the log; whatever the grid, equal states are equal trials."""
-    code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
+    code = replace(settings, ranges=Ranges()).hash
     names = [_hash(["basin", code, asdict(state)]) for state in states]
     return {TrialKey(0, int(n[:8], 16), n, plan): state for n, state in zip(names, states, strict=True)}
 
@@ -154,11 +154,8 @@ def drop(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: T
     """Simulate one state from the apex on."""
     wrong = Disturbance(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
     floor = Perturbation(key.robot_seed, friction=state.friction, noise=settings.noise)
-    verdict = judged(
-        lambda: simulate_landing(
-            tape, robot, wrong, mode=settings.mode, perturbation=floor, scene=scene, reaim=settings.reaim
-        )
-    )
+    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine)
+    verdict = judged(lambda: simulate_landing(tape, robot, wrong, perturbation=floor, scene=scene, **how))
     return Trial.from_line(Trial(key, floor.to_json(), asdict(state), *verdict).line())
 
 

@@ -33,7 +33,17 @@ from jumplab.io import folder as store
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
+from jumplab.sim import (
+    DEFAULT_ENGINE,
+    Metrics,
+    Perturbation,
+    Ranges,
+    Scene,
+    SensorNoise,
+    SimulationResult,
+    simulate_jump,
+)
+from jumplab.sim.engine import engine_class
 from jumplab.sim.playback import MODES
 from jumplab.sim.result import STAND_S
 from jumplab.task import JumpTask
@@ -58,7 +68,15 @@ def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]
 
 # trial ------------------------------------------------------------------------------------------
 SCHEMA = "jumplab-trials-1"
-SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")  # whose versions decide a trial's outcome
+SHAPING = (
+    "jumplab",
+    "casadi",
+    "numpy",
+    "pin",
+    "proxsuite",
+    "pybullet",
+    "mujoco",
+)  # whose versions decide a trial's outcome
 LOOKING = ("cli", "show")  # rooms of the package that decide nothing about a jump
 HASH_DIGITS = 16  # 64 bits: enough to tell settings apart
 LEG_ROLES = ("hip_pitch", "knee", "ankle_pitch")
@@ -74,16 +92,19 @@ class TrialSettings:
     reaim : turn the legs in the air against the trunk's measured pitch error.
     noise : on what the controllers are told.
     ranges : half-widths of the draws.
+    engine : "bullet" or "mujoco".
     """
 
     mode: str = "position"
     reaim: bool = True
     noise: SensorNoise = field(default_factory=SensorNoise)
     ranges: Ranges = field(default_factory=Ranges)
+    engine: str = DEFAULT_ENGINE
 
     def __post_init__(self):
         if self.mode not in MODES:
             raise InputError(f"mode {self.mode!r}: must be one of {', '.join(MODES)}")
+        engine_class(self.engine)
 
     @property
     def hash(self) -> str:
@@ -152,8 +173,8 @@ def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, k
         If the tape is not this robot's.
     """
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    verdict = judged(lambda: simulate_jump(
-        tape, robot, mode=settings.mode, perturbation=drawn, scene=scene, reaim=settings.reaim))  # fmt: skip
+    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine)
+    verdict = judged(lambda: simulate_jump(tape, robot, perturbation=drawn, scene=scene, **how))
     trial = Trial(key, drawn.to_json(), features(drawn, robot), *verdict)
     return Trial.from_line(trial.line())  # the very thing that a resumed run reads
 

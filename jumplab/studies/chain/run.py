@@ -11,7 +11,7 @@ import numpy as np
 from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import SLIGHT, STEP_S, Perturbation, Ranges, SensorNoise
+from jumplab.sim import DEFAULT_ENGINE, SLIGHT, STEP_S, Perturbation, Ranges, SensorNoise
 from jumplab.sim.loop import Run
 from jumplab.sim.pilot import LANDINGS
 from jumplab.stages.planner import METHODS, Planner
@@ -38,6 +38,7 @@ def run_chain(
     revise_s: float | None = REVISE_S,
     landing: str = "spring",
     method: str = "three-step",
+    engine: str = DEFAULT_ENGINE,
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.
 
@@ -59,6 +60,7 @@ def run_chain(
         None. The robot waits for neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
+    engine : "bullet" or "mujoco".
 
     Returns
     -------
@@ -78,7 +80,7 @@ def run_chain(
     course.check(waiting, planner.stage("reach"))
     if rehearsal is None and rehearse:
         rehearsal = Rehearsal.of(course, planner, method)
-    run = Run(waiting, perturbation, course.scene(waiting))
+    run = Run(waiting, perturbation, course.scene(waiting), engine)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s, method)
     pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s)
     run.play(pilot, stance_configuration(waiting), np.zeros(waiting.model.nv))
