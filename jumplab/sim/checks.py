@@ -24,6 +24,7 @@ UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, UNEXPLAINED_TORQUE = 1.0, 0.5, 3.0  # [
 SUBSTEPPED_FORCE_N, SUBSTEPPED_MOMENT = 6.0, 6.0  # [N], [N m] 1.5 % of the weight
 NUMERIC = 1e-6  # rounding
 JUMP_M = 1e-4  # [m, rad] the engine's own step is kept to 1e-5
+SUBSTEPPED_JUMP_M = 1e-3  # [m, rad] a light foot that chatters swings by 0.2 mrad within a step and is back at its end
 SWING = 3.0  # [1] where a contact begins or ends, velocities swing within a step by some times what the log shows
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
 LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
@@ -40,13 +41,14 @@ def _mechanics(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     base, joints = unexplained(result, robot)
     uneven = np.abs(np.diff(result.t) - STEP_S).max(initial=0.0)
     one = result.settings["engine"]["substeps"] == 1
-    force, moment = (UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT) if one else (SUBSTEPPED_FORCE_N, SUBSTEPPED_MOMENT)
+    limits = UNEXPLAINED_FORCE_N, UNEXPLAINED_MOMENT, JUMP_M
+    force, moment, jump = limits if one else (SUBSTEPPED_FORCE_N, SUBSTEPPED_MOMENT, SUBSTEPPED_JUMP_M)
     hidden = "a pinned or carried base, a force from nowhere"
     return (
         Finding("unexplained force on the body", _worst(base[:, :3]), force, "N", hidden),
         Finding("unexplained moment on the body", _worst(base[:, 3:]), moment, "N m", hidden),
         Finding("unexplained joint torque", _worst(joints), UNEXPLAINED_TORQUE, "N m", "motors stronger than logged"),
-        Finding("largest jump of the state", _largest_jump(result, robot), JUMP_M, "m or rad", "a reset"),
+        Finding("largest jump of the state", _largest_jump(result, robot), jump, "m or rad", "a reset"),
         Finding("unevenness of time", float(uneven), NUMERIC, "s", "a gap in the log"),
     )
 
