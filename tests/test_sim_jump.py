@@ -252,18 +252,6 @@ def test_the_landing_is_planned_in_flight(bhr, tape):
     assert torque < 0.95 * spring_torque and force < 0.8 * spring_force
 
 
-@pytest.mark.parametrize("mode", ["position", "pd"])
-def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
-    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes."""
-    weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
-    asked, weakly, late = (
-        simulate(tape, bhr, mode=mode, perturbation=p, stand_s=0.01).metrics
-        for p in (Perturbation(), weak, Perturbation(delay_s=0.004))
-    )
-    assert weakly.com_rise_m < asked.com_rise_m - 0.004
-    assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
-
-
 def test_late_commands_make_no_joint_swing(bhr, tape):
     """In the air a light foot must not be driven faster than a delay of 4 ms allows."""
     run = simulate(tape, bhr, mode="pd", perturbation=Perturbation(delay_s=0.004), stand_s=0.01)

@@ -58,9 +58,8 @@ def run_chain(
     look_s : when the next jump is planned, after touchdown [s]; negative: so long before the touchdown that is due.
     revise_s : when a plan made in the air is made again from where the feet really are, after touchdown [s]; never if
         None. The robot waits for neither: it begins with the latest plan that is there.
-    landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
+    landing, engine : "planned" or "spring", "bullet" or "mujoco", see :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
-    engine : "bullet" or "mujoco".
 
     Returns
     -------
