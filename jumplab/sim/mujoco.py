@@ -168,12 +168,11 @@ class MujocoEngine(Engine):
     def _feel(self, origins: np.ndarray) -> None:
         """Add the contacts of one substep; moments are about the links' ``origins`` (k, 3) before the step."""
         model, data, force, points = self._model, self._data, np.zeros(6), ([], [])
-        for number in range(data.ncon):
-            contact = data.contact[number]
+        bodies, places, frames = model.geom_bodyid[data.contact.geom], data.contact.pos, data.contact.frame
+        for number, (one, other) in enumerate(bodies.tolist()):
             mujoco.mj_contactForce(model, data, number, force)
             if force[0] <= 0:
                 continue
-            one, other = model.geom_bodyid[contact.geom1], model.geom_bodyid[contact.geom2]
             if one and other:
                 self._colliding.add((self.links[one - 1], self.links[other - 1]))
                 continue
@@ -181,8 +180,10 @@ class MujocoEngine(Engine):
             self._touching.add(self.links[body - 1])
             side = self._feet.get(body)
             if side is not None:
-                push = sign * contact.frame.reshape(3, 3).T @ force[:3]
-                self._wrench[side] += np.concatenate([push, pin.skew(contact.pos - origins[body]) @ push])
-                points[side].append(data.xmat[body].reshape(3, 3).T @ (contact.pos - data.xpos[body]))
-        for seen in filter(None, points):
-            self._note_sole(np.array(seen))
+                push = sign * force[:3] @ frames[number].reshape(3, 3)
+                self._wrench[side, :3] += push
+                self._wrench[side, 3:] += pin.skew(places[number] - origins[body]) @ push
+                points[side].append(places[number])
+        for body, side in self._feet.items():
+            if points[side]:
+                self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))
