@@ -150,8 +150,8 @@ class BulletEngine(Engine):
         self._joints = [by_joint[name] for name in self.robot.joint_names]
         self._feet = {self.links.index(name) - 1: side for side, name in enumerate(self.robot.foot.frames)}
         dynamics = self._bullet.getDynamicsInfo(self._body, -1)
-        self._lever, tilt = np.array(dynamics[3]), dynamics[4]
-        if abs(abs(tilt[3]) - 1) > 1e-9:
+        self._lever = np.array(dynamics[3])
+        if abs(abs(dynamics[4][3]) - 1) > 1e-9:
             raise RobotError(f"robot {self.robot.name}: the inertial frame of {base} is turned; align it with its link")
 
     def _dynamics(self) -> list[tuple]:
