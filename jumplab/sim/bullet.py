@@ -149,13 +149,12 @@ class BulletEngine(Engine):
         self.links = (base, *(row[12].decode() for row in info))  # Bullet's link i is links[i + 1]
         self._joints = [by_joint[name] for name in self.robot.joint_names]
         self._feet = {self.links.index(name) - 1: side for side, name in enumerate(self.robot.foot.frames)}
-        dynamics = self._bullet.getDynamicsInfo(self._body, -1)
-        self._lever = np.array(dynamics[3])
-        if abs(abs(dynamics[4][3]) - 1) > 1e-9:
+        lever, tilt = self._bullet.getDynamicsInfo(self._body, -1)[3:5]
+        self._lever = np.array(lever)
+        if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(f"robot {self.robot.name}: the inertial frame of {base} is turned; align it with its link")
 
     def _dynamics(self) -> list[tuple]:
-        """What the engine has about each link: mass [kg], friction, and more."""
         return [self._bullet.getDynamicsInfo(self._body, i - 1) for i in range(len(self.links))]
 
     def _set_dynamics(self, friction: float) -> None:
