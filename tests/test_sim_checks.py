@@ -8,7 +8,8 @@ import pybullet as bullet
 import pytest
 
 from jumplab.cli.common import print_simulation
-from jumplab.sim import Disturbance, Perturbation, World, simulate_jump, simulate_landing
+from jumplab.sim import BulletEngine, Disturbance, MujocoEngine, Perturbation, simulate_jump, simulate_landing
+from jumplab.sim import bullet as engines
 from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
 from jumplab.sim.playback import Motors
@@ -26,13 +27,13 @@ def tape(bhr):
 
 
 def failed(result) -> set[str]:
-    assert len(result.checks) == 13
+    assert len(result.checks) == 14
     return {finding.name for finding in result.checks if not finding.passed}
 
 
 def at_step(monkeypatch, when, cheat):
     """Do ``cheat(world)`` before one step of the run."""
-    honest, count = World.step, [0]
+    honest, count = BulletEngine.step, [0]
 
     def step(world):
         if count[0] == when:
@@ -40,7 +41,7 @@ def at_step(monkeypatch, when, cheat):
         count[0] += 1
         honest(world)
 
-    monkeypatch.setattr(World, "step", step)
+    monkeypatch.setattr(BulletEngine, "step", step)
 
 
 def test_the_flight_is_where_the_cheats_expect_it(tape):
@@ -50,14 +51,14 @@ def test_the_flight_is_where_the_cheats_expect_it(tape):
 LATE = Perturbation(friction=0.5, delay_s=0.003)
 
 
-@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}])
+@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}, {"engine": "mujoco"}])
 def test_an_honest_jump_passes(bhr, tape, options, capsys):
     result = simulate_jump(tape, bhr, **options)
     assert result.landed and result.checks_passed and failed(result) == set()
     said = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert said["honest"] and all(row["passed"] for row in said["honesty"])
     print_simulation(said)
-    assert "honesty: all 13 checks of the run passed" in capsys.readouterr().out
+    assert "honesty: all 14 checks of the run passed" in capsys.readouterr().out
 
 
 def test_a_fall_is_honest_too(bhr, tape):
@@ -92,7 +93,7 @@ def test_a_pinned_base(bhr, tape, monkeypatch, when, capsys):
 
 def test_a_helping_hand(bhr, tape, monkeypatch):
     """5 % of the weight, all the time."""
-    honest = World.step
+    honest = BulletEngine.step
 
     def step(world):
         place = bullet.getBasePositionAndOrientation(world._body, physicsClientId=world._client)[0]
@@ -100,32 +101,48 @@ def test_a_helping_hand(bhr, tape, monkeypatch):
                                   physicsClientId=world._client)  # fmt: skip
         honest(world)
 
-    monkeypatch.setattr(World, "step", step)
+    monkeypatch.setattr(BulletEngine, "step", step)
     assert failed(simulate_jump(tape, bhr, stand_s=SHORT_S)) == {
         "unexplained force on the body",
         "unexplained moment on the body",
     }
 
 
-def test_unlimited_torque(bhr, tape, monkeypatch):
-    def apply(motors, world, command, rate):
-        tau = 3 * command.tau
-        world.command_torque(tau)
-        return tau
+@pytest.mark.parametrize(
+    ("cheat", "caught"),
+    [
+        (lambda data: data.xfrc_applied.__setitem__((1, 2), 20.6), "unexplained force on the body"),
+        (lambda data: data.qpos.__setitem__(2, data.qpos[2] + 0.01), "largest jump of the state"),
+        (lambda data: data.qvel.__setitem__(0, data.qvel[0] + 0.1), "unexplained force on the body"),
+    ],
+)
+def test_hands_in_mujoco(bhr, tape, monkeypatch, cheat, caught):
+    """5 % of the weight from mid-flight on; a place set; a velocity set."""
+    honest, count = MujocoEngine.step, [0]
 
-    monkeypatch.setattr(Motors, "apply", apply)
+    def step(world):
+        if count[0] == IN_FLIGHT:
+            cheat(world._data)
+        count[0] += 1
+        honest(world)
+
+    monkeypatch.setattr(MujocoEngine, "step", step)
+    assert caught in failed(simulate_jump(tape, bhr, engine="mujoco", stand_s=SHORT_S))
+
+
+def test_unlimited_torque(bhr, tape, monkeypatch):
+    monkeypatch.setattr(Motors, "deliver", lambda motors, tau, rate: 3 * tau)
     assert "torque beyond the motors" in failed(simulate_jump(tape, bhr, mode="pd", stand_s=SHORT_S))
 
 
 def test_torque_that_the_log_conceals(bhr, tape, monkeypatch):
-    honest = Motors.apply
+    honest = BulletEngine.set_torque
 
-    def apply(motors, world, command, rate):
-        tau = honest(motors, world, command, rate)
-        world.command_torque(1.2 * tau)
-        return tau
+    def stronger(world, tau):
+        honest(world, 1.2 * tau)
+        world._torque = tau
 
-    monkeypatch.setattr(Motors, "apply", apply)
+    monkeypatch.setattr(BulletEngine, "set_torque", stronger)
     assert failed(simulate_jump(tape, bhr, mode="pd", stand_s=SHORT_S)) == {"unexplained joint torque"}
 
 
@@ -148,9 +165,10 @@ def test_a_velocity_set_in_mid_run(bhr, tape, monkeypatch):
 
 
 def test_oversized_feet(bhr, tape, monkeypatch):
-    honest, sole = World._load, '<box size="0.24 0.1 0.03" />'
+    honest, sole = engines.load_urdf, '<box size="0.24 0.1 0.03" />'
     assert sole in bhr.urdf
-    monkeypatch.setattr(World, "_load", lambda w, urdf: honest(w, urdf.replace(sole, '<box size="0.27 0.1 0.03" />')))
+    longer = '<box size="0.27 0.1 0.03" />'
+    monkeypatch.setattr(engines, "load_urdf", lambda urdf, *options: honest(urdf.replace(sole, longer), *options))
     result = simulate_jump(tape, bhr, stand_s=SHORT_S)
     assert "contact points outside the sole" in failed(result)
     assert result.settings["engine"]["beyond_sole_m"] == pytest.approx(0.015, abs=0.001)
@@ -169,9 +187,9 @@ def test_sticky_feet(bhr, tape, monkeypatch):
     """Stated 0.2, really 2: read back, and seen in the forces."""
 
     def sticky(robot, q, v, **options):
-        return World(robot, q, v, **{**options, "friction": 2.0})
+        return BulletEngine(robot, q, v, **{**options, "friction": 2.0})
 
-    monkeypatch.setattr(jump, "World", sticky)
+    monkeypatch.setattr(jump, "engine_class", lambda name: sticky)
     result = simulate_jump(tape, bhr, perturbation=Perturbation(friction=0.2), stand_s=SHORT_S)
     assert failed(result) == {"friction used, of the stated coefficient", "friction read back, less the stated"}
 

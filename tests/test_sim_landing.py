@@ -6,9 +6,10 @@ import pytest
 from scipy.optimize import brentq
 
 from jumplab.robot.stance import com_from_toe, configuration, stance_configuration
-from jumplab.sim import LandingController, LandingReference, World
+from jumplab.sim import BulletEngine, LandingController, LandingReference
 from jumplab.sim.landing import PERIOD_STEPS, BodyTerms
-from jumplab.sim.playback import Actuators
+from jumplab.sim.playback import Actuators, Command
+from jumplab.sim.servo import Servo
 
 
 class Catch:
@@ -16,25 +17,25 @@ class Catch:
 
     def __init__(self, robot, q, v=None, seconds=3.0, controller=None, friction=0.8):
         self.controller = controller or LandingController(robot)
-        motors, hold, data = Actuators(robot), q[7:], robot.model.createData()
+        motors, servo, data = Actuators(robot), Servo(robot), robot.model.createData()
+        hold = Command(q=q[7:], rate=np.zeros(14), acceleration=np.zeros(14))
         self.worst_torque, self.touching, touchdown, tau = 0.0, set(), None, np.zeros(14)
-        with World(robot, q, v, friction=friction) as world:
+        with BulletEngine(robot, q, v, friction=friction) as world:
             force = np.zeros(2)
             for step in range(round(seconds * 1000)):
                 q, v = world.state()
                 if touchdown is None and force.sum() > 20:
                     touchdown = step
-                    world.release()
                 if touchdown is None:
-                    world.command_position(hold, np.zeros(14), motors.effort, 0.1, 1.0)
+                    tau = servo.torque(hold, q, v)
                 else:
                     since = step - touchdown
                     if since % PERIOD_STEPS == 0:
                         tau = self.controller.torque(since / 1000, q, v, force)
                         low, high = motors.range(v[6:])
                         assert (tau <= high + 1e-9).all() and (tau >= low - 1e-9).all()
-                    world.command_torque(tau)
                     self.worst_torque = max(self.worst_torque, np.max(np.abs(tau) / motors.effort))
+                world.set_torque(tau)
                 world.step()
                 contacts = world.contacts()
                 force, self.touching = contacts.wrench[:, 2], self.touching | contacts.touching

@@ -1,17 +1,39 @@
-"""The simulated world against what must be true of any world."""
+"""Every engine against what must be true of any world."""
+
+import sys
 
 import numpy as np
 import pinocchio as pin
 import pybullet as bullet
 import pytest
 
-from jumplab.errors import InputError, JumplabError
+from jumplab.errors import InputError, JumplabError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import STEP_S, Perturbation, Scene, World, base_from_bullet, base_to_bullet
-from jumplab.sim.playback import Actuators, Delay
+from jumplab.sim import ENGINES, STEP_S, Perturbation, Scene, base_from_bullet, base_to_bullet, engine_class
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.playback import AIR, FLAT, Actuators, Command, Delay, Motors
+from jumplab.sim.servo import Servo
 
-HOLD = dict(position_gain=0.1, velocity_gain=1.0)
+
+@pytest.fixture(params=ENGINES)
+def engine(request):
+    """Each engine in turn."""
+    return engine_class(request.param)
+
+
+class Hold:
+    """Keeps the joints of a robot where they are in ``q``, by the servo law."""
+
+    def __init__(self, robot, q, feet=FLAT):
+        still = np.zeros(len(q) - 7)
+        self.servo, self.motors = Servo(robot), Motors(robot, {})
+        self.command = Command(q=q[7:], rate=still, acceleration=still, feet=feet)
+
+    def step(self, world):
+        q, v = world.state()
+        world.set_torque(self.motors.deliver(self.servo.torque(self.command, q, v), v[6:]))
+        world.step()
 
 
 def random_state(robot, seed, height=3.0):
@@ -50,21 +72,21 @@ def test_base_conversion_by_hand():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_state_round_trip_through_the_engine(bhr, seed):
+def test_state_round_trip_through_the_engine(engine, bhr, seed):
     q, v = random_state(bhr, seed)
-    with World(bhr, q, v) as world:
+    with engine(bhr, q, v) as world:
         back_q, back_v = world.state()
     assert back_q == pytest.approx(q, abs=1e-12)
     assert back_v == pytest.approx(v, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_free_flight_conserves_momentum(bhr, seed):
+def test_free_flight_conserves_momentum(engine, bhr, seed):
     """No damping anywhere: the CoM falls as a stone does, L stays. Bullet's default damping would eat 3 % of L."""
     q, v = random_state(bhr, seed)
     com, linear, angular = momentum(bhr, q, v)
     steps = 300
-    with World(bhr, q, v) as world:
+    with engine(bhr, q, v) as world:
         for _ in range(steps):
             world.step()
         assert world.contacts().touching == frozenset()
@@ -73,23 +95,39 @@ def test_free_flight_conserves_momentum(bhr, seed):
     assert end_linear[:2] == pytest.approx(linear[:2], abs=0.1)  # of 42 kg at about 1 m/s
     assert end_linear[2] - linear[2] == pytest.approx(-42 * 9.8 * t, abs=0.1)
     assert end_angular == pytest.approx(angular, abs=0.02 * max(1, np.abs(angular).max()))
-    semi_implicit = -9.8 * t * STEP_S / 2  # the engine's own error of a free fall
+    semi_implicit = -9.8 * t * STEP_S / engine.substeps / 2  # the engine's own error of a free fall
     fall = linear[2] / 42 * t - 9.8 * t**2 / 2 + semi_implicit
     assert end_com[2] - com[2] == pytest.approx(fall, abs=1e-3)
 
 
-def test_mass_is_the_planned_one(bhr):
-    """A dummy link without <inertial> weighs nothing to Pinocchio and 1 kg to PyBullet: said, not simulated."""
+def test_a_body_without_mass_is_refused(bhr):
+    """A dummy link without <inertial> weighs nothing to Pinocchio and 1 kg to PyBullet, and MuJoCo will not have it."""
     first = bhr.urdf.index("<inertial>", bhr.urdf.index('name="left_ankle_link"'))
     last = bhr.urdf.index("</inertial>", first) + len("</inertial>")
     robot = Robot.from_text(bhr.urdf[:first] + bhr.urdf[last:], bhr.config_text)
     with pytest.raises(JumplabError, match=r"PyBullet's robot weighs 42\.9990 kg, Pinocchio's 41\.9990 kg"):
-        World(robot, pin.neutral(robot.model))
+        engine_class("bullet")(robot, pin.neutral(robot.model))
+    with pytest.raises(RobotError, match=r"^robot bhr: MuJoCo cannot read the URDF: .*mass and inertia"):
+        engine_class("mujoco")(robot, pin.neutral(robot.model))
+
+
+@pytest.mark.parametrize("name", ["ode", "", None, 3])
+def test_unknown_engines_are_refused(name):
+    with pytest.raises(InputError, match=r"^engine .*: must be one of bullet, mujoco$"):
+        engine_class(name)
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.delitem(sys.modules, "jumplab.sim.mujoco", raising=False)
+    words = "engine 'mujoco': the package mujoco is not installed; pip install mujoco"
+    with pytest.raises(InputError, match=f"^{words}$"):
+        engine_class("mujoco")
 
 
 @pytest.mark.parametrize("friction", [0.37, 0.8])
-def test_friction_reaches_every_link(bhr, friction):
-    with World(bhr, stance_configuration(bhr), friction=friction) as world:
+def test_friction_reaches_every_link(engine, bhr, friction):
+    with engine(bhr, stance_configuration(bhr), friction=friction) as world:
         assert set(world.friction) >= {"trunk", "left_foot", "right_foot", "left_arm"}
         assert set(world.friction.values()) == {friction}
 
@@ -105,31 +143,33 @@ def test_friction_that_did_not_arrive_is_refused(bhr, monkeypatch):
 
     monkeypatch.setattr(bullet, "changeDynamics", lossy)
     with pytest.raises(JumplabError, match=r"PyBullet kept friction 0\.5 on \w+ where 0\.83 was set"):
-        World(bhr, stance_configuration(bhr), friction=0.83)
+        engine_class("bullet")(bhr, stance_configuration(bhr), friction=0.83)
 
 
-def test_friction_decides_when_feet_slip(bhr):
-    """A stiff robot pushed along by its own speed stops after v^2 / (2 mu g)."""
+def test_sliding_feet_are_braked_by_friction(engine, bhr):
+    """Against their motion, with the stated share of what presses on them."""
     q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
     pitch = bhr.stance["trunk_pitch_rad"]
     v[[0, 2]] = 0.3 * np.cos(pitch), 0.3 * np.sin(pitch)  # 0.3 m/s forward, in base axes
-    effort = Actuators(bhr).effort
-    for friction in (0.06, 0.12):  # so little that it slides before it tips
-        with World(bhr, q, v, friction=friction) as world:
-            for _ in range(700):
-                world.command_position(q[7:], np.zeros(14), effort, **HOLD)
-                world.step()
-            travel = world.state()[0][0] - q[0]
-        assert travel == pytest.approx(0.3**2 / (2 * friction * 9.8), rel=0.1)
+    hold, gauge = Hold(bhr, q, AIR), Gauge(bhr)
+    for friction in (0.06, 0.12):
+        impulse = np.zeros(3)
+        with engine(bhr, q, v, friction=friction) as world:
+            for _ in range(12):
+                hold.step(world)
+                impulse += STEP_S * world.contacts().wrench.sum(axis=0)[:3]
+            speed = gauge.soles(world.state()[0])[0] / (12 * STEP_S)
+        assert speed > 0.1 and impulse[2] > 0.5 * 42 * 9.8 * 12 * STEP_S
+        assert -impulse[0] == pytest.approx(friction * impulse[2], rel=0.02)
 
 
-def test_foot_sensors_weigh_the_robot(bhr):
+def test_foot_sensors_weigh_the_robot(engine, bhr):
     """In a quiet stance: m g, no net horizontal force, CoP below the CoM; only feet touch, nothing collides."""
-    q, effort = stance_configuration(bhr), Actuators(bhr).effort
-    with World(bhr, q) as world:
+    q = stance_configuration(bhr)
+    hold = Hold(bhr, q)
+    with engine(bhr, q) as world:
         for _ in range(1000):
-            world.command_position(q[7:], np.zeros(14), effort, **HOLD)
-            world.step()
+            hold.step(world)
         contacts, (end, v) = world.contacts(), world.state()
     total = contacts.wrench.sum(axis=0)
     assert total[2] == pytest.approx(42 * 9.8, rel=1e-4)
@@ -146,24 +186,23 @@ def test_foot_sensors_weigh_the_robot(bhr):
     assert moment[0] / total[2] == pytest.approx(com[1], abs=1e-3)
 
 
-def test_contact_impulse_is_change_of_momentum(bhr):
+def test_contact_impulse_is_change_of_momentum(engine, bhr):
     """Sliding down onto the ground: every step the measured forces explain the change of momentum, sign and size."""
     q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
     q[2] += 0.002
     v[0], v[2] = 0.5, -0.5
-    effort = Actuators(bhr).effort
+    hold = Hold(bhr, q)
     impulse, start = np.zeros(3), momentum(bhr, q, v)[1]
-    with World(bhr, q, v) as world:
+    with engine(bhr, q, v) as world:
         for _ in range(60):
-            world.command_position(q[7:], np.zeros(14), effort, **HOLD)
-            world.step()
+            hold.step(world)
             impulse += STEP_S * (world.contacts().wrench.sum(axis=0)[:3] - [0, 0, 42 * 9.8])
         change = momentum(bhr, *world.state())[1] - start
     assert abs(impulse[0]) > 3
     assert impulse == pytest.approx(change, abs=0.3)
 
 
-def test_sagittal_postures_never_collide_but_crossed_legs_do(bhr):
+def test_sagittal_postures_never_collide_but_crossed_legs_do(engine, bhr):
     """Self-collision is on, without exclusions beyond direct neighbours: the ranges of the joints are real."""
     rng, names = np.random.default_rng(0), bhr.joint_names
     role = {name: role for role, pair in bhr.joints.items() for name in pair}
@@ -175,31 +214,30 @@ def test_sagittal_postures_never_collide_but_crossed_legs_do(bhr):
             if name in role:
                 limits = bhr.actuators[name]
                 q[7 + i] = limits["lower"] + share[role[name]] * (limits["upper"] - limits["lower"])
-        with World(bhr, q) as world:
+        with engine(bhr, q) as world:
             world.step()
             assert not world.contacts().colliding
     q = pin.neutral(bhr.model)
     q[2] = 3.0
     q[7 + names.index("left_hip_roll")], q[7 + names.index("right_hip_roll")] = -0.2, 0.2
-    with World(bhr, q) as world:
+    with engine(bhr, q) as world:
         world.step()
         assert world.contacts().colliding
 
 
-def test_scenes_have_real_edges(bhr):
+def test_scenes_have_real_edges(engine, bhr):
     """Over the ditch the robot falls to its floor, on the platform it stands on the platform."""
     ditch, platform = Scene.ditch(0.3, 1.3, depth=0.5), Scene.platform(0.4, 0.3)
     assert [ditch.top_at(x) for x in (0, 0.8, 1.5)] == [0, -0.5, 0]
     assert [platform.top_at(x) for x in (0, 1)] == [0, 0.3]
-    effort = Actuators(bhr).effort
+    hold = Hold(bhr, stance_configuration(bhr), AIR)
     for scene, x, z, end in ((ditch, 0.8, 0.0, -0.5), (platform, 0.8, 0.3, 0.3), (platform, 0.0, 0.0, 0.0)):
         q = stance_configuration(bhr)
         height = q[2]
         q[:3] += [x, 0, z]
-        with World(bhr, q, scene=scene) as world:
+        with engine(bhr, q, scene=scene) as world:
             for _ in range(600):
-                world.command_position(q[7:], np.zeros(14), effort, **HOLD)
-                world.step()
+                hold.step(world)
             assert world.state()[0][2] == pytest.approx(height + end, abs=0.02)
 
 
@@ -219,7 +257,7 @@ def test_impossible_worlds_are_refused(make, words):
         make()
 
 
-def test_perturbations_are_seeded_and_bounded(bhr):
+def test_perturbations_are_seeded_and_bounded(engine, bhr):
     one, same, other = (Perturbation.draw(bhr, seed) for seed in (7, 7, 8))
     assert one == same and one != other
     assert len(one.mass) == 9  # the massless dummies are left alone
@@ -235,7 +273,7 @@ def test_perturbations_are_seeded_and_bounded(bhr):
     factor = one.mass["left_shank"] * one.inertia["left_shank"]
     assert model.inertias[knee].inertia == pytest.approx(planned.inertias[knee].inertia * factor)
     assert Perturbation().robot(bhr) is bhr
-    with World(real, stance_configuration(bhr), friction=one.friction) as world:  # checks its mass against Pinocchio
+    with engine(real, stance_configuration(bhr), friction=one.friction) as world:  # checks its mass against Pinocchio
         assert set(world.friction.values()) == {one.friction}
 
 
@@ -256,10 +294,10 @@ def test_delay_line():
     assert [prompt(x) for x in "abc"] == ["a", "b", "c"]
 
 
-def test_read_back_is_what_the_engine_has(bhr):
-    with World(bhr, stance_configuration(bhr), scene=Scene.platform(0.5, 0.2), friction=0.7) as world:
+def test_read_back_is_what_the_engine_has(engine, bhr):
+    with engine(bhr, stance_configuration(bhr), scene=Scene.platform(0.5, 0.2), friction=0.7) as world:
         said = world.read_back()
         assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
-        assert said["mass_kg"] == pytest.approx(42)
+        assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
         q, v = world.state()  # the probe of the self-collision has left nothing behind
     assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()

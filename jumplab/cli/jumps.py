@@ -7,7 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from jumplab.cli import common
-from jumplab.cli.common import JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
+from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
 from jumplab.errors import InputError
 from jumplab.task import JumpTask
 
@@ -84,12 +84,13 @@ def audit(args: Namespace) -> None:
     common.judge(report, args.dir)
 
 
-@command(PLAN, MODE)
+@command(PLAN, MODE, ENGINE)
 def simulate(args: Namespace) -> None:
-    """Simulate a plan in PyBullet."""
+    """Simulate a plan in PyBullet or MuJoCo."""
     tape, robot, summary = store.read_plan(args.dir)
     store.ensure_writable(args.dir)
-    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=sim.Scene.of_plan(summary, robot))
+    scene = sim.Scene.of_plan(summary, robot)
+    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine)
     store.write_simulation(args.dir, result, summary)
     common.print_simulation(result.to_json())
 

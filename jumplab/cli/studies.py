@@ -9,7 +9,21 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
-from jumplab.cli.common import JUMP, METHODS, MODE, ROBOT, Kind, Late, command, folder, needing, number, opt, whole
+from jumplab.cli.common import (
+    ENGINE,
+    JUMP,
+    METHODS,
+    MODE,
+    ROBOT,
+    Kind,
+    Late,
+    command,
+    folder,
+    needing,
+    number,
+    opt,
+    whole,
+)
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.task import JumpTask
 
@@ -50,6 +64,7 @@ def _count(least: int, most: float = math.inf) -> Kind:
     opt("--seed S", "seed of the robots (default 0)", None, _count(0)),
     opt("--basin", "the robot as planned, from 225 wrong states at the apex; writes basin.json"),
     MODE,
+    ENGINE,
     opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
     opt("--noise", "tell the controllers noisy measurements instead of the truth", False),
     opt("--jobs J", "processes (default: one per core)", None, _count(1)),
@@ -61,7 +76,8 @@ def trials(args: Namespace) -> None:
         raise InputError("--seed says which robots are drawn, and --basin draws none; leave one of them away")
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
-    settings = many.TrialSettings(args.mode, args.reaim, sim.SensorNoise.typical() if args.noise else sim.SensorNoise())
+    noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
+    settings = many.TrialSettings(args.mode, args.reaim, noise, engine=args.engine)
     try:
         if args.basin:
             report = basins.landing_basin(args.dir, args.n, settings, jobs=args.jobs)
@@ -95,13 +111,14 @@ def trials(args: Namespace) -> None:
     opt("--solve-s S", "charge each plan this [s] instead of its wall clock", None, number),
     opt("--landing", "how it lands", "spring", ("planned", "spring")),
     opt("--method", "of planning", METHODS[0], METHODS),
+    ENGINE,
     opt("--jobs J", "processes for several runs (default: one per core)", None, whole(1, 4096)),
     opt("--out DIR", "folder for plans, log, report and 3-D page", None, folder, required=True),
 )
 def chain(args: Namespace) -> None:
     """Several jumps in a row, each planned while the one before lands."""
     start = time.perf_counter()
-    how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method")}
+    how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method", "engine")}
     how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
     course, robot = chains.Course.of(args.distances_m, args.height_m, args.platforms_m), robots.Robot.load(args.robot)

@@ -34,7 +34,8 @@ from jumplab.task import GRAVITY
 T = TypeVar("T")
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
-PACKAGES = tuple("jumplab casadi pin coal cvxpy clarabel proxsuite pybullet numpy scipy matplotlib".split())
+PLANNING = ("casadi", "pin", "cvxpy", "clarabel", "proxsuite")
+PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy", "matplotlib")
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")

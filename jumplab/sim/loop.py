@@ -11,8 +11,9 @@ import pinocchio as pin
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import STEP_S
+from jumplab.sim import DEFAULT_ENGINE, STEP_S
 from jumplab.sim.checks import check
+from jumplab.sim.engine import engine_class
 from jumplab.sim.estimator import Perception
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.perturbation import Perturbation
@@ -21,7 +22,7 @@ from jumplab.sim.playback import Command, Delay, Motors
 from jumplab.sim.reference import LandingSource
 from jumplab.sim.result import STAND_S, Recorder, SimulationResult
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import World
+from jumplab.sim.servo import Servo
 
 
 class Commander(Protocol):
@@ -38,9 +39,16 @@ class Commander(Protocol):
 
 
 class Run:
-    """One run: ``robot`` as planned, perturbed as it really is (``real``), on a ground."""
+    """One run: ``robot`` as planned, perturbed as it really is (``real``), on a ground, in one of the engines."""
 
-    def __init__(self, robot: Robot, perturbation: Perturbation | None = None, scene: Scene | None = None):
+    def __init__(
+        self,
+        robot: Robot,
+        perturbation: Perturbation | None = None,
+        scene: Scene | None = None,
+        engine: str = DEFAULT_ENGINE,
+    ):
+        self._open = engine_class(engine)
         self.robot, self.perturbation = robot, perturbation or Perturbation()
         self.scene, self.real = scene or Scene.flat(), self.perturbation.robot(robot)
 
@@ -48,22 +56,23 @@ class Run:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
+        servo, motors, delay = Servo(self.robot), Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
-        with World(self.real, q, v, scene=self.scene, friction=how.friction) as world:
-            contacts, fallen_s = world.contacts(), 0.0
+        with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
+            contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
-                q, v = world.state()
-                told = delay(pilot.command(step, *perceive(q, v, contacts.wrench)))
+                q, v = engine.state()
+                seen = perceive(q, v, contacts.wrench)
+                command = pilot.command(step, *seen)
                 if pilot.part == len(self.recorders):
-                    self.recorders.append(Recorder(self.real, pilot.goal, world.links))
-                tau = motors.apply(world, told, v[6:])
-                world.step()
-                contacts = world.contacts()
-                self.recorders[-1].add(q, v, world.servo_torque() if tau is None else tau, contacts)
+                    self.recorders.append(Recorder(self.real, pilot.goal, engine.links))
+                engine.set_torque(motors.deliver(delay(servo.torque(command, *seen[:2])), v[6:]))
+                engine.step()
+                contacts = engine.contacts()
+                self.recorders[-1].add(q, v, engine.applied(), contacts)
                 fallen_s = self.recorders[-1].fallen_steps * STEP_S
                 step += 1
-            self.engine, self.perception = world.read_back(), perceive.to_json()
+            self.engine, self.perception = engine.read_back(), perceive.to_json()
 
     def result(self, part: int, solves: tuple[int, int], **settings: Any) -> SimulationResult:
         """The checked record of one part of the run; ``solves`` are the QPs posed and failed in it."""
@@ -111,6 +120,7 @@ def simulate_jump(
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
     disturbance: Disturbance | None = None,
+    engine: str = DEFAULT_ENGINE,
 ) -> SimulationResult:
     """Play ``tape`` on a simulated robot, catch it, and watch it stand.
 
@@ -129,6 +139,7 @@ def simulate_jump(
         at touchdown (None: it found none).
     stand_s : how long to watch after touchdown [s]; less than the default is never called a landing.
     disturbance : begin at the apex of the flight, in a state that differs so; time, distance and rise count from there.
+    engine : "bullet" or "mujoco", whose physics it is.
 
     Returns
     -------
@@ -138,10 +149,10 @@ def simulate_jump(
     Raises
     ------
     InputError
-        If the tape is not this robot's, or ``mode`` or ``stand_s`` make no sense.
+        If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, or the engine is unknown or not there.
     """
     _check(tape, robot, perturbation, scene, reference, stand_s)
-    run = Run(robot, perturbation, scene)
+    run = Run(robot, perturbation, scene, engine)
     pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s)
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
     run.play(pilot, q, v, step)

@@ -1,13 +1,13 @@
 """Launch and flight as the paper plays them: the tape goes to the joints, and nothing else does (Sec. VI-B).
 
-What the motors are told, how late, and what they can give stands here too.
+What the motors are told, how late, and what they can give stands here too. Commands become torques, torques grow old
+(:class:`Delay`), and what arrives is delivered as well as each motor can (:class:`Motors`), in both modes alike.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -18,12 +18,9 @@ from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import planned_pitch
 
-if TYPE_CHECKING:
-    from jumplab.sim.world import World
-
 MODES = ("position", "pd")
-POSITION_GAIN = 0.1  # [1] an error decays in 10 ms, ten control cycles; the torque limit decides the rest
-VELOCITY_GAIN = 1.0  # [1] the wished rate is met within a cycle, as by the inner loop of a drive
+FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
+HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
 
 
 class Actuators:
@@ -47,52 +44,43 @@ class Actuators:
         return lower, upper
 
     def either_way(self, rate: np.ndarray) -> np.ndarray:
-        """Torque (nv - 6,) [N m] that is available in both directions: the limit given to position servos."""
+        """Torque (nv - 6,) [N m] that is available in both directions: the limit of the servo law."""
         return self.effort * np.clip((self.speed - np.abs(rate)) * self._slope, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Command:
-    """What the motors are told for one step: a position servo's target, or a torque."""
+    """What the joints shall do in one step: move, as the servo law sees to, or give a torque."""
 
     q: np.ndarray | None = None  # (nv - 6,) [rad]
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
+    acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
+    feet: str = AIR  # how they stand by the plan
     share: float = 1.0  # of the torque limit, for the servo
 
 
 class Delay:
-    """A line of ``steps`` commands between the controller and the motors; the first command fills it."""
+    """A line of ``steps`` torques between the controller and the motors; the first one fills it."""
 
     def __init__(self, steps: int):
         self._line: deque = deque(maxlen=steps + 1)
 
-    def __call__(self, command: Command) -> Command:
-        self._line.extend([command] * (1 if self._line else self._line.maxlen))
+    def __call__(self, tau: np.ndarray) -> np.ndarray:
+        self._line.extend([tau] * (1 if self._line else self._line.maxlen))
         return self._line[0]
 
 
 class Motors:
-    """Turns commands into torques within the limits; ``gain`` is joint -> torque delivered per torque commanded."""
+    """Turns commanded into delivered torques; ``gain`` is joint -> torque delivered per torque commanded."""
 
     def __init__(self, robot: Robot, gain: dict[str, float]):
         self.actuators = Actuators(robot)
         self._gain = np.array([gain.get(name, 1.0) for name in robot.joint_names])
-        self._servo = False
 
-    def apply(self, world: World, command: Command, rate: np.ndarray) -> np.ndarray | None:
-        """Give ``command`` to the engine at true joint rates ``rate``; returns the torque, None for a servo."""
-        if command.tau is None:
-            self._servo = True
-            limit = command.share * self.actuators.either_way(rate) * np.minimum(self._gain, 1.0)
-            world.command_position(command.q, command.rate, limit, POSITION_GAIN, VELOCITY_GAIN)
-            return None
-        if self._servo:
-            world.release()
-            self._servo = False
-        tau = np.clip(self._gain * command.tau, *self.actuators.range(rate))
-        world.command_torque(tau)
-        return tau
+    def deliver(self, tau: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """What becomes of ``tau`` (nv - 6,) [N m] at true joint rates ``rate``."""
+        return np.clip(self._gain * tau, *self.actuators.range(rate))
 
 
 @dataclass(frozen=True)
@@ -124,8 +112,9 @@ GAINS = PdGains()
 class Playback:
     """The tape on the 1 ms grid of the simulation, as commands. After its end the last posture is held.
 
-    In ``mode`` "position" a servo follows it, the planned rate fed forward; in "pd" the planned torque is commanded,
-    plus PD. Raises :class:`InputError` if the mode is unknown or the tape belongs to another robot.
+    In ``mode`` "position" the servo law of :mod:`.servo` follows its angles, rates and accelerations and sees no
+    planned torque; in "pd" the planned torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown
+    or the tape belongs to another robot.
     """
 
     def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):
@@ -137,7 +126,7 @@ class Playback:
         self.mode = mode
         self.steps = round(float(tape.t[-1]) / STEP_S)
         grid = np.arange(self.steps + 1) * STEP_S
-        # the engine's steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
+        # steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
         self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
         self._q, self._rate, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v[:, 6:], tape.tau))
         self._pitch = np.interp(grid, tape.t, planned_pitch(tape.q))
@@ -145,6 +134,20 @@ class Playback:
         self._kp, self._kd = GAINS.of(robot)
         self._model, self._data = robot.model, robot.model.createData()
         self._takeoff = round(tape.takeoff_time / STEP_S)
+        self._heel_off = self._first_tilt(robot, tape)
+
+    def _first_tilt(self, robot: Robot, tape: Tape) -> int:
+        """Step at which the heels leave the ground."""
+        data, frame = self._data, robot.model.getFrameId(robot.foot.frames[0])
+        for t, q in zip(tape.t, tape.q, strict=True):
+            pin.framesForwardKinematics(robot.model, data, q)
+            if abs(data.oMf[frame].rotation[2, 0]) > HEEL_RAD:
+                return round(float(t) / STEP_S)
+        return self.steps
+
+    def stands(self, step: int) -> str:
+        """How the feet stand by the plan."""
+        return AIR if step >= self._takeoff else TOE if step >= self._heel_off else FLAT
 
     def shifted(
         self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction: np.ndarray
@@ -154,9 +157,10 @@ class Playback:
         if at >= self.steps:
             return self.command(self.steps, q, v, correction)
         ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
+        change = (_between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate
         if self.mode == "position":
-            return Command(q=ahead + correction, rate=rate)
+            return Command(q=ahead + correction, rate=rate, acceleration=(1 + pace) ** 2 * change)
         wish = GAINS.flight_corner * (angles + correction - q[7:]) + rate + self._correction_rate(correction) - v[6:]
         return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish))
 
@@ -164,9 +168,9 @@ class Playback:
         """Command for one step; the measured state is read in "pd" mode only, ``correction`` is added to the angles."""
         now, holding = min(step, self.steps), step >= self.steps
         if self.mode == "position":
-            # the servo steers to the rate that is due at the end of the step
-            rate = self._rest if holding else self._rate[min(step + 1, self.steps)]
-            return Command(q=self._ahead[now] + correction, rate=rate)
+            rate = self._rest if holding else self._rate[now]
+            due = (self._rate[min(now + 1, self.steps)] - self._rate[now]) / STEP_S
+            return Command(q=self._ahead[now] + correction, rate=rate, acceleration=due, feet=self.stands(step))
         rate = self._rest if holding else self._rate[now]
         error, rate_error = self._q[now] + correction - q[7:], rate + self._correction_rate(correction) - v[6:]
         if step < self._takeoff:
@@ -197,4 +201,4 @@ def _resample(grid: np.ndarray, t: np.ndarray, columns: np.ndarray) -> np.ndarra
 def _between(rows: np.ndarray, at: float) -> np.ndarray:
     """The row (k,) at a place between two."""
     low = min(int(at), len(rows) - 2)
-    return rows[low] + (at - low) * (rows[low + 1] - rows[low])
+    return rows[low] + min(at - low, 1.0) * (rows[low + 1] - rows[low])

@@ -139,6 +139,8 @@ class Tuck:
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
         now = step * STEP_S
+        if not np.isfinite(time_left):  # it will not rise to where it should land: by the clock
+            time_left = max(self._end - now, STEP_S)
         near = float(np.interp(now, self._t, self._pitch)) if self._turned is None else self._turned
         seen = float(pitch_of(q))
         self._turned = seen + 2 * np.pi * round((near - seen) / (2 * np.pi))  # whole turns counted

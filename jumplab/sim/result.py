@@ -207,7 +207,7 @@ class Recorder:
         """
         q, v, tau = (np.array([row[i] for row in self._rows]) for i in range(3))
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
-            raise SolverError("PyBullet lost the robot: its state is not finite", stage="simulation")
+            raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
         contacts = [row[3] for row in self._rows]
         wrench = np.array([c.wrench for c in contacts])
         liftoff, touchdown = _events(wrench[:, :, 2].sum(axis=1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,7 @@ def landing_basin(
 
 def state_keys(states: Sequence[BasinState], settings: TrialSettings, plan: str) -> dict[TrialKey, BasinState]:
     """Each state's name in the log; whatever the grid, equal states are equal trials."""
-    code = TrialSettings(settings.mode, settings.reaim, settings.noise, Ranges()).hash
+    code = replace(settings, ranges=Ranges()).hash
     names = [short_hash(["basin", code, asdict(state)]) for state in states]
     return {TrialKey(0, int(n[:8], 16), n, plan): state for n, state in zip(names, states, strict=True)}
 
@@ -104,6 +104,6 @@ def drop(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: T
     """Simulate one state from the apex on."""
     wrong = Disturbance(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
     floor = Perturbation(key.robot_seed, friction=state.friction, noise=settings.noise)
-    how = {"mode": settings.mode, "perturbation": floor, "scene": scene, "reaim": settings.reaim}
+    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=floor, scene=scene)
     verdict = series.judged(lambda: simulate_landing(tape, robot, wrong, **how))
     return Trial(key, floor.to_json(), asdict(state), *verdict).as_kept()

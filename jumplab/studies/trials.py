@@ -32,14 +32,24 @@ from jumplab.io.files import Log, open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import Metrics, Perturbation, Ranges, Scene, SensorNoise, SimulationResult, simulate_jump
+from jumplab.sim import (
+    DEFAULT_ENGINE,
+    Metrics,
+    Perturbation,
+    Ranges,
+    Scene,
+    SensorNoise,
+    SimulationResult,
+    simulate_jump,
+)
+from jumplab.sim.engine import engine_class
 from jumplab.sim.playback import MODES
 
 SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
 CONFIDENCE = 0.95
 LOOK_S = 0.5  # how often a worker looks whether its parent still lives
 # whose versions decide a trial's outcome, and which sources of this package do: trials of others are not these trials
-SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet")
+SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet", "mujoco")
 SOURCES = (
     *("errors.py", "task.py", "robot_import", "robot", "io", "ocp", "models", "stages", "sim"),
     *("studies/trials.py", "studies/basin.py"),
@@ -72,10 +82,12 @@ class TrialSettings:
     reaim: bool = True  # turn the legs in the air against the trunk's measured pitch error
     noise: SensorNoise = field(default_factory=SensorNoise)  # on what the controllers are told
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
+    engine: str = DEFAULT_ENGINE  # or "mujoco"
 
     def __post_init__(self):
         if self.mode not in MODES:
             raise InputError(f"mode {self.mode!r}: must be one of {', '.join(MODES)}")
+        engine_class(self.engine)
 
     @property
     def hash(self) -> str:
@@ -133,7 +145,7 @@ class Trial:
 def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: TrialKey) -> Trial:
     """Draw the robot of ``key`` and let it jump; raises :class:`InputError` if the tape is not this robot's."""
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    how = {"mode": settings.mode, "perturbation": drawn, "scene": scene, "reaim": settings.reaim}
+    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=drawn, scene=scene)
     verdict = judged(lambda: simulate_jump(tape, robot, **how))
     return Trial(key, drawn.to_json(), features(drawn, robot), *verdict).as_kept()
 

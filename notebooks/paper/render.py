@@ -24,8 +24,8 @@ from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, JOINT_RADIUS_M, LIMB_SHARE, ROD_RADIUS_M, skeleton
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
+from jumplab.sim.bullet import base_to_bullet, bullet, load_urdf
 from jumplab.sim.scene import Scene
-from jumplab.sim.world import base_to_bullet, bullet, load_urdf
 
 if TYPE_CHECKING:
     from jumplab.sim import SimulationResult

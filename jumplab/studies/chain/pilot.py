@@ -304,4 +304,6 @@ class ChainPilot:
         s, (error, rate) = time / BLEND_S, self._offset
         angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
         speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
-        return replace(command, q=command.q + angle, rate=command.rate + speed)
+        push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
+        moved = dict(q=command.q + angle, rate=command.rate + speed, acceleration=command.acceleration + push)
+        return replace(command, **moved)

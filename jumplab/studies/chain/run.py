@@ -11,7 +11,7 @@ import numpy as np
 from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import SLIGHT, STEP_S, Perturbation, Ranges, SensorNoise
+from jumplab.sim import DEFAULT_ENGINE, SLIGHT, STEP_S, Perturbation, Ranges, SensorNoise
 from jumplab.sim.loop import Run
 from jumplab.sim.pilot import LANDINGS
 from jumplab.stages.planner import METHODS, Planner
@@ -38,6 +38,7 @@ def run_chain(
     revise_s: float | None = REVISE_S,
     landing: str = "spring",
     method: str = "three-step",
+    engine: str = DEFAULT_ENGINE,
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.
 
@@ -58,6 +59,7 @@ def run_chain(
     revise_s : when a plan made in the air is made again, after touchdown [s]; never if None. The robot waits for
         neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
+    engine : "bullet" or "mujoco".
     method : "three-step" or "direct".
     """
     _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
@@ -68,7 +70,7 @@ def run_chain(
     course.check(waiting, planner.stage("reach"))
     if rehearsal is None and rehearse:
         rehearsal = Rehearsal.of(course, planner, method)
-    run = Run(waiting, perturbation, course.scene(waiting))
+    run = Run(waiting, perturbation, course.scene(waiting), engine)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s, method)
     pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s)
     run.play(pilot, stance_configuration(waiting), np.zeros(waiting.model.nv))

@@ -1,7 +1,4 @@
-"""The PyBullet world: ground with edges, the robot from its own URDF, contact and actuators as stated.
-
-Everything outside this file speaks Pinocchio: ``q`` and ``v`` of the base *link* frame, joints in Pinocchio's order.
-"""
+"""PyBullet as an engine: ground with edges, the robot from its own URDF, contact as stated."""
 
 from __future__ import annotations
 
@@ -17,12 +14,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import JumplabError, RobotError
-from jumplab.robot import Robot
+from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
+from jumplab.sim.engine import Engine
 from jumplab.sim.kinematics import rotation
-from jumplab.sim.perturbation import FRICTION
-from jumplab.sim.scene import REACH_M, Block, Contacts, Scene
+from jumplab.sim.scene import REACH_M, Block, Contacts
 
 
 @dataclass(frozen=True)
@@ -106,43 +102,22 @@ def base_from_bullet(
     return np.concatenate([position - attitude @ lever, quaternion]), np.concatenate([local_velocity, local_rate])
 
 
-class World:
-    """A robot in a scene. Use as a context manager, or call :meth:`close`.
+class BulletEngine(Engine):
+    """PyBullet behind the interface of :class:`.engine.Engine`."""
 
-    Parameters
-    ----------
-    robot : the robot as it really is (perturbed, if at all). The names of its links are ``links``, the base first.
-    q, v : initial configuration (nq,) and velocity (nv,), rest if ``v`` is None. Set once; nothing is ever reset.
-    friction : effective coefficient between robot and ground.
+    name, title = "bullet", "PyBullet"
+    _client: int | None = None
 
-    Raises
-    ------
-    JumplabError
-        If the engine's masses, damping or friction, read back, are not what was asked for.
-    """
-
-    def __init__(self, robot: Robot, q: np.ndarray, v=None, *, scene: Scene | None = None, friction: float = FRICTION):
-        self.robot, self.scene, self._beyond_sole = robot, scene or Scene.flat(), 0.0
+    def _build(self, friction: float) -> None:
         self._client = bullet.connect(bullet.DIRECT)
         self._bullet = _Client(self._client)
-        try:
-            self._set_engine()
-            self._ground = [self._add_block(b) for b in self.scene.blocks]
-            self._body = self._load(robot.urdf)
-            self._index_links()
-            self._set_dynamics(friction)
-            self.release()
-            self._solid = self._feels_itself()
-            self._place(np.asarray(q, float), np.zeros(robot.model.nv) if v is None else np.asarray(v, float))
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> World:
-        return self
-
-    def __exit__(self, *exc) -> None:
-        self.close()
+        self._set_engine()
+        self._ground = [self._add_block(b) for b in self.scene.blocks]
+        self._body = load_urdf(self.robot.urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
+        self._index_links()
+        self._set_dynamics(friction)
+        for joint in self._joints:  # Bullet's own motors hold every joint until they are told not to
+            self._bullet.setJointMotorControl2(self._body, joint, bullet.VELOCITY_CONTROL, force=0.0)
 
     def close(self) -> None:
         """Free the engine."""
@@ -159,15 +134,12 @@ class World:
 
     def _add_block(self, block: Block) -> int:
         half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
-        shape = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
         centre = [(block.x_from + block.x_to) / 2, 0, block.top - block.thickness / 2]
-        body = self._bullet.createMultiBody(0, shape, basePosition=centre)
+        box = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
+        body = self._bullet.createMultiBody(0, box, basePosition=centre)
         self._bullet.changeDynamics(body, -1, lateralFriction=SETTINGS.ground_friction)
         self._bullet.changeDynamics(body, -1, restitution=0.0)
         return body
-
-    def _load(self, urdf: str) -> int:
-        return load_urdf(urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
 
     def _index_links(self) -> None:
         info = [self._bullet.getJointInfo(self._body, i) for i in range(self._bullet.getNumJoints(self._body))]
@@ -176,13 +148,12 @@ class World:
         self.links = (base, *(row[12].decode() for row in info))  # Bullet's link i is links[i + 1]
         self._joints = [by_joint[name] for name in self.robot.joint_names]
         self._feet = {self.links.index(name) - 1: side for side, name in enumerate(self.robot.foot.frames)}
-        dynamics = self._bullet.getDynamicsInfo(self._body, -1)
-        self._lever, tilt = np.array(dynamics[3]), dynamics[4]
+        lever, tilt = self._bullet.getDynamicsInfo(self._body, -1)[3:5]
+        self._lever = np.array(lever)
         if abs(abs(tilt[3]) - 1) > 1e-9:
             raise RobotError(f"robot {self.robot.name}: the inertial frame of {base} is turned; align it with its link")
 
     def _dynamics(self) -> list[tuple]:
-        """What the engine has about each link: mass [kg], friction, and more."""
         return [self._bullet.getDynamicsInfo(self._body, i - 1) for i in range(len(self.links))]
 
     def _set_dynamics(self, friction: float) -> None:
@@ -191,12 +162,6 @@ class World:
             still = dict(linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, restitution=0.0)
             change(link, maxJointVelocity=SETTINGS.fastest, **still)
             change(link, lateralFriction=friction)  # ignored if in the call above
-        for name, found in self.friction.items():
-            if abs(found - friction) > 1e-9:
-                raise JumplabError(f"PyBullet kept friction {found:g} on {name} where {friction:g} was set")
-        total = sum(row[0] for row in self._dynamics())
-        if abs(total - self.robot.total_mass) > 1e-6:
-            raise JumplabError(f"PyBullet's robot weighs {total:.4f} kg, Pinocchio's {self.robot.total_mass:.4f} kg")
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
         position, quaternion, velocity, rate = base_to_bullet(q, v, self._lever)
@@ -206,7 +171,6 @@ class World:
             self._bullet.resetJointState(self._body, joint, float(angle), float(speed))
 
     def _feels_itself(self) -> bool:
-        """Whether the engine notices links in each other: tangles the robot, before it is placed for the run."""
         rng = np.random.default_rng(0)
         self._bullet.resetBasePositionAndOrientation(self._body, [0.0, 0.0, REACH_M], [0.0, 0.0, 0.0, 1.0])
         for _ in range(SETTINGS.tangles):
@@ -218,17 +182,25 @@ class World:
         return False
 
     @property
+    def mass_kg(self) -> float:
+        """Mass of the robot as the engine has it."""
+        return sum(row[0] for row in self._dynamics())
+
+    @property
     def friction(self) -> dict[str, float]:
         """Friction coefficient of every link as the engine has it."""
         return {name: row[1] for name, row in zip(self.links, self._dynamics(), strict=True)}
 
-    def read_back(self) -> dict:
-        """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg],
-        whether links collide with each other, and how far beyond the stated sole a foot ever touched [m]."""
-        ground = [self._bullet.getDynamicsInfo(block, -1)[1] for block in self._ground]
-        friction = sorted({self.friction[foot] * block for foot in self.robot.foot.frames for block in ground})
-        mass = sum(row[0] for row in self._dynamics())
-        return dict(friction=friction, mass_kg=mass, self_collision=self._solid, beyond_sole_m=self._beyond_sole)
+    @property
+    def ground_friction(self) -> list[float]:
+        """Friction coefficient of every block of the scene as the engine has it."""
+        return [self._bullet.getDynamicsInfo(block, -1)[1] for block in self._ground]
+
+    @property
+    def damping(self) -> float:
+        """Largest damping or dry friction of a joint as the engine has it, in SI units."""
+        rows = (self._bullet.getJointInfo(self._body, joint) for joint in self._joints)
+        return max(max(row[6:8]) for row in rows)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
@@ -238,36 +210,18 @@ class World:
         joints = np.array([row[:2] for row in self._bullet.getJointStates(self._body, self._joints)])
         return np.concatenate([base_q, joints[:, 0]]), np.concatenate([base_v, joints[:, 1]])
 
-    def _command(self, control: int, **targets) -> None:
-        self._bullet.setJointMotorControlArray(self._body, self._joints, control, **targets)
-
-    def command_torque(self, tau: np.ndarray) -> None:
-        """Torque of every joint for the next step [N m]; the caller clips."""
-        self._command(bullet.TORQUE_CONTROL, forces=tau.tolist())
-
-    def command_position(
-        self, q: np.ndarray, rate: np.ndarray, limit: np.ndarray, position_gain: float, velocity_gain: float
-    ) -> None:
-        """Position servo of every joint for the next steps: target angle, its rate, largest torque (each (nv - 6,)).
-
-        At the end of each step the servo asks for the rate ``velocity_gain * rate + position_gain * error / step``.
-        """
-        gains = dict(positionGains=[position_gain] * len(q), velocityGains=[velocity_gain] * len(q))
-        targets = dict(targetPositions=q.tolist(), targetVelocities=rate.tolist(), forces=limit.tolist())
-        self._command(bullet.POSITION_CONTROL, **targets, **gains)
-
-    def release(self) -> None:
-        """Switch the position servos off, before torques are commanded."""
-        zero = [0.0] * len(self._joints)
-        self._command(bullet.VELOCITY_CONTROL, targetVelocities=zero, forces=zero)
+    def set_torque(self, tau: np.ndarray) -> None:
+        """Torque of every joint for the next step [N m]."""
+        self._torque = np.array(tau, float)
+        self._bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=self._torque)
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""
         self._bullet.stepSimulation()
 
-    def servo_torque(self) -> np.ndarray:
-        """Torque (nv - 6,) that the position servos gave in the last step [N m]."""
-        return np.array([row[3] for row in self._bullet.getJointStates(self._body, self._joints)])
+    def applied(self) -> np.ndarray:
+        """Torque of the last step (nv - 6,) [N m], as PyBullet was told: it reports those of its own motors only."""
+        return self._torque
 
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
@@ -293,10 +247,3 @@ class World:
                 wrench[side, 3:] -= pin.skew(origin) @ wrench[side, :3]
                 self._note_sole((np.array(points[side]) - origin) @ rotation(state[5]))
         return Contacts(wrench, frozenset(touching), frozenset(colliding))
-
-    def _note_sole(self, points: np.ndarray) -> None:
-        """Remember how far contact points (k, 3) in the foot's frame lay beyond the stated sole."""
-        foot = self.robot.foot
-        side = np.abs(points[:, 1] - foot.center[1]) - foot.half_width
-        beyond = max((foot.heel - points[:, 0]).max(), (points[:, 0] - foot.toe).max(), side.max())
-        self._beyond_sole = max(self._beyond_sole, float(beyond))

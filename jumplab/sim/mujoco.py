@@ -1,0 +1,188 @@
+"""MuJoCo as an engine: the same boxes and the same robot, over contacts that give way by a hair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import RobotError
+from jumplab.sim import STEP_S
+from jumplab.sim.engine import Engine
+from jumplab.sim.kinematics import rotation
+from jumplab.sim.scene import REACH_M, Contacts
+
+
+@dataclass(frozen=True)
+class Softness:
+    """How a contact gives way; MuJoCo's names are those of its solref and solimp."""
+
+    time_s: float = 0.002  # [s] a penetration fades; eight of the engine's steps, it wants two at least
+    damping_ratio: float = 1.0  # [1] nothing bounces
+    impedance: tuple[float, float] = (0.95, 0.99)  # [1] share of a contact's acceleration that is held off
+
+
+SOFTNESS = Softness()  # as hard as Bullet's ground: launches slip by less than a millimetre; by default, 7 mm
+SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
+CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
+ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
+TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
+FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
+
+
+class MujocoEngine(Engine):
+    """MuJoCo behind the interface of :class:`.engine.Engine`; ``softness`` may be set on the class for a study."""
+
+    name, title, substeps = "mujoco", "MuJoCo", SUBSTEPS
+    softness = SOFTNESS
+
+    def _build(self, friction: float) -> None:
+        spec = self._read()
+        option = spec.option
+        option.timestep, option.gravity = STEP_S / SUBSTEPS, [0.0, 0.0, -self.robot.gravity]
+        option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
+        option.impratio, option.iterations, option.tolerance = CONE_RATIO, ITERATIONS, TOLERANCE
+        for geom in spec.geoms:
+            geom.friction, geom.priority = [friction, 0.0, 0.0], FIRST
+        for block in self.scene.blocks:
+            half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
+            centre = [(block.x_from + block.x_to) / 2, 0.0, block.top - block.thickness / 2]
+            box = mujoco.mjtGeom.mjGEOM_BOX
+            spec.worldbody.add_geom(type=box, size=half, pos=centre, friction=[1.0, 0.0, 0.0])
+        for geom in spec.geoms:
+            geom.condim, geom.margin = 3, 0.0
+            geom.solref = [self.softness.time_s, self.softness.damping_ratio]
+            geom.solimp = [*self.softness.impedance, 0.001, 0.5, 2.0]
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        for own in (self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss):
+            own[:] = 0.0
+        self._model.jnt_solref[:] = [self.softness.time_s, self.softness.damping_ratio]
+        self._index_links()
+
+    def _read(self) -> mujoco.MjSpec:
+        """The robot's URDF, its base free, every link kept, none of its pictures."""
+        try:
+            spec = mujoco.MjSpec.from_string(self.robot.urdf)
+            spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
+            base = spec.worldbody.first_body()
+            if base is None:
+                raise ValueError("it has no body of its own")
+            base.add_freejoint()
+            spec.copy().compile()
+        except ValueError as e:
+            said = " ".join(str(e).split())
+            raise RobotError(f"robot {self.robot.name}: MuJoCo cannot read the URDF: {said}") from e
+        return spec
+
+    def _index_links(self) -> None:
+        model = self._model
+        self.links = tuple(model.body(i).name for i in range(1, model.nbody))  # body i is links[i - 1]
+        joints = [model.joint(name) for name in self.robot.joint_names]
+        self._angles = np.array([joint.qposadr[0] for joint in joints])
+        self._rates = np.array([joint.dofadr[0] for joint in joints])
+        self._feet = {model.body(name).id: side for side, name in enumerate(self.robot.foot.frames)}
+        self._torque = np.zeros(len(joints))
+        self._wrench, self._touching, self._colliding = np.zeros((2, 6)), set(), set()
+
+    def close(self) -> None:
+        """Free the engine."""
+        self._data = self._model = None
+
+    def _feels_itself(self) -> bool:
+        rng, data = np.random.default_rng(0), mujoco.MjData(self._model)
+        data.qpos[2] = REACH_M
+        for _ in range(TANGLES):
+            data.qpos[self._angles] = rng.uniform(-np.pi, np.pi, len(self._angles))
+            mujoco.mj_forward(self._model, data)
+            if data.ncon:
+                return True
+        return False
+
+    def _place(self, q: np.ndarray, v: np.ndarray) -> None:
+        data = self._data
+        data.qpos[:3], data.qpos[3:7], data.qpos[self._angles] = q[:3], q[[6, 3, 4, 5]], q[7:]
+        data.qvel[:3], data.qvel[3:6], data.qvel[self._rates] = rotation(q[3:7]) @ v[:3], v[3:6], v[6:]
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of the robot as the engine has it."""
+        return float(self._model.body_mass.sum())
+
+    @property
+    def friction(self) -> dict[str, float]:
+        """Friction coefficient between every link that can touch, and the ground, as the engine has it."""
+        model = self._model
+        robot = np.flatnonzero(model.geom_bodyid)
+        ground = np.flatnonzero(model.geom_bodyid == 0)
+        wins = model.geom_priority[robot] > model.geom_priority[ground].max()
+        both = np.maximum(model.geom_friction[robot, 0], model.geom_friction[ground, 0].max())
+        used = np.where(wins, model.geom_friction[robot, 0], both)
+        return {self.links[model.geom_bodyid[g] - 1]: float(mu) for g, mu in zip(robot, used, strict=True)}
+
+    @property
+    def ground_friction(self) -> list[float]:
+        """Friction coefficient of every block of the scene as the engine has it."""
+        return self._model.geom_friction[self._model.geom_bodyid == 0, 0].tolist()
+
+    @property
+    def damping(self) -> float:
+        """Largest damping, armature or dry friction of a joint as the engine has it, in SI units."""
+        model = self._model
+        return float(max(np.abs(x).max() for x in (model.dof_damping, model.dof_armature, model.dof_frictionloss)))
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
+        position, quaternion = self._data.qpos[:3], self._data.qpos[[4, 5, 6, 3]]
+        velocity, rate = rotation(quaternion).T @ self._data.qvel[:3], self._data.qvel[3:6]
+        return (
+            np.concatenate([position, quaternion, self._data.qpos[self._angles]]),
+            np.concatenate([velocity, rate, self._data.qvel[self._rates]]),
+        )
+
+    def set_torque(self, tau: np.ndarray) -> None:
+        """Torque of every joint for the next step [N m]."""
+        self._data.qfrc_applied[self._rates] = tau
+
+    def applied(self) -> np.ndarray:
+        """Torque (nv - 6,) that acted in the last step [N m]."""
+        return self._torque
+
+    def step(self) -> None:
+        """Advance by :data:`jumplab.sim.STEP_S`."""
+        self._wrench, self._touching, self._colliding = np.zeros((2, 6)), set(), set()
+        mujoco.mj_kinematics(self._model, self._data)
+        origins = self._data.xpos.copy()
+        for _ in range(SUBSTEPS):
+            mujoco.mj_step(self._model, self._data)
+            self._feel(origins)
+        self._torque = self._data.qfrc_applied[self._rates].copy()
+
+    def contacts(self) -> Contacts:
+        """Mean forces of the ground on the feet, and all that touched, in the last step."""
+        return Contacts(self._wrench / SUBSTEPS, frozenset(self._touching), frozenset(self._colliding))
+
+    def _feel(self, origins: np.ndarray) -> None:
+        """Add the contacts of one substep; moments are about the links' ``origins`` (k, 3) before the step."""
+        model, data, force, points = self._model, self._data, np.zeros(6), ([], [])
+        bodies, places, frames = model.geom_bodyid[data.contact.geom], data.contact.pos, data.contact.frame
+        for number, (one, other) in enumerate(bodies.tolist()):
+            mujoco.mj_contactForce(model, data, number, force)
+            if force[0] <= 0:
+                continue
+            if one and other:
+                self._colliding.add((self.links[one - 1], self.links[other - 1]))
+                continue
+            body, sign = (other, 1.0) if one == 0 else (one, -1.0)
+            self._touching.add(self.links[body - 1])
+            side = self._feet.get(body)
+            if side is not None:
+                push = sign * force[:3] @ frames[number].reshape(3, 3)
+                self._wrench[side, :3] += push
+                self._wrench[side, 3:] += pin.skew(places[number] - origins[body]) @ push
+                points[side].append(places[number])
+        for body, side in self._feet.items():
+            if points[side]:
+                self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))

@@ -1,0 +1,108 @@
+"""The servo law of position mode: target, rate and acceleration of the joints in, torques out, whatever the engine.
+
+It sums what the motion takes and what its errors ask for, both from the planned robot at the measured state and with
+the feet standing as they do in the plan. What the joints' accelerations a_j take is inverse dynamics; those of the base
+a_b and the wrenches f on the feet go with it,
+
+    min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f|^2   so that   M a + h = J^T f   in the rows of the base.
+
+Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may be far stiffer than
+what is computed from the velocity before the step,
+
+    tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f   and   J v+ = 0,
+
+and the wished rate is the due one plus corner times the error of the angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command
+
+
+@dataclass(frozen=True)
+class ServoGains:
+    """The paper prints none of these numbers."""
+
+    damping: float = 45.0  # [N m s/rad] of the strongest motor; 60 swings with commands that are 4 ms old
+    corner: float = 25.0  # [rad/s] stiffness over damping
+    lever_m: float = 0.1  # moments on a foot count as forces at this distance
+    epsilon: float = 1e-8  # [(m/s^2)^2/N^2] settles what each foot takes, and nothing else
+
+
+GAINS = ServoGains()
+AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+PITCH = 4  # row of a foot's twist that is free while it stands on its toe
+
+
+class Servo:
+    """Torques for commands of position mode, from the measured state; ``robot`` is as planned."""
+
+    def __init__(self, robot: Robot, gains: ServoGains = GAINS):
+        self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
+        self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
+        self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
+
+    def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]; those of the command, if it has any."""
+        if command.tau is not None:
+            return command.tau
+        model, data = self._gauge.model, self._gauge.data
+        pin.computeAllTerms(model, data, q, v)
+        pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
+        feet, drift, units = self._feet(command.feet)
+        push = feet.T * units
+        tau = self._feed_forward(command.acceleration, feet, drift, push)
+        wish = command.rate + STEP_S * command.acceleration + self._gains.corner * (command.q - q[7:])
+        tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
+        most = command.share * self._motors.either_way(v[6:])
+        return np.clip(tau, -most, most)
+
+    def _feed_forward(self, joints: np.ndarray, feet: np.ndarray, drift: np.ndarray, push: np.ndarray) -> np.ndarray:
+        """Torques (nv - 6,) that accelerate the ``joints`` as told, while the feet stay where they are."""
+        data, held = self._gauge.data, 6 + len(drift)
+        offset = data.nle + data.M[:, 6:] @ joints
+        kkt, right = np.zeros((held + 6, held + 6)), np.zeros(held + 6)
+        kkt[:6, :6] = feet[:, :6].T @ feet[:, :6]
+        kkt[range(6, held), range(6, held)] = self._gains.epsilon
+        kkt[held:, :6], kkt[held:, 6:held] = data.M[:6, :6], -push[:6]
+        kkt[:held, held:] = kkt[held:, :held].T
+        right[:6], right[held:] = -feet[:, :6].T @ (drift + feet[:, 6:] @ joints), -offset[:6]
+        x = np.linalg.solve(kkt, right)
+        return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held]
+
+    def _rates_after(self, tau: np.ndarray, wish: np.ndarray, v: np.ndarray, push: np.ndarray) -> np.ndarray:
+        """Joint rates (nv - 6,) at the end of the step, if ``tau`` and damping towards ``wish`` act [rad/s]."""
+        data, nv, held = self._gauge.data, len(v), push.shape[1]
+        kkt, right, joints = np.zeros((nv + held, nv + held)), np.zeros(nv + held), range(6, nv)
+        kkt[:nv, :nv] = data.M
+        kkt[joints, joints] += STEP_S * self._damping
+        kkt[:nv, nv:], kkt[nv:, :nv] = -push, -push.T
+        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * STEP_S
+        right[:nv] = data.M @ v - STEP_S * data.nle
+        right[6:nv] += STEP_S * (tau + self._damping * wish)
+        return np.linalg.solve(kkt, right)[6:nv]
+
+    def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench against each."""
+        model, data = self._gauge.model, self._gauge.data
+        rows, drifts, units = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
+        held = np.delete(np.arange(6), [] if stand == FLAT else PITCH)
+        for frame in self._gauge.frames if stand != AIR else ():
+            arm = pin.updateFramePlacement(model, data, frame).rotation @ self._pivot[stand]
+            jacobian = pin.getFrameJacobian(model, data, frame, AXES)
+            jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
+            drift = pin.getFrameClassicalAcceleration(model, data, frame, AXES)
+            spin = pin.skew(pin.getFrameVelocity(model, data, frame, AXES).angular)
+            linear = drift.linear + pin.skew(drift.angular) @ arm + spin @ (spin @ arm)
+            rows.append(jacobian[held])
+            drifts.append(np.concatenate([linear, drift.angular])[held])
+            units.append(np.repeat([1.0, self._gains.lever_m], 3)[held])
+        return np.vstack(rows), np.concatenate(drifts), np.concatenate(units)

@@ -1,0 +1,91 @@
+"""The servo law of position mode against the plan, against Pinocchio, and against a drive that is simply stiff."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from jumplab.robot.stance import stance_configuration
+from jumplab.sim import STEP_S, Perturbation, simulate_jump
+from jumplab.sim.landing import BodyTerms
+from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Motors, Playback
+from jumplab.sim.servo import GAINS, Servo
+from jumplab.stages.planner import plan_jump
+from jumplab.task import JumpTask
+
+
+@pytest.fixture(scope="module")
+def tape(bhr):
+    return plan_jump(JumpTask(0.6, 0.3), bhr, method="direct").tape
+
+
+def told(robot, posture, **changed) -> Command:
+    still = np.zeros(len(robot.joint_names))
+    return Command(**{**dict(q=posture[7:], rate=still, acceleration=still, feet=FLAT), **changed})
+
+
+def test_a_stance_takes_what_its_weight_takes(bhr):
+    q = stance_configuration(bhr)
+    body = BodyTerms(bhr, 1.0)
+    body.update(q, np.zeros(bhr.model.nv))
+    body.set_contact(both := np.array([True, True]))
+    tau = Servo(bhr).torque(told(bhr, q), q, np.zeros(bhr.model.nv))
+    pitch = [bhr.joint_names.index(name) for pair in bhr.joints.values() for name in pair]
+    assert tau[pitch] == pytest.approx(body.gravity_torque(both)[pitch], abs=1e-3)
+
+
+def test_on_the_tape_it_asks_for_the_planned_torques_that_it_never_saw(bhr, tape):
+    """Flat, on the toes and in the air; but where the tape jumps from one to the next."""
+    servo, player, effort = Servo(bhr), Playback(tape, bhr), Actuators(bhr).effort
+    worst = {FLAT: 0.0, TOE: 0.0, AIR: 0.0}
+    for row in range(0, len(tape.t) - 1, 7):
+        step = round(float(tape.t[row]) / STEP_S)
+        stand = player.stands(step)
+        if any(player.stands(step + k) != stand for k in (-5, 5)):
+            continue
+        command = Command(q=tape.q[row, 7:], rate=tape.v[row, 6:], acceleration=tape.a[row, 6:], feet=stand)
+        miss = servo.torque(command, tape.q[row], tape.v[row]) - tape.tau[row]
+        worst[stand] = max(worst[stand], float(np.abs(miss / effort).max()))
+    assert 0 < worst[FLAT] < 0.005 and 0 < worst[AIR] < 1e-4
+    assert 0 < worst[TOE] < 0.02  # [of the effort] the toes' line moves a little in the plan, and not in the law
+
+
+def test_in_the_air_an_error_is_met_by_a_damper_of_the_free_body(bhr, tape):
+    """The stated damping, softened by what the rates change within the step: an implicit step, solved another way."""
+    q, v = tape.q[-200], np.zeros(bhr.model.nv)
+    servo, data, dt = Servo(bhr), bhr.model.createData(), STEP_S
+    error = np.random.default_rng(0).normal(size=14) * 1e-3
+    free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e, feet=AIR), q, v) for e in (0 * error, error))
+    damping = GAINS.damping * Actuators(bhr).effort / Actuators(bhr).effort.max()
+    mass = pin.crba(bhr.model, data, q)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    answer = np.linalg.inv(mass)[6:, 6:]  # rates per impulse
+    stiff = np.diag(damping) @ np.linalg.inv(np.eye(14) + dt * answer @ np.diag(damping))
+    assert pulled - free == pytest.approx(stiff @ (GAINS.corner * error), abs=1e-9)
+
+
+def test_torques_keep_to_the_share_of_the_motors(bhr):
+    q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
+    far = told(bhr, q, q=q[7:] + 10.0, share=0.2)
+    tau = Servo(bhr).torque(far, q, v)
+    assert np.abs(tau) == pytest.approx(0.2 * Actuators(bhr).effort)
+    assert np.array_equal(Servo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
+
+
+def test_a_gain_scales_what_is_delivered(bhr):
+    names, tau, still = bhr.joint_names, np.full(14, 10.0), np.zeros(14)
+    delivered = Motors(bhr, {names[3]: 0.8, names[9]: 1.1}).deliver(tau, still)
+    assert delivered[3] == pytest.approx(8) and delivered[9] == pytest.approx(11)
+    assert np.delete(delivered, [3, 9]) == pytest.approx(10)
+    assert Motors(bhr, {}).deliver(1e3 * tau, still) == pytest.approx(Actuators(bhr).effort)
+
+
+@pytest.mark.parametrize("mode", ["position", "pd"])
+def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
+    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes."""
+    weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
+    asked, weakly, late = (
+        simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01).metrics
+        for p in (Perturbation(), weak, Perturbation(delay_s=0.004))
+    )
+    assert weakly.com_rise_m < asked.com_rise_m - 0.004
+    assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
