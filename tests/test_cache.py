@@ -13,7 +13,7 @@ from test_transcription import random_point, toy
 from jumplab.ocp import cache
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
-from jumplab.robot.reach import reach
+from jumplab.robot.reach import reach, shipped_reach
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp import planner as srmp_planner
 from jumplab.stages.srmp.planner import reach_of
@@ -144,13 +144,23 @@ def test_a_folder_that_cannot_be_written_is_no_failure(place, monkeypatch, count
 
 def test_reach_comes_back_to_the_last_bit(bhr, place, monkeypatch):
     """And from the file, not sampled again; a damaged file is passed over."""
-    made = reach_of(bhr, keep=True)
-    sampled = []
+    other = bhr.with_limits(effort=0.9)  # nothing is shipped for it
+    made, sampled = reach_of(other, keep=True), []
     monkeypatch.setattr(srmp_planner, "reach", lambda robot: sampled.append(robot) or reach(robot))
-    for name, value in vars(reach_of(bhr, keep=True)).items():
+    for name, value in vars(reach_of(other, keep=True)).items():
         np.testing.assert_array_equal(value, getattr(made, name))
-        assert type(value) is type(getattr(made, name)) is type(getattr(reach(bhr), name))
+        assert type(value) is type(getattr(made, name)) is type(getattr(reach(other), name))
     assert not sampled
     (file,) = place.glob("*.json")
     file.write_bytes(file.read_bytes()[:-5])
-    assert reach_of(bhr, keep=True).to_json() == made.to_json() and len(sampled) == 1
+    assert reach_of(other, keep=True).to_json() == made.to_json() and len(sampled) == 1
+
+
+def test_the_shipped_reach_is_what_sampling_gives(bhr):
+    shipped, sampled = shipped_reach(bhr), reach(bhr)
+    for name, value in vars(sampled).items():
+        if name == "weakest":
+            assert shipped.weakest == value
+        else:
+            np.testing.assert_allclose(getattr(shipped, name), value, rtol=1e-9, atol=1e-12)
+    assert shipped_reach(bhr.with_limits(speed=0.9)) is None

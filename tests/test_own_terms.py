@@ -19,6 +19,7 @@ import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.ocp import Nlp, Term, changed
 from jumplab.ocp import cache as kept
+from jumplab.robot_import.urdf import have_published
 from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.srmp import build_problem as srmp_problem
@@ -378,7 +379,7 @@ def test_cached_and_uncached_processes_plan_the_same(tmp_path):
     np.testing.assert_array_equal(found["fresh"], found["again"])
     np.testing.assert_array_equal(found["fresh"], found["none"])
     assert found["other"].shape != found["fresh"].shape or np.abs(found["other"] - found["fresh"]).max() > 1e-3
-    assert len(list((tmp_path / "cache").iterdir())) == 3  # stage 1 once, stage 3 with either expression
+    assert len(list((tmp_path / "cache").glob("*.casadi"))) == 3  # stage 1 once, stage 3 with either expression
 
 
 @pytest.mark.slow
@@ -410,6 +411,7 @@ def test_a_growing_weight_calms_the_arms_of_flips():
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 def test_the_resolve_for_jerk_keeps_own_terms():
     """A robot whose jerk jumps too far is solved again with a dearer jerk: with the same terms."""
     found = [jl.Planner(jl.Robot.load("g1"), terms={"whole body/flight": [calm(w)]}) for w in (0.0, 0.05)]

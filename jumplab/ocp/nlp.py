@@ -44,7 +44,7 @@ IPOPT = {
 # to begin from a solution close by with its multipliers: the start is not pushed away from its limits
 PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 WARM = {"warm_start_init_point": "yes"} | {f"warm_start_{push}": 1e-6 for push in PUSHES}
-# of the diagnosis
+# for saying why a solve failed
 NAMED = 4  # so many terms are named at most
 CONFLICT_LIMIT = 1e-3  # scaled row error that is worth a word
 COST_SHARE = 1e-4  # enough of the cost to keep the motion sane, too little to buy violations

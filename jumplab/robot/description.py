@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
-import tomlkit
 
 from jumplab.errors import RobotError, quoted
 from jumplab.robot import changes
@@ -21,10 +21,11 @@ from jumplab.robot.reduction import check_reduction
 from jumplab.robot.sagittal import SagittalModel, read_only, reduce
 from jumplab.robot.stance import check_stance
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
-from jumplab.robot_import.jumper import Jumper, make_jumper
-from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import locate, read_urdf
 from jumplab.task import GRAVITY
+
+if TYPE_CHECKING:
+    from jumplab.robot_import.jumper import Jumper
 
 HERE = Path(__file__).parent
 SHIPPED = {path.stem: path for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))}
@@ -104,6 +105,8 @@ class Robot:
         path, config = files_of(name_or_path)
         if config is not None and "source" not in read_toml(config, str(path)):
             return cls.from_text(read_urdf(path), config)
+        from jumplab.robot_import.roles import draft  # the importer takes time that most robots need not wait for
+
         robot = cls.imported(path, draft(path, repair).text if config is None else config)[1]
         check_reduction(robot)
         check_stance(robot)
@@ -119,6 +122,8 @@ class Robot:
         if "source" not in config:
             missing = "the table [source] is missing: it names trunk, forward, up and repair"
             raise RobotError(f"robot configuration: {missing}")
+        from jumplab.robot_import.jumper import make_jumper
+
         jumper = make_jumper(read_urdf(path), config, path.name, path)
         return jumper, cls.from_text(jumper.urdf, jumper.config_text)
 
@@ -264,6 +269,8 @@ class Robot:
         unknown = sorted(stance.keys() - self.stance.keys())
         if unknown:
             raise RobotError(f"a stance has {', '.join(self.stance)}, not {', '.join(unknown)}")
+        import tomlkit
+
         config = tomlkit.parse(self.config_text)
         config["stance"].update({key: float(angle) for key, angle in stance.items()})
         return replace(self, config_text=tomlkit.dumps(config))

@@ -6,8 +6,10 @@ ranges are dropped, and the extremes over each CoM distance phi give smooth enve
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,7 @@ class ReachSettings:
 
 
 SETTINGS = ReachSettings()
+SHIPPED_REACH = Path(__file__).parent / "bhr" / "reach.json"
 
 
 @dataclass(frozen=True)
@@ -227,3 +230,17 @@ def reach(robot: Robot, count: int = SETTINGS.samples) -> Reach:
         mass=mass,
         weakest=_weakest(m, p, phi),
     )
+
+
+def shipped_reach(robot: Robot) -> Reach | None:
+    """The envelopes of the default robot as they are shipped, those of any other robot None.
+
+    ``python -m jumplab.robot.reach`` samples and writes them; a test holds them against :func:`reach`.
+    """
+    data = json.loads(SHIPPED_REACH.read_bytes())
+    return Reach.from_json(data["reach"]) if data["robot_hash"] == robot.hash else None
+
+
+if __name__ == "__main__":
+    found = {"robot_hash": Robot.load().hash, "reach": reach(Robot.load()).to_json()}
+    SHIPPED_REACH.write_text(json.dumps(found, indent=1) + "\n")

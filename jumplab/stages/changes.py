@@ -64,11 +64,10 @@ class StageChanges:
             out |= dict.fromkeys(parts or [name], value)
         return out
 
-    @staticmethod
-    def still_there(problem: Problem, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of the names that the problem has not already left out."""
-        known = _names(problem)
-        return tuple(name for name in names if name in known)
+    def still_there(self, problem: Problem, names: Iterable[str]) -> tuple[str, ...]:
+        """The names less those that these changes have already left out of the problem."""
+        known, gone = _names(problem), {part for name in self.off for part in (name, name.rpartition("/")[2])}
+        return tuple(name for name in names if name in known or name not in gone)
 
 
 def _names(problem: Problem) -> set[str]:

@@ -21,8 +21,9 @@ from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.io.files import Log, append, open_log
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import SAGITTAL_JOINTS, Robot
-from jumplab.robot.reach import Reach, reach
+from jumplab.robot.reach import Reach
 from jumplab.stages.reconstruction import planar_motion, planar_quantities
+from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.settings import Limits
@@ -161,7 +162,7 @@ def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> 
     if robot.hash not in _tools:
         # on the fine mesh at once: most cells begin with a neighbour's solution, which is nearer than steps would lead
         options = {"max_iter": MAX_ITERATIONS}
-        _tools[robot.hash] = reach(robot), WholeBodyPlanner(robot, tracking=False, options=options, refine=False)
+        _tools[robot.hash] = reach_of(robot), WholeBodyPlanner(robot, tracking=False, options=options, refine=False)
     known, planner = _tools[robot.hash]
     try:
         check_reachable(task, known, robot)

@@ -18,8 +18,8 @@ from jumplab.models.srmp import COORDINATES
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Statistics
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
-from jumplab.robot.reach import SETTINGS, Reach, reach
-from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground
+from jumplab.robot.reach import SETTINGS, Reach
+from jumplab.stages.srmp.planner import SrmpStance, grid, on_ground, reach_of
 from jumplab.stages.srmp.problem import SCALES, cop_terms, launch_terms, limit, srmp_state
 from jumplab.stages.srmp.settings import SrmpSettings
 
@@ -190,7 +190,7 @@ class LandingPlanner:
     """Landings of one robot: built once, solved from any touchdown."""
 
     def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings()):
-        self.robot, self.settings, self.reach = robot, settings, reach(robot)
+        self.robot, self.settings, self.reach = robot, settings, reach_of(robot)
         self._mass, self._margin = robot.sagittal.total_mass, SrmpSettings().inertia_margin
         self.nlp = Nlp(build_landing(robot, settings, self.reach))
 

@@ -15,7 +15,7 @@ from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
-from jumplab.robot.reach import Reach, reach
+from jumplab.robot.reach import Reach, reach, shipped_reach
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.stages.srmp.reachable import check_reachable, nearest
@@ -143,9 +143,13 @@ def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict
 
 
 def reach_of(robot: Robot, *, keep: bool = False) -> Reach:
-    """What the robot can do, see :func:`jumplab.robot.reach.reach`; with ``keep`` from a file, if an earlier process
-    left one."""
-    return Reach.from_json(remembered("reach", robot.hash, lambda: reach(robot).to_json())) if keep else reach(robot)
+    """What the robot can do, see :func:`jumplab.robot.reach.reach`: from the file shipped with it, else sampled.
+
+    With ``keep``, what was sampled is left for later processes.
+    """
+    if (known := shipped_reach(robot)) is not None or not keep:
+        return known or reach(robot)
+    return Reach.from_json(remembered("reach", robot.hash, lambda: reach(robot).to_json()))
 
 
 class SrmpPlanner:
