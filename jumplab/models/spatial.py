@@ -1,0 +1,343 @@
+"""Any tree of turning joints in space, in CasADi: inverse dynamics, momentum, CoM and points of links.
+
+The base has the coordinates x, y, z of its origin and the angles yaw, roll, pitch, turned in this order about its own
+axes z, x, y: yaw and pitch may pass any number of full turns, roll stays within a quarter. The joints follow in
+Pinocchio's order. Every body is re-framed so that its joint turns about a coordinate axis: what such a rotation leaves
+alone costs nothing. Pinocchio says the same of every quantity (tests).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from jumplab.errors import RobotError
+from jumplab.task import GRAVITY
+
+CHART = ("x", "y", "z", "yaw", "roll", "pitch")  # coordinates of the base
+ATTITUDE_AXES = (2, 0, 1)  # that yaw, roll and pitch turn about
+ROUNDING = 1e-12  # entries of rotations and inertias below it are none
+ALONG = 1 - 1e-12  # cosine from which an axis is a coordinate axis
+
+
+@dataclass(frozen=True)
+class Body:
+    """One link with its joint, in a frame whose coordinate axis ``axis`` is the joint's."""
+
+    name: str
+    parent: int  # index of the body that carries it; 0 is the base
+    axis: int
+    turn: np.ndarray  # (3, 3) of the frame at angle zero, in the parent's
+    place: np.ndarray  # (3,) its origin there [m]
+    own: np.ndarray  # (3, 3) the frame's axes in Pinocchio's frame of this joint
+    mass: float  # [kg]
+    first: np.ndarray  # (3,) mass times CoM [kg m]
+    second: np.ndarray  # (3, 3) inertia about the origin [kg m^2]
+
+
+def _clean(x: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(x) < ROUNDING, 0.0, x)
+
+
+def _frame_along(axis: np.ndarray) -> tuple[int, np.ndarray]:
+    """(k, Q): the coordinate axis k of the frame with axes Q points along ``axis`` (3,)."""
+    k = int(np.argmax(np.abs(axis)))
+    if axis[k] > ALONG:
+        return k, np.eye(3)
+    if axis[k] < -ALONG:
+        return k, np.diag(np.where(np.arange(3) == (k + 1) % 3, 1.0, -1.0))
+    return 2, pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).toRotationMatrix()
+
+
+class SpatialModel:
+    """Numbers of a robot's tree, from its Pinocchio model with a free-flyer base.
+
+    Attributes
+    ----------
+    bodies : the base first, then one per joint.  names : of the coordinates, (6 + joints,).
+    mass : [kg].  joints : number of joints.  armature : (joints,) of the motors, at the joints [kg m^2].
+    """
+
+    def __init__(self, model: pin.Model):
+        self.model, data = model, model.createData()
+        if model.joints[1].shortname() != "JointModelFreeFlyer" or model.nv - 6 != model.njoints - 2:
+            raise RobotError(f"robot {model.name}: the spatial model takes a free base and joints of one axis each")
+        neutral, frames, self.bodies = pin.neutral(model), {}, []
+        for j in range(1, model.njoints):
+            parent = max(0, model.parents[j] - 1)
+            axis, own = 1, np.eye(3)
+            if j > 1:
+                way = pin.computeJointJacobian(model, data, neutral, j)[:, model.idx_vs[j]]
+                if model.nqs[j] != 1 or abs(np.linalg.norm(way[3:]) - 1) > 1e-9 or np.abs(way[:3]).max() > 1e-9:
+                    raise RobotError(f"robot {model.name}: joint {model.names[j]!r} is no joint that turns in a range")
+                axis, own = _frame_along(way[3:])
+            frames[j] = own
+            above, placement, inertia = frames.get(j - 1 if j == 1 else model.parents[j], np.eye(3)), *_of(model, j)
+            c = own.T @ inertia.lever
+            about = own.T @ inertia.inertia @ own + inertia.mass * (c @ c * np.eye(3) - np.outer(c, c))
+            turn, place = _clean(above.T @ placement.rotation @ own), _clean(above.T @ placement.translation)
+            numbers = inertia.mass, _clean(inertia.mass * c), _clean(about)
+            self.bodies.append(Body(model.names[j], parent, axis, turn, place, own, *numbers))
+        self.mass = float(sum(b.mass for b in self.bodies))
+        self.joints, self.armature = len(self.bodies) - 1, np.array(model.armature[6:])
+        self.names = (*CHART, *(b.name for b in self.bodies[1:]))
+
+    def local(self, joint: int, point: np.ndarray) -> np.ndarray:
+        """A ``point`` (3,) in Pinocchio's frame of a ``joint`` (its index there), in the frame of its body here."""
+        return _clean(self.bodies[joint - 1].own.T @ np.asarray(point, float))
+
+    def rotations(self, q: np.ndarray) -> np.ndarray:
+        """Attitudes of the base (n, 3, 3) from charts (n, >= 6)."""
+        (cy, cr, cp), (sy, sr, sp) = np.cos(q[:, 3:6]).T, np.sin(q[:, 3:6]).T
+        rows = cy * cp - sy * sr * sp, -sy * cr, cy * sp + sy * sr * cp, sy * cp + cy * sr * sp, cy * cr
+        rows += sy * sp - cy * sr * cp, -cr * sp, sr, cr * cp
+        return np.stack(rows, -1).reshape(-1, 3, 3)
+
+    def to_pinocchio(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Configurations (n, nq), twists (n, nv) and their time derivatives from charts, rates, accelerations (n, nv)."""
+        turn, n = self.rotations(q), len(q)
+        slope, drift = _spin_slope(q[:, 4], q[:, 5]), _spin_drift(q[:, 4], q[:, 5], v[:, 3:6])
+        spin = np.einsum("nij,nj->ni", slope, v[:, 3:6])
+        out_q, out_v, out_a = np.empty((n, self.model.nq)), v.copy(), a.copy()
+        out_q[:, :3], out_q[:, 7:] = q[:, :3], q[:, 6:]
+        half = q[:, 3:6] / 2
+        (cy, cr, cp), (sy, sr, sp) = np.cos(half).T, np.sin(half).T  # quaternions that follow whole turns
+        out_q[:, 3:7] = np.stack(
+            [cy * sr * cp - sy * cr * sp, sy * sr * cp + cy * cr * sp, sy * cr * cp + cy * sr * sp, cy * cr * cp - sy * sr * sp],
+            -1,
+        )
+        out_v[:, :3], out_v[:, 3:6] = np.einsum("nji,nj->ni", turn, v[:, :3]), spin
+        out_a[:, :3] = np.einsum("nji,nj->ni", turn, a[:, :3]) - np.cross(spin, out_v[:, :3])
+        out_a[:, 3:6] = np.einsum("nij,nj->ni", slope, a[:, 3:6]) + drift
+        return out_q, out_v, out_a
+
+    def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """Charts (n, 6 + joints) of configurations (n, nq), angles continuous; the first within half a turn of ``near`` (3,)."""
+        x, y, z, w = q[:, 3:7].T
+        roll = np.arcsin(np.clip(2 * (y * z + w * x), -1, 1))
+        yaw = np.arctan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
+        pitch = np.arctan2(-2 * (x * z - w * y), 1 - 2 * (x * x + y * y))
+        angles = np.stack([yaw, roll, pitch], -1)
+        first = np.zeros(3) if near is None else near
+        angles = np.unwrap(np.vstack([first, angles]), axis=0)[1:]
+        return np.concatenate([q[:, :3], angles, q[:, 7:]], axis=1)
+
+
+def _of(model: pin.Model, j: int):
+    return model.jointPlacements[j], model.inertias[j]
+
+
+def _spin_slope(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """(n, 3, 3): angular velocity in base axes = slope @ rates of yaw, roll, pitch."""
+    cr, sr, cp, sp, one = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.ones_like(roll)
+    return np.stack([-cr * sp, cp, 0 * one, sr, 0 * one, one, cr * cp, sp, 0 * one], -1).reshape(-1, 3, 3)
+
+
+def _spin_drift(roll: np.ndarray, pitch: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """(n, 3): rate of that slope times the rates."""
+    (yaw_v, roll_v, pitch_v), cr, sr, cp, sp = rates.T, np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    x = (sr * sp * roll_v - cr * cp * pitch_v) * yaw_v - sp * pitch_v * roll_v
+    z = (-sr * cp * roll_v - cr * sp * pitch_v) * yaw_v + cp * pitch_v * roll_v
+    return np.stack([x, cr * roll_v * yaw_v, z], -1)
+
+
+class Turn:
+    """A rotation about a coordinate axis by an angle, after a fixed one."""
+
+    def __init__(self, axis: int, angle: ca.SX, fixed: np.ndarray | None = None):
+        self.c, self.s, self.i, self.j = ca.cos(angle), ca.sin(angle), (axis + 1) % 3, (axis + 2) % 3
+        self.axis, self.fixed = axis, None if fixed is None or np.array_equal(fixed, np.eye(3)) else ca.DM(fixed)
+
+    def out(self, x: ca.SX) -> ca.SX:
+        """A vector (3,) of the turned frame in the outer one; or the columns of a matrix."""
+        y = ca.SX(x)
+        y[self.i, :], y[self.j, :] = self.c * x[self.i, :] - self.s * x[self.j, :], self.s * x[self.i, :] + self.c * x[self.j, :]
+        return y if self.fixed is None else self.fixed @ y
+
+    def into(self, x: ca.SX) -> ca.SX:
+        """A vector (3,) of the outer frame in the turned one."""
+        x = ca.SX(x) if self.fixed is None else self.fixed.T @ x
+        y = ca.SX(x)
+        y[self.i], y[self.j] = self.c * x[self.i] + self.s * x[self.j], self.c * x[self.j] - self.s * x[self.i]
+        return y
+
+
+def cross(x: ca.SX, y: ca.SX) -> ca.SX:
+    """Vector product (3,)."""
+    return ca.vertcat(x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0])
+
+
+class SpatialState:
+    """All quantities of a tree at one instant, as CasADi expressions; made when first asked for.
+
+    ``q``, ``v``, ``a`` (6 + joints,) are chart, rates and accelerations; vectors are in world axes if not said
+    otherwise. ``gravity`` is positive [m/s^2].
+    """
+
+    def __init__(self, model: SpatialModel, q: ca.SX, v: ca.SX, a: ca.SX, gravity: float | ca.SX = GRAVITY):
+        self.model, self.q, self.v, self.a, self.gravity = model, q, v, a, gravity
+        self._base = [Turn(axis, q[3 + k]) for k, axis in enumerate(ATTITUDE_AXES)]
+        joints = enumerate(model.bodies[1:], start=6)
+        self._turns = [None, *(Turn(b.axis, q[k], b.turn) for k, b in joints)]
+
+    @cached_property
+    def _spins(self) -> list[ca.SX]:
+        """Angular velocity of every body, in its own axes."""
+        spin = ca.SX.zeros(3)
+        for k, turn in enumerate(self._base):
+            spin = turn.into(spin)
+            spin[turn.axis] += self.v[3 + k]
+        spins = [spin]
+        for k, b in enumerate(self.model.bodies[1:], start=1):
+            spin = self._turns[k].into(spins[b.parent])
+            spin[b.axis] += self.v[5 + k]
+            spins.append(spin)
+        return spins
+
+    @cached_property
+    def _accelerations(self) -> list[tuple[ca.SX, ca.SX]]:
+        """(linear less gravity, angular) acceleration of every body's origin, in its own axes."""
+        linear, angular, spin = self.a[:3] + ca.vertcat(0, 0, self.gravity), ca.SX.zeros(3), ca.SX.zeros(3)
+        for k, turn in enumerate(self._base):
+            linear, angular, spin = turn.into(linear), turn.into(angular), turn.into(spin)
+            angular += cross(spin, _unit(turn.axis, self.v[3 + k])) + _unit(turn.axis, self.a[3 + k])
+            spin[turn.axis] += self.v[3 + k]
+        found = [(linear, angular)]
+        for k, b in enumerate(self.model.bodies[1:], start=1):
+            turn, (linear, angular), spin = self._turns[k], found[b.parent], self._spins[b.parent]
+            if np.any(b.place):
+                linear = linear + cross(angular, b.place) + cross(spin, cross(spin, b.place))
+            linear, angular, spin = turn.into(linear), turn.into(angular), turn.into(spin)
+            angular += cross(spin, _unit(b.axis, self.v[5 + k])) + _unit(b.axis, self.a[5 + k])
+            found.append((linear, angular))
+        return found
+
+    def _gathered(self, parts: list[tuple[ca.SX, ca.SX]]) -> tuple[ca.SX, ca.SX, list]:
+        """Sums over the tree of (force-like, moment-like) vectors at the bodies' origins: at the base's origin in world
+        axes, and per joint the component of the moment about its axis."""
+        parts, along = list(parts), []
+        for k in range(len(parts) - 1, 0, -1):
+            b, turn, (force, moment) = self.model.bodies[k], self._turns[k], parts[k]
+            along.append(moment[b.axis])
+            force, moment = turn.out(force), turn.out(moment)
+            if np.any(b.place):
+                moment = moment + cross(b.place, force)
+            parts[b.parent] = parts[b.parent][0] + force, parts[b.parent][1] + moment
+        force, moment = parts[0]
+        for turn in self._base[::-1]:
+            force, moment = turn.out(force), turn.out(moment)
+        return force, moment, along[::-1]
+
+    def dynamics(self, wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = {}) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Inverse dynamics: (force, moment about the base's origin, joint torques) that the motion needs besides.
+
+        ``wrenches`` act from outside: body -> (force, moment about the body's origin), world axes.
+        """
+        parts = []
+        for k, (b, spin, (linear, angular)) in enumerate(zip(self.model.bodies, self._spins, self._accelerations, strict=True)):
+            first, second = ca.DM(b.first), ca.DM(b.second)
+            force = b.mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
+            moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
+            if k in wrenches:
+                outside = [self.rotation(k).T @ x for x in wrenches[k]]
+                force, moment = force - outside[0], moment - outside[1]
+            parts.append((force, moment))
+        force, moment, torques = self._gathered(parts)
+        return force, moment, ca.vertcat(ca.SX(0, 1), *torques) + self.model.armature * self.a[6:]
+
+    @cached_property
+    def _momenta(self) -> tuple[ca.SX, ca.SX]:
+        """Linear momentum, and angular momentum about the base's origin, of a base whose origin rests."""
+        linear, parts = [ca.SX.zeros(3)], []
+        for k, b in enumerate(self.model.bodies):
+            if k:
+                at = linear[b.parent]
+                if np.any(b.place):
+                    at = at + cross(self._spins[b.parent], b.place)
+                linear.append(self._turns[k].into(at))
+            first, second, spin = ca.DM(b.first), ca.DM(b.second), self._spins[k]
+            parts.append((b.mass * linear[k] + cross(spin, first), second @ spin + cross(first, linear[k])))
+        return self._gathered(parts)[:2]
+
+    @cached_property
+    def com_from_base(self) -> ca.SX:
+        """CoM seen from the base's origin (3,) [m]."""
+        parts = [ca.SX(ca.DM(b.first)) for b in self.model.bodies]
+        for k in range(len(parts) - 1, 0, -1):
+            b = self.model.bodies[k]
+            parts[b.parent] += self._turns[k].out(parts[k]) + self._carried[k] * ca.DM(b.place)
+        first = parts[0]
+        for turn in self._base[::-1]:
+            first = turn.out(first)
+        return first / self.model.mass
+
+    @property
+    def _carried(self) -> list[float]:
+        """Mass that each joint carries [kg]."""
+        bodies, carried = self.model.bodies, [b.mass for b in self.model.bodies]
+        for k in range(len(bodies) - 1, 0, -1):
+            carried[bodies[k].parent] += carried[k]
+        return carried
+
+    @property
+    def com(self) -> ca.SX:
+        """Centre of mass (3,) [m]."""
+        return self.q[:3] + self.com_from_base
+
+    @property
+    def com_velocity(self) -> ca.SX:
+        """Its velocity (3,) [m/s]."""
+        return self.v[:3] + self._momenta[0] / self.model.mass
+
+    @property
+    def angular_momentum(self) -> ca.SX:
+        """About the CoM (3,) [kg m^2/s]; independent of the base's place and velocity."""
+        linear, angular = self._momenta
+        return angular - cross(self.com_from_base, linear)
+
+    @cached_property
+    def _frames(self) -> list:
+        return [None] * len(self.model.bodies)
+
+    def rotation(self, body: int) -> ca.SX:
+        """Attitude (3, 3) of a body."""
+        return self._frame(body)[0]
+
+    def origin(self, body: int) -> ca.SX:
+        """Origin of a body (3,) [m], seen from the base's."""
+        return self._frame(body)[1]
+
+    def _frame(self, k: int) -> tuple[ca.SX, ca.SX]:
+        if self._frames[k] is None:
+            if k == 0:
+                turn = ca.SX.eye(3)
+                for one in self._base[::-1]:
+                    turn = one.out(turn)
+                self._frames[k] = turn, ca.SX.zeros(3)
+            else:
+                b, t = self.model.bodies[k], self._turns[k]
+                above, place = self._frame(b.parent)
+                fixed = above if t.fixed is None else above @ t.fixed
+                turn = ca.SX(fixed)
+                turn[:, t.i], turn[:, t.j] = fixed[:, t.i] * t.c + fixed[:, t.j] * t.s, fixed[:, t.j] * t.c - fixed[:, t.i] * t.s
+                self._frames[k] = turn, place + above @ ca.DM(b.place)
+        return self._frames[k]
+
+    def point(self, body: int, local: np.ndarray) -> ca.SX:
+        """Place of a point of a body (3,) [m], in the world; see :meth:`SpatialModel.local`."""
+        return self.q[:3] + self.origin(body) + self.rotation(body) @ ca.DM(local)
+
+    def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
+        """Its velocity (3,) [m/s]."""
+        return ca.jtimes(self.point(body, local), self.q, self.v)
+
+
+def _unit(axis: int, size: ca.SX) -> ca.SX:
+    x = ca.SX.zeros(3)
+    x[axis] = size
+    return x
