@@ -8,7 +8,7 @@ alone costs nothing. Pinocchio says the same of every quantity (tests).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -334,7 +334,17 @@ class SpatialState:
 
     def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
         """Its velocity (3,) [m/s]."""
-        return ca.jtimes(self.point(body, local), self.q, self.v)
+        return rates(lambda q: SpatialState(self.model, q, q, q).point(body, local), self.q, self.v)[0]
+
+
+def rates(of: Callable[[ca.SX], ca.SX], q: ca.SX, v: ca.SX, a: ca.SX | None = None) -> tuple[ca.SX, ca.SX | None]:
+    """First and second time derivative of a column that depends on the chart alone; without ``a`` only the first."""
+    x, w, b = (ca.SX.sym(name, q.numel()) for name in "qva")
+    first = ca.jtimes(of(x), x, w)
+    second = None if a is None else ca.jtimes(first, ca.vertcat(x, w), ca.vertcat(w, b))
+    made = ca.Function("rates", [x, w, b], [first] if a is None else [first, second])
+    found = made(q, v, v if a is None else a)
+    return (found, None) if a is None else found
 
 
 def _unit(axis: int, size: ca.SX) -> ca.SX:

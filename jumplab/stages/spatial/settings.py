@@ -1,0 +1,53 @@
+"""Limits, weights and mesh of the spatial program. The paper prints none of these numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jumplab.stages.whole_body.settings import Mesh
+
+
+@dataclass(frozen=True)
+class SpatialLimits:
+    """What a plan may use of the robot and the ground."""
+
+    torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
+    speed_share: float = 0.90  # of the speed limit
+    range_margin_rad: float = 0.03  # to the joint stops
+    friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
+    heel_margin_m: float = 0.03  # CoP ahead of the heel; at the toe none, it ends there before the heel rises
+    side_margin_m: float = 0.02  # CoP inside the sole's sides
+    foot_share: float = 0.15  # of the weight, on each flat foot at least
+    heel_up_rad: float = 0.9  # foot pitch at most during toe-off
+    knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
+    roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn
+    flat_s: tuple[float, float] = (0.25, 0.70)  # duration of the flat-foot phase
+    toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
+    clearance_m: float = 0.035  # of the soles over the ground in mid-flight
+    body_clearance_m: float = 0.05  # of knees and hands over the ground
+    link_distance_m: float = 0.015  # between links
+    touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
+    touchdown_trunk_rate: float = 1.0  # [rad/s]
+    touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
+    touchdown_knee: tuple[float, float] = (0.95, 1.4)  # [rad]
+    touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
+    touchdown_roll: float = 0.10  # [rad] of the base, either way
+    touchdown_yaw: float = 0.20  # [rad] of the base against the feet, either way
+    capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
+    capture_slope_s: float = 0.13
+    capture_window_m: float = 0.02
+
+
+@dataclass(frozen=True)
+class SpatialWeights:
+    """Cost weights, integrated over time. Units: [1] / [unit of the term]^2 / [s]."""
+
+    acceleration: float = 2e-3  # [1] / [rad/s^2]^2 / [s]
+    jerk: float = 2e-7  # [1] / [rad/s^3]^2 / [s]
+    torque: float = 2e-4  # [1] / [N m]^2 / [s]
+    force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
+    momentum_rate: float = 1.0  # [1] / [N m]^2 / [s]
+    mirror: float = 5.0  # [1] / [rad]^2 / [s], jumps straight ahead only
+
+
+SPATIAL_MESH = Mesh(20, 14, 24)

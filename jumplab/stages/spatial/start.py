@@ -1,0 +1,96 @@
+"""Where the spatial program starts: a planar plan of the same rise, with straight ramps of side and yaw in flight."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import nnls
+
+from jumplab.io.tape import Tape
+from jumplab.ocp.solution import PhaseGuess
+from jumplab.stages.spatial.terms import MOMENT_ARM_M, PYRAMID, SpatialTerms
+from jumplab.stages.whole_body.settings import Contact, Mesh
+from jumplab.task import JumpTask
+
+
+def from_tape(terms: dict[str, SpatialTerms], tape: Tape, toe_phase_s: float, mesh: Mesh, task: JumpTask) -> dict:
+    """Phase name -> :class:`PhaseGuess` from a planar ``tape`` whose heels rise at ``toe_phase_s``."""
+    split, end = tape.takeoff_time, float(tape.t[-1])
+    row, out = tape.takeoff_index, {}
+    for name, t in mesh.nodes(toe_phase_s, split, end).items():
+        part = slice(row, None) if name == "flight" else slice(0, row)
+        b = terms[name]
+        q, v, a, tau, f = (_sampled(t, tape.t[part], x[part]) for x in (tape.q, tape.v, tape.a, tape.tau, tape.f))
+        q, v, a = _charts(b, q, v, a)
+        if b.contact is Contact.FLIGHT:
+            s = np.linspace(0, 1, len(t))
+            flight_s = end - split
+            com, speed = _takeoff(b, tape, row)
+            q[:, 3], v[:, 3] = task.yaw_rad * s, task.yaw_rad / flight_s
+            speed[1] = task.side_m / flight_s
+            constants = {f"{k}_{x}": y for k, col in (("com", com), ("vel", speed)) for x, y in zip("xyz", col, strict=True)}
+            z = np.hstack([np.zeros((len(t), 3)), tau])
+            out[name] = PhaseGuess(flight_s, q[:, 3:], v[:, 3:], a[:, 3:], z, constants)
+        else:
+            z = np.hstack([spread(b, q, f), tau])
+            out[name] = PhaseGuess(t[-1] - t[0], q, v, a, z)
+    return out
+
+
+def _sampled(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    flat = values.reshape(len(values), -1)
+    return np.stack([np.interp(t, times, x) for x in flat.T], -1).reshape(len(t), *values.shape[1:])
+
+
+def _charts(b: SpatialTerms, q, v, a):
+    """Charts of a motion that turns about +y alone."""
+    chart = b.model.of_pinocchio(q)
+    pitch = chart[:, 5]
+    c, s = np.cos(pitch), np.sin(pitch)
+
+    def world(x):
+        return np.stack([c * x[:, 0] + s * x[:, 2], x[:, 1], c * x[:, 2] - s * x[:, 0]], -1)
+
+    def charted(linear, x):
+        return np.concatenate([linear, x[:, 5:6], x[:, 3:4], x[:, 4:5], x[:, 6:]], axis=1)
+
+    w = v[:, 4]
+    turning = np.stack([w * v[:, 2], 0 * w, -w * v[:, 0]], -1)  # w cross v in base axes
+    return chart, charted(world(v[:, :3]), v), charted(world(a[:, :3] + turning), a)
+
+
+def _takeoff(b: SpatialTerms, tape: Tape, row: int) -> tuple[np.ndarray, np.ndarray]:
+    import pinocchio as pin
+
+    model, data = b.model.model, b.model.model.createData()
+    pin.centerOfMass(model, data, tape.q[row], tape.v[row])
+    return data.com[0].copy(), data.vcom[0].copy()
+
+
+def generators(b: SpatialTerms, side: int) -> np.ndarray:
+    """(6, 4 k): force and moment about the world's origin per unit of each cone edge of one foot."""
+    mu, columns = b.limits.friction, []
+    for corner in b.corners[side]:
+        for x, y in mu * PYRAMID:
+            force = np.array([x, y, 1.0])
+            columns.append(np.concatenate([force, np.cross(corner, force)]))
+    return np.array(columns).T
+
+
+def spread(b: SpatialTerms, q: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """Forces along the cones' edges (n, 2 * 4 k) that come nearest to wrenches (n, 2, 6) at the feet's frames."""
+    import pinocchio as pin
+
+    model, data = b.model.model, b.model.model.createData()
+    frames = [model.getFrameId(name) for name in b.robot.foot.frames]
+    edges, weight, out = [generators(b, side) for side in (0, 1)], np.repeat([1.0, 1 / MOMENT_ARM_M], 3), []
+    still = np.zeros_like(q)
+    for config, wrench in zip(b.model.to_pinocchio(q, still, still)[0], f, strict=True):
+        pin.framesForwardKinematics(model, data, config)
+        found = []
+        for one, w, frame in zip(edges, wrench, frames, strict=True):
+            about = np.concatenate([w[:3], w[3:] + np.cross(data.oMf[frame].translation, w[:3])])
+            small = 1e-2 * np.eye(one.shape[1])  # spreads what several sets of forces could do
+            rows = np.vstack([weight[:, None] * one, small])
+            found.append(nnls(rows, np.concatenate([weight * about, np.zeros(one.shape[1])]))[0])
+        out.append(np.concatenate(found))
+    return np.array(out)

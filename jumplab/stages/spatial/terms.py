@@ -1,0 +1,303 @@
+"""The named costs and constraints of the spatial program, as functions of one instant; nothing here solves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+
+from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
+from jumplab.ocp.problem import Point, Term
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
+from jumplab.stages.whole_body.settings import Contact
+from jumplab.stages.whole_body.terms import POSITIVE, cost, row
+from jumplab.task import GRAVITY
+
+PYRAMID = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # directions of the friction cone's edges
+MOMENT_ARM_M = 0.1  # nominal size of moments over that of forces
+
+
+class SpatialTerms:
+    """Terms of one phase, which is a mode of contact, and the expressions that they share.
+
+    The world's origin lies in the middle of the soles in their first place, x forward, z up.
+
+    Attributes
+    ----------
+    coordinates : of the phase: the chart with the base's place, in flight without it, then the joints.
+    states : further variables: force along each edge of each corner's friction cone, in flight the acceleration of
+        the base against free fall; then the joint torques.
+    corners : (2, k, 3) places on the ground where forces act.
+    """
+
+    def __init__(self, robot: Robot, limits: SpatialLimits, weights: SpatialWeights, contact: Contact):
+        self.robot, self.limits, self.weights, self.contact = robot, limits, weights, contact
+        self.model, self.flying = SpatialModel(robot.model), contact is Contact.FLIGHT
+        self.mg, foot = self.model.mass * GRAVITY, robot.foot
+        frames = [self.model.model.frames[self.model.model.getFrameId(name)] for name in foot.frames]
+        self.feet = [f.parentJoint - 1 for f in frames]
+        self._foot_axes = [self.model.bodies[k].own.T @ f.placement.rotation for k, f in zip(self.feet, frames, strict=True)]
+
+        def on_foot(x):
+            return [self.model.local(f.parentJoint, f.placement.act(np.array(x))) for f in frames]
+
+        self.toes, self.soles = on_foot([foot.toe, 0.0, foot.sole_z]), on_foot(foot.center)
+        self.sole_corners = np.array([on_foot(x) for x in foot.corners]).transpose(1, 0, 2)  # (2, 4, 3)
+        self.stance = self.model.of_pinocchio(stance_configuration(robot)[None])[0]
+        self.places = self._first_places(frames)
+        self.corners = self._ground_corners()
+        first = 3 if self.flying else 0
+        self.coordinates = self.model.names[first:]
+        n = self.corners.shape[1] * len(PYRAMID)
+        forces = [f"force {k} of {side} foot" for side in ("left", "right") for k in range(n)]
+        falling = [f"acceleration {x} against free fall" for x in "xyz"]
+        self.n_forces = 0 if self.flying else len(forces)
+        self.states = (*(falling if self.flying else forces), *(f"torque of {name}" for name in self.joint_names))
+        rows = [robot.actuators[name] for name in self.joint_names]
+        self.motors = {key: np.array([r[key] for r in rows]) for key in rows[0]}
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.model.names[len(CHART) :]
+
+    def _first_places(self, frames) -> np.ndarray:
+        """Middles of both soles (2, 3) as the robot stands [m]."""
+        model, data = self.model.model, self.model.model.createData()
+        import pinocchio as pin
+
+        pin.framesForwardKinematics(model, data, stance_configuration(self.robot))
+        ids = [model.getFrameId(name) for name in self.robot.foot.frames]
+        return np.array([data.oMf[i].act(self.robot.foot.center) for i in ids])
+
+    def _ground_corners(self) -> np.ndarray:
+        lim, foot = self.limits, self.robot.foot
+        half, wide = (foot.toe - foot.heel) / 2, foot.half_width - lim.side_margin_m
+        xs = {Contact.FLAT: (lim.heel_margin_m - half, half), Contact.TOE: (half,), Contact.FLIGHT: ()}[self.contact]
+        local = np.array([[x, y, 0.0] for x in xs for y in (-wide, wide)]).reshape(-1, 3)
+        return self.places[:, None] + local
+
+    # model on a point -------------------------------------------------------------------------------------------
+    def state(self, p: Point) -> SpatialState:
+        """The robot at this point; in flight its base rests at the origin and is accelerated against free fall."""
+        if "state" not in p.memo:
+            q, v, a = p.q, p.v, p.a
+            if self.flying:
+                q, v, a = ca.vertcat(ca.SX.zeros(3), q), ca.vertcat(ca.SX.zeros(3), v), ca.vertcat(p.z[:3], a)
+            p.memo["state"] = SpatialState(self.model, q, v, a, 0.0 if self.flying else p.p.gravity)
+        return p.memo["state"]
+
+    def torques(self, p: Point) -> ca.SX:
+        """Joint torques [N m]."""
+        return p.z[self.n_forces or 3 :]
+
+    def base(self, p: Point) -> ca.SX:
+        """Place of the base (3,) [m]: in flight the CoM's parabola less the CoM seen from the base."""
+        if not self.flying:
+            return ca.SX.zeros(3)  # the state knows it
+        return self.com(p) - self.state(p).com_from_base
+
+    def com(self, p: Point) -> ca.SX:
+        """Centre of mass (3,) [m]."""
+        if not self.flying:
+            return self.state(p).com
+        t, c = p.time, p.c
+        place = c.com_x + c.vel_x * t, c.com_y + c.vel_y * t, c.com_z + c.vel_z * t - p.p.gravity * t * t / 2
+        return ca.vertcat(*place)
+
+    def at(self, p: Point, body: int, local: np.ndarray) -> ca.SX:
+        """Place of a point of a body (3,) [m]."""
+        return self.base(p) + self.state(p).point(body, local)
+
+    def foot_axes(self, p: Point, side: int) -> ca.SX:
+        """Attitude (3, 3) of a foot."""
+        return self.state(p).rotation(self.feet[side]) @ ca.DM(self._foot_axes[side])
+
+    def foot_force(self, p: Point, side: int) -> list[ca.SX]:
+        """Forces (3,) at the corners of one foot [N]."""
+        k = self.corners.shape[1]
+        f = ca.reshape(p.z[side * 4 * k : (side + 1) * 4 * k], 4, k)
+        return [ca.vertcat(self.limits.friction * (PYRAMID.T @ f[:, i]), ca.sum1(f[:, i])) for i in range(k)]
+
+    def needed(self, p: Point) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """(force, moment about the base, torques) that the motion needs besides the ground's forces; made once."""
+        if "needed" not in p.memo:
+            s, wrenches = self.state(p), {}
+            for side, body in enumerate(self.feet if not self.flying else ()):
+                origin, forces = p.q[:3] + s.origin(body), self.foot_force(p, side)
+                arms = [ca.DM(c) - origin for c in self.corners[side]]
+                moment = sum(ca.cross(arm, f) for arm, f in zip(arms, forces, strict=True))
+                wrenches[body] = sum(forces), moment
+            p.memo["needed"] = s.dynamics(wrenches)
+        return p.memo["needed"]
+
+    # all phases -------------------------------------------------------------------------------------------------
+    def smoothness(self) -> list[Term]:
+        """Costs on accelerations, jerk and torques; on what is not mirrored, where the weight is not zero."""
+        w, first, joints = self.weights, len(self.coordinates) - self.model.joints - 3, len(CHART)
+        terms = [
+            cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: p.a[first:], w.acceleration),
+            cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: p.j, w.jerk, "mid"),
+            cost("torque", "ours: effort", "N m", self.torques, w.torque),
+        ]
+        if not self.flying:
+            terms.append(cost("force", "ours: spread", "N", lambda p: p.z[: self.n_forces], w.force))
+        return terms
+
+    def dynamics(self) -> list[Term]:
+        """Newton and Euler: nothing but the ground moves the base; joint torques go with the motion."""
+
+        def torques(p):
+            return self.needed(p)[2] - self.torques(p)
+
+        rows = [row("joint dynamics", "ours", "N m", torques, scale=MOMENT_ARM_M * self.mg, identity=True)]
+        rows.append(row("base forces", "ours", "N", lambda p: self.needed(p)[0], scale=self.mg, identity=True))
+        if not self.flying:
+            turn = row("base moments", "ours", "N m", lambda p: self.needed(p)[1], scale=MOMENT_ARM_M * self.mg)
+            rows.append(turn)
+        return rows
+
+    def motor_lines(self) -> Term:
+        """Torque against speed of every joint."""
+        m, first = self.motors, len(self.coordinates) - self.model.joints
+        slope = m["effort"] / (m["speed"] - m["corner_speed"]) * self.limits.torque_share
+        top = slope * m["speed"]
+        return row(
+            "torque-speed", "ours: motor line", "N m", lambda p: self.torques(p) + slope * p.v[first:], -top, top, scale=100.0
+        )
+
+    # launch -----------------------------------------------------------------------------------------------------
+    def contact_rows(self, q: ca.SX) -> ca.SX:
+        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch."""
+        s, rows, half = SpatialState(self.model, q, q, q), [], (self.robot.foot.toe - self.robot.foot.heel) / 2
+        for body, own, toe, first in zip(self.feet, self._foot_axes, self.toes, self.places, strict=True):
+            axes = s.rotation(body) @ ca.DM(own)
+            place = s.point(body, toe) - ca.DM(first + np.array([half, 0.0, 0.0]))
+            rows += [place, axes[2, 1], axes[0, 1]]
+            if self.contact is Contact.FLAT:
+                rows.append(axes[2, 0])
+        return ca.vertcat(*rows)
+
+    def pitches(self, q: ca.SX) -> ca.SX:
+        """Sines of the feet's pitch (2,); positive is heel up."""
+        s = SpatialState(self.model, q, q, q)
+        return ca.vertcat(*(-(s.rotation(k) @ ca.DM(own))[2, 0] for k, own in zip(self.feet, self._foot_axes, strict=True)))
+
+    def launch_rows(self) -> list[Term]:
+        """Feet in their places; loads of the feet; take-off."""
+        lim = self.limits
+        rows = [row("feet in place", "ours", "m, 1", lambda p: self.contact_rows(p.q), scale=0.1, skip=(1, 0))]
+        if self.contact is Contact.FLAT:
+
+            def loads(p):
+                return ca.vertcat(*(sum(self.foot_force(p, side))[2] for side in (0, 1)))
+
+            def heels(p):
+                return rates(self.pitches, p.q, p.v)[0]
+
+            least = lim.foot_share * self.mg
+            rows.append(row("load of each foot", "ours", "N", loads, least, np.inf, scale=self.mg))
+            rows.append(row("heels still at rest", "ours", "rad/s", heels, at="end"))
+            return rows
+
+        def accelerations(p):
+            return rates(self.contact_rows, p.q, p.v, p.a)[1]
+
+        heel = row("heels not below ground", "WL-K2", "1", lambda p: self.pitches(p.q), 0.0, np.sin(lim.heel_up_rad), skip=(1, 0))
+        speed = row("vertical take-off speed", "SL-E2, WL-E1", "m/s", lambda p: self.state(p).com_velocity[2] - p.p.takeoff_speed, at="end")
+        still = row("toes still at take-off", "ours", "m/s^2, 1/s^2", accelerations, scale=10.0, at="end")
+        return [*rows, heel, speed, still]
+
+    # flight -----------------------------------------------------------------------------------------------------
+    def flight_rows(self) -> list[Term]:
+        """Flight: all three components of L stay, soles and body clear the ground."""
+        lim = self.limits
+
+        def kept(p):
+            return self.state(p).angular_momentum - ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
+
+        def rate(p):
+            return self.needed(p)[1] - ca.cross(self.state(p).com_from_base, self.needed(p)[0])
+
+        def clearance(p):
+            shape, places = (4 * p.s * (1 - p.s)) ** 3, []
+            for body, corners in zip(self.feet, self.sole_corners, strict=True):
+                places += [self.at(p, body, c) for c in corners]
+            return ca.vertcat(*(x[2] - self.ground(p, x) - lim.clearance_m * shape for x in places))
+
+        return [
+            row("angular momentum", "WF-D1, three components", "kg m^2/s", kept),
+            row("moment at take-off", "WF-D1", "N m", rate, scale=20.0, at="start"),
+            cost("momentum rate", "WF-D1, between the nodes", "N m", rate, self.weights.momentum_rate),
+            row("sole clearance", "ours", "m", clearance, *POSITIVE, scale=0.1, skip=(1, 1)),
+        ]
+
+    def ground(self, p: Point, x: ca.SX) -> ca.SX:
+        """Height of the surface below a point."""
+        return p.p.platform * (1 + ca.tanh((x[0] - p.p.edge) / 0.015)) / 2
+
+    def body_clearance(self) -> Term:
+        """Knees and hands stay away from the ground."""
+
+        def heights(p):
+            places = [self.at(p, body, local) for body, local in self.limb_points]
+            return ca.vertcat(*(x[2] - self.ground(p, x) for x in places))
+
+        return row("body clearance", "ours", "m", heights, self.limits.body_clearance_m, np.inf, scale=0.1)
+
+    @property
+    def limb_points(self) -> list[tuple[int, np.ndarray]]:
+        """Knees and hands: (body, place in it)."""
+        robot, bodies, hand = self.robot, self.model.names[5:], self.robot.sagittal.span[4]
+        points = [(bodies.index(name), np.zeros(3)) for name in robot.joints["knee"]]
+        for name in robot.joints["shoulder_pitch"]:
+            body = bodies.index(name)
+            points.append((body, self.model.bodies[body].own.T @ np.array([hand[0], 0.0, hand[1]])))
+        return points
+
+    def touchdown_rows(self) -> list[Term]:
+        """Touchdown: both feet in their new places, flat; posture, rates, and where the soles are against the CoM."""
+        lim, rate = self.limits, self.limits.touchdown_joint_rate
+
+        def turned(p, x):
+            c, s = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
+            return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
+
+        def feet(p):
+            rows = []
+            for side, body in enumerate(self.feet):
+                goal = turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
+                axes, across = self.foot_axes(p, side), turned(p, [0.0, 1.0, 0.0])
+                ahead = ca.vertcat(across[1], -across[0], 0)
+                flat = axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])
+                rows += [self.at(p, body, self.soles[side]) - goal, *flat]
+            return ca.vertcat(*rows)
+
+        def foot_rates(p):
+            s = self.state(p)
+            return ca.vertcat(*(s.rotation(body) @ s._spins[body] for body in self.feet))
+
+        def attitude(p):
+            return p.q[:3] - ca.vertcat(p.p.yaw, 0, p.p.rotation)
+
+        def capture(p):
+            middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
+            ahead = turned(p, [lim.capture_offset_m, 0.0, 0.0])
+            off = middle - self.com(p) - ahead - lim.capture_slope_s * ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
+            return off[:2]
+
+        low = -lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]
+        high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
+        knees = [3 + self.joint_names.index(name) for name in self.robot.joints["knee"]]
+        return [
+            row("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", feet, scale=0.1, at="end"),
+            row("foot rates at touchdown", "ours", "rad/s", foot_rates, -lim.touchdown_foot_rate, lim.touchdown_foot_rate, at="end"),
+            row("attitude at touchdown", "ours", "rad", attitude, low, high, at="end"),
+            row("knees at touchdown", "ours: stroke", "rad", lambda p: p.q[knees], *lim.touchdown_knee, at="end"),
+            row("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate, at="end"),
+            row("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], -lim.touchdown_trunk_rate, lim.touchdown_trunk_rate, at="end"),
+            row("capture window", "ours; replaces WF-E2", "m", capture, -lim.capture_window_m, lim.capture_window_m, at="end", scale=0.1),
+        ]
