@@ -46,7 +46,7 @@ def _flat_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
     def stance(parameters):
         return parameters["stance"]
 
-    legs = {j for k in b.feet for j in _chain(b, k)}
+    legs = {j for k in b.feet for j in b.chain(k)}
     rest = np.array([np.inf if k - len(CHART) + 1 in legs else 0.0 for k in range(len(b.coordinates))])
     start = (
         Bound("stance", "ours: the paper prints no start", "rad", "q", stance, stance, "start"),
@@ -56,15 +56,6 @@ def _flat_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
     )
     terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance())
     return Phase(b.contact.value, b.coordinates, mesh.flat, b.limits.flat_s, terms, (*_boxes(b), *start), b.states, scales=_scales(b))
-
-
-def _chain(b: SpatialTerms, body: int) -> list[int]:
-    """Bodies from a foot up to the base, the base left out."""
-    chain = []
-    while body:
-        chain.append(body)
-        body = b.model.bodies[body].parent
-    return chain
 
 
 def _toe_phase(b: SpatialTerms, mesh: Mesh) -> Phase:

@@ -64,6 +64,14 @@ class SpatialTerms:
         """Names of the joints."""
         return self.model.names[len(CHART) :]
 
+    def chain(self, body: int) -> list[int]:
+        """Bodies from one up to the base, which is left out."""
+        found = []
+        while body:
+            found.append(body)
+            body = self.model.bodies[body].parent
+        return found
+
     def _first_places(self, frames) -> np.ndarray:
         """Middles of both soles (2, 3) as the robot stands [m]."""
         model, data = self.model.model, self.model.model.createData()

@@ -1,0 +1,201 @@
+"""The 1 kHz tape of a spatial plan, exact between the nodes: feet do not slip, momentum is kept, no wrench is missing.
+
+Between nodes the plan's polynomials miss the contact by fractions of a millimetre. In launch the legs follow from base,
+arms and the feet's pitch by inverse kinematics on all three levels, and the ground's wrenches take up what inverse
+dynamics still misses. In flight the joints' polynomials stand; the base follows from L and the CoM's parabola.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from jumplab.io.tape import RATE_HZ, Tape
+from jumplab.models.spatial import CHART, SpatialModel
+from jumplab.ocp.solution import PhaseSolution
+from jumplab.stages.reconstruction import SHORTEST_STEP
+from jumplab.stages.spatial.start import generators
+from jumplab.stages.spatial.terms import SpatialTerms
+
+LEG_STEPS = 3  # of Newton's method from errors below a millimetre
+WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
+LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
+
+
+def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolution], gravity: float) -> Tape:
+    """The tape of a solution; ``terms`` are those of its phases, by name."""
+    b, flat, toe, flight = terms["flat"], phases["flat"], phases["toe"], phases["flight"]
+    robot = b.robot.under_gravity(gravity)
+    launch_s = flat.duration + toe.duration
+    t = launch_s - np.arange(int(np.ceil(launch_s * RATE_HZ - 1e-9)), -1, -1) / RATE_HZ
+    legs = Legs(b)
+    q, v, a, w = _launch(terms, phases, legs, np.maximum(t, 0.0))
+    late = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
+    fly = _flight(b.model, flight, q[-1, 3:6], late, gravity)
+    start = [b.model.to_pinocchio(q, v, a), fly]
+    q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
+    wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
+    f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
+    phase = np.repeat(["launch", "flight"], [len(t), len(late)])
+    extra = {"com": com[:, :3], "com_velocity": com[:, 3:], "angular_momentum": spin, "toe_phase_start": flat.duration - t[0]}
+    times = np.concatenate([t - t[0], launch_s - t[0] + late])
+    names = np.array(robot.foot.frames), np.array(robot.joint_names)
+    return Tape(times, q, v, a, tau, phase, names[0], f, names[1], extra)
+
+
+class Legs:
+    """Contact as functions of the chart, mapped over many instants."""
+
+    def __init__(self, b: SpatialTerms):
+        self.b, n = b, len(b.model.names)
+        q, v, a = (ca.SX.sym(k, n) for k in "qva")
+        rows = b.contact_rows(q)
+        slope = ca.jtimes(rows, q, v)
+        drift = ca.jtimes(slope, ca.vertcat(q, v), ca.vertcat(v, a))
+        self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
+        self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
+        bodies = sorted({j for k in b.feet for j in b.chain(k)})
+        self.columns = np.array([len(CHART) - 1 + j for j in bodies])
+        self.pitches = np.arange(rows.numel()).reshape(2, -1)[:, -1]  # rows that say how the feet pitch
+
+    def held(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Charts, rates and accelerations (n, .) with the legs moved so that the feet stay in their places.
+
+        Where not ``flat`` (n,) the feet pitch as they did.
+        """
+        n, (q, v, a) = len(q), (x.copy() for x in (q, v, a))
+        goals = [x.full().T.copy() for x in self._levels.map(n)(q.T, v.T, a.T)]
+        for goal in goals:
+            pitch = np.where(flat[:, None], 0.0, goal[:, self.pitches])
+            goal[:] = 0.0
+            goal[:, self.pitches] = pitch
+        for _ in range(LEG_STEPS):
+            rows, slope = (x.full() for x in self._slope.map(n)(q.T))
+            slope = slope.reshape(rows.shape[0], n, -1).transpose(1, 0, 2)
+            q[:, self.columns] += self._solved(slope, goals[0] - rows.T)
+        slope = self._slope.map(n)(q.T)[1].full().reshape(goals[0].shape[1], n, -1).transpose(1, 0, 2)
+        v[:, self.columns] += self._solved(slope, goals[1] - self._levels.map(n)(q.T, v.T, a.T)[1].full().T)
+        a[:, self.columns] += self._solved(slope, goals[2] - self._levels.map(n)(q.T, v.T, a.T)[2].full().T)
+        return q, v, a
+
+    def _solved(self, slope: np.ndarray, off: np.ndarray) -> np.ndarray:
+        return np.einsum("nij,nj->ni", np.linalg.pinv(slope[:, :, self.columns]), off)
+
+
+def _launch(terms, phases, legs: Legs, t: np.ndarray):
+    """Charts, rates, accelerations (n, .) and the feet's wrenches (n, 2, 6) about the world's origin at times ``t``."""
+    flat, toe = phases["flat"], phases["toe"]
+    first = t < flat.duration
+    times = t[first], np.minimum(t[~first] - flat.duration, toe.duration)
+    sampled = [np.concatenate(x) for x in zip(flat.sample(times[0]), toe.sample(times[1]), strict=True)]
+    q, v, a = legs.held(*sampled, first)
+    wrench = []
+    for name, phase, at in (("flat", flat, times[0]), ("toe", toe, times[1])):
+        b = terms[name]
+        edges = [generators(b, side) for side in (0, 1)]
+        z = np.stack([np.interp(at, phase.t, x) for x in phase.z[:, : b.n_forces].T], -1)
+        wrench.append(np.stack([x @ e.T for x, e in zip(np.hsplit(z, 2), edges, strict=True)], 1))
+    return q, v, a, np.concatenate(wrench)
+
+
+def _flight(model: SpatialModel, flight: PhaseSolution, angles: np.ndarray, t: np.ndarray, gravity: float):
+    """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands."""
+    data, c = model.model.createData(), flight.constants
+    spin = np.array([c[f"L_{x}"] for x in "xyz"])
+    halves = np.concatenate([t, (t[1:] + t[:-1]) / 2])
+    q, v, a = (x[:, 3:] for x in flight.sample(halves))
+    zero, neutral = np.zeros(6), pin.neutral(model.model)[:7]
+    own, carried = np.empty((len(halves), 3, 3)), np.empty((len(halves), 3))
+    for k, (qj, vj) in enumerate(zip(q, v, strict=True)):
+        pin.ccrba(model.model, data, np.concatenate([neutral, qj]), np.concatenate([zero, vj]))
+        own[k], carried[k] = data.Ag[3:, 3:6], data.hg.angular
+
+    def rate(x, k):
+        turn = model.rotations(np.concatenate([np.zeros(3), x])[None])[0]
+        return np.linalg.solve(slope_of(x), np.linalg.solve(own[k], turn.T @ spin - carried[k]))
+
+    n, chart = len(t), np.empty((len(t), 3))
+    chart[0] = angles
+    for k in range(n - 1):  # Runge and Kutta, fourth order
+        h, x, mid = t[k + 1] - t[k], chart[k], n + k
+        k1 = rate(x, k)
+        k2 = rate(x + h / 2 * k1, mid)
+        k3 = rate(x + h / 2 * k2, mid)
+        chart[k + 1] = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, k + 1))
+    rates = np.array([rate(x, k) for k, x in enumerate(chart)])
+    com = np.array([c[f"com_{x}"] for x in "xyz"]), np.array([c[f"vel_{x}"] for x in "xyz"])
+    return _falling(model, (q[:n], v[:n], a[:n]), chart, rates, com, t, gravity)
+
+
+def slope_of(angles: np.ndarray) -> np.ndarray:
+    """(3, 3): angular velocity in base axes = slope @ rates of yaw, roll, pitch (3,)."""
+    from jumplab.models.spatial import _spin_slope
+
+    return _spin_slope(angles[1:2], angles[2:3])[0]
+
+
+def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
+    """The base's place and accelerations where nothing but gravity acts."""
+    tree, n = model.model.copy(), len(t)
+    tree.gravity.linear = np.array([0.0, 0.0, -gravity])
+    data, (qj, vj, aj) = tree.createData(), joints
+    place, zero = np.zeros((n, 3)), np.zeros((n, 3))
+    q, v, a = model.to_pinocchio(*(np.concatenate(x, 1) for x in ((place, chart, qj), (zero, rates, vj), (zero, zero, aj))))
+    fall = np.array([0.0, 0.0, -gravity])
+    for k in range(n):
+        pin.centerOfMass(tree, data, q[k], v[k])
+        turn = data.oMi[1].rotation
+        q[k, :3] = com[0] + com[1] * t[k] + fall * t[k] ** 2 / 2 - data.com[0]
+        v[k, :3] = turn.T @ (com[1] + fall * t[k] - data.vcom[0])
+        a[k, :6] = 0.0
+        missing = pin.rnea(tree, data, q[k], v[k], a[k])[:6]
+        inertia = np.triu(pin.crba(tree, data, q[k]))[:6, :6]
+        a[k, :6] = -np.linalg.solve(inertia + np.triu(inertia, 1).T, missing)
+    return q, v, a
+
+
+def _forces(robot, q, v, a, wrench, standing: int):
+    """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
+
+    What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
+    """
+    model, data, n = robot.model, robot.model.createData(), len(q)
+    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    f, tau = np.zeros((n, 2, 6)), np.empty((n, model.nv - 6))
+    com, spin = np.empty((n, 6)), np.empty((n, 3))
+    least = LEAST_LOAD * robot.total_mass * robot.gravity
+    for k in range(n):
+        need = pin.rnea(model, data, q[k], v[k], a[k])
+        if k < standing:
+            jacobians = pin.computeJointJacobians(model, data, q[k])
+            pin.updateFramePlacements(model, data)
+            base = data.oMi[1]
+            force = base.rotation @ need[:3]
+            missing = np.concatenate([force, base.rotation @ need[3:6] + np.cross(base.translation, force)]) - wrench[k].sum(0)
+            columns, shares = [], []
+            for i, frame in enumerate(frames):
+                place = data.oMf[frame].act(robot.foot.center)
+                columns.append(np.block([[np.eye(3), np.zeros((3, 3))], [pin.skew(place), np.eye(3)]]))
+                shares.append(max(wrench[k, i, 2], least) * np.repeat([1.0, WRENCH_ARM_M**2], 3))
+            spread = np.hstack(columns)
+            weighted = np.concatenate(shares)[:, None] * spread.T
+            extra = (weighted @ np.linalg.solve(spread @ weighted, missing)).reshape(2, 6)
+            for i, (frame, column) in enumerate(zip(frames, columns, strict=True)):
+                total = wrench[k, i] + column @ extra[i]
+                f[k, i] = total
+                f[k, i, 3:] -= np.cross(data.oMf[frame].translation, total[:3])
+                joint = model.frames[frame].parentJoint
+                need -= _joint_jacobian(model, data, joint, jacobians).T @ total
+        tau[k] = need[6:]
+        pin.computeCentroidalMomentum(model, data, q[k], v[k])
+        pin.centerOfMass(model, data, q[k], v[k])
+        com[k, :3], com[k, 3:], spin[k] = data.com[0], data.vcom[0], data.hg.angular
+    return f, tau, com, spin
+
+
+def _joint_jacobian(model, data, joint, jacobians) -> np.ndarray:
+    """Jacobian (6, nv) of a joint's body, spatial velocity about the world's origin."""
+    return pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)
