@@ -27,14 +27,25 @@ def pitched(q: np.ndarray, angle: float) -> np.ndarray:
 
 
 def pitch_of(q: np.ndarray) -> np.ndarray:
-    """Pitch (...) of the trunk in configurations ``q`` (..., nq), within half a turn [rad]."""
+    """Pitch (...) of the trunk in its own heading, in configurations ``q`` (..., nq), within half a turn [rad]."""
     x, y, z, w = np.moveaxis(q[..., 3:7], -1, 0)
-    return np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+    return np.arctan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y))
 
 
 def planned_pitch(q: np.ndarray) -> np.ndarray:
-    """Pitch (N,) of a base that turns about y only, as tapes have it, continuous through full turns [rad]."""
-    return np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]))
+    """Pitch (N,) of the base along a tape, continuous through full turns [rad]."""
+    return np.unwrap(pitch_of(q))
+
+
+def headed(q: np.ndarray, heading_rad: float) -> np.ndarray:
+    """Configurations (..., nq) as somebody sees them who looks along ``heading_rad``; ``q`` itself if that is zero."""
+    if heading_rad == 0:
+        return q
+    out, (c, s), half = q.copy(), (np.cos(heading_rad), np.sin(heading_rad)), -heading_rad / 2
+    out[..., 0], out[..., 1] = c * q[..., 0] + s * q[..., 1], c * q[..., 1] - s * q[..., 0]
+    (x, y, z, w), cz, sz = np.moveaxis(q[..., 3:7], -1, 0), np.cos(half), np.sin(half)
+    out[..., 3:7] = np.stack([cz * x - sz * y, cz * y + sz * x, cz * z + sz * w, cz * w - sz * z], -1)
+    return out
 
 
 class Gauge:
@@ -55,6 +66,12 @@ class Gauge:
     def _on_feet(self, q: np.ndarray, point: np.ndarray) -> np.ndarray:
         pin.framesForwardKinematics(self.model, self.data, q)
         return np.mean([self.data.oMf[frame].act(point) for frame in self.frames], axis=0)
+
+    def heading(self, q: np.ndarray) -> float:
+        """Where the feet point, seen from above, within half a turn of +x [rad]."""
+        pin.framesForwardKinematics(self.model, self.data, q)
+        x, y = np.sum([self.data.oMf[frame].rotation[:2, 0] for frame in self.frames], axis=0)
+        return float(np.arctan2(y, x))
 
     def com(self, q: np.ndarray) -> np.ndarray:
         """CoM (3,) [m]."""

@@ -10,7 +10,7 @@ from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import pitch_of
+from jumplab.sim.kinematics import Gauge, headed
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
 from jumplab.sim.playback import Command, Playback
 from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
@@ -60,6 +60,8 @@ class Pilot:
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
+        self.goal, self._heading = tape.q[-1], Gauge(robot).heading(tape.q[-1])
+        tape, scene = replace(tape, q=headed(tape.q, self._heading)), scene.seen_along(self._heading, robot, self.goal)
         self._robot, self._playback, self.forecast = robot, Playback(tape, robot, mode), Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         self._landing = LandingController(robot, reference=None if callable(reference) else reference)
@@ -77,7 +79,7 @@ class Pilot:
         if self._tuck is not None:
             self._tape_until = min(self._earliest, round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S))
         self._none = self._tau = np.zeros(len(robot.joint_names))
-        self.goal, self._stand_s = tape.q[-1], stand_s
+        self._stand_s = stand_s
         self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
         self.touchdown: int | None = None
 
@@ -104,7 +106,11 @@ class Pilot:
         return step >= self.touchdown + round((self._stand_s + EXTRA_S) / STEP_S) or fallen_s > AFTER_FALL_S
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
-        """Command at ``step`` from measured state and vertical foot forces."""
+        """Command at ``step`` from measured state and vertical foot forces.
+
+        All that feeds back sees the robot along the heading in which it shall land.
+        """
+        q = headed(q, self._heading)
         if self.touchdown is None:
             if step < self._tape_until:
                 return self._playback.command(step, q, v, self._none)
@@ -144,7 +150,7 @@ class Pilot:
 
     def _error(self, step: int, q: np.ndarray) -> float:
         """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
-        error = pitch_of(q) - self._playback.trunk_pitch(step) if self._tuck is None else self._tuck.miss
+        error = self._playback.attitude_error(step, q)[1] if self._tuck is None else self._tuck.miss
         return float(np.arctan2(np.sin(error), np.cos(error)))
 
     def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:

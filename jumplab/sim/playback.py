@@ -16,7 +16,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import planned_pitch
+from jumplab.sim.kinematics import rotation
 
 MODES = ("position", "pd")
 FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
@@ -129,7 +129,7 @@ class Playback:
         # steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
         self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
         self._q, self._rate, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v[:, 6:], tape.tau))
-        self._pitch = np.interp(grid, tape.t, planned_pitch(tape.q))
+        self._attitude = _resample(grid, tape.t, tape.q[:, 3:7])
         self._rest = self._corrected = np.zeros(len(names))
         self._kp, self._kd = GAINS.of(robot)
         self._model, self._data = robot.model, robot.model.createData()
@@ -189,9 +189,10 @@ class Playback:
         lever = whole[:6, 6:]
         return whole[6:, 6:] - lever.T @ np.linalg.solve(whole[:6, :6], lever)
 
-    def trunk_pitch(self, step: int) -> float:
-        """Planned trunk pitch [rad], continuous through full turns."""
-        return float(self._pitch[min(step, self.steps)])
+    def attitude_error(self, step: int, q: np.ndarray) -> np.ndarray:
+        """How far the trunk is turned away from the plan: rotation vector (3,) in the axes of ``q`` and tape [rad]."""
+        planned = self._attitude[min(step, self.steps)]
+        return pin.log3(rotation(q[3:7]) @ rotation(planned / np.linalg.norm(planned)).T)
 
 
 def _resample(grid: np.ndarray, t: np.ndarray, columns: np.ndarray) -> np.ndarray:

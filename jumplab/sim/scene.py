@@ -10,6 +10,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.robot import Robot
+from jumplab.sim.kinematics import Gauge
 
 REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
@@ -71,6 +72,13 @@ class Scene:
             return cls.flat()
         edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
         return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)))
+
+    def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
+        """The ground for somebody who looks along a heading: itself ahead, else the surface under the soles of ``q``."""
+        if heading_rad == 0:
+            return self
+        x = float(Gauge(robot).soles(q)[0])
+        return Scene(self.name, (Block(-REACH_M, REACH_M, self.top_at(x)),))
 
     def top_at(self, x: float) -> float:
         """Height of the highest surface at ``x`` [m]."""
