@@ -36,6 +36,9 @@ class JumpTask:
     platform_m : height of the landing surface above the launching surface [m].
     rotation_rad : rotation about +y in flight, 0 or a multiple of 2 pi (theta_tar; -2 pi is a backflip).
     gravity : [m/s^2].
+    side_m : travel of the middle between the soles to the left [m]; negative is to the right.
+    yaw_rad : turn about the vertical, counter-clockwise seen from above [rad]; ``distance_m`` and ``side_m`` stay in
+        the axes of the start, and are then those of the middle between the soles.
     """
 
     distance_m: float
@@ -43,6 +46,8 @@ class JumpTask:
     platform_m: float = 0.0
     rotation_rad: float = 0.0
     gravity: float = GRAVITY
+    side_m: float = 0.0
+    yaw_rad: float = 0.0
 
     def __post_init__(self):
         clean = {
@@ -51,6 +56,8 @@ class JumpTask:
             "platform_m": _number("platform", self.platform_m, -MAX_PLATFORM_M, MAX_PLATFORM_M, "m"),
             "rotation_rad": _number("rotation", self.rotation_rad, -4 * math.pi, 4 * math.pi, "rad"),
             "gravity": _number("gravity", self.gravity, 0.5, 30.0, "m/s^2"),
+            "side_m": _number("side", self.side_m, -MAX_DISTANCE_M, MAX_DISTANCE_M, "m"),
+            "yaw_rad": _number("yaw", self.yaw_rad, -2 * math.pi, 2 * math.pi, "rad"),
         }
         for name, x in clean.items():
             object.__setattr__(self, name, x)
@@ -60,6 +67,11 @@ class JumpTask:
                 f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet only after a "
                 f"multiple of 360 deg; nearest is {360 * round(turns):g} deg"
             )
+
+    @property
+    def in_plane(self) -> bool:
+        """Whether the jump stays in the sagittal plane: neither side nor yaw."""
+        return self.side_m == 0 and self.yaw_rad == 0
 
     @property
     def takeoff_speed(self) -> float:

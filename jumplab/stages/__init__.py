@@ -4,7 +4,7 @@ import lazy_loader as lazy
 
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
-    submodules=["joint_qp", "plan", "planner", "reconstruction", "srmp", "whole_body"],
+    submodules=["joint_qp", "plan", "planner", "reconstruction", "spatial", "srmp", "whole_body"],
     submod_attrs={
         "plan": ["JumpPlan", "StageRow"],
         "planner": ["Planner", "guess_from_joints", "make_tape", "to_link_angles"],

@@ -54,20 +54,20 @@ def _flat_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
         # where the legs' accelerations follow from feet in place, no second condition is wanted at this end
         Bound("at rest (acceleration)", "ours", "rad/s^2", "a", -rest, rest, "start"),
     )
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance())
+    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
     return Phase(b.contact.value, b.coordinates, mesh.flat, b.limits.flat_s, terms, (*_boxes(b), *start), b.states, scales=_scales(b))
 
 
 def _toe_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
     gone = np.concatenate([np.zeros(b.n_forces), np.full(b.model.joints, np.inf)])
     off = Bound("no force at take-off", "SL-E3, E4, E6 for the whole body", "N", "z", -gone, gone, "end")
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance())
+    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
     return Phase(b.contact.value, b.coordinates, mesh.toe, b.limits.toe_s, terms, (*_boxes(b), off), b.states, scales=_scales(b))
 
 
 def _flight_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
     constants = {f"{kind}_{x}": box for kind, box in (("com", COM_BOX_M), ("vel", SPEED_BOX_M_S), ("L", SPIN_BOX)) for x in "xyz"}
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.flight_rows(), b.body_clearance(), *b.touchdown_rows())
+    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.flight_rows(), b.body_clearance(), *b.link_distances(), *b.touchdown_rows())
     return Phase(b.contact.value, b.coordinates, mesh.flight, FLIGHT_S, terms, _boxes(b), b.states, constants, scales=_scales(b))
 
 

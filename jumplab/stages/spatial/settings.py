@@ -25,7 +25,7 @@ class SpatialLimits:
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
     clearance_m: float = 0.035  # of the soles over the ground in mid-flight
     body_clearance_m: float = 0.05  # of knees and hands over the ground
-    link_distance_m: float = 0.015  # between links
+    link_distance_m: float = 0.003  # between links of legs and trunk
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
@@ -33,6 +33,7 @@ class SpatialLimits:
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
     touchdown_roll: float = 0.10  # [rad] of the base, either way
     touchdown_yaw: float = 0.20  # [rad] of the base against the feet, either way
+    edge_before_heel_m: float = 0.05  # a platform begins this far before the landing soles
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02

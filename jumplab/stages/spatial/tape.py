@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import cumulative_trapezoid
 
 from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.spatial import CHART, SpatialModel
@@ -20,6 +21,8 @@ from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.start import generators
 from jumplab.stages.spatial.terms import SpatialTerms
 
+BALANCING = 2  # corrections, each a hundred times smaller than the one before
+JOINING_S = 0.05  # after take-off, over which joints pass from the launch as held by the ground to the planned flight
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
@@ -32,10 +35,10 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     launch_s = flat.duration + toe.duration
     t = launch_s - np.arange(int(np.ceil(launch_s * RATE_HZ - 1e-9)), -1, -1) / RATE_HZ
     legs = Legs(b)
-    q, v, a, w = _launch(terms, phases, legs, np.maximum(t, 0.0))
+    q, v, a, w = _launch(terms, phases, legs, np.maximum(t, 0.0), gravity)
     late = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
-    fly = _flight(b.model, flight, q[-1, 3:6], late, gravity)
-    start = [b.model.to_pinocchio(q, v, a), fly]
+    stood = b.model.to_pinocchio(q, v, a)
+    start = [stood, _flight(b.model, flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
     q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
     wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
     f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
@@ -85,13 +88,13 @@ class Legs:
         return np.einsum("nij,nj->ni", np.linalg.pinv(slope[:, :, self.columns]), off)
 
 
-def _launch(terms, phases, legs: Legs, t: np.ndarray):
+def _launch(terms, phases, legs: Legs, t: np.ndarray, gravity: float):
     """Charts, rates, accelerations (n, .) and the feet's wrenches (n, 2, 6) about the world's origin at times ``t``."""
     flat, toe = phases["flat"], phases["toe"]
     first = t < flat.duration
     times = t[first], np.minimum(t[~first] - flat.duration, toe.duration)
     sampled = [np.concatenate(x) for x in zip(flat.sample(times[0]), toe.sample(times[1]), strict=True)]
-    q, v, a = legs.held(*sampled, first)
+    q, v, a = _balanced(legs, sampled, first, t, gravity)
     wrench = []
     for name, phase, at in (("flat", flat, times[0]), ("toe", toe, times[1])):
         b = terms[name]
@@ -101,12 +104,58 @@ def _launch(terms, phases, legs: Legs, t: np.ndarray):
     return q, v, a, np.concatenate(wrench)
 
 
-def _flight(model: SpatialModel, flight: PhaseSolution, angles: np.ndarray, t: np.ndarray, gravity: float):
-    """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands."""
-    data, c = model.model.createData(), flight.constants
-    spin = np.array([c[f"L_{x}"] for x in "xyz"])
+def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: float):
+    """The motion with feet held, its base moved by some micrometres so that the ground's force stays on the toes.
+
+    Heels up, no ground force has a moment about the line of the toes: what the motion between nodes needs of it goes.
+    """
+    q, v, a = motion
+    x = float(legs.b.places[:, 0].mean() + (legs.b.robot.foot.toe - legs.b.robot.foot.heel) / 2)
+    up = np.flatnonzero(~flat)
+
+    def moment(q, v, a):
+        need = np.array([x for x in _needed(legs.b.model, q[up], v[up], a[up], gravity)])
+        return need[:, 4] + x * need[:, 2]
+
+    for _ in range(BALANCING):
+        held = legs.held(q, v, a, flat)
+        pushed = a + np.eye(q.shape[1])[0]
+        missing = moment(*held)
+        gain = moment(*legs.held(q, v, pushed, flat)) - missing
+        more = np.zeros(len(t))
+        more[up] = -missing / gain
+        rate = cumulative_trapezoid(more, t, initial=0.0)
+        q, v, a = (y.copy() for y in (q, v, a))
+        for y, change in ((q, cumulative_trapezoid(rate, t, initial=0.0)), (v, rate), (a, more)):
+            y[:, 0] += change
+    return legs.held(q, v, a, flat)
+
+
+def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gravity: float):
+    """Wrenches (6,) about the world's origin that motions, as charts (n, .), need from the ground, one by one."""
+    tree = model.model.copy()
+    tree.gravity.linear = np.array([0.0, 0.0, -gravity])
+    data = tree.createData()
+    for motion in zip(*model.to_pinocchio(q, v, a), strict=True):
+        need, (x, y, z, w) = pin.rnea(tree, data, *motion)[:6], motion[0][3:7]
+        base = pin.Quaternion(w, x, y, z).toRotationMatrix()
+        force = base @ need[:3]
+        yield np.concatenate([force, base @ need[3:] + np.cross(motion[0][:3], force)])
+
+
+def _flight(model: SpatialModel, flight: PhaseSolution, chart0, stood, t: np.ndarray, gravity: float):
+    """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands.
+
+    It begins where the launch ends, as charts and as Pinocchio has it; within :data:`JOINING_S` the joints are as planned.
+    """
+    data = model.model.createData()
+    pin.computeCentroidalMomentum(model.model, data, *stood[:2])
+    pin.centerOfMass(model.model, data, *stood[:2])
+    spin, com = data.hg.angular.copy(), (data.com[0].copy(), data.vcom[0].copy())
     halves = np.concatenate([t, (t[1:] + t[:-1]) / 2])
-    q, v, a = (x[:, 3:] for x in flight.sample(halves))
+    planned = [x[:, 3:] for x in flight.sample(halves)]
+    off = [x[len(CHART) :] - y[0] for x, y in zip(chart0, planned, strict=True)]
+    q, v, a = (x + y for x, y in zip(planned, _fading(off, halves), strict=True))
     zero, neutral = np.zeros(6), pin.neutral(model.model)[:7]
     own, carried = np.empty((len(halves), 3, 3)), np.empty((len(halves), 3))
     for k, (qj, vj) in enumerate(zip(q, v, strict=True)):
@@ -118,7 +167,7 @@ def _flight(model: SpatialModel, flight: PhaseSolution, angles: np.ndarray, t: n
         return np.linalg.solve(slope_of(x), np.linalg.solve(own[k], turn.T @ spin - carried[k]))
 
     n, chart = len(t), np.empty((len(t), 3))
-    chart[0] = angles
+    chart[0] = chart0[0][3:6]
     for k in range(n - 1):  # Runge and Kutta, fourth order
         h, x, mid = t[k + 1] - t[k], chart[k], n + k
         k1 = rate(x, k)
@@ -126,8 +175,21 @@ def _flight(model: SpatialModel, flight: PhaseSolution, angles: np.ndarray, t: n
         k3 = rate(x + h / 2 * k2, mid)
         chart[k + 1] = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, k + 1))
     rates = np.array([rate(x, k) for k, x in enumerate(chart)])
-    com = np.array([c[f"com_{x}"] for x in "xyz"]), np.array([c[f"vel_{x}"] for x in "xyz"])
     return _falling(model, (q[:n], v[:n], a[:n]), chart, rates, com, t, gravity)
+
+
+def _fading(off, t: np.ndarray) -> list[np.ndarray]:
+    """A motion (n, k) on three levels that begins with ``off`` (k,) each and has ended after :data:`JOINING_S`."""
+    s = np.clip(t / JOINING_S, 0.0, 1.0)
+    ends = np.array([[1, 1, 1], [3, 4, 5], [6, 12, 20]])  # value, slope and curvature of s^3, s^4, s^5 at one
+    x, v, a = (y * JOINING_S**k for k, y in enumerate(off))
+    rest = np.linalg.solve(ends, -np.array([x + v + a / 2, v + a, a]))
+    powers = np.concatenate([[x, v, a / 2], rest])  # (6, k) of a polynomial in s
+    out = []
+    for order in range(3):
+        out.append(np.stack([s**k for k in range(len(powers))], -1) @ powers / JOINING_S**order)
+        powers = powers[1:] * np.arange(1, len(powers))[:, None]
+    return out
 
 
 def slope_of(angles: np.ndarray) -> np.ndarray:
@@ -177,7 +239,7 @@ def _forces(robot, q, v, a, wrench, standing: int):
             missing = np.concatenate([force, base.rotation @ need[3:6] + np.cross(base.translation, force)]) - wrench[k].sum(0)
             columns, shares = [], []
             for i, frame in enumerate(frames):
-                place = data.oMf[frame].act(robot.foot.center)
+                place = _pressure(wrench[k, i], data.oMf[frame].act(robot.foot.center))
                 columns.append(np.block([[np.eye(3), np.zeros((3, 3))], [pin.skew(place), np.eye(3)]]))
                 shares.append(max(wrench[k, i, 2], least) * np.repeat([1.0, WRENCH_ARM_M**2], 3))
             spread = np.hstack(columns)
@@ -194,6 +256,13 @@ def _forces(robot, q, v, a, wrench, standing: int):
         pin.centerOfMass(model, data, q[k], v[k])
         com[k, :3], com[k, 3:], spin[k] = data.com[0], data.vcom[0], data.hg.angular
     return f, tau, com, spin
+
+
+def _pressure(wrench: np.ndarray, sole: np.ndarray) -> np.ndarray:
+    """Centre of pressure (3,) of a wrench about the world's origin; the middle of the sole if there is no load."""
+    if wrench[2] <= 0:
+        return sole
+    return np.array([-wrench[4] / wrench[2], wrench[3] / wrench[2], 0.0])
 
 
 def _joint_jacobian(model, data, joint, jacobians) -> np.ndarray:

@@ -11,6 +11,7 @@ from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
+from jumplab.stages.spatial.shapes import pairs
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
 from jumplab.stages.whole_body.settings import Contact
 from jumplab.stages.whole_body.terms import POSITIVE, cost, row
@@ -47,6 +48,8 @@ class SpatialTerms:
         self.toes, self.soles = on_foot([foot.toe, 0.0, foot.sole_z]), on_foot(foot.center)
         self.sole_corners = np.array([on_foot(x) for x in foot.corners]).transpose(1, 0, 2)  # (2, 4, 3)
         self.stance = self.model.of_pinocchio(stance_configuration(robot)[None])[0]
+        legs = {0, *(j for k in self.feet for j in self.chain(k))}
+        self.pairs = pairs(robot, self.model, legs, stance_configuration(robot))
         self.places = self._first_places(frames)
         self.corners = self._ground_corners()
         first = 3 if self.flying else 0
@@ -255,6 +258,16 @@ class SpatialTerms:
             return ca.vertcat(*(x[2] - self.ground(p, x) for x in places))
 
         return row("body clearance", "ours", "m", heights, self.limits.body_clearance_m, np.inf, scale=0.1)
+
+    def link_distances(self) -> list[Term]:
+        """Legs and trunk stay apart from each other wherever they can meet."""
+        if not self.pairs:
+            return []
+
+        def gaps(p):
+            return ca.vertcat(*(pair.gap(self.state(p)) for pair in self.pairs))
+
+        return [row("distances between links", "ours", "m", gaps, self.limits.link_distance_m, np.inf, scale=0.1)]
 
     @property
     def limb_points(self) -> list[tuple[int, np.ndarray]]:

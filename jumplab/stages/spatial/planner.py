@@ -1,0 +1,158 @@
+"""Solving the spatial program for a target: guess, coarse mesh, fine mesh, and the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jumplab.errors import InfeasibleError, SolverError
+from jumplab.io.tape import Tape
+from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess, Solution, Statistics
+from jumplab.robot import Robot
+from jumplab.stages.changes import StageChanges
+from jumplab.stages.spatial.problem import build_problem
+from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.start import from_tape
+from jumplab.stages.spatial.tape import make_tape
+from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.whole_body.settings import Contact, Mesh
+from jumplab.task import JumpTask
+
+FINE = {"tol": 1e-3, "compl_inf_tol": 1e-4}  # beyond, the cost moves by less than one in a million
+# the coarse solution is only a start, digits beyond these would be lost on the finer mesh
+COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
+REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2}  # what the coarse mesh leads to is a good start
+
+
+@dataclass(frozen=True)
+class SpatialPlan:
+    """Result of the spatial program."""
+
+    task: JumpTask
+    solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
+    edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
+    coarse: Statistics | None = None  # of the coarse mesh before it
+    limits: SpatialLimits = SpatialLimits()  # that it was made with
+    uneven: tuple[Statistics, ...] = ()
+
+    @property
+    def launch_s(self) -> float:
+        """Duration of the launch [s]."""
+        return self.solution.phases["flat"].duration + self.solution.phases["toe"].duration
+
+    @property
+    def flight_s(self) -> float:
+        """Duration of the flight [s]."""
+        return self.solution.phases["flight"].duration
+
+
+class SpatialPlanner:
+    """The spatial program of one robot: built once, solved for any target.
+
+    ``keep`` keeps what was built for later processes; ``changes`` are own terms, weights and switches.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        mesh: Mesh = SPATIAL_MESH,
+        limits: SpatialLimits = SpatialLimits(),
+        weights: SpatialWeights = SpatialWeights(),
+        *,
+        options: Mapping | None = None,
+        keep: bool = False,
+        changes: StageChanges = StageChanges(),
+    ):
+        self.robot, self.mesh, self.limits, self.weights, self.changes = robot, mesh, limits, weights, changes
+        self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
+        options = dict(options or {})
+        problem = changes.applied(build_problem(robot, mesh, limits, weights))
+        key = f"{robot.hash} {limits} {weights}" if keep else None
+        self.nlp = Nlp(problem, {**FINE, **options}, key)
+        self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
+        self._warm = self.nlp.with_options({**FINE, **WARM, **options})
+        self._coarse = Nlp(problem.on_mesh(mesh.coarse().intervals()), {**COARSE, **options}, key, self.nlp)
+
+    def plan(
+        self,
+        task: JumpTask,
+        start: Tape | None = None,
+        toe_phase_s: float = 0.0,
+        *,
+        weights: Mapping[str, float] | None = None,
+        near: SpatialPlan | None = None,
+    ) -> SpatialPlan:
+        """Solve for a target.
+
+        Parameters
+        ----------
+        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        weights : of cost terms, instead of their own.
+        near : this planner's plan for a target close by, to begin with.
+
+        Raises
+        ------
+        SolverError
+            If there is no plan; names the terms in conflict.
+        """
+        asked = self.parameters(task)
+        how = {"weights": self.changes.spread(self.nlp.problem, weights or {})}
+        edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
+        if near is not None:
+            try:
+                found = self._warm.solve(asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how)
+                return SpatialPlan(task, found, edge, limits=self.limits)
+            except SolverError:
+                if start is None:
+                    raise
+        guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
+        try:
+            return self._refine(task, asked, guess, edge, how)
+        except SolverError:  # the fine mesh has the last word, and the better explanation
+            return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, limits=self.limits)
+
+    def _refine(self, task: JumpTask, asked: Mapping, guess: Mapping[str, PhaseGuess], edge: float, how: Mapping) -> SpatialPlan:
+        """The solution by way of the coarse mesh."""
+        coarse = self.mesh.coarse().intervals()
+        first = self._coarse.solve(asked, {k: guess[k].resampled(n) for k, n in coarse.items()}, explain=False, **how)
+        start = first.guess(self.mesh.intervals())
+        found = self._refined.solve(asked, start, multipliers=first.multipliers, explain=False, **how)
+        return SpatialPlan(task, found, edge, first.statistics, self.limits)
+
+    def tape(self, plan: SpatialPlan) -> Tape:
+        """The 1 kHz tape of a plan."""
+        return make_tape(self.terms, plan.solution.phases, plan.task.gravity)
+
+    def parameters(self, task: JumpTask) -> dict[str, Any]:
+        """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
+        flat = self.terms["flat"]
+        values = dict(stance=flat.stance, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
+        values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
+        return values | dict(edge=self._edge(task), gravity=task.gravity)
+
+    def _edge(self, task: JumpTask) -> float:
+        """Where the ground steps up or down [m], from the world's origin."""
+        c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
+        corners = np.concatenate([self.terms["flat"].places[:, None] + self._sole() for _ in (0,)]).reshape(-1, 3)
+        landed = task.distance_m + corners[:, 0] * c - corners[:, 1] * s
+        room, first = self.limits.edge_before_heel_m, float(corners[:, 0].max())
+        up, down = float(landed.min()) - room, first + room
+        edge = down if task.platform_m < 0 else up
+        apart = up - first if task.platform_m > 0 else float(landed.min()) - down
+        if task.platform_m and apart < 0:
+            raise InfeasibleError(
+                f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
+                f"under a sole of {self.robot.name}; ask for a distance of {task.distance_m - apart:.2f} m or more"
+            )
+        return edge
+
+    def _sole(self) -> np.ndarray:
+        return self.robot.foot.corners - self.robot.foot.center
+
+
+def at_rest_in_plane(task: JumpTask) -> JumpTask:
+    """The same rise and distance without side and yaw, whose planar plan the spatial program starts from."""
+    return replace(task, side_m=0.0, yaw_rad=0.0)
