@@ -36,7 +36,7 @@ def checks(r: Replay) -> list[Check]:
         *_steps(r),
         *_reintegration(r),
         *_switch(r),
-        *_symmetry(r),
+        *(_symmetry(r) if r.task is None or r.task.in_plane else ()),
     ]
 
 
@@ -142,9 +142,35 @@ def target(r: Replay) -> list[Check]:
 
 
 def foot_turn(r: Replay) -> np.ndarray:
-    """(K,) rotation of each foot about +y from the first to the last sample [rad], whole turns counted."""
-    x_axis = r.foot_rotation[..., :, 0]  # (N, K, 3)
-    return np.diff(np.unwrap(np.arctan2(-x_axis[..., 2], x_axis[..., 0]), axis=0)[[0, -1]], axis=0)[0]
+    """(K,) rotation of each foot about +y in its heading from the first to the last sample [rad], whole turns counted."""
+    down = r.foot_rotation[..., 2, :]  # (N, K, 3) the vertical in the feet's axes
+    return np.diff(np.unwrap(np.arctan2(-down[..., 0], down[..., 2]), axis=0)[[0, -1]], axis=0)[0]
+
+
+def foot_yaw(r: Replay) -> np.ndarray:
+    """(K,) turn of each foot about the vertical, whole turns counted [rad]; by its left side, level in a flip too."""
+    left = r.foot_rotation[..., :, 1]
+    return np.diff(np.unwrap(np.arctan2(-left[..., 0], left[..., 1]), axis=0)[[0, -1]], axis=0)[0]
+
+
+def _place(r: Replay, task: JumpTask) -> list[Check]:
+    """Where the feet of a jump out of the plane stand in the end."""
+    t, feet = r.tape.t[-1:], r.tape.contact_frames
+    middles = r.sole_points[[0, -1]].mean(axis=2)  # (2, K, 3)
+    c, s, centre = np.cos(task.yaw_rad), np.sin(task.yaw_rad), middles[0].mean(axis=0)
+    goal = (
+        centre
+        + [task.distance_m, task.side_m, 0]
+        + (middles[0] - centre) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    )
+    miss, found = 1e3 * np.linalg.norm((middles[1] - goal)[:, :2], axis=1), (middles[1] - middles[0]).mean(axis=0)
+    turn = foot_yaw(r)
+    asked = dict(ahead=found[0], left=found[1], asked=task.distance_m, aside=task.side_m)
+    wrong, degrees = 1e3 * np.abs(turn - task.yaw_rad), np.degrees([turn.mean(), task.yaw_rad])
+    return [
+        LIMITS["place"].worst(miss[None], t, feet, **asked),
+        LIMITS["heading"].worst(wrong[None], t, feet, found=degrees[0], asked=degrees[1]),
+    ]
 
 
 def _asked(r: Replay, task: JumpTask) -> list[Check]:
@@ -152,13 +178,15 @@ def _asked(r: Replay, task: JumpTask) -> list[Check]:
     t, feet = tape.t, tape.contact_frames
     travel = (r.toe_corners[-1] - r.toe_corners[0]).mean(axis=1)[:, :2]  # (K, 2)
     miss = 1e3 * np.linalg.norm(travel - np.array([task.distance_m, 0.0]), axis=-1)
+    found = dict(found=travel[:, 0].mean(), asked=task.distance_m)
+    place = [LIMITS["distance"].worst(miss[None], t[-1:], feet, **found)] if task.in_plane else _place(r, task)
     highest = int(np.argmax(r.com[i:, 2])) + i
     rise, turn = float(r.com[highest, 2] - r.com[i, 2]), foot_turn(r)
     wrong, degrees = 1e3 * np.abs(turn - task.rotation_rad), np.degrees([turn.mean(), task.rotation_rad])
     names = [*("base",) * 6, *map(str, tape.joint_names)]
     return [
         LIMITS["start at rest"].worst(np.abs(tape.v[:1]), t[:1], names),
-        LIMITS["distance"].worst(miss[None], t[-1:], feet, found=travel[:, 0].mean(), asked=task.distance_m),
+        *place,
         LIMITS["rise"].check(1e3 * abs(rise - task.height_m), float(t[highest]), found=rise, asked=task.height_m),
         LIMITS["rotation"].worst(wrong[None], t[-1:], feet, found=degrees[0], asked=degrees[1]),
     ]

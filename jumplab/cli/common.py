@@ -1,6 +1,7 @@
 """What the commands share: how one is declared, its options and what they take, and what is printed of a result."""
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
@@ -135,7 +136,9 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     print(f"{'stage':<22}{'iterations':>11}{'build':>10}{'solve':>10}")
     for row in summary["stages"]:
         print(f"{row['stage']:<22}{row['iterations']:>11}{row['build_s']:>8.2f} s{row['solve_s']:>8.2f} s")
-    print(f"planned: distance {summary['planned_distance_m']:.3f} m, rise {summary['planned_rise_m']:.3f} m")
+    side, yaw = summary.get("planned_side_m"), summary.get("planned_yaw_rad")
+    away = "" if side is None else f", side {side:.3f} m, turn {math.degrees(yaw):.1f} deg"
+    print(f"planned: distance {summary['planned_distance_m']:.3f} m, rise {summary['planned_rise_m']:.3f} m{away}")
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:

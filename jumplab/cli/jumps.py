@@ -58,12 +58,15 @@ def run(args: Namespace) -> None:
     opt("--out DIR", "folder for the plan", None, folder, required=True),
     opt("--platform-m M", "height of the landing surface [m] (default 0)", "0", number),
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
+    opt("--side-m M", "travel of the feet to the left [m] (default 0)", "0", number),
+    opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
     opt("--method", "the paper's three steps, or the whole-body problem without them", METHODS[0], METHODS),
 )
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
     start = time.perf_counter()
-    task = JumpTask(args.distance_m, args.height_m, args.platform_m, math.radians(args.rotation_deg))
+    turns = {"rotation_rad": math.radians(args.rotation_deg), "yaw_rad": math.radians(args.yaw_deg)}
+    task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     found = planner.plan_jump(task, robot, method=args.method)

@@ -108,7 +108,12 @@ class SpatialModel:
         half = q[:, 3:6] / 2
         (cy, cr, cp), (sy, sr, sp) = np.cos(half).T, np.sin(half).T  # quaternions that follow whole turns
         out_q[:, 3:7] = np.stack(
-            [cy * sr * cp - sy * cr * sp, sy * sr * cp + cy * cr * sp, sy * cr * cp + cy * sr * sp, cy * cr * cp - sy * sr * sp],
+            [
+                cy * sr * cp - sy * cr * sp,
+                sy * sr * cp + cy * cr * sp,
+                sy * cr * cp + cy * sr * sp,
+                cy * cr * cp - sy * sr * sp,
+            ],
             -1,
         )
         out_v[:, :3], out_v[:, 3:6] = np.einsum("nji,nj->ni", turn, v[:, :3]), spin
@@ -156,7 +161,10 @@ class Turn:
     def out(self, x: ca.SX) -> ca.SX:
         """A vector (3,) of the turned frame in the outer one; or the columns of a matrix."""
         y = ca.SX(x)
-        y[self.i, :], y[self.j, :] = self.c * x[self.i, :] - self.s * x[self.j, :], self.s * x[self.i, :] + self.c * x[self.j, :]
+        y[self.i, :], y[self.j, :] = (
+            self.c * x[self.i, :] - self.s * x[self.j, :],
+            self.s * x[self.i, :] + self.c * x[self.j, :],
+        )
         return y if self.fixed is None else self.fixed @ y
 
     def into(self, x: ca.SX) -> ca.SX:
@@ -239,7 +247,9 @@ class SpatialState:
         ``wrenches`` act from outside: body -> (force, moment about the body's origin), world axes.
         """
         parts = []
-        for k, (b, spin, (linear, angular)) in enumerate(zip(self.model.bodies, self._spins, self._accelerations, strict=True)):
+        for k, (b, spin, (linear, angular)) in enumerate(
+            zip(self.model.bodies, self._spins, self._accelerations, strict=True)
+        ):
             first, second = ca.DM(b.first), ca.DM(b.second)
             force = b.mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
             moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
@@ -324,7 +334,10 @@ class SpatialState:
                 above, place = self._frame(b.parent)
                 fixed = above if t.fixed is None else above @ t.fixed
                 turn = ca.SX(fixed)
-                turn[:, t.i], turn[:, t.j] = fixed[:, t.i] * t.c + fixed[:, t.j] * t.s, fixed[:, t.j] * t.c - fixed[:, t.i] * t.s
+                turn[:, t.i], turn[:, t.j] = (
+                    fixed[:, t.i] * t.c + fixed[:, t.j] * t.s,
+                    fixed[:, t.j] * t.c - fixed[:, t.i] * t.s,
+                )
                 self._frames[k] = turn, place + above @ ca.DM(b.place)
         return self._frames[k]
 

@@ -29,7 +29,17 @@ from jumplab.ocp.problem import Problem
 
 HOME = ("jumplab.",)  # a problem with terms from elsewhere is not kept, unless it knows the hashes of their expressions
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules and misses none
-BUILT_BY = ("errors", "task", "ocp", "models", "robot", "robot_import", "stages.srmp", "stages.whole_body", "stages.spatial")
+BUILT_BY = (
+    "errors",
+    "task",
+    "ocp",
+    "models",
+    "robot",
+    "robot_import",
+    "stages.srmp",
+    "stages.whole_body",
+    "stages.spatial",
+)
 
 
 def folder() -> Path | None:

@@ -14,6 +14,7 @@ PHASES = {  # stage -> names of its phases; with stages 1 and 3 "launch" means b
     "srmp": (*LAUNCH, "launch", "flight"),
     "joint qp": ("launch", "flight"),
     "whole body": (*LAUNCH, "launch", "flight"),
+    "spatial": (*LAUNCH, "launch", "flight"),
 }
 LAST = "whole body"  # the stage of names without one; the direct planner takes its terms too
 Settings = TypeVar("Settings")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
+from jumplab.stages.spatial import SpatialPlan
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
@@ -40,7 +41,8 @@ class JumpPlan:
     task, robot, method : what was asked, of whom (under the task's gravity), and how it was planned.
     tape : the 1 kHz tape of the full robot.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
-    whole_body : result of stage 3 or of the direct planner; None if the plan was read from a result folder.
+    whole_body : result of stage 3 or of the direct planner, out of the plane of the spatial program, which began with
+        their motion; None if the plan was read from a result folder.
     statistics : one row per stage.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
@@ -52,7 +54,7 @@ class JumpPlan:
     tape: Tape
     srmp: SrmpPlan | None
     joints: JointPlan | None
-    whole_body: WholeBodyPlan | None
+    whole_body: WholeBodyPlan | SpatialPlan | None
     statistics: tuple[StageRow, ...]
     skipped: str | None = None
     stored: Mapping[str, Any] | None = None
@@ -60,20 +62,39 @@ class JumpPlan:
     @classmethod
     def on_file(cls, tape: Tape, robot: Robot, summary: Mapping[str, Any]) -> JumpPlan:
         """The plan of a result folder: its tape and its summary; the stages' own results are not on file."""
-        task = JumpTask(**{f.name: summary["target"][f.name] for f in fields(JumpTask)})
+        target = summary["target"]
+        task = JumpTask(**{f.name: target[f.name] for f in fields(JumpTask) if f.name in target})
         rows = tuple(StageRow(**row) for row in summary["stages"])
         return cls(task, robot, summary["method"], tape, None, None, None, rows, summary.get("skipped"), summary)
 
     @property
     def planned_distance_m(self) -> float:
-        """Travel of the toe over the whole tape [m]."""
+        """Travel of the toe over the whole tape, of the middle between the soles in a jump out of the plane [m]."""
+        if "soles_travel" in self.tape.extra:
+            return float(self.tape.extra["soles_travel"][0])
         toe = self.tape.extra["planar_toe"]
         return float(toe[-1, 0] - toe[0, 0])
 
     @property
+    def toe_phase_s(self) -> float:
+        """When the heels rise, on the tape [s]."""
+        return float(self.tape.extra["planar_toe_phase_start" if self.task.in_plane else "toe_phase_start"])
+
+    @property
+    def planned_side_m(self) -> float:
+        """Travel of the middle between the soles to the left [m], on the tape."""
+        return float(self.tape.extra["soles_travel"][1]) if "soles_travel" in self.tape.extra else 0.0
+
+    @property
+    def planned_yaw_rad(self) -> float:
+        """Turn of the feet about the vertical [rad], on the tape."""
+        return float(self.tape.extra.get("feet_turn", 0.0))
+
+    @property
     def planned_rise_m(self) -> float:
         """CoM apex minus CoM at take-off [m], on the tape."""
-        com = self.tape.extra["planar_com"][self.tape.takeoff_index :, 1]
+        extra = self.tape.extra
+        com = (extra["com"] if "com" in extra else extra["planar_com"])[self.tape.takeoff_index :, -1]
         return float(com.max() - com[0])
 
     @property
@@ -120,16 +141,19 @@ class JumpPlan:
         """What ``summary.json`` says: target, method, results, cost of the stages; plain types."""
         if self.stored is not None:
             return dict(self.stored)
-        task = {f: getattr(self.task, f) for f in ("distance_m", "height_m", "platform_m", "rotation_rad", "gravity")}
+        body, away = self.whole_body, {}
+        if not self.task.in_plane:
+            away = dict(planned_side_m=self.planned_side_m, planned_yaw_rad=self.planned_yaw_rad)
         return {
-            "target": task,
+            "target": asdict(self.task),
             "method": self.method,
             "robot": {"name": self.robot.name, "hash": self.robot.hash, "mass_kg": self.robot.total_mass},
             "planned_distance_m": self.planned_distance_m,
             "planned_rise_m": self.planned_rise_m,
-            "launch_s": self.whole_body.launch_s,
-            "flight_s": self.whole_body.flight_s,
-            "platform_edge_m": platform_edge_m(self.task, self.robot, self.whole_body.limits),
+            **away,
+            "launch_s": body.launch_s,
+            "flight_s": body.flight_s,
+            "platform_edge_m": platform_edge_m(self.task, self.robot, body.limits) if not away else body.edge_m,
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             "stages": [vars(row) for row in self.statistics],

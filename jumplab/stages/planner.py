@@ -24,6 +24,7 @@ from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
+from jumplab.stages.spatial import SpatialPlan, SpatialPlanner
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
@@ -100,10 +101,11 @@ class Planner:
         return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
     def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
+        """A stage's planner: "reach", "spatial", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
+            build["spatial"] = lambda flip: SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"])
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 
@@ -188,6 +190,8 @@ class Planner:
         require_type(task, JumpTask, "the target")
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
+        if not task.in_plane:
+            return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
@@ -222,6 +226,30 @@ class Planner:
         return JumpPlan(
             body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
         )
+
+    def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
+        """A jump out of the plane: the planar jump of the same distance and rise, then the spatial program."""
+        if start is not None:
+            raise InputError("a jump to the side or with a turn begins in the stance; leave its start away")
+        last, asked = self.stage("spatial"), sorted_out(weights=weights)
+        last.parameters(task)  # refuses what cannot be before anything is solved
+        if asked["spatial"]:
+            asked["spatial"].applied(last.nlp.problem)
+        rest = {
+            f"{stage}/{name}": w for stage, x in asked.items() if stage != "spatial" for name, w in x.weights.items()
+        }
+        first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest)
+        body = last.plan(task, first.tape, first.toe_phase_s, weights=asked["spatial"].weights)
+        rows = (*first.statistics, *body_rows("4 spatial" if method == "three-step" else "spatial", body))
+        return self._placed(method, body, rows, first)
+
+    def _placed(
+        self, method: str, body: SpatialPlan, rows: tuple[StageRow, ...], first: JumpPlan | None = None
+    ) -> JumpPlan:
+        """The plan of a spatial solution; ``first`` is the planar one that it began with."""
+        tape, robot = self.stage("spatial").tape(body), self.robot.under_gravity(body.task.gravity)
+        srmp, joints = (None, None) if first is None else (first.srmp, first.joints)
+        return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, first and first.skipped)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
@@ -306,6 +334,15 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
+        if not task.in_plane:
+            near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
+            if near is None or start is not None:
+                return self.plan(task, previous.method, start=start)
+            try:
+                body = self.stage("spatial").plan(task, near=near)
+            except SolverError:
+                return self.plan(task, previous.method)
+            return self._placed(previous.method, body, body_rows("spatial", body))
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
         srmp, last = None, "direct"

@@ -103,7 +103,9 @@ class SpatialPlanner:
         edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
         if near is not None:
             try:
-                found = self._warm.solve(asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how)
+                found = self._warm.solve(
+                    asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how
+                )
                 return SpatialPlan(task, found, edge, limits=self.limits)
             except SolverError:
                 if start is None:
@@ -114,7 +116,9 @@ class SpatialPlanner:
         except SolverError:  # the fine mesh has the last word, and the better explanation
             return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, limits=self.limits)
 
-    def _refine(self, task: JumpTask, asked: Mapping, guess: Mapping[str, PhaseGuess], edge: float, how: Mapping) -> SpatialPlan:
+    def _refine(
+        self, task: JumpTask, asked: Mapping, guess: Mapping[str, PhaseGuess], edge: float, how: Mapping
+    ) -> SpatialPlan:
         """The solution by way of the coarse mesh."""
         coarse = self.mesh.coarse().intervals()
         first = self._coarse.solve(asked, {k: guess[k].resampled(n) for k, n in coarse.items()}, explain=False, **how)

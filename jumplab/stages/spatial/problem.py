@@ -33,7 +33,14 @@ def _boxes(b: SpatialTerms) -> tuple[Bound, ...]:
     return (
         Bound("joint range", "ours: stops", "rad", "q", np.concatenate([-wide, low]), np.concatenate([wide, high])),
         Bound("joint speed", "ours: limit", "rad/s", "v", -rates, rates),
-        Bound("forces and torques", "ours: limit", "N, N m", "z", np.concatenate([least, -torques]), np.concatenate([free, torques])),
+        Bound(
+            "forces and torques",
+            "ours: limit",
+            "N, N m",
+            "z",
+            np.concatenate([least, -torques]),
+            np.concatenate([free, torques]),
+        ),
     )
 
 
@@ -55,20 +62,43 @@ def _flat_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
         Bound("at rest (acceleration)", "ours", "rad/s^2", "a", -rest, rest, "start"),
     )
     terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
-    return Phase(b.contact.value, b.coordinates, mesh.flat, b.limits.flat_s, terms, (*_boxes(b), *start), b.states, scales=_scales(b))
+    return Phase(
+        b.contact.value,
+        b.coordinates,
+        mesh.flat,
+        b.limits.flat_s,
+        terms,
+        (*_boxes(b), *start),
+        b.states,
+        scales=_scales(b),
+    )
 
 
 def _toe_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
     gone = np.concatenate([np.zeros(b.n_forces), np.full(b.model.joints, np.inf)])
     off = Bound("no force at take-off", "SL-E3, E4, E6 for the whole body", "N", "z", -gone, gone, "end")
     terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
-    return Phase(b.contact.value, b.coordinates, mesh.toe, b.limits.toe_s, terms, (*_boxes(b), off), b.states, scales=_scales(b))
+    return Phase(
+        b.contact.value, b.coordinates, mesh.toe, b.limits.toe_s, terms, (*_boxes(b), off), b.states, scales=_scales(b)
+    )
 
 
 def _flight_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
-    constants = {f"{kind}_{x}": box for kind, box in (("com", COM_BOX_M), ("vel", SPEED_BOX_M_S), ("L", SPIN_BOX)) for x in "xyz"}
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.flight_rows(), b.body_clearance(), *b.link_distances(), *b.touchdown_rows())
-    return Phase(b.contact.value, b.coordinates, mesh.flight, FLIGHT_S, terms, _boxes(b), b.states, constants, scales=_scales(b))
+    constants = {
+        f"{kind}_{x}": box for kind, box in (("com", COM_BOX_M), ("vel", SPEED_BOX_M_S), ("L", SPIN_BOX)) for x in "xyz"
+    }
+    terms = (
+        *b.smoothness(),
+        *b.dynamics(),
+        b.motor_lines(),
+        *b.flight_rows(),
+        b.body_clearance(),
+        *b.link_distances(),
+        *b.touchdown_rows(),
+    )
+    return Phase(
+        b.contact.value, b.coordinates, mesh.flight, FLIGHT_S, terms, _boxes(b), b.states, constants, scales=_scales(b)
+    )
 
 
 def _joined() -> Term:
@@ -97,7 +127,10 @@ def _released(toe: SpatialTerms) -> tuple[Term, Term]:
 
 
 def build_problem(
-    robot: Robot, mesh: Mesh = SPATIAL_MESH, limits: SpatialLimits = SpatialLimits(), weights: SpatialWeights = SpatialWeights()
+    robot: Robot,
+    mesh: Mesh = SPATIAL_MESH,
+    limits: SpatialLimits = SpatialLimits(),
+    weights: SpatialWeights = SpatialWeights(),
 ) -> Problem:
     """Flat foot, toes and flight in one problem."""
     flat, toe, flight = (SpatialTerms(robot, limits, weights, contact) for contact in Contact)

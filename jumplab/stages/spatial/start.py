@@ -27,7 +27,9 @@ def from_tape(terms: dict[str, SpatialTerms], tape: Tape, toe_phase_s: float, me
             com, speed = _takeoff(b, tape, row)
             q[:, 3], v[:, 3] = task.yaw_rad * s, task.yaw_rad / flight_s
             speed[1] = task.side_m / flight_s
-            constants = {f"{k}_{x}": y for k, col in (("com", com), ("vel", speed)) for x, y in zip("xyz", col, strict=True)}
+            constants = {
+                f"{k}_{x}": y for k, col in (("com", com), ("vel", speed)) for x, y in zip("xyz", col, strict=True)
+            }
             z = np.hstack([np.zeros((len(t), 3)), tau])
             out[name] = PhaseGuess(flight_s, q[:, 3:], v[:, 3:], a[:, 3:], z, constants)
         else:

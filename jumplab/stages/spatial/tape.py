@@ -43,10 +43,30 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
     f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
     phase = np.repeat(["launch", "flight"], [len(t), len(late)])
-    extra = {"com": com[:, :3], "com_velocity": com[:, 3:], "angular_momentum": spin, "toe_phase_start": flat.duration - t[0]}
+    extra = {
+        "com": com[:, :3],
+        "com_velocity": com[:, 3:],
+        "angular_momentum": spin,
+        "toe_phase_start": flat.duration - t[0],
+    }
+    extra |= _travel(b.robot, q)
     times = np.concatenate([t - t[0], launch_s - t[0] + late])
     names = np.array(robot.foot.frames), np.array(robot.joint_names)
     return Tape(times, q, v, a, tau, phase, names[0], f, names[1], extra)
+
+
+def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
+    """How far the middle between the soles moves (3,) [m], and by how much the feet turn about the vertical [rad]."""
+    model, data = robot.model, robot.model.createData()
+    ends, turn = [], []
+    for x in q:
+        pin.framesForwardKinematics(model, data, x)
+        frames = [data.oMf[model.getFrameId(name)] for name in robot.foot.frames]
+        ends.append(np.mean([f.act(robot.foot.center) for f in frames], axis=0))
+        left = np.mean([f.rotation[:, 1] for f in frames], axis=0)  # it stays level in a flip, too
+        turn.append(np.arctan2(-left[0], left[1]))
+    turned = np.unwrap(turn)
+    return {"soles_travel": ends[-1] - ends[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
 class Legs:
@@ -205,7 +225,9 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
     tree.gravity.linear = np.array([0.0, 0.0, -gravity])
     data, (qj, vj, aj) = tree.createData(), joints
     place, zero = np.zeros((n, 3)), np.zeros((n, 3))
-    q, v, a = model.to_pinocchio(*(np.concatenate(x, 1) for x in ((place, chart, qj), (zero, rates, vj), (zero, zero, aj))))
+    q, v, a = model.to_pinocchio(
+        *(np.concatenate(x, 1) for x in ((place, chart, qj), (zero, rates, vj), (zero, zero, aj)))
+    )
     fall = np.array([0.0, 0.0, -gravity])
     for k in range(n):
         pin.centerOfMass(tree, data, q[k], v[k])
@@ -236,7 +258,9 @@ def _forces(robot, q, v, a, wrench, standing: int):
             pin.updateFramePlacements(model, data)
             base = data.oMi[1]
             force = base.rotation @ need[:3]
-            missing = np.concatenate([force, base.rotation @ need[3:6] + np.cross(base.translation, force)]) - wrench[k].sum(0)
+            missing = np.concatenate([force, base.rotation @ need[3:6] + np.cross(base.translation, force)]) - wrench[
+                k
+            ].sum(0)
             columns, shares = [], []
             for i, frame in enumerate(frames):
                 place = _pressure(wrench[k, i], data.oMf[frame].act(robot.foot.center))

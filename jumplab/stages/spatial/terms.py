@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import casadi as ca
 import numpy as np
 
@@ -11,8 +9,8 @@ from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.stages.spatial.shapes import pairs
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.shapes import pairs
 from jumplab.stages.whole_body.settings import Contact
 from jumplab.stages.whole_body.terms import POSITIVE, cost, row
 from jumplab.task import GRAVITY
@@ -40,7 +38,9 @@ class SpatialTerms:
         self.mg, foot = self.model.mass * GRAVITY, robot.foot
         frames = [self.model.model.frames[self.model.model.getFrameId(name)] for name in foot.frames]
         self.feet = [f.parentJoint - 1 for f in frames]
-        self._foot_axes = [self.model.bodies[k].own.T @ f.placement.rotation for k, f in zip(self.feet, frames, strict=True)]
+        self._foot_axes = [
+            self.model.bodies[k].own.T @ f.placement.rotation for k, f in zip(self.feet, frames, strict=True)
+        ]
 
         def on_foot(x):
             return [self.model.local(f.parentJoint, f.placement.act(np.array(x))) for f in frames]
@@ -177,7 +177,13 @@ class SpatialTerms:
         slope = m["effort"] / (m["speed"] - m["corner_speed"]) * self.limits.torque_share
         top = slope * m["speed"]
         return row(
-            "torque-speed", "ours: motor line", "N m", lambda p: self.torques(p) + slope * p.v[first:], -top, top, scale=100.0
+            "torque-speed",
+            "ours: motor line",
+            "N m",
+            lambda p: self.torques(p) + slope * p.v[first:],
+            -top,
+            top,
+            scale=100.0,
         )
 
     # launch -----------------------------------------------------------------------------------------------------
@@ -195,7 +201,9 @@ class SpatialTerms:
     def pitches(self, q: ca.SX) -> ca.SX:
         """Sines of the feet's pitch (2,); positive is heel up."""
         s = SpatialState(self.model, q, q, q)
-        return ca.vertcat(*(-(s.rotation(k) @ ca.DM(own))[2, 0] for k, own in zip(self.feet, self._foot_axes, strict=True)))
+        return ca.vertcat(
+            *(-(s.rotation(k) @ ca.DM(own))[2, 0] for k, own in zip(self.feet, self._foot_axes, strict=True))
+        )
 
     def launch_rows(self) -> list[Term]:
         """Feet in their places; loads of the feet; take-off."""
@@ -217,8 +225,22 @@ class SpatialTerms:
         def accelerations(p):
             return rates(self.contact_rows, p.q, p.v, p.a)[1]
 
-        heel = row("heels not below ground", "WL-K2", "1", lambda p: self.pitches(p.q), 0.0, np.sin(lim.heel_up_rad), skip=(1, 0))
-        speed = row("vertical take-off speed", "SL-E2, WL-E1", "m/s", lambda p: self.state(p).com_velocity[2] - p.p.takeoff_speed, at="end")
+        heel = row(
+            "heels not below ground",
+            "WL-K2",
+            "1",
+            lambda p: self.pitches(p.q),
+            0.0,
+            np.sin(lim.heel_up_rad),
+            skip=(1, 0),
+        )
+        speed = row(
+            "vertical take-off speed",
+            "SL-E2, WL-E1",
+            "m/s",
+            lambda p: self.state(p).com_velocity[2] - p.p.takeoff_speed,
+            at="end",
+        )
         still = row("toes still at take-off", "ours", "m/s^2, 1/s^2", accelerations, scale=10.0, at="end")
         return [*rows, heel, speed, still]
 
@@ -315,10 +337,35 @@ class SpatialTerms:
         knees = [3 + self.joint_names.index(name) for name in self.robot.joints["knee"]]
         return [
             row("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", feet, scale=0.1, at="end"),
-            row("foot rates at touchdown", "ours", "rad/s", foot_rates, -lim.touchdown_foot_rate, lim.touchdown_foot_rate, at="end"),
+            row(
+                "foot rates at touchdown",
+                "ours",
+                "rad/s",
+                foot_rates,
+                -lim.touchdown_foot_rate,
+                lim.touchdown_foot_rate,
+                at="end",
+            ),
             row("attitude at touchdown", "ours", "rad", attitude, low, high, at="end"),
             row("knees at touchdown", "ours: stroke", "rad", lambda p: p.q[knees], *lim.touchdown_knee, at="end"),
             row("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate, at="end"),
-            row("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], -lim.touchdown_trunk_rate, lim.touchdown_trunk_rate, at="end"),
-            row("capture window", "ours; replaces WF-E2", "m", capture, -lim.capture_window_m, lim.capture_window_m, at="end", scale=0.1),
+            row(
+                "trunk rates at touchdown",
+                "ours",
+                "rad/s",
+                lambda p: p.v[:3],
+                -lim.touchdown_trunk_rate,
+                lim.touchdown_trunk_rate,
+                at="end",
+            ),
+            row(
+                "capture window",
+                "ours; replaces WF-E2",
+                "m",
+                capture,
+                -lim.capture_window_m,
+                lim.capture_window_m,
+                at="end",
+                scale=0.1,
+            ),
         ]
