@@ -142,7 +142,7 @@ def target(r: Replay) -> list[Check]:
 
 
 def foot_turn(r: Replay) -> np.ndarray:
-    """(K,) rotation of each foot about +y in its heading from the first to the last sample [rad], whole turns counted."""
+    """(K,) turn of each foot about +y in its heading, from the first to the last sample, whole turns counted [rad]."""
     down = r.foot_rotation[..., 2, :]  # (N, K, 3) the vertical in the feet's axes
     return np.diff(np.unwrap(np.arctan2(-down[..., 0], down[..., 2]), axis=0)[[0, -1]], axis=0)[0]
 

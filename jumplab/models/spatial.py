@@ -60,7 +60,8 @@ class SpatialModel:
     Attributes
     ----------
     bodies : the base first, then one per joint.  names : of the coordinates, (6 + joints,).
-    mass : [kg].  joints : number of joints.  armature : (joints,) of the motors, at the joints [kg m^2].
+    mass : [kg].  carried : (bodies,) mass that each joint carries [kg].
+    joints : number of joints.  armature : (joints,) of the motors, at the joints [kg m^2].
     """
 
     def __init__(self, model: pin.Model):
@@ -77,13 +78,17 @@ class SpatialModel:
                     raise RobotError(f"robot {model.name}: joint {model.names[j]!r} is no joint that turns in a range")
                 axis, own = _frame_along(way[3:])
             frames[j] = own
-            above, placement, inertia = frames.get(j - 1 if j == 1 else model.parents[j], np.eye(3)), *_of(model, j)
+            above, placement = frames.get(model.parents[j], np.eye(3)), model.jointPlacements[j]
+            inertia = model.inertias[j]
             c = own.T @ inertia.lever
             about = own.T @ inertia.inertia @ own + inertia.mass * (c @ c * np.eye(3) - np.outer(c, c))
             turn, place = _clean(above.T @ placement.rotation @ own), _clean(above.T @ placement.translation)
             numbers = inertia.mass, _clean(inertia.mass * c), _clean(about)
             self.bodies.append(Body(model.names[j], parent, axis, turn, place, own, *numbers))
         self.mass = float(sum(b.mass for b in self.bodies))
+        self.carried = [b.mass for b in self.bodies]
+        for k in range(len(self.bodies) - 1, 0, -1):
+            self.carried[self.bodies[k].parent] += self.carried[k]
         self.joints, self.armature = len(self.bodies) - 1, np.array(model.armature[6:])
         self.names = (*CHART, *(b.name for b in self.bodies[1:]))
 
@@ -99,9 +104,9 @@ class SpatialModel:
         return np.stack(rows, -1).reshape(-1, 3, 3)
 
     def to_pinocchio(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Configurations (n, nq), twists (n, nv) and their time derivatives from charts, rates, accelerations (n, nv)."""
+        """Configurations (n, nq), twists and their time derivatives from charts, rates, accelerations, all (n, nv)."""
         turn, n = self.rotations(q), len(q)
-        slope, drift = _spin_slope(q[:, 4], q[:, 5]), _spin_drift(q[:, 4], q[:, 5], v[:, 3:6])
+        slope, drift = spin_slope(q[:, 4], q[:, 5]), _spin_drift(q[:, 4], q[:, 5], v[:, 3:6])
         spin = np.einsum("nij,nj->ni", slope, v[:, 3:6])
         out_q, out_v, out_a = np.empty((n, self.model.nq)), v.copy(), a.copy()
         out_q[:, :3], out_q[:, 7:] = q[:, :3], q[:, 6:]
@@ -122,7 +127,10 @@ class SpatialModel:
         return out_q, out_v, out_a
 
     def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Charts (n, 6 + joints) of configurations (n, nq), angles continuous; the first within half a turn of ``near`` (3,)."""
+        """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
+
+        The first attitude is within half a turn of the angles ``near`` (3,), by default zero.
+        """
         x, y, z, w = q[:, 3:7].T
         roll = np.arcsin(np.clip(2 * (y * z + w * x), -1, 1))
         yaw = np.arctan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
@@ -133,11 +141,7 @@ class SpatialModel:
         return np.concatenate([q[:, :3], angles, q[:, 7:]], axis=1)
 
 
-def _of(model: pin.Model, j: int):
-    return model.jointPlacements[j], model.inertias[j]
-
-
-def _spin_slope(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+def spin_slope(roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
     """(n, 3, 3): angular velocity in base axes = slope @ rates of yaw, roll, pitch."""
     cr, sr, cp, sp, one = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.ones_like(roll)
     return np.stack([-cr * sp, cp, 0 * one, sr, 0 * one, one, cr * cp, sp, 0 * one], -1).reshape(-1, 3, 3)
@@ -280,19 +284,11 @@ class SpatialState:
         parts = [ca.SX(ca.DM(b.first)) for b in self.model.bodies]
         for k in range(len(parts) - 1, 0, -1):
             b = self.model.bodies[k]
-            parts[b.parent] += self._turns[k].out(parts[k]) + self._carried[k] * ca.DM(b.place)
+            parts[b.parent] += self._turns[k].out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
         first = parts[0]
         for turn in self._base[::-1]:
             first = turn.out(first)
         return first / self.model.mass
-
-    @property
-    def _carried(self) -> list[float]:
-        """Mass that each joint carries [kg]."""
-        bodies, carried = self.model.bodies, [b.mass for b in self.model.bodies]
-        for k in range(len(bodies) - 1, 0, -1):
-            carried[bodies[k].parent] += carried[k]
-        return carried
 
     @property
     def com(self) -> ca.SX:
@@ -313,6 +309,10 @@ class SpatialState:
     @cached_property
     def _frames(self) -> list:
         return [None] * len(self.model.bodies)
+
+    def spin(self, body: int) -> ca.SX:
+        """Angular velocity (3,) of a body [rad/s]."""
+        return self.rotation(body) @ self._spins[body]
 
     def rotation(self, body: int) -> ca.SX:
         """Attitude (3, 3) of a body."""

@@ -74,7 +74,7 @@ class Scene:
         return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)))
 
     def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
-        """The ground for somebody who looks along a heading: itself ahead, else the surface under the soles of ``q``."""
+        """The ground as seen along a heading: itself straight ahead, else the surface under the soles of ``q``."""
         if heading_rad == 0:
             return self
         x = float(Gauge(robot).soles(q)[0])

@@ -101,7 +101,7 @@ class Planner:
         return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
     def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "spatial", "srmp", "whole body" or "direct"; the last three also as "... flip"."""
+        """A stage's planner: "reach", "spatial", "srmp", "whole body", "direct"; the last three as "... flip" too."""
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}

@@ -1,16 +1,16 @@
-"""Solving the spatial program for a target: guess, coarse mesh, fine mesh, and the result."""
+"""Solving the spatial program for a target: cold from a planar plan, or from a neighbour's plan; and the result."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess, Solution, Statistics
+from jumplab.ocp.nlp import WARM, Nlp, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
@@ -21,10 +21,8 @@ from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
-FINE = {"tol": 1e-3, "compl_inf_tol": 1e-4}  # beyond, the cost moves by less than one in a million
-# the coarse solution is only a start, digits beyond these would be lost on the finer mesh
-COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
-REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2}  # what the coarse mesh leads to is a good start
+# beyond, the cost moves by less than one in a million; a solve that needs more time is lost
+IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_cpu_time": 60.0, "max_wall_time": 600.0}  # [s]
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class SpatialPlan:
     task: JumpTask
     solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
     edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
-    coarse: Statistics | None = None  # of the coarse mesh before it
+    coarse: Statistics | None = None  # there is no coarse mesh
     limits: SpatialLimits = SpatialLimits()  # that it was made with
     uneven: tuple[Statistics, ...] = ()
 
@@ -71,10 +69,8 @@ class SpatialPlanner:
         options = dict(options or {})
         problem = changes.applied(build_problem(robot, mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
-        self.nlp = Nlp(problem, {**FINE, **options}, key)
-        self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
-        self._warm = self.nlp.with_options({**FINE, **WARM, **options})
-        self._coarse = Nlp(problem.on_mesh(mesh.coarse().intervals()), {**COARSE, **options}, key, self.nlp)
+        self.nlp = Nlp(problem, {**IPOPT, **options}, key)
+        self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
 
     def plan(
         self,
@@ -111,20 +107,7 @@ class SpatialPlanner:
                 if start is None:
                     raise
         guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
-        try:
-            return self._refine(task, asked, guess, edge, how)
-        except SolverError:  # the fine mesh has the last word, and the better explanation
-            return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, limits=self.limits)
-
-    def _refine(
-        self, task: JumpTask, asked: Mapping, guess: Mapping[str, PhaseGuess], edge: float, how: Mapping
-    ) -> SpatialPlan:
-        """The solution by way of the coarse mesh."""
-        coarse = self.mesh.coarse().intervals()
-        first = self._coarse.solve(asked, {k: guess[k].resampled(n) for k, n in coarse.items()}, explain=False, **how)
-        start = first.guess(self.mesh.intervals())
-        found = self._refined.solve(asked, start, multipliers=first.multipliers, explain=False, **how)
-        return SpatialPlan(task, found, edge, first.statistics, self.limits)
+        return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, limits=self.limits)
 
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan."""
@@ -140,7 +123,8 @@ class SpatialPlanner:
     def _edge(self, task: JumpTask) -> float:
         """Where the ground steps up or down [m], from the world's origin."""
         c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
-        corners = np.concatenate([self.terms["flat"].places[:, None] + self._sole() for _ in (0,)]).reshape(-1, 3)
+        soles = self.robot.foot.corners - self.robot.foot.center
+        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)
         landed = task.distance_m + corners[:, 0] * c - corners[:, 1] * s
         room, first = self.limits.edge_before_heel_m, float(corners[:, 0].max())
         up, down = float(landed.min()) - room, first + room
@@ -152,11 +136,3 @@ class SpatialPlanner:
                 f"under a sole of {self.robot.name}; ask for a distance of {task.distance_m - apart:.2f} m or more"
             )
         return edge
-
-    def _sole(self) -> np.ndarray:
-        return self.robot.foot.corners - self.robot.foot.center
-
-
-def at_rest_in_plane(task: JumpTask) -> JumpTask:
-    """The same rise and distance without side and yaw, whose planar plan the spatial program starts from."""
-    return replace(task, side_m=0.0, yaw_rad=0.0)

@@ -87,8 +87,8 @@ def pairs(robot: Robot, model: SpatialModel, bodies: set[int], stance: np.ndarra
 
 
 def _postures(model: SpatialModel, geometry: pin.GeometryModel, stance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of the stance and postures all over the joints' ranges: distances of the pairs (n, k), attitudes (n, bodies, 3, 3)
-    and places (n, bodies, 3) of the bodies."""
+    """Of the stance and of postures all over the joints' ranges: distances of the pairs (n, k), attitudes of the bodies
+    (n, bodies, 3, 3) and their places (n, bodies, 3)."""
     tree = model.model
     data, shapes, q = tree.createData(), geometry.createData(), np.array(stance)
     low, high = tree.lowerPositionLimit[7:], tree.upperPositionLimit[7:]

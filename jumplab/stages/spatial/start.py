@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 from scipy.optimize import nnls
 
 from jumplab.io.tape import Tape
@@ -61,8 +62,6 @@ def _charts(b: SpatialTerms, q, v, a):
 
 
 def _takeoff(b: SpatialTerms, tape: Tape, row: int) -> tuple[np.ndarray, np.ndarray]:
-    import pinocchio as pin
-
     model, data = b.model.model, b.model.model.createData()
     pin.centerOfMass(model, data, tape.q[row], tape.v[row])
     return data.com[0].copy(), data.vcom[0].copy()
@@ -80,8 +79,6 @@ def generators(b: SpatialTerms, side: int) -> np.ndarray:
 
 def spread(b: SpatialTerms, q: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Forces along the cones' edges (n, 2 * 4 k) that come nearest to wrenches (n, 2, 6) at the feet's frames."""
-    import pinocchio as pin
-
     model, data = b.model.model, b.model.model.createData()
     frames = [model.getFrameId(name) for name in b.robot.foot.frames]
     edges, weight, out = [generators(b, side) for side in (0, 1)], np.repeat([1.0, 1 / MOMENT_ARM_M], 3), []

@@ -15,7 +15,7 @@ import pinocchio as pin
 from scipy.integrate import cumulative_trapezoid
 
 from jumplab.io.tape import RATE_HZ, Tape
-from jumplab.models.spatial import CHART, SpatialModel
+from jumplab.models.spatial import CHART, SpatialModel, spin_slope
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.start import generators
@@ -134,7 +134,7 @@ def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: floa
     up = np.flatnonzero(~flat)
 
     def moment(q, v, a):
-        need = np.array([x for x in _needed(legs.b.model, q[up], v[up], a[up], gravity)])
+        need = np.array(list(_needed(legs.b.model, q[up], v[up], a[up], gravity)))
         return need[:, 4] + x * need[:, 2]
 
     for _ in range(BALANCING):
@@ -166,7 +166,7 @@ def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gr
 def _flight(model: SpatialModel, flight: PhaseSolution, chart0, stood, t: np.ndarray, gravity: float):
     """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands.
 
-    It begins where the launch ends, as charts and as Pinocchio has it; within :data:`JOINING_S` the joints are as planned.
+    It begins where the launch ends, as charts and as Pinocchio has it; the joints are as planned a little later.
     """
     data = model.model.createData()
     pin.computeCentroidalMomentum(model.model, data, *stood[:2])
@@ -184,7 +184,7 @@ def _flight(model: SpatialModel, flight: PhaseSolution, chart0, stood, t: np.nda
 
     def rate(x, k):
         turn = model.rotations(np.concatenate([np.zeros(3), x])[None])[0]
-        return np.linalg.solve(slope_of(x), np.linalg.solve(own[k], turn.T @ spin - carried[k]))
+        return np.linalg.solve(spin_slope(x[1:2], x[2:3])[0], np.linalg.solve(own[k], turn.T @ spin - carried[k]))
 
     n, chart = len(t), np.empty((len(t), 3))
     chart[0] = chart0[0][3:6]
@@ -210,13 +210,6 @@ def _fading(off, t: np.ndarray) -> list[np.ndarray]:
         out.append(np.stack([s**k for k in range(len(powers))], -1) @ powers / JOINING_S**order)
         powers = powers[1:] * np.arange(1, len(powers))[:, None]
     return out
-
-
-def slope_of(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): angular velocity in base axes = slope @ rates of yaw, roll, pitch (3,)."""
-    from jumplab.models.spatial import _spin_slope
-
-    return _spin_slope(angles[1:2], angles[2:3])[0]
 
 
 def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
@@ -254,7 +247,7 @@ def _forces(robot, q, v, a, wrench, standing: int):
     for k in range(n):
         need = pin.rnea(model, data, q[k], v[k], a[k])
         if k < standing:
-            jacobians = pin.computeJointJacobians(model, data, q[k])
+            pin.computeJointJacobians(model, data, q[k])
             pin.updateFramePlacements(model, data)
             base = data.oMi[1]
             force = base.rotation @ need[:3]
@@ -274,7 +267,7 @@ def _forces(robot, q, v, a, wrench, standing: int):
                 f[k, i] = total
                 f[k, i, 3:] -= np.cross(data.oMf[frame].translation, total[:3])
                 joint = model.frames[frame].parentJoint
-                need -= _joint_jacobian(model, data, joint, jacobians).T @ total
+                need -= pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD).T @ total
         tau[k] = need[6:]
         pin.computeCentroidalMomentum(model, data, q[k], v[k])
         pin.centerOfMass(model, data, q[k], v[k])
@@ -287,8 +280,3 @@ def _pressure(wrench: np.ndarray, sole: np.ndarray) -> np.ndarray:
     if wrench[2] <= 0:
         return sole
     return np.array([-wrench[4] / wrench[2], wrench[3] / wrench[2], 0.0])
-
-
-def _joint_jacobian(model, data, joint, jacobians) -> np.ndarray:
-    """Jacobian (6, nv) of a joint's body, spatial velocity about the world's origin."""
-    return pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 
 from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
 from jumplab.ocp.problem import Point, Term
@@ -78,8 +79,6 @@ class SpatialTerms:
     def _first_places(self, frames) -> np.ndarray:
         """Middles of both soles (2, 3) as the robot stands [m]."""
         model, data = self.model.model, self.model.model.createData()
-        import pinocchio as pin
-
         pin.framesForwardKinematics(model, data, stance_configuration(self.robot))
         ids = [model.getFrameId(name) for name in self.robot.foot.frames]
         return np.array([data.oMf[i].act(self.robot.foot.center) for i in ids])
@@ -147,8 +146,8 @@ class SpatialTerms:
 
     # all phases -------------------------------------------------------------------------------------------------
     def smoothness(self) -> list[Term]:
-        """Costs on accelerations, jerk and torques; on what is not mirrored, where the weight is not zero."""
-        w, first, joints = self.weights, len(self.coordinates) - self.model.joints - 3, len(CHART)
+        """Costs on accelerations, jerk, torques and forces."""
+        w, first = self.weights, len(self.coordinates) - self.model.joints - 3
         terms = [
             cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: p.a[first:], w.acceleration),
             cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: p.j, w.jerk, "mid"),
@@ -301,71 +300,51 @@ class SpatialTerms:
             points.append((body, self.model.bodies[body].own.T @ np.array([hand[0], 0.0, hand[1]])))
         return points
 
+    def turned(self, p: Point, x: ca.SX | np.ndarray) -> ca.SX:
+        """A vector (3,) turned by the asked yaw."""
+        c, s = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
+        return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
+
+    def feet_at_goal(self, p: Point) -> ca.SX:
+        """What is left between both feet and their new places: place (3,), pitch, roll, heading of each."""
+        rows = []
+        for side, body in enumerate(self.feet):
+            goal = self.turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
+            axes, ahead = self.foot_axes(p, side), self.turned(p, np.array([1.0, 0.0, 0.0]))
+            rows += [self.at(p, body, self.soles[side]) - goal, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
+        return ca.vertcat(*rows)
+
+    def capture(self, p: Point) -> ca.SX:
+        """How far the middle between the soles is off the place (2,) where it catches the robot [m]."""
+        lim = self.limits
+        middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
+        ahead = self.turned(p, np.array([lim.capture_offset_m, 0.0, 0.0]))
+        speed = ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
+        return (middle - self.com(p) - ahead - lim.capture_slope_s * speed)[:2]
+
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: both feet in their new places, flat; posture, rates, and where the soles are against the CoM."""
-        lim, rate = self.limits, self.limits.touchdown_joint_rate
+        lim, rate, foot = self.limits, self.limits.touchdown_joint_rate, self.limits.touchdown_foot_rate
+        trunk, window = lim.touchdown_trunk_rate, lim.capture_window_m
 
-        def turned(p, x):
-            c, s = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
-            return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
-
-        def feet(p):
-            rows = []
-            for side, body in enumerate(self.feet):
-                goal = turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
-                axes, across = self.foot_axes(p, side), turned(p, [0.0, 1.0, 0.0])
-                ahead = ca.vertcat(across[1], -across[0], 0)
-                flat = axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])
-                rows += [self.at(p, body, self.soles[side]) - goal, *flat]
-            return ca.vertcat(*rows)
-
-        def foot_rates(p):
-            s = self.state(p)
-            return ca.vertcat(*(s.rotation(body) @ s._spins[body] for body in self.feet))
+        def spins(p):
+            return ca.vertcat(*(self.state(p).spin(body) for body in self.feet))
 
         def attitude(p):
             return p.q[:3] - ca.vertcat(p.p.yaw, 0, p.p.rotation)
 
-        def capture(p):
-            middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
-            ahead = turned(p, [lim.capture_offset_m, 0.0, 0.0])
-            off = middle - self.com(p) - ahead - lim.capture_slope_s * ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
-            return off[:2]
+        def end(name, equation, unit, of, lower=0.0, upper=0.0, **how):
+            return row(name, equation, unit, of, lower, upper, at="end", **how)
 
         low = -lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]
         high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
         knees = [3 + self.joint_names.index(name) for name in self.robot.joints["knee"]]
         return [
-            row("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", feet, scale=0.1, at="end"),
-            row(
-                "foot rates at touchdown",
-                "ours",
-                "rad/s",
-                foot_rates,
-                -lim.touchdown_foot_rate,
-                lim.touchdown_foot_rate,
-                at="end",
-            ),
-            row("attitude at touchdown", "ours", "rad", attitude, low, high, at="end"),
-            row("knees at touchdown", "ours: stroke", "rad", lambda p: p.q[knees], *lim.touchdown_knee, at="end"),
-            row("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate, at="end"),
-            row(
-                "trunk rates at touchdown",
-                "ours",
-                "rad/s",
-                lambda p: p.v[:3],
-                -lim.touchdown_trunk_rate,
-                lim.touchdown_trunk_rate,
-                at="end",
-            ),
-            row(
-                "capture window",
-                "ours; replaces WF-E2",
-                "m",
-                capture,
-                -lim.capture_window_m,
-                lim.capture_window_m,
-                at="end",
-                scale=0.1,
-            ),
+            end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal, scale=0.1),
+            end("foot rates at touchdown", "ours", "rad/s", spins, -foot, foot),
+            end("attitude at touchdown", "ours", "rad", attitude, low, high),
+            end("knees at touchdown", "ours: stroke", "rad", lambda p: p.q[knees], *lim.touchdown_knee),
+            end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
+            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], -trunk, trunk),
+            end("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, scale=0.1),
         ]
