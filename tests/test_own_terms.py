@@ -28,7 +28,7 @@ from jumplab.stages.whole_body import Limits, Mesh, build_problem
 SMALL = Mesh(6, 4, 6)
 STAGES = (
     "srmp/flat, srmp/toe, srmp/launch, srmp/flight, joint qp/launch, joint qp/flight, whole body/flat, whole body/toe, "
-    "whole body/launch, whole body/flight"
+    "whole body/launch, whole body/flight, spatial/flat, spatial/toe, spatial/launch, spatial/flight"
 )
 
 

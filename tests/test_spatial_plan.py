@@ -2,8 +2,10 @@
 
 import json
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -13,12 +15,14 @@ from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.ocp.problem import Point
 from jumplab.sim.kinematics import Gauge, headed, pitch_of, planned_pitch, rotation
 from jumplab.sim.scene import Scene
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
 from jumplab.stages.spatial.start import spread
 from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.spatial.view import SpatialView
 from jumplab.stages.whole_body.settings import Contact
 from jumplab.task import JumpTask
 
@@ -100,8 +104,35 @@ def test_neighbour_is_planned_from_the_plan():
 
 
 def test_own_weights_and_terms_reach_it(bhr):
-    plan = planner().plan(SIDE, "direct", weights={"spatial/flight/torque": 0.01})
+    def still(p):
+        return ca.vertcat(p.joint_rates.left_shoulder_pitch, p.joint_rates.right_shoulder_pitch)
+
+    arms = jl.Term("still arms", "ours", "rad/s", "node", still, weight=1.0)
+    mine = Planner(bhr, terms={"spatial/launch": [arms], "spatial/flight": [arms]})
+    plan = mine.plan(SIDE, "direct", weights={"spatial/flight/torque": 0.01})
     assert plan.weights["whole body"]["flight/torque"] == 0.01
+    assert plan.weights["whole body"]["flight/still arms"] == 1.0
+    rows = [6 + bhr.joint_names.index(f"{side}_shoulder_pitch") for side in ("left", "right")]
+    swings = [np.abs(p.tape.v[:, rows]).max() for p in (jump(SIDE), plan)]
+    assert swings[1] < swings[0] / 2
+
+
+def test_points_know_the_robot_by_name(bhr):
+    b = SpatialTerms(bhr, SpatialLimits(), SpatialWeights(), Contact.FLIGHT)
+    names = {"q": b.coordinates, "v": b.coordinates, "a": b.coordinates, "z": b.states}
+    known = {key: ca.SX.sym(key, len(x)) for key, x in names.items()}
+    constants = SimpleNamespace(**{f"{k}_{x}": ca.SX.sym(k + x) for k in ("com", "vel", "L") for x in "xyz"})
+    time, more = ca.SX.sym("t"), SimpleNamespace(gravity=9.8)
+    p = Point(**known, j=None, duration=time, s=1.0, c=constants, p=more, ref=None, view=partial(SpatialView, b))
+    assert ca.is_equal(p.joints.left_knee, known["q"][3 + b.joint_names.index("left_knee")])
+    assert p.com.shape == p.com_velocity.shape == p.L.shape == p.attitude.shape == p.origin("left_knee").shape == (3, 1)
+    assert len(vars(p.torques)) == b.model.joints and all(x.is_zero() for x in p.feet_forces)
+    with pytest.raises(InputError) as e:
+        p.origin("elbow")
+    assert str(e.value).startswith("the robot has no joint 'elbow'; it has left_hip_yaw, left_hip_roll")
+
+
+def test_names_that_do_not_exist_are_refused():
     with pytest.raises(InputError, match="the problem 'spatial' has no such term"):
         planner().plan(SIDE, "direct", weights={"spatial/flight/torq": 0.01})
 
@@ -137,8 +168,8 @@ def test_command_line_plans_and_simulates_a_turn(tmp_path, capsys):
     assert main(["simulate", out]) == 0
     told = json.loads((tmp_path / "turn" / "simulation.json").read_text())
     assert told["side_m"] == pytest.approx(-0.1, abs=0.02) and told["yaw_rad"] == pytest.approx(np.pi / 3, abs=0.06)
-    tape, robot, summary = jl.load(out).tape, jl.load(out).robot, jl.load(out).summary
-    assert summary["target"]["yaw_rad"] == pytest.approx(np.pi / 3) and tape.t[-1] > 1 and robot.name == "bhr"
+    target = json.loads((tmp_path / "turn" / "summary.json").read_text())["target"]
+    assert JumpTask(**target) == TURN
 
 
 # what it is made of -----------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from jumplab.models.spatial import SpatialModel
 from jumplab.ocp import Bound, Problem
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
-from jumplab.robot.stance import stance_angles
-from jumplab.stages import srmp, whole_body
+from jumplab.robot.stance import stance_angles, stance_configuration
+from jumplab.stages import spatial, srmp, whole_body
 from jumplab.stages.joint_qp.settings import GENTLE, Options
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Limits, Weights
@@ -62,6 +63,8 @@ def table() -> str:
     flips = [*lines(srmp.build_problem(robot, SrmpSettings().of_flip()), rod)]
     flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
     found += [f"of a flip: {line}" for line in flips if line not in found]
+    stance = SpatialModel(robot.model).of_pinocchio(stance_configuration(robot)[None])[0]
+    found += lines(spatial.build_problem(robot), {"stance": stance})
     for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
         for part, fields in asdict(options).items():
             rows = fields.items() if isinstance(fields, dict) else [("", fields)]
@@ -77,7 +80,12 @@ def test_every_term_is_as_the_table_says():
 
 def test_the_table_is_whole():
     stages = [line.partition("/")[0] for line in TABLE.read_text().splitlines()]
-    assert stages.count("SRMP") > 60 and stages.count("whole body") > 60 and stages.count("joint qp") > 30
+    assert (
+        stages.count("SRMP") > 60
+        and stages.count("whole body") > 60
+        and stages.count("joint qp") > 30
+        and stages.count("spatial") > 60
+    )
 
 
 if __name__ == "__main__":

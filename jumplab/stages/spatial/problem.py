@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import casadi as ca
 import numpy as np
 
@@ -10,6 +13,7 @@ from jumplab.ocp.problem import Bound, Phase, Problem, Term
 from jumplab.robot import Robot
 from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.spatial.view import SpatialView
 from jumplab.stages.whole_body.problem import COM_BOX_M, FLIGHT_S, SCALES, SPEED_BOX_M_S
 from jumplab.stages.whole_body.settings import Contact, Mesh
 
@@ -134,7 +138,8 @@ def build_problem(
 ) -> Problem:
     """Flat foot, toes and flight in one problem."""
     flat, toe, flight = (SpatialTerms(robot, limits, weights, contact) for contact in Contact)
-    phases = _flat_phase(flat, mesh), _toe_phase(toe, mesh), _flight_phase(flight, mesh)
+    made = (flat, _flat_phase(flat, mesh)), (toe, _toe_phase(toe, mesh)), (flight, _flight_phase(flight, mesh))
+    phases = tuple(replace(phase, view=partial(SpatialView, b)) for b, phase in made)
     parameters = dict(stance=len(flat.coordinates), distance=1, side=1, yaw=1, platform=1, edge=1)
     parameters |= dict(takeoff_speed=1, rotation=1, gravity=1)
     return Problem("spatial", phases, (_joined(), *_released(toe)), parameters)
