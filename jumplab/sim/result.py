@@ -65,7 +65,7 @@ class Metrics:
     foot_distance_m: float | None = None  # travel of the toes from the start to where they stand at the end
     foot_distance_touchdown_m: float | None = None  # the same, to the first touchdown
     side_m: float | None = None  # travel of the soles to the left, from the start to the end
-    yaw_rad: float | None = None  # turn of the feet about the vertical, within half a turn of what was planned
+    yaw_rad: float | None = None  # turn of the feet about the vertical, whole turns counted
     com_rise_m: float | None = None  # apex minus CoM at lift-off, the last contact force above a few newtons
     takeoff_velocity: tuple[float, float] | None = None  # of the CoM at lift-off [m/s]
     takeoff_momentum: float | None = None  # L_y at lift-off [kg m^2/s]
@@ -256,13 +256,14 @@ class Recorder:
         if touchdown is not None:
             turn = self._gauge.heading(self._planned_end)
             place = self._gauge.soles if turn else self._gauge.toe  # a turn moves the toes, and shall be no distance
-            (start, touch, end), yaw = (place(q[row]) for row in (0, touchdown, -1)), self._gauge.heading(q[-1]) - turn
+            start, touch, end = (place(q[row]) for row in (0, touchdown, -1))
+            yaw = self._gauge.heading(q[-1]) - self._gauge.heading(q[0])
             found |= dict(
                 touchdown_s=float(t[touchdown]),
                 foot_distance_m=float(end[0] - start[0]),
                 foot_distance_touchdown_m=float(touch[0] - start[0]),
                 side_m=float(end[1] - start[1]),
-                yaw_rad=turn + float(np.arctan2(np.sin(yaw), np.cos(yaw))),
+                yaw_rad=yaw + 2 * np.pi * round((_turned(q) - yaw) / (2 * np.pi)),
                 touchdown_trunk_pitch_rad=_counted(pitch_of(q[: touchdown + 1])),
                 touchdown_com_velocity=_xz(velocity[touchdown]),
                 sole_ahead_m=float(self._gauge.soles(q[touchdown])[0] - com[touchdown, 0]),
@@ -327,6 +328,13 @@ def _events(force: np.ndarray) -> tuple[int | None, int | None]:
 
 def _xz(vector: np.ndarray) -> tuple[float, float]:
     return float(vector[0]), float(vector[2])
+
+
+def _turned(q: np.ndarray) -> float:
+    """How far the trunk turns about the vertical in configurations ``q`` (N, nq), whole turns counted [rad]."""
+    x, y, z, w = q[:, 3:7].T
+    yaw = np.unwrap(np.arctan2(2 * (w * z - x * y), 1 - 2 * (x * x + z * z)))
+    return float(yaw[-1] - yaw[0])
 
 
 def _counted(pitch: np.ndarray) -> float:
