@@ -18,6 +18,7 @@ END_OF_PHASE = 1e-9  # share of a phase, far below one interval
 MATRICES = ("jacobian", "hessian", "gauss_newton")  # of the symmetric ones the upper triangle
 FUNCTIONS = ("costs", "gradient", "rows", *MATRICES)  # that an element may be asked for
 SAID = 300  # characters of another error that a sentence quotes
+LARGE = 1500  # operations; in the derivatives of more the search takes seconds, and saves a few per cent of a solve
 RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
@@ -61,7 +62,8 @@ class Formulas:
             rows, cols = expression.sparsity().get_triplet()
             expression = ca.vertcat(ca.SX(0, 1), *expression.nonzeros())
         arguments = [self.local, self.data, self.parameters, *more]
-        function = ca.Function(name, arguments, [expression], {"cse": name not in RARE})
+        shared = name not in RARE and (name not in MATRICES or ca.n_nodes(ca.vertcat(self.g, self.parts)) < LARGE)
+        function = ca.Function(name, arguments, [expression], {"cse": shared})
         return function, np.array(rows, int), np.array(cols, int)
 
     def _squares(self, scale) -> tuple:
