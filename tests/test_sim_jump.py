@@ -26,7 +26,6 @@ from jumplab.sim import (
     simulate_landing,
 )
 from jumplab.sim import simulate_jump as simulate
-from jumplab.sim.kinematics import pitch_of
 from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.reference import Forecast
 from jumplab.sim.result import Recorder, _events
