@@ -240,7 +240,8 @@ class Planner:
         }
         first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest)
         body = last.plan(task, first.tape, first.toe_phase_s, weights=asked["spatial"].weights)
-        rows = (*first.statistics, *body_rows("4 spatial" if method == "three-step" else "spatial", body))
+        name = "4 spatial" if method == "three-step" else "spatial"
+        rows = (*first.statistics, _row(name, body.solution.statistics))
         return self._placed(method, body, rows, first)
 
     def _placed(
@@ -342,7 +343,7 @@ class Planner:
                 body = self.stage("spatial").plan(task, near=near)
             except SolverError:
                 return self.plan(task, previous.method)
-            return self._placed(previous.method, body, body_rows("spatial", body))
+            return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
         srmp, last = None, "direct"

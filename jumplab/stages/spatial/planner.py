@@ -10,7 +10,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import WARM, Nlp, Solution, Statistics
+from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
@@ -36,9 +36,7 @@ class SpatialPlan:
     task: JumpTask
     solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
     edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
-    coarse: Statistics | None = None  # there is no coarse mesh
     limits: SpatialLimits = SpatialLimits()  # that it was made with
-    uneven: tuple[Statistics, ...] = ()
 
     @property
     def launch_s(self) -> float:
@@ -106,12 +104,12 @@ class SpatialPlanner:
                 found = self._warm.solve(
                     asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how
                 )
-                return SpatialPlan(task, found, edge, limits=self.limits)
+                return SpatialPlan(task, found, edge, self.limits)
             except SolverError:
                 if start is None:
                     raise
         guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
-        return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, limits=self.limits)
+        return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, self.limits)
 
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan."""
