@@ -179,6 +179,10 @@ def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
     way = "forward" if task.distance_m >= 0 else "backward"
     parts = [f"{abs(task.distance_m):.2f} m {way}", f"CoM rise {task.height_m:.2f} m"]
+    if task.side_m:
+        parts.insert(1, f"{abs(task.side_m):.2f} m to the {'left' if task.side_m > 0 else 'right'}")
+    if task.yaw_rad:
+        parts.append(f"turn {np.degrees(task.yaw_rad):.0f} deg")
     if task.platform_m:
         parts.append(f"landing {abs(task.platform_m):.2f} m {'higher' if task.platform_m > 0 else 'lower'}")
     if task.rotation_rad:

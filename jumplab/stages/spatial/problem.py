@@ -20,6 +20,7 @@ from jumplab.stages.whole_body.settings import Contact, Mesh
 ANGLE_BOX_RAD = 15.0  # beyond two full turns
 RATE_BOX = 30.0  # [rad/s, m/s] of the base
 TORQUE_SCALE, FALL_SCALE = 100.0, 10.0  # [N m], [m/s^2] for conditioning
+JOINED_SCALE = 0.01  # a jump of 5 um between two phases would be a centimetre a second on the tape
 SPIN_BOX = (-100.0, 100.0, 1.0)  # [kg m^2/s] angular momentum in flight; scale
 
 
@@ -110,7 +111,7 @@ def _joined() -> Term:
         a, b = ends["flat"].end, ends["toe"].start
         return ca.vertcat(*((getattr(a, k) - getattr(b, k)) / SCALES[k] for k in "qva"))
 
-    return Term("flat to toe", "WF-L1..L3", "scaled", "problem", jump, identity=True)
+    return Term("flat to toe", "WF-L1..L3", "scaled", "problem", jump, scale=JOINED_SCALE, identity=True)
 
 
 def _released(toe: SpatialTerms) -> tuple[Term, Term]:
@@ -125,7 +126,7 @@ def _released(toe: SpatialTerms) -> tuple[Term, Term]:
         return ca.vertcat(s.com - place, s.com_velocity - speed)
 
     return (
-        Term("toe to flight", "WF-L1..L3", "scaled", "problem", jump, identity=True),
+        Term("toe to flight", "WF-L1..L3", "scaled", "problem", jump, scale=JOINED_SCALE, identity=True),
         Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff, identity=True),
     )
 
