@@ -129,25 +129,22 @@ def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: floa
 
     Heels up, no ground force has a moment about the line of the toes: what the motion between nodes needs of it goes.
     """
-    q, v, a = motion
+    up, model = np.flatnonzero(~flat), legs.b.model
     x = float(legs.b.places[:, 0].mean() + (legs.b.robot.foot.toe - legs.b.robot.foot.heel) / 2)
-    up = np.flatnonzero(~flat)
+    q, v, a = (y.copy() for y in motion)
+    push = np.eye(q.shape[1])[0]
 
-    def moment(q, v, a):
-        need = np.array(list(_needed(legs.b.model, q[up], v[up], a[up], gravity)))
+    def moment(change: np.ndarray | float = 0.0):
+        held = legs.held(q[up], v[up], a[up] + change, flat[up])
+        need = np.array(list(_needed(model, *held, gravity)))
         return need[:, 4] + x * need[:, 2]
 
     for _ in range(BALANCING):
-        held = legs.held(q, v, a, flat)
-        pushed = a + np.eye(q.shape[1])[0]
-        missing = moment(*held)
-        gain = moment(*legs.held(q, v, pushed, flat)) - missing
-        more = np.zeros(len(t))
-        more[up] = -missing / gain
-        rate = cumulative_trapezoid(more, t, initial=0.0)
-        q, v, a = (y.copy() for y in (q, v, a))
-        for y, change in ((q, cumulative_trapezoid(rate, t, initial=0.0)), (v, rate), (a, more)):
-            y[:, 0] += change
+        missing = moment()
+        more = -missing / (moment(push) - missing)
+        rate = cumulative_trapezoid(more, t[up], initial=0.0)
+        for y, change in ((q, cumulative_trapezoid(rate, t[up], initial=0.0)), (v, rate), (a, more)):
+            y[up, 0] += change
     return legs.held(q, v, a, flat)
 
 
