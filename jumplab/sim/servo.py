@@ -11,7 +11,8 @@ what is computed from the velocity before the step,
 
     tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f   and   J v+ = 0,
 
-and the wished rate is the due one plus corner times the error of the angle.
+and the wished rate is the due one plus corner times the error of the angle. Where torques are known to arrive late, the
+step is longer by as much: a light limb whose error is asked away within a millisecond overshoots until that is seen.
 """
 
 from __future__ import annotations
@@ -43,9 +44,11 @@ PITCH = 4  # row of a foot's twist that is free while it stands on its toe
 
 
 class Servo:
-    """Torques for commands of position mode, from the measured state; ``robot`` is as planned."""
+    """Torques for commands of position mode, from the measured state; ``robot`` is as planned, and torques are known
+    to arrive ``late_s`` late."""
 
-    def __init__(self, robot: Robot, gains: ServoGains = GAINS):
+    def __init__(self, robot: Robot, gains: ServoGains = GAINS, late_s: float = 0.0):
+        self._step_s = STEP_S + late_s
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
@@ -60,7 +63,7 @@ class Servo:
         feet, drift, units = self._feet(command.feet)
         push = feet.T * units
         tau = self._feed_forward(command.acceleration, feet, drift, push)
-        wish = command.rate + STEP_S * command.acceleration + self._gains.corner * (command.q - q[7:])
+        wish = command.rate + self._step_s * command.acceleration + self._gains.corner * (command.q - q[7:])
         tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
@@ -83,11 +86,12 @@ class Servo:
         data, nv, held = self._gauge.data, len(v), push.shape[1]
         kkt, right, joints = np.zeros((nv + held, nv + held)), np.zeros(nv + held), range(6, nv)
         kkt[:nv, :nv] = data.M
-        kkt[joints, joints] += STEP_S * self._damping
+        step_s = self._step_s
+        kkt[joints, joints] += step_s * self._damping
         kkt[:nv, nv:], kkt[nv:, :nv] = -push, -push.T
-        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * STEP_S
-        right[:nv] = data.M @ v - STEP_S * data.nle
-        right[6:nv] += STEP_S * (tau + self._damping * wish)
+        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * step_s
+        right[:nv] = data.M @ v - step_s * data.nle
+        right[6:nv] += step_s * (tau + self._damping * wish)
         return np.linalg.solve(kkt, right)[6:nv]
 
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
