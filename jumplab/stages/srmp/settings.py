@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from jumplab.task import FRICTION
+
 
 @dataclass(frozen=True)
 class SrmpSettings:
     """Weights and bounds of stage 1; the paper prints none of these numbers. Weights are integrated over time."""
 
     intervals: tuple[int, int, int] = (28, 12, 40)  # flat foot, toe, flight
-    friction: float = 0.45  # as in stage 3
+    friction: float = FRICTION
     cop_margin_m: float = 0.015  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     toe_band_m: float = 0.0015  # heel up: the CoP is this close to the toe edge; less, and solves take longer
     toe_slack_n_m: float = 2.0  # added there, where force and torque vanish together and their quotient bends

@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from jumplab.errors import InputError, quoted
+from jumplab.task import FRICTION
 
 JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
@@ -30,7 +31,7 @@ class Limits:
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
-    friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
+    friction: float = FRICTION
     cop_margin_m: float = 0.01  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     range_margin_rad: float = 0.03  # to the joint stops
     hand_clearance_m: float = 0.05  # above the ground in launch
