@@ -99,9 +99,9 @@ class Weights:
     torque: float = 1e-4  # [1] / [N m]^2 / [s]
     track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
     # inertia in shares of the stance's, so that weights mean the same for robots of any size
-    track_inertia: float = 9000.0  # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
-    track_inertia_rate: float = 45.0  # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
-    track_flight_inertia_rate: float = 180.0  # the same in flight; less, and arms swing the other way and miss by 6 %
+    track_inertia: float = 6800.0  # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
+    track_inertia_rate: float = 23.0  # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
+    track_flight_inertia_rate: float = 136.0  # the same in flight; less, and arms swing the other way and miss by 6 %
     track_momentum: float = 2.0  # [1] / [kg m^2/s]^2 / [s]
     heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
     ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
