@@ -23,6 +23,9 @@ class SrmpSettings:
     corner_speed: float = 0.5  # share of the extension speed up to which the full leg force is there
     momentum: tuple[float, float] = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
     inertia_margin: float = 0.05  # share of the envelope's width kept free on either side
+    flight_inertia: float = (
+        0.76  # share of its width up to which a flight goes: more takes straight legs and raised arms
+    )
     takeoff_lean: tuple[float, float] = (-0.5, 0.7)  # [rad]
     takeoff_length: float = 0.95  # share of the standing phi at most: knees still bent, far from the straight leg
     inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
@@ -58,4 +61,4 @@ class SrmpSettings:
         Trunk and arms swing upward with the legs' extension, so a flip leaves the ground faster than legs alone would;
         the turn is had by folding, not by more momentum in an open body.
         """
-        return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0))
+        return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0), flight_inertia=1.0)
