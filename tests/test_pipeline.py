@@ -180,7 +180,7 @@ def test_guess_is_stage_twos_motion(plan):
         assert angle == pytest.approx(own, abs=1e-9)
     arm = pipeline.to_link_angles(robot, plan.joints.q, plan.joints.v, plan.joints.a)[0][-1, 4]
     naive = body.naive_guess(plan.task)["flight"].q[-1, 4]
-    mixed = pipeline.OWN_ARMS * arm + pipeline.NAIVE_ARMS * naive
+    mixed = pipeline.OWN_ARMS * arm + (1 - pipeline.OWN_ARMS) * naive
     assert guess["flight"].q[-1, 4] == pytest.approx(mixed, abs=1e-9)
     velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
     rows = plan.joints.rows("flight")

@@ -33,7 +33,7 @@ from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS = ("three-step", "direct")
-OWN_ARMS, NAIVE_ARMS = 0.25, 0.75  # shares of the arms' swing in stage 3's guess: stage 2's arms swing too far
+OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
 SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
@@ -343,7 +343,7 @@ def guess_from_joints(
 ) -> dict[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing mostly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`. ``toe_s`` is the length of
+    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`. ``toe_s`` is the length of
     the toe phase [s].
     """
     motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
@@ -358,15 +358,15 @@ def guess_from_joints(
         if name == "toe":
             q[:, 0] = np.maximum(q[:, 0], 0.0)
         body = PhaseGuess(t[-1] - t[0], q, v, a, None, ballistic if name == "flight" else {})
-        out[name] = _with_arms(body, naive[name])
+        out[name] = _with_arms(body, naive[name], OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS)
     return out
 
 
-def _with_arms(body: PhaseGuess, arms: PhaseGuess) -> PhaseGuess:
-    """One phase of a guess, its last link swinging partly as in another guess, in its own time."""
+def _with_arms(body: PhaseGuess, arms: PhaseGuess, own: float) -> PhaseGuess:
+    """One phase of a guess, its last link swinging by a share of its ``own``, and as in another guess in its time."""
     pace, joined = arms.duration / body.duration, []
     for k, (x, y) in enumerate(((body.q, arms.q), (body.v, arms.v), (body.a, arms.a))):
-        arm = OWN_ARMS * x[:, -1] + NAIVE_ARMS * (y[:, -1] * pace**k)
+        arm = own * x[:, -1] + (1 - own) * (y[:, -1] * pace**k)
         joined.append(np.column_stack([x[:, :-1], arm]))
     return replace(body, q=joined[0], v=joined[1], a=joined[2])
 
