@@ -330,8 +330,20 @@ def same(one: jl.JumpPlan, other: jl.JumpPlan) -> None:
 
 @pytest.mark.parametrize("method", ["three-step", "direct"])
 def test_a_weight_of_zero_changes_no_digit(method):
-    task = jl.JumpTask(0.4, 0.3)
-    same(armed(0.0).plan(task, method), planner().plan(task, method))
+    task, usual = jl.JumpTask(0.4, 0.3), planner().plan(jl.JumpTask(0.4, 0.3), method)
+    same(armed(0.0).plan(task, method), usual)
+    same(armed(0.1).plan(task, method, weights={"flight/calm arms": 0}), usual)
+
+
+def test_a_weight_of_zero_in_one_plan_drops_that_term_alone():
+    task, rod = jl.JumpTask(0.4, 0.3), jl.Term("upright", "ours", "rad", "node", lambda p: p.posture, weight=1.0)
+    both = jl.Planner(jl.Robot.load(), terms={"srmp/launch": [rod], "whole body/flight": [calm()]})
+    asked = {"srmp/launch/upright": 0, "calm arms": 0.2}
+    for _ in range(2):
+        plan = both.plan(task, weights=asked)
+        same(plan, armed(0.2).plan(task))
+        assert "toe/upright" not in plan.weights["SRMP"] and plan.weights["whole body"]["flight/calm arms"] == 0.2
+    assert both.plan(task).weights["SRMP"]["toe/upright"] == 1.0
 
 
 def test_a_solved_plan_lists_its_terms():
@@ -402,12 +414,28 @@ def test_a_growing_weight_straightens_stage_one(target):
     assert falls([turning(stage.plan(jl.JumpTask(*target)).solution.phases) for stage in how])
 
 
+# targets, each with one of the methods
+FLIPS = [("three-step", 0.0, 0.5, -1), ("direct", 0.2, 0.5, -1), ("direct", 0.0, 0.4, -1)]
+FLIPS += [("three-step", 0.0, 0.5, 1), ("three-step", 0.2, 0.5, 1), ("direct", 0.2, 0.4, 1)]
+
+
 @pytest.mark.slow
-def test_a_growing_weight_calms_the_arms_of_flips():
-    task = jl.JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi)
-    for method in ("three-step", "direct"):
-        found = [armed(w).plan(task, method) for w in (0.0, 0.1, 1.0)]
-        assert falls([swing(plan.whole_body.solution.phases) for plan in found])
+@pytest.mark.parametrize(("method", "distance_m", "height_m", "turns"), FLIPS)
+def test_a_growing_weight_calms_the_arms_of_flips(method, distance_m, height_m, turns):
+    """A flip has several local solutions; as the weight grows, it stays with one of them."""
+    task = jl.JumpTask(distance_m, height_m, rotation_rad=2 * np.pi * turns)
+    found = [armed(w).plan(task, method) for w in GROWING]
+    assert falls([swing(plan.whole_body.solution.phases) for plan in found])
+
+
+@pytest.mark.slow
+def test_a_flip_with_weights_begins_with_the_one_without():
+    """Weights of one plan are those of a planner, and a weight of zero changes no digit."""
+    task = jl.JumpTask(0.0, 0.4, rotation_rad=-2 * np.pi)
+    usual = planner().plan(task, "direct")
+    same(armed(0.0).plan(task, "direct"), usual)
+    same(armed(0.1).plan(task, "direct", weights={"calm arms": 0}), usual)
+    same(armed(0.1).plan(task, "direct", weights={"calm arms": 1.0}), armed(1.0).plan(task, "direct"))
 
 
 @pytest.mark.slow

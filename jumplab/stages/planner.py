@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -142,6 +143,23 @@ class Planner:
                 changes.applied(stage.nlp.problem)
         return asked
 
+    def _less(self, asked: Mapping[str, StageChanges]) -> Planner:
+        """This planner; where one plan gives an own term the weight 0, one that has these weights and not that term.
+
+        In the problem it would still move the last digits.
+        """
+        own = {(stage, t.name) for stage, c in self.changes.items() for terms in c.terms.values() for t in terms}
+        now = {stage: dict(c.weights) for stage, c in asked.items()}
+        if not own & {(stage, n.rpartition("/")[2]) for stage in now for n, w in now[stage].items() if w == 0}:
+            return self
+        if (key := repr(now)) not in self._stages:
+            less = self._stages[key] = copy(self)
+            less._stages, less.changes = {}, {}
+            for stage, c in self.changes.items():
+                before = {n: w for n, w in c.weights.items() if n not in now[stage]}
+                less.changes[stage] = replace(c, weights=before | now[stage])
+        return self._stages[key]
+
     def _joint_options(self, weights: Mapping[str, float] = MappingProxyType({})) -> Options:
         """Stage 2's options with what is changed about it; refuses what does not fit."""
         own = self.changes["joint qp"]
@@ -192,6 +210,8 @@ class Planner:
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
         asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
+        if (less := self._less(asked)) is not self:
+            return less.plan(task, method, start=start)
         where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
