@@ -19,11 +19,14 @@ import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.ocp import Nlp, Term, changed
 from jumplab.ocp import cache as kept
+from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.urdf import have_published
 from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.srmp import build_problem as srmp_problem
 from jumplab.stages.whole_body import Limits, Mesh, build_problem
+from jumplab.studies.chain import Course, crouched, run_chain, run_chains
+from jumplab.studies.chain.pilot import Foresight, Rehearsal
 
 SMALL = Mesh(6, 4, 6)
 STAGES = (
@@ -449,10 +452,27 @@ def test_the_resolve_for_jerk_keeps_own_terms():
     assert swing(plans[1].whole_body.solution.phases) < swing(plans[0].whole_body.solution.phases)
 
 
+@cache
+def waiting(weight: float) -> jl.Planner:
+    return jl.Planner(crouched(jl.Robot.load()), terms={"whole body/flight": [calm(weight)]})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_growing_weight_calms_the_arms_of_chains(target):
+    """A chain's first jump is planned from a measured posture, beginning with the rehearsed plan or with nothing."""
+    course, found = Course.of([target[0]], target[1]), {"rehearsed": [], "fresh": []}
+    for one in map(waiting, GROWING):
+        for how, rehearsal in (("rehearsed", Rehearsal.of(course, one)), ("fresh", None)):
+            foresight, q = Foresight(course, one.robot, one, rehearsal, 0.3), stance_configuration(one.robot)
+            q[7:] += 0.03
+            foresight.learn_posture(q)
+            found[how].append(swing(foresight.look(0, 0.5, np.zeros(3)).plan.whole_body.solution.phases))
+    assert falls(found["rehearsed"]) and falls(found["fresh"]), found
+
+
 @pytest.mark.slow
 def test_chains_plan_with_own_terms():
-    from jumplab.studies.chain import Course, crouched, run_chain, run_chains
-
     robot = jl.Robot.load()
     one = jl.Planner(crouched(robot), terms={"whole body/flight": [calm(1.0)]})
     run = run_chain(Course.of([0.4], 0.3), robot, planner=one, solve_s=0.3)
