@@ -64,7 +64,8 @@ class Planner:
     mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
 
-    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too.
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
+    terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
 
     Raises
     ------
@@ -194,7 +195,8 @@ class Planner:
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
-        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`.
+        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
+            left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
             None. Not for flips.
 
