@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -63,7 +64,8 @@ class Planner:
     mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
 
-    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too.
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
+    terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
 
     Raises
     ------
@@ -142,6 +144,23 @@ class Planner:
                 changes.applied(stage.nlp.problem)
         return asked
 
+    def _less(self, asked: Mapping[str, StageChanges]) -> Planner:
+        """This planner; where one plan gives an own term the weight 0, one that has these weights and not that term.
+
+        In the problem it would still move the last digits.
+        """
+        own = {(stage, t.name) for stage, c in self.changes.items() for terms in c.terms.values() for t in terms}
+        now = {stage: dict(c.weights) for stage, c in asked.items()}
+        if not own & {(stage, n.rpartition("/")[2]) for stage in now for n, w in now[stage].items() if w == 0}:
+            return self
+        if (key := repr(now)) not in self._stages:
+            less = self._stages[key] = copy(self)
+            less._stages, less.changes = {}, {}
+            for stage, c in self.changes.items():
+                before = {n: w for n, w in c.weights.items() if n not in now[stage]}
+                less.changes[stage] = replace(c, weights=before | now[stage])
+        return self._stages[key]
+
     def _joint_options(self, weights: Mapping[str, float] = MappingProxyType({})) -> Options:
         """Stage 2's options with what is changed about it; refuses what does not fit."""
         own = self.changes["joint qp"]
@@ -176,7 +195,8 @@ class Planner:
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
-        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`.
+        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
+            left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
             None. Not for flips.
 
@@ -192,6 +212,8 @@ class Planner:
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
         asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
+        if (less := self._less(asked)) is not self:
+            return less.plan(task, method, start=start)
         where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
