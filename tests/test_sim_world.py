@@ -10,10 +10,21 @@ import pytest
 from jumplab.errors import InputError, JumplabError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import ENGINES, STEP_S, Perturbation, Scene, base_from_bullet, base_to_bullet, engine_class
+from jumplab.sim import (
+    ENGINES,
+    STEP_S,
+    Perturbation,
+    Scene,
+    base_from_bullet,
+    base_to_bullet,
+    engine_class,
+    simulate_jump,
+)
 from jumplab.sim.kinematics import Gauge
 from jumplab.sim.playback import AIR, FLAT, Actuators, Command, Delay, Motors
 from jumplab.sim.servo import Servo
+from jumplab.stages.planner import plan_jump
+from jumplab.task import JumpTask
 
 
 @pytest.fixture(params=ENGINES)
@@ -184,6 +195,21 @@ def test_foot_sensors_weigh_the_robot(engine, bhr):
     com = momentum(bhr, end, v)[0]
     assert -moment[1] / total[2] == pytest.approx(com[0], abs=1e-3)
     assert moment[0] / total[2] == pytest.approx(com[1], abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def front_flip(bhr):
+    return plan_jump(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi), bhr).tape
+
+
+def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):
+    """Turning legs pull at the contact (J' v): the ground must neither let go of a loaded toe nor give way to it."""
+    tape, toe = front_flip, Gauge(bhr).toe
+    run, takeoff = simulate_jump(tape, bhr, mode="pd", engine=engine.name, stand_s=0.01), round(1e3 * tape.takeoff_time)
+    push = run.foot_wrench[takeoff - 150 : takeoff - 15, :, 2].sum(axis=1)
+    assert push.min() > 2 * 42 * 9.8 and np.abs(np.diff(push)).max() < 100
+    assert abs(toe(run.q[takeoff - 5])[0] - toe(run.q[0])[0]) < 5e-4
+    assert run.metrics.takeoff_momentum == pytest.approx(tape.extra["planar_L"][tape.takeoff_index], abs=0.15)
 
 
 def test_contact_impulse_is_change_of_momentum(engine, bhr):

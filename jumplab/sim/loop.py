@@ -56,7 +56,8 @@ class Run:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        servo, motors, delay = Servo(self.robot), Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
+        servo = Servo(self.robot, substeps=self._open.substeps)
+        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
         with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
             contacts, fallen_s = engine.contacts(), 0.0

@@ -19,12 +19,15 @@ from jumplab.sim.scene import REACH_M, Contacts
 class Softness:
     """How a contact gives way; MuJoCo's names are those of its solref and solimp."""
 
-    time_s: float = 0.002  # [s] a penetration fades; eight of the engine's steps, it wants two at least
+    time_s: float = 0.001  # [s] a penetration fades; of the engine's steps it takes four, with two feet would bounce
     damping_ratio: float = 1.0  # [1] nothing bounces
-    impedance: tuple[float, float] = (0.95, 0.99)  # [1] share of a contact's acceleration that is held off
+    # [1] share of a contact's acceleration that is held off, at the surface and ``depth_m`` below. MuJoCo's contacts do
+    # not see what turning legs add to it (J' v): a share of 0.95 at the surface lets loaded toes lift off and fall back
+    impedance: tuple[float, float] = (0.5, 0.95)
+    depth_m: float = 1e-4  # [m] as deep as feet stand in Bullet's ground
 
 
-SOFTNESS = Softness()  # as hard as Bullet's ground: launches slip by less than a millimetre; by default, 7 mm
+SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm
 SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
@@ -54,7 +57,7 @@ class MujocoEngine(Engine):
         for geom in spec.geoms:
             geom.condim, geom.margin = 3, 0.0
             geom.solref = [self.softness.time_s, self.softness.damping_ratio]
-            geom.solimp = [*self.softness.impedance, 0.001, 0.5, 2.0]
+            geom.solimp = [*self.softness.impedance, self.softness.depth_m, 0.5, 2.0]
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         for own in (self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss):
