@@ -106,11 +106,34 @@ def test_a_gain_scales_what_is_delivered(bhr):
 
 @pytest.mark.parametrize("mode", ["position", "pd"])
 def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
-    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes."""
+    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes. A delay that is
+    known is led by: no difference is left that anyone would see."""
     weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
-    asked, weakly, late = (
-        simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01).metrics
-        for p in (Perturbation(), weak, Perturbation(delay_s=0.004))
-    )
+    late, known = Perturbation(delay_s=0.004), Perturbation(delay_s=0.004, known_delay_s=0.004)
+    jumps = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
+    asked, weakly, late, known = (jump.metrics for jump in jumps)
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
+    assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
+    assert abs(known.com_rise_m - asked.com_rise_m) < 0.005
+
+
+@pytest.mark.parametrize("mode", ["position", "pd"])
+def test_what_is_sent_ahead_is_what_the_tape_takes_later(bhr, tape, mode):
+    """Commands with a lead are those without it so many steps on: on the tape, and off it by an error that stays."""
+    lead, servo, none = 3, Servo(bhr), np.zeros(14)
+    ahead, plain = Playback(tape, bhr, mode, lead * STEP_S), Playback(tape, bhr, mode)
+    effort, off = Actuators(bhr).effort, np.full(14, 5e-3)
+
+    def sent(player, step, seen, error):
+        row = int(np.searchsorted(tape.t, seen * STEP_S - 1e-9))
+        q, v = tape.q[row].copy(), tape.v[row]
+        q[7:] += error
+        command = player.command(step, q, v, none)
+        return servo.torque(command, *(command.state or (q, v)))
+
+    for step in (100, round(tape.takeoff_time / STEP_S) + 150):
+        for error in (none, off):
+            miss = sent(ahead, step, step, error) - sent(plain, step + lead, step + lead, error)
+            assert np.abs(miss / effort).max() < 1e-6, step
+        assert np.abs((sent(ahead, step, step, off) - sent(ahead, step, step, none)) / effort).max() > 0.01

@@ -1,6 +1,7 @@
 """Every engine against what must be true of any world."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +15,9 @@ from jumplab.sim import (
     ENGINES,
     STEP_S,
     Perturbation,
+    Ranges,
     Scene,
+    SensorNoise,
     base_from_bullet,
     base_to_bullet,
     engine_class,
@@ -275,7 +278,8 @@ def test_scenes_have_real_edges(engine, bhr):
         (lambda: Scene.ditch(0.5, 1.0, depth=0), "ditch of depth 0 m: the depth must be positive"),
         (lambda: Scene.platform(0.3, -0.1), "platform at 0.3 m, -0.1 m high: both numbers must be positive"),
         (lambda: Perturbation(friction=0.0), "friction = 0 is outside 0 ... 2"),
-        (lambda: Perturbation(delay_s=0.1), "delay = 0.1 s is outside 0 ... 0.02 s"),
+        (lambda: Perturbation(delay_s=0.1), "^delay = 0.1 s is outside 0 ... 0.02 s$"),
+        (lambda: Perturbation(known_delay_s=-0.001), "^known delay = -0.001 s is outside 0 ... 0.02 s$"),
     ],
 )
 def test_impossible_worlds_are_refused(make, words):
@@ -290,7 +294,7 @@ def test_perturbations_are_seeded_and_bounded(engine, bhr):
     assert all(abs(f - 1) <= 0.05 for f in one.mass.values())
     assert all(abs(f - 1) <= 0.10 for f in one.inertia.values())
     assert all(abs(x) <= 0.015 for shift in one.com.values() for x in shift)
-    assert 0.5 <= one.friction <= 1.0 and 0 <= one.delay_s <= 0.004
+    assert 0.5 <= one.friction <= 1.0 and 0 <= one.delay_s <= 0.004 and one.known_delay_s == 0.002
     real = one.robot(bhr)
     model, planned = real.model, bhr.model
     knee = model.getJointId("left_knee")
@@ -301,6 +305,19 @@ def test_perturbations_are_seeded_and_bounded(engine, bhr):
     assert Perturbation().robot(bhr) is bhr
     with engine(real, stance_configuration(bhr), friction=one.friction) as world:  # checks its mass against Pinocchio
         assert set(world.friction.values()) == {one.friction}
+
+
+def test_ranges_and_sensors_say_what_they_are():
+    """Every number, changed, changes the sentence."""
+    said = (
+        "masses ±5 %, centres of mass ±15 mm per axis, inertias ±10 %, motors ±5 %, friction 0.5 ... 1, "
+        "commands 0 ... 4 ms late and sent 2 ms ahead"
+    )
+    assert str(Ranges()) == said and str(SensorNoise()) == "the true state and foot forces"
+    for start in (Ranges(), SensorNoise.typical()):
+        for name, value in vars(start).items():
+            other = (0.1, value[1]) if isinstance(value, tuple) else 2 * value
+            assert str(replace(start, **{name: other})) != str(start), name
 
 
 def test_motors_follow_their_torque_speed_line(bhr):

@@ -66,7 +66,7 @@ def _count(least: int, most: float = math.inf) -> Kind:
     MODE,
     ENGINE,
     opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
-    opt("--noise", "tell the controllers noisy measurements instead of the truth", False),
+    opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
     opt("--jobs J", "processes (default: one per core)", None, _count(1)),
 )
 def trials(args: Namespace) -> None:
@@ -86,6 +86,8 @@ def trials(args: Namespace) -> None:
     except KeyboardInterrupt:
         said = "interrupted; finished trials are kept, and the same command goes on from there"
         raise KeyboardInterrupt(said) from None
+    for what, said in report.conditions.items():
+        print(f"{what}: {said}")
     low, high = report.interval
     print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
     for reason, count in report.reasons.items():

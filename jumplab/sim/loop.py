@@ -56,10 +56,10 @@ class Run:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        servo = Servo(self.robot, substeps=self._open.substeps)
         motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
         with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
+            servo = Servo(self.robot, late_s=how.known_delay_s, substeps=engine.substeps)
             contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
                 q, v = engine.state()
@@ -67,7 +67,7 @@ class Run:
                 command = pilot.command(step, *seen)
                 if pilot.part == len(self.recorders):
                     self.recorders.append(Recorder(self.real, pilot.goal, engine.links))
-                engine.set_torque(motors.deliver(delay(servo.torque(command, *seen[:2])), v[6:]))
+                engine.set_torque(motors.deliver(delay(servo.torque(command, *(command.state or seen[:2]))), v[6:]))
                 engine.step()
                 contacts = engine.contacts()
                 self.recorders[-1].add(q, v, engine.applied(), contacts)
@@ -154,7 +154,8 @@ def simulate_jump(
     """
     _check(tape, robot, perturbation, scene, reference, stand_s)
     run = Run(robot, perturbation, scene, engine)
-    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s)
+    known_delay_s = run.perturbation.known_delay_s
+    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s)
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
     run.play(pilot, q, v, step)
     said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))

@@ -11,7 +11,8 @@ what is computed from the velocity before the step,
 
     tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f   and   J v+ = 0,
 
-and the wished rate is the due one plus corner times the error of the angle.
+and the wished rate is the due one plus corner times the error of the angle. Where torques are known to arrive late, the
+step is longer by as much: a light limb whose error is asked away within a millisecond overshoots until that is seen.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ PITCH = 4  # row of a foot's twist that is free while it stands on its toe
 class Servo:
     """Torques for commands, from the measured state.
 
-    ``robot`` is as planned. A torque acts for a whole step, which an engine takes in ``substeps`` semi-implicit ones.
-    It is felt at their beginnings, on average (1 - 1/substeps) / 2 of the step late, and planned torques change
-    meanwhile. Joints whose rates are right run ahead by half a substep.
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. They act for a whole step, which an engine
+    takes in ``substeps`` semi-implicit ones: they are felt at the beginnings of these, on average (1 - 1/substeps) / 2
+    of the step late, and planned ones change meanwhile. Joints whose rates are right run ahead by half a substep.
     """
 
-    def __init__(self, robot: Robot, gains: ServoGains = GAINS, substeps: int = 1):
-        self._late, self._ahead_s = (1 - 1 / substeps) / 2, STEP_S / substeps / 2
+    def __init__(self, robot: Robot, gains: ServoGains = GAINS, late_s: float = 0.0, substeps: int = 1):
+        self._step_s, self._late, self._ahead_s = STEP_S + late_s, (1 - 1 / substeps) / 2, STEP_S / substeps / 2
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
@@ -67,7 +68,7 @@ class Servo:
         push = feet.T * units
         tau = self._feed_forward(command.acceleration, feet, drift, push)
         error = command.q + self._ahead_s * command.rate - q[7:]
-        wish = command.rate + STEP_S * command.acceleration + self._gains.corner * error
+        wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
         tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
@@ -90,11 +91,12 @@ class Servo:
         data, nv, held = self._gauge.data, len(v), push.shape[1]
         kkt, right, joints = np.zeros((nv + held, nv + held)), np.zeros(nv + held), range(6, nv)
         kkt[:nv, :nv] = data.M
-        kkt[joints, joints] += STEP_S * self._damping
+        step_s = self._step_s
+        kkt[joints, joints] += step_s * self._damping
         kkt[:nv, nv:], kkt[nv:, :nv] = -push, -push.T
-        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * STEP_S
-        right[:nv] = data.M @ v - STEP_S * data.nle
-        right[6:nv] += STEP_S * (tau + self._damping * wish)
+        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * step_s
+        right[:nv] = data.M @ v - step_s * data.nle
+        right[6:nv] += step_s * (tau + self._damping * wish)
         return np.linalg.solve(kkt, right)[6:nv]
 
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
