@@ -8,11 +8,10 @@ from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from paper import experiments as pictures
-from paper import render
 from paper.measurement import measure
 
 from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
-from jumplab.sim import Scene, SensorNoise, simulate_jump
+from jumplab.sim import Engine, Scene, SensorNoise, simulate_jump
 from jumplab.studies.basin import BasinGrid, BasinReport
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
 
@@ -33,7 +32,7 @@ def result(tape, bhr):
 @pytest.fixture(autouse=True)
 def no_simulation(result, monkeypatch):
     """No picture may simulate."""
-    monkeypatch.setattr(render.bullet, "stepSimulation", None)
+    monkeypatch.setattr(Engine, "__init__", None)
 
 
 def smallest_font(fig) -> float:

@@ -15,7 +15,7 @@ from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import (
-    ENGINES,
+    INSTALLED,
     STEP_S,
     Disturbance,
     LandingReference,
@@ -44,7 +44,7 @@ def tape(bhr):
     return plan_jump(JumpTask(DISTANCE, HEIGHT), bhr, method="direct").tape
 
 
-@pytest.fixture(scope="module", params=[(mode, engine) for engine in ENGINES for mode in ("position", "pd")])
+@pytest.fixture(scope="module", params=[(mode, engine) for engine in INSTALLED for mode in ("position", "pd")])
 def jump(request, bhr, tape):
     mode, engine = request.param
     return simulate(tape, bhr, mode=mode, engine=engine)

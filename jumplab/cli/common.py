@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.sim import DEFAULT_ENGINE, ENGINES
 
 Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
 Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
@@ -71,16 +72,6 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
     return names or (placeholder.lower(),), {"help": text, "default": default, **how}
 
 
-def engine_option() -> argparse.ArgumentParser:
-    """The option ``--engine``."""
-    from jumplab.sim import DEFAULT_ENGINE, ENGINES
-
-    engine = argparse.ArgumentParser(add_help=False)
-    engine.add_argument("--engine", choices=tuple(ENGINES), default=DEFAULT_ENGINE,
-                        help=f"whose physics it is (default {DEFAULT_ENGINE})")  # fmt: skip
-    return engine
-
-
 def number(option: str, text: str) -> float:
     """The number that an option was given."""
     try:
@@ -111,7 +102,7 @@ folder = needing("name a folder", str.strip)
 DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
 PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
-ENGINE = opt("--engine", "physics engine of the simulation", "bullet", ("bullet", "mujoco"))
+ENGINE = opt("--engine", "physics engine of the simulation", DEFAULT_ENGINE, tuple(ENGINES))
 METHODS = ("three-step", "direct")
 ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
 JUMP = (

@@ -36,6 +36,7 @@ Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 PLANNING = ("casadi", "pin", "cvxpy", "clarabel", "proxsuite")
 PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy", "matplotlib")
+BUILDS = {"pybullet": "pybullet-arm64"}  # the same sources, built for later Pythons under another name
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")
@@ -99,10 +100,10 @@ def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+        for build in (name, BUILDS.get(name, name)):
+            with contextlib.suppress(metadata.PackageNotFoundError):
+                found.setdefault(name, metadata.version(build))
+        found.setdefault(name, "not installed")
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
-from jumplab.sim import DEFAULT_ENGINE, ENGINES
+from jumplab.sim import DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import Contacts, Scene
 
@@ -151,11 +151,12 @@ class Engine(ABC):
 def engine_class(name: str = DEFAULT_ENGINE) -> type[Engine]:
     """The class of an engine, imported now; raises :class:`InputError` if it is unknown or not installed."""
     if not isinstance(name, str) or name not in ENGINES:
-        raise InputError(f"engine {quoted(name)}: must be one of {', '.join(ENGINES)}")
-    module, kind, package = ENGINES[name]
+        raise InputError(f"engine {quoted(name)}: must be one of {', '.join(INSTALLED)}")
+    module, kind, package, cure = ENGINES[name]
     try:
         return getattr(import_module(f"jumplab.sim.{module}"), kind)
     except ModuleNotFoundError as e:
         if e.name != package:
             raise
-        raise InputError(f"engine {name!r}: the package {package} is not installed; pip install {package}") from e
+        others = "".join(f"take {other!r}, or " for other in INSTALLED if other != name)
+        raise InputError(f"engine {name!r}: the package {package} is not installed; {others}{cure}") from e

@@ -140,7 +140,7 @@ def simulate_jump(
         at touchdown (None: it found none).
     stand_s : how long to watch after touchdown [s]; less than the default is never called a landing.
     disturbance : begin at the apex of the flight, in a state that differs so; time, distance and rise count from there.
-    engine : "bullet" or "mujoco", whose physics it is.
+    engine : "bullet" or "mujoco", whose physics it is; where PyBullet is not installed, "mujoco" is the default.
 
     Returns
     -------

@@ -152,8 +152,8 @@ def experiment_frames(runs: Sequence[tuple[str, SimulationResult, Scene]], robot
     fig = new_figure(PAGE_IN, sum(heights))
     axes = fig.subplots(len(runs), len(FRAMES), squeeze=False, height_ratios=heights)
     for (name, result, scene), line, camera in zip(runs, axes, cameras, strict=True):
-        with Renderer(robot, scene=scene) as studio:
-            draw_frames(line, studio, result, frame_rows(result)[list(FRAMES)], camera, fontsize=7)
+        rows = frame_rows(result)[list(FRAMES)]
+        draw_frames(line, Renderer(robot, scene=scene), result, rows, camera, fontsize=7)
         line[0].text(-0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center", fontsize=8)
     return fig
 

@@ -59,7 +59,7 @@ def run_chain(
     revise_s : when a plan made in the air is made again, after touchdown [s]; never if None. The robot waits for
         neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
-    engine : "bullet" or "mujoco".
+    engine : as in :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
     """
     _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
