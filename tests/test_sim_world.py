@@ -350,5 +350,16 @@ def test_read_back_is_what_the_engine_has(engine, bhr):
         said = world.read_back()
         assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
         assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
+        assert said["gravity"] == [0, 0, -9.8] and said["inertia_error"] < 1e-12
         q, v = world.state()  # the probe of the self-collision has left nothing behind
     assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()
+
+
+def test_the_moon_and_another_robot_are_read_back(engine, bhr):
+    """Gravity is the robot's own; inertias are compared with its own, turned and shifted ones included."""
+    other = Perturbation.draw(bhr, 3).robot(bhr).under_gravity(1.62)
+    with engine(other, stance_configuration(bhr)) as world:
+        said, has = world.read_back(), world.inertials
+    assert said["gravity"] == [0, 0, -1.62] and said["inertia_error"] < 1e-12
+    planned = bhr.model.inertias[bhr.model.getJointId("left_knee")]
+    assert np.abs(has["left_shank"].inertia - planned.inertia).max() > 1e-4  # it is the other one's
