@@ -133,10 +133,12 @@ class ModeReport:
         told = [f"{self.mode} mode: {engine} does not land it: {t.reason}"
                 for engine, t in self.planned.items() if not t.landed]  # fmt: skip
         for d in self.differences:
-            if not d.within:
-                by = "not measured in all engines" if d.apart is None else f"{d.apart:.3g}, at most {d.limit:.3g}"
-                unit = "" if d.apart is None or d.quantity.relative else f" {d.quantity.unit}"
-                told.append(f"{self.mode} mode: {d.quantity.name} is apart by {by}{unit}")
+            unit = "" if d.quantity.relative else f" {d.quantity.unit}"
+            if d.apart is None:
+                told.append(f"{self.mode} mode: {d.quantity.name} was not measured in every engine")
+            elif not d.within:
+                apart = f"the engines are {d.apart:.3g}{unit} apart in {d.quantity.name}"
+                told.append(f"{self.mode} mode: {apart}, at most {d.limit:.3g}{unit}")
         if self.same < self.limits.verdict_share * len(self.pairs):
             least = f"at least {100 * self.limits.verdict_share:g} % are asked for"
             told.append(f"{self.mode} mode: {self.same} of {len(self.pairs)} perturbed robots fare alike, {least}")
