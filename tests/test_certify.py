@@ -135,6 +135,21 @@ def test_perturbed_robots_must_fare_alike(folder, physics, capsys):
     assert [row["same"] for row in many] == [True, True, False, True]
 
 
+def test_the_median_of_perturbed_robots_is_held_to_the_limits(folder, physics):
+    """One of three may be far off; with a second one the engines disagree."""
+    far = [series.TrialKey(0, index, "", "").robot_seed for index in (0, 2)]
+
+    def say(engine, mode, drawn):
+        return {"foot_distance_m": 0.7} if engine == "mujoco" and drawn and drawn.seed in odd else {}
+
+    physics.say, odd = say, far[:1]
+    assert certify(folder, 3, jobs=1).passed
+    odd = far
+    (folder / "trials.jsonl").unlink()
+    words = "{} mode: perturbed robots are 0.1 m apart in toes in the end (median), at most 0.01"
+    assert certify(folder, 3, jobs=1).failures == [words.format("position"), words.format("pd")]
+
+
 def test_a_plan_that_fails_its_audit_is_not_certified(folder, physics, monkeypatch):
     bad = SimpleNamespace(name="torque", passed=False)
     audit = SimpleNamespace(passed=False, checks=(bad,), failed=(bad,))

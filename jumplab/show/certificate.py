@@ -20,7 +20,7 @@ GOOD, BAD = (mcolors.to_hex(color) for color in (LANDING, VERMILION))
 CERTIFIED = "The audit is clean, and the engines agree: it lands."
 KEY = (
     "On each scale the engines are apart by nothing on the left, by the limit at the line in the middle. Diamond: the "
-    "robot as planned. Dots: perturbed robots, the same in all engines; the limits do not bind them, their verdicts do."
+    "robot as planned. Dots: perturbed robots, the same in all engines; the limits hold for their median."
 )
 
 

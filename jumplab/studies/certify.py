@@ -29,7 +29,7 @@ SCHEMA, (NAME, PAGE) = "jumplab-certificate-1", store.CERTIFICATE
 
 @dataclass(frozen=True)
 class Limits:
-    """How far apart engines may be and still agree."""
+    """How far apart engines may be and still agree: for the robot as planned, and in the median of perturbed ones."""
 
     touchdown_s: float = 0.005  # [s] of touchdown; five control cycles, 1.5 cm of a fall at 3 m/s
     place_m: float = 0.01  # [m] of the toes at touchdown and in the end; a twentieth of a foot
@@ -139,6 +139,13 @@ class ModeReport:
             elif not d.within:
                 apart = f"the engines are {d.apart:.3g}{unit} apart in {d.quantity.name}"
                 told.append(f"{self.mode} mode: {apart}, at most {d.limit:.3g}{unit}")
+        for q in QUANTITIES:
+            apart, limit = self.apart(q), getattr(self.limits, q.limit)
+            if len(apart) and np.median(apart) > limit:
+                middle = f"{np.median(apart):.3g}{'' if q.relative else f' {q.unit}'}"
+                told.append(
+                    f"{self.mode} mode: perturbed robots are {middle} apart in {q.name} (median), at most {limit:.3g}"
+                )
         if self.same < self.limits.verdict_share * len(self.pairs):
             least = f"at least {100 * self.limits.verdict_share:g} % are asked for"
             told.append(f"{self.mode} mode: {self.same} of {len(self.pairs)} perturbed robots fare alike, {least}")
