@@ -35,7 +35,7 @@ def test_a_stance_takes_what_its_weight_takes(bhr):
 
 def test_on_the_tape_it_asks_for_the_planned_torques_that_it_never_saw(bhr, tape):
     """Flat, on the toes and in the air; but where the tape jumps from one to the next."""
-    servo, player, effort = Servo(bhr), Playback(tape, bhr), Actuators(bhr).effort
+    servo, player, effort = Servo(bhr, substeps=10**6), Playback(tape, bhr), Actuators(bhr).effort
     worst = {FLAT: 0.0, TOE: 0.0, AIR: 0.0}
     for row in range(0, len(tape.t) - 1, 7):
         step = round(float(tape.t[row]) / STEP_S)
@@ -69,6 +69,31 @@ def test_torques_keep_to_the_share_of_the_motors(bhr):
     tau = Servo(bhr).torque(far, q, v)
     assert np.abs(tau) == pytest.approx(0.2 * Actuators(bhr).effort)
     assert np.array_equal(Servo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
+
+
+def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
+    """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
+    q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
+    for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
+        given = Servo(bhr, substeps=substeps).torque(Command(tau=tau, change=change), q, v)
+        assert given == pytest.approx(tau + share * change, abs=1e-6)
+    takeoff = round(tape.takeoff_time / STEP_S)
+    player, none = Playback(tape, bhr, "pd"), np.zeros(14)
+    changes = [player.command(step, q, v, none).change for step in (100, takeoff - 1)]
+    assert changes[0] == pytest.approx(change, abs=1e-6) and not np.any(changes[1])  # the ground lets go at once
+
+
+def test_joints_whose_rates_are_right_are_where_substeps_bring_them(bhr, tape):
+    """Semi-implicit steps end half a step ahead: there no error is left, and so the damper is all that is felt."""
+    q, rate = stance_configuration(bhr), np.linspace(-2, 2, 14)
+    for substeps in (1, 4):
+        ahead = np.concatenate([q[:7], q[7:] + STEP_S / substeps / 2 * rate])
+        v = np.concatenate([np.zeros(6), rate])
+        here, there = (Servo(bhr, substeps=n).torque(told(bhr, q, rate=rate, feet=AIR), ahead, v)
+                       for n in (substeps, 10**9))  # fmt: skip
+        wish = told(bhr, ahead, rate=rate, feet=AIR)
+        assert here == pytest.approx(Servo(bhr, substeps=10**9).torque(wish, ahead, v), abs=1e-6)
+        assert np.abs(here - there).max() > 0.1
 
 
 def test_a_gain_scales_what_is_delivered(bhr):

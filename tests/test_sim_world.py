@@ -11,19 +11,13 @@ from jumplab import sim
 from jumplab.errors import InputError, JumplabError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import (
-    INSTALLED,
-    STEP_S,
-    Perturbation,
-    Ranges,
-    Scene,
-    SensorNoise,
-    engine_class,
-)
+from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, Scene, SensorNoise, engine_class, simulate_jump
 from jumplab.sim import engine as engines
 from jumplab.sim.kinematics import Gauge
 from jumplab.sim.playback import AIR, FLAT, Actuators, Command, Delay, Motors
 from jumplab.sim.servo import Servo
+from jumplab.stages.planner import plan_jump
+from jumplab.task import JumpTask
 
 with_bullet = pytest.mark.skipif("bullet" not in INSTALLED, reason="PyBullet is not installed")
 
@@ -214,6 +208,21 @@ def test_foot_sensors_weigh_the_robot(engine, bhr):
     assert moment[0] / total[2] == pytest.approx(com[1], abs=1e-3)
 
 
+@pytest.fixture(scope="module")
+def front_flip(bhr):
+    return plan_jump(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi), bhr).tape
+
+
+def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):
+    """Turning legs pull at the contact (J' v): the ground must neither let go of a loaded toe nor give way to it."""
+    tape, toe = front_flip, Gauge(bhr).toe
+    run, takeoff = simulate_jump(tape, bhr, mode="pd", engine=engine.name, stand_s=0.01), round(1e3 * tape.takeoff_time)
+    push = run.foot_wrench[takeoff - 150 : takeoff - 15, :, 2].sum(axis=1)
+    assert push.min() > 2 * 42 * 9.8 and np.abs(np.diff(push)).max() < 100
+    assert abs(toe(run.q[takeoff - 5])[0] - toe(run.q[0])[0]) < 5e-4
+    assert run.metrics.takeoff_momentum == pytest.approx(tape.extra["planar_L"][tape.takeoff_index], abs=0.15)
+
+
 def test_contact_impulse_is_change_of_momentum(engine, bhr):
     """Sliding down onto the ground: every step the measured forces explain the change of momentum, sign and size."""
     q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
@@ -341,5 +350,16 @@ def test_read_back_is_what_the_engine_has(engine, bhr):
         said = world.read_back()
         assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
         assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
+        assert said["gravity"] == [0, 0, -9.8] and said["inertia_error"] < 1e-12
         q, v = world.state()  # the probe of the self-collision has left nothing behind
     assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()
+
+
+def test_the_moon_and_another_robot_are_read_back(engine, bhr):
+    """Gravity is the robot's own; inertias are compared with its own, turned and shifted ones included."""
+    other = Perturbation.draw(bhr, 3).robot(bhr).under_gravity(1.62)
+    with engine(other, stance_configuration(bhr)) as world:
+        said, has = world.read_back(), world.inertials
+    assert said["gravity"] == [0, 0, -1.62] and said["inertia_error"] < 1e-12
+    planned = bhr.model.inertias[bhr.model.getJointId("left_knee")]
+    assert np.abs(has["left_shank"].inertia - planned.inertia).max() > 1e-4  # it is the other one's

@@ -185,12 +185,16 @@ def _engine(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     engine, stated = result.settings["engine"], result.settings["perturbation"]["friction"]
     miss = max(abs(friction - stated) for friction in engine["friction"])
     through, lost = float(not engine["self_collision"]), abs(engine["mass_kg"] - robot.total_mass)
+    falls = float(np.abs(np.subtract(engine["gravity"], [0.0, 0.0, -robot.gravity])).max())
+    turns = engine["inertia_error"]
     return (
         Finding("friction read back, less the stated", miss, NUMERIC, "", "friction that never reached the feet"),
         Finding("contact points outside the sole", engine["beyond_sole_m"], SOLE_M, "m", "oversized feet"),
         Finding("links that pass through each other", through, 0.0, "", "self-collision switched off"),
         Finding("damping and armature read back", engine["damping"], NUMERIC, "SI", "joints that brake or hold"),
         Finding("mass read back, less the stated", lost, 1e-3, "kg", "a lighter robot"),
+        Finding("inertia read back, less the stated", turns, NUMERIC, "kg m^2", "bodies that turn more easily"),
+        Finding("gravity read back, less the target's", falls, NUMERIC, "m/s^2", "a jump on another planet"),
     )
 
 

@@ -23,6 +23,12 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
     return pin.Quaternion(w, x, y, z).toRotationMatrix()
 
 
+def inertial(mass: float, com: np.ndarray, quaternion: np.ndarray, moments: np.ndarray) -> pin.Inertia:
+    """Inertia of a link in its frame, from its CoM (3,) there [m], and moments (3,) about axes that are turned."""
+    turn = rotation(np.asarray(quaternion))
+    return pin.Inertia(float(mass), np.asarray(com), turn @ np.diag(moments) @ turn.T)
+
+
 def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """A copy of ``q`` (nq,) with its base turned in place by ``turn`` (3, 3), world axes."""
     out = q.copy()

@@ -56,10 +56,10 @@ class Run:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        servo, motors = Servo(self.robot, late_s=how.known_delay_s), Motors(self.robot, how.motor_gain)
-        delay = Delay(round(how.delay_s / STEP_S))
+        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
         with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
+            servo = Servo(self.robot, late_s=how.known_delay_s, substeps=engine.substeps)
             contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
                 q, v = engine.state()

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine
-from jumplab.sim.kinematics import rotation
+from jumplab.sim.kinematics import inertial, rotation
 from jumplab.sim.scene import REACH_M, Contacts
 
 
@@ -19,16 +19,18 @@ from jumplab.sim.scene import REACH_M, Contacts
 class Softness:
     """How a contact gives way; MuJoCo's names are those of its solref and solimp."""
 
-    time_s: float = 0.002  # [s] a penetration fades; eight of the engine's steps, it wants two at least
+    time_s: float = 0.001  # [s] a penetration fades; of the engine's steps it takes four, with two feet would bounce
     damping_ratio: float = 1.0  # [1] nothing bounces
-    impedance: tuple[float, float] = (0.95, 0.99)  # [1] share of a contact's acceleration that is held off
+    # [1] share of a contact's acceleration that is held off, at the surface and ``depth_m`` below. MuJoCo's contacts do
+    # not see what turning legs add to it (J' v): a share of 0.95 at the surface lets loaded toes lift off and fall back
+    impedance: tuple[float, float] = (0.5, 0.95)
+    depth_m: float = 1e-4  # [m] as deep as feet stand in Bullet's ground
 
 
-SOFTNESS = Softness()  # as hard as Bullet's ground: launches slip by less than a millimetre; by default, 7 mm
+SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm
 SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
-TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
 
 
@@ -54,7 +56,7 @@ class MujocoEngine(Engine):
         for geom in spec.geoms:
             geom.condim, geom.margin = 3, 0.0
             geom.solref = [self.softness.time_s, self.softness.damping_ratio]
-            geom.solimp = [*self.softness.impedance, 0.001, 0.5, 2.0]
+            geom.solimp = [*self.softness.impedance, self.softness.depth_m, 0.5, 2.0]
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         for own in (self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss):
@@ -91,15 +93,11 @@ class MujocoEngine(Engine):
         """Free the engine."""
         self._data = self._model = None
 
-    def _feels_itself(self) -> bool:
-        rng, data = np.random.default_rng(0), mujoco.MjData(self._model)
-        data.qpos[2] = REACH_M
-        for _ in range(TANGLES):
-            data.qpos[self._angles] = rng.uniform(-np.pi, np.pi, len(self._angles))
-            mujoco.mj_forward(self._model, data)
-            if data.ncon:
-                return True
-        return False
+    def _tangled(self, angles: np.ndarray) -> bool:
+        data = mujoco.MjData(self._model)
+        data.qpos[2], data.qpos[self._angles] = REACH_M, angles
+        mujoco.mj_forward(self._model, data)
+        return bool(data.ncon)
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
         data = self._data
@@ -107,9 +105,16 @@ class MujocoEngine(Engine):
         data.qvel[:3], data.qvel[3:6], data.qvel[self._rates] = rotation(q[3:7]) @ v[:3], v[3:6], v[6:]
 
     @property
-    def mass_kg(self) -> float:
-        """Mass of the robot as the engine has it."""
-        return float(self._model.body_mass.sum())
+    def inertials(self) -> dict[str, pin.Inertia]:
+        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
+        has = self._model
+        rows = zip(has.body_mass, has.body_ipos, has.body_iquat[:, [1, 2, 3, 0]], has.body_inertia, strict=True)
+        return dict(zip(self.links, (inertial(*row) for row in list(rows)[1:]), strict=True))
+
+    @property
+    def gravity(self) -> list[float]:
+        """Gravity (3,) as the engine has it [m/s^2]."""
+        return self._model.opt.gravity.tolist()
 
     @property
     def friction(self) -> dict[str, float]:

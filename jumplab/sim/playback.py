@@ -56,6 +56,7 @@ class Command:
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
+    change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
     share: float = 1.0  # of the torque limit, for the servo
     state: tuple[np.ndarray, np.ndarray] | None = None  # (q, v) that it is expected to arrive in; as measured if None
@@ -130,8 +131,6 @@ class Playback:
         self.mode = mode
         self.steps, self.lead = round(float(tape.t[-1]) / STEP_S), round(lead_s / STEP_S)
         grid = np.arange(self.steps + 1) * STEP_S
-        # steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
-        self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
         self._q, self._v, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v, tape.tau))
         self._rate = self._v[:, 6:]
         self._pitch = np.interp(grid, tape.t, planned_pitch(tape.q))
@@ -139,6 +138,8 @@ class Playback:
         self._kp, self._kd = GAINS.of(robot)
         self._model, self._data = robot.model, robot.model.createData()
         self._takeoff = round(tape.takeoff_time / STEP_S)
+        self._change = np.vstack([np.diff(self._tau, axis=0), self._rest])
+        self._change[self._takeoff - 1] = 0.0  # what the ground held ends there at once
         self._heel_off = self._first_tilt(robot, tape)
 
     def _first_tilt(self, robot: Robot, tape: Tape) -> int:
@@ -162,13 +163,13 @@ class Playback:
         if at >= self.steps:
             return self.command(self.steps, q, v, correction)
         q, v = self._arriving(at, q, v)
-        ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
-        change = (_between(self._rate, at + 1.0) - rate) / STEP_S
+        angles, rate, tau, change = (_between(x, at) for x in (self._q, self._rate, self._tau, self._change))
+        due = (_between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate
         if self.mode == "position":
-            return Command(q=ahead + correction, rate=rate, acceleration=(1 + pace) ** 2 * change, state=(q, v))
+            return Command(q=angles + correction, rate=rate, acceleration=(1 + pace) ** 2 * due, state=(q, v))
         wish = GAINS.flight_corner * (angles + correction - q[7:]) + rate + self._correction_rate(correction) - v[6:]
-        return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish))
+        return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish), change=change)
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
         """Command to send at one step, from the measured state; ``correction`` is added to the angles."""
@@ -178,14 +179,14 @@ class Playback:
         if self.mode == "position":
             rate = self._rest if holding else self._rate[now]
             due = (self._rate[min(now + 1, self.steps)] - self._rate[now]) / STEP_S
-            moves = dict(q=self._ahead[now] + correction, rate=rate, acceleration=due)
+            moves = dict(q=self._q[now] + correction, rate=rate, acceleration=due)
             return Command(**moves, feet=self.stands(step), state=(q, v))
         rate = self._rest if holding else self._rate[now]
         error, rate_error = self._q[now] + correction - q[7:], rate + self._correction_rate(correction) - v[6:]
         if step < self._takeoff:
-            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error)
+            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error, change=self._change[now])
         wish = GAINS.flight_bandwidth * (GAINS.flight_corner * error + rate_error)
-        return Command(tau=self._tau[now] + self._inertia(q) @ wish)
+        return Command(tau=self._tau[now] + self._inertia(q) @ wish, change=self._change[now])
 
     def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as now."""

@@ -44,11 +44,15 @@ PITCH = 4  # row of a foot's twist that is free while it stands on its toe
 
 
 class Servo:
-    """Torques for commands of position mode, from the measured state; ``robot`` is as planned, and torques are known
-    to arrive ``late_s`` late."""
+    """Torques for commands, from the measured state.
 
-    def __init__(self, robot: Robot, gains: ServoGains = GAINS, late_s: float = 0.0):
-        self._step_s = STEP_S + late_s
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. They act for a whole step, which an engine
+    takes in ``substeps`` semi-implicit ones: they are felt at the beginnings of these, on average (1 - 1/substeps) / 2
+    of the step late, and planned ones change meanwhile. Joints whose rates are right run ahead by half a substep.
+    """
+
+    def __init__(self, robot: Robot, gains: ServoGains = GAINS, late_s: float = 0.0, substeps: int = 1):
+        self._step_s, self._late, self._ahead_s = STEP_S + late_s, (1 - 1 / substeps) / 2, STEP_S / substeps / 2
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
@@ -56,14 +60,15 @@ class Servo:
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]; those of the command, if it has any."""
         if command.tau is not None:
-            return command.tau
+            return command.tau + self._late * command.change
         model, data = self._gauge.model, self._gauge.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
         feet, drift, units = self._feet(command.feet)
         push = feet.T * units
         tau = self._feed_forward(command.acceleration, feet, drift, push)
-        wish = command.rate + self._step_s * command.acceleration + self._gains.corner * (command.q - q[7:])
+        error = command.q + self._ahead_s * command.rate - q[7:]
+        wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
         tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
