@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import functools
 import importlib
 import inspect
 import os
@@ -24,7 +25,7 @@ import pytest
 AUDIT = tuple(f"jumplab.auditing.{part}" for part in ("audit", "contact", "dynamics", "motion", "replay", "report"))
 # what is judged: modules, tests, and the least share of mutants that they must notice
 JUDGED = {
-    "audit": (AUDIT, ("tests/test_audit_amounts.py", "tests/test_audit_truths.py"), 0.95),
+    "audit": (AUDIT, ("tests/test_audit_amounts.py", "tests/test_audit_words.py", "tests/test_audit_truths.py"), 0.95),
     "exports": (("jumplab.io.export", "jumplab.io.motion"), ("tests/test_motion.py", "tests/test_export.py"), 0.95),
     "checks": (("jumplab.sim.checks",), ("tests/test_sim_amounts.py",), 0.90),
 }
@@ -53,22 +54,26 @@ def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
         yield repr(value), lambda n: setattr(n, "value", new)
     for field in ("id", "attr"):
         if (name := getattr(node, field, None)) in NAMES:
-            yield name, lambda n, f=field, new=NAMES.get(name): setattr(n, f, new)
-    if isinstance(node, ast.keyword):
+            yield name, functools.partial(lambda f, new, n: setattr(n, f, new), field, NAMES[name])
+    if isinstance(node, ast.keyword) and node.arg != "strict":
         yield f"{node.arg}=", lambda n: setattr(n, "value", ast.Constant(None))
 
 
 def mutants(module: ModuleType) -> Iterator[tuple[str, Callable[[], ast.Module]]]:
-    """(where and what, program) of every mutant of a module; annotations and docstrings are left alone."""
+    """(where and what, program) of every mutant of a module, but for annotations, docstrings and zip's strict."""
     text = inspect.getsource(module)
     tree, lines = ast.parse(text), text.splitlines()
     passive = [n.value for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
+    passive += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "strict"]  # a guard
     passive += [a for n in ast.walk(tree) for f in ("annotation", "returns") if (a := getattr(n, f, None))]
     alone = {id(n) for a in passive for n in ast.walk(a)}
     for at, node in enumerate(ast.walk(tree)):
         for which, (what, _) in enumerate(changes(node) if id(node) not in alone else ()):
             row = getattr(node, "lineno", 0) or node.value.lineno
-            yield f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}", lambda at=at, k=which: build(tree, at, k)
+            yield (
+                f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}",
+                lambda at=at, k=which: build(tree, at, k),
+            )
 
 
 def build(tree: ast.Module, at: int, which: int) -> ast.Module:
@@ -86,8 +91,10 @@ def install(module: ModuleType, tree: ast.Module) -> None:
     others = [m for name, m in sys.modules.items() if name.startswith(("jumplab", "test_", "fixtures"))]
     for name, new in mutant.items():
         old = usual.get(name)
-        if name.startswith("__") or isinstance(old, ModuleType) or getattr(old, "__module__", module.__name__) != (
-            module.__name__
+        if (
+            name.startswith("__")
+            or isinstance(old, ModuleType)
+            or getattr(old, "__module__", module.__name__) != (module.__name__)
         ):
             continue
         if isinstance(old, FunctionType):
