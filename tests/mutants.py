@@ -46,7 +46,8 @@ def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
     elif isinstance(sign, ast.Not | ast.Invert):
         yield type(sign).__name__, lambda n: setattr(n, "operand", ast.UnaryOp(type(sign)(), n.operand))
     for i, sense in enumerate(getattr(node, "ops", ())):
-        yield type(sense).__name__, lambda n, i=i, new=SWAPS[type(sense)]: n.ops.__setitem__(i, new())
+        new = SWAPS[type(sense)]
+        yield type(sense).__name__, functools.partial(lambda i, new, n: n.ops.__setitem__(i, new()), i, new)
     if isinstance(node, ast.If | ast.IfExp | ast.While):
         yield "condition", lambda n: setattr(n, "test", ast.UnaryOp(ast.Not(), n.test))
     if isinstance(node, ast.Constant) and isinstance(value, bool | int | float | str):
