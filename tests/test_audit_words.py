@@ -313,22 +313,53 @@ def test_quotients_of_almost_nothing():
     assert audit(slow, ROBOT)["mass"].note.startswith("the ground force moves 20.000 kg")
 
 
-def test_a_foot_is_tipped_when_both_ends_of_its_heel_are_up():
-    """A rolled foot: the heel's lower end counts, 5 mm and not a hair less."""
+def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0):
+    """A tape whose only force is 200 N at a point of the left sole [m], in one row; its lower heel end at a height."""
     tape, row = random_tape(0), 3
     q, f = np.array(tape.q), np.zeros_like(tape.f)
     q[row] = stance_configuration(ROBOT)
-    roll = 7 + JOINTS.index("left_ankle_roll")
-    q[row, roll] = 0.1
-    f[row, 0] = [0, 0, 200.0, 0, 0, 0]
-    low = replay(dataclasses.replace(tape, q=q.copy()), ROBOT, None).heel_corners[row, 0, :, 2].min()
-    q[row, 2] -= low
-    values = []
-    for lift in (0.0049, 0.0051):
-        q[row, 2] += lift
-        values.append(audit(dataclasses.replace(tape, q=q.copy(), f=f), ROBOT)["CoP at the toe"].value)
-        q[row, 2] -= lift
-    assert values[0] == 0.0 and values[1] > 50
+    for name, angle in (("left_ankle_pitch", pitch), ("left_ankle_roll", roll)):
+        q[row, 7 + JOINTS.index(name)] += angle
+    before = replay(dataclasses.replace(tape, q=q.copy()), ROBOT, None)
+    q[row, 2] += lift - before.heel_corners[row, 0, :, 2].min()
+    place = before.foot_rotation[row, 0] @ point
+    origin = before.foot[row, 0] + [0, 0, q[row, 2] - before.tape.q[row, 2]]
+    place[2] = -origin[2]  # on the ground
+    f[row, 0] = [0, 0, 200.0, *np.cross(place, [0, 0, 200.0])]
+    return audit(dataclasses.replace(tape, q=q, f=f), ROBOT)
+
+
+def test_a_foot_is_tipped_when_both_ends_of_its_heel_are_up():
+    """The heel's lower end counts, 5 mm and not a hair less, whichever side it is on."""
+    for roll in (0.1, -0.1):
+        tipped = [pressed(np.zeros(3), 0.1, roll, lift)["CoP at the toe"].value for lift in (0.0049, 0.0051)]
+        assert tipped[0] == 0.0 and 125 < tipped[1] < 145
+
+
+def test_pressure_beyond_each_edge_of_the_sole():
+    foot = ROBOT.foot
+    for x, y, beyond in ((foot.toe + 0.02, 0, 20), (foot.heel - 0.03, 0, 30), (0, foot.half_width + 0.04, 40),
+                         (0, -foot.half_width - 0.05, 50), (0, 0, -50), (foot.toe - 0.01, 0, -10),
+                         (foot.heel + 0.02, 0.01, -20)):  # fmt: skip
+        found = pressed(np.array([x, y, 0.0]))["CoP in the sole"]
+        assert found.value == pytest.approx(beyond, abs=1e-6) and found.note.endswith("; worst: left_foot")
+
+
+def test_symmetry_names_what_is_worst():
+    tape = random_tape(0)
+    still = {"tau": np.zeros_like(tape.tau), "f": np.zeros_like(tape.f)}
+    for column, both, name in ((1, 1.0, "lateral force"), (2, -1.0, "foot load")):
+        f = np.zeros_like(tape.f)
+        f[4, :, column] = [10.0, both * 10.0]
+        found = audit(dataclasses.replace(tape, **{**still, "f": f}), ROBOT)["left/right effort"]
+        assert found.note.endswith(f"; worst: {name}") and found.value == pytest.approx(100 * 20 / (42 * 9.8))
+    q = np.tile(stance_configuration(ROBOT), (len(tape.t), 1))
+    for column, value, name in ((1, 0.03, "lateral shift"), (3, 0.1, "roll"), (5, 0.1, "yaw")):
+        other = q.copy()
+        other[4, column] += value
+        found = audit(dataclasses.replace(tape, q=other), ROBOT)["left/right posture"]
+        amount = 1e3 * value * (1 if column == 1 else 2)
+        assert found.note.endswith(f"; worst: {name}") and found.value == pytest.approx(amount)
 
 
 # ------------------------------------------------------------------------------------------------ folders
