@@ -26,7 +26,11 @@ AUDIT = tuple(f"jumplab.auditing.{part}" for part in ("audit", "contact", "dynam
 # what is judged: modules, tests, and the least share of mutants that they must notice
 JUDGED = {
     "audit": (AUDIT, ("tests/test_audit_amounts.py", "tests/test_audit_words.py"), 0.95),
-    "exports": (("jumplab.io.export", "jumplab.io.motion"), ("tests/test_motion.py", "tests/test_export.py"), 0.95),
+    "exports": (
+        ("jumplab.io.export", "jumplab.io.motion"),
+        ("tests/test_export_amounts.py", "tests/test_motion.py"),
+        0.95,
+    ),
     "checks": (("jumplab.sim.checks",), ("tests/test_sim_amounts.py",), 0.90),
 }
 SWAPS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.And: ast.Or,
