@@ -188,17 +188,12 @@ def test_guess_is_stage_twos_motion(plan):
 
 
 @pytest.mark.slow
-def test_another_gravity_is_planned_or_refused():
+def test_another_gravity_is_planned():
     """Never a tape whose forces belong to another planet; and no stage that fails because it thinks of 9.8."""
-    task = JumpTask(0.3, 0.3, gravity=7.0)
     for method in METHODS:
-        try:
-            plan = planner().plan(task, method)
-        except InputError:
-            continue
-        residual = np.abs(Replay(plan).residual)
-        assert residual[:, :6].max() < 0.005 * 42.0 * 7.0
-        assert residual[:, 6:].max() < 1e-6
+        residual = np.abs(Replay(planner().plan(JumpTask(0.3, 0.3, gravity=7.0), method)).residual)
+        assert residual[:, :6].max() < 0.02  # [N, N m] of a weight of 294 N: between the nodes
+        assert residual[:, 6:].max() < 1e-9
 
 
 @pytest.mark.slow
