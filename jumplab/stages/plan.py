@@ -42,7 +42,7 @@ class JumpPlan:
     tape : the 1 kHz tape of the full robot.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner; None if the plan was read from a result folder.
-    statistics : one row per stage.
+    statistics : one row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less closely.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
     """
@@ -114,6 +114,8 @@ class JumpPlan:
             s = self.joints.statistics
             found["joint map"] = {"solver": s.method, "problems": s.steps, "iterations": s.iterations,
                                   "residual": s.worst_residual}  # fmt: skip
+            if self.joints.gentle:
+                found["joint map"]["gentle"] = self.joints.gentle
         return {**found, "whole body": _solver(self.whole_body.solution.statistics)}
 
     @property

@@ -345,7 +345,7 @@ def _row(stage: str, s: Statistics) -> StageRow:
 
 def _joint_row(joints: JointPlan) -> StageRow:
     s = joints.statistics
-    return StageRow("2 joint map", s.iterations, s.total_s - s.solve_s, s.solve_s)
+    return StageRow("2 joint map" + ", gentle" * bool(joints.gentle), s.iterations, s.total_s - s.solve_s, s.solve_s)
 
 
 def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
@@ -361,13 +361,14 @@ def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> Ju
 
 
 def guess_from_joints(
-    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float
+    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float, own_arms: float | None = None
 ) -> dict[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`. ``toe_s`` is the length of
-    the toe phase [s].
+    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`; ``own_arms`` is stage 2's share of them, by default
+    :data:`OWN_ARMS`. ``toe_s`` is the length of the toe phase [s].
     """
+    share = (OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS) if own_arms is None else own_arms
     motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
     takeoff, naive, out = float(joints.t[row]), planner.naive_guess(task), {}
     now, names = (x[row : row + 1] for x in motion), ("com", "com_velocity")
@@ -380,7 +381,7 @@ def guess_from_joints(
         if name == "toe":
             q[:, 0] = np.maximum(q[:, 0], 0.0)
         body = PhaseGuess(t[-1] - t[0], q, v, a, None, ballistic if name == "flight" else {})
-        out[name] = _with_arms(body, naive[name], OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS)
+        out[name] = _with_arms(body, naive[name], share)
     return out
 
 
