@@ -365,8 +365,8 @@ def guess_from_joints(
 ) -> dict[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`; ``own_arms`` is stage 2's share of them, by default
-    :data:`OWN_ARMS`. ``toe_s`` is the length of the toe phase [s].
+    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`; ``own_arms`` is stage 2's share of them, by
+    default :data:`OWN_ARMS`. ``toe_s`` is the length of the toe phase [s].
     """
     share = (OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS) if own_arms is None else own_arms
     motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))

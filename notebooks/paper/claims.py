@@ -188,8 +188,8 @@ def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlan
 def against_crouch(rows: Sequence[Start]) -> list[dict]:
     """One row per start: solved targets, and medians of iterations and time as shares of the crouch's.
 
-    Only targets count that the crouch has solved too; shares are None where there is none. ``costlier`` counts the jumps
-    that cost more than :data:`SAME_COST` times the cheapest one found for their target, from whatever start.
+    Only targets count that the crouch has solved too; shares are None where there is none. ``costlier`` counts the
+    jumps that cost more than :data:`SAME_COST` times the cheapest one found for their target, from whatever start.
     """
     crouch = {r.task: r for r in rows if r.start == STARTS[0] and r.iterations is not None}
     least = {t: min((r.cost for r in rows if r.task == t and r.cost is not None), default=0.0) for t in crouch}
@@ -215,8 +215,8 @@ def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:
 
     Returns
     -------
-    ``lift-off``, ``least``, ``greatest``, ``touchdown``; ``legs`` and ``arms``, by how much the inertia changes if of the
-    posture where it is greatest only the legs, or only the arms, go to where they are when it is least after that.
+    ``lift-off``, ``least``, ``greatest``, ``touchdown``; ``legs`` and ``arms``, by how much the inertia changes if of
+    the posture where it is greatest only the legs, or only the arms, go to where they are when it is least after that.
     """
     at = np.searchsorted(run.t, [run.metrics.liftoff_s, run.metrics.touchdown_s])
     rho, body = run.rho[at[0] : at[1]], FullBody(robot)

@@ -1,11 +1,12 @@
 """Three steps against one program where it is hard: far targets, platforms, tight limits, other robots, bad guesses.
 
 ``python -m paper.hard_cases`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve, and can
-be stopped and started again; notebook 10 draws the file.
+be stopped and started again; it takes some minutes. Notebook 10 draws the file.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +24,7 @@ from jumplab.errors import JumplabError, SolverError
 from jumplab.io.files import open_log
 from jumplab.ocp import PhaseGuess
 from jumplab.robot import Robot
-from jumplab.show.style import PAGE_IN, PURPLE, VERMILION, new_figure
+from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, new_figure
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import METHODS, STEPS_S, Planner, guess_from_joints, make_tape
 from jumplab.stages.whole_body import WholeBodyPlan
@@ -144,6 +145,76 @@ def run(path: str | Path = LOG, asked: Sequence[Case] | None = None) -> list[dic
                     log.done[case.number, method] = row = solve(case, method)
                     log.add(row)
         return [log.done[case.number, method] for case in asked for method in METHODS]
+
+
+def read(path: str | Path = LOG) -> list[dict[str, Any]]:
+    """Rows of a file that :func:`run` has written, in the order of their cases; nothing is solved."""
+    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    return sorted(map(json.loads, lines), key=lambda row: (row["number"], METHODS.index(row["method"])))
+
+
+def _pairs(rows: Sequence[Mapping[str, Any]], kind: str) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """(three steps, direct) of each case of a kind, or of all."""
+    by = {(r["number"], r["method"]): r for r in rows if kind in (r["kind"], "all")}
+    return [(by[n, METHODS[0]], by[n, METHODS[1]]) for n in dict.fromkeys(n for n, _ in by)]
+
+
+def _ratios(pairs: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], key: str) -> np.ndarray:
+    """Three steps over direct, where both are clean."""
+    return np.array([a[key] / b[key] for a, b in pairs if a["clean"] and b["clean"]])
+
+
+def compared(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per kind of cases, and one for all: how often each method ends in a clean plan, and medians of ratios.
+
+    ``same`` of a method is the share of its clean plans from bad guesses whose effort is the least that it found for
+    that target, within :data:`WITHIN`; None for other kinds. Ratios are three steps over direct, where both are clean.
+    """
+    out = []
+    for kind in (*KINDS, "all"):
+        pairs = _pairs(rows, kind)
+        row: dict[str, Any] = {"cases": kind, "number": len(pairs)}
+        for k, method in enumerate(METHODS):
+            good = [pair[k] for pair in pairs if pair[k]["clean"]]
+            row[f"{method}, clean"] = len(good)
+            least: dict[tuple[float, float], float] = {}
+            for r in good:
+                target = r["distance_m"], r["height_m"]
+                least[target] = min(least.get(target, np.inf), r["effort"])
+            near = [r["effort"] <= WITHIN * least[r["distance_m"], r["height_m"]] for r in good]
+            row[f"{method}, same"] = float(np.mean(near)) if kind == KINDS[-1] and near else None
+        for key in ("cpu_s", "effort"):
+            found = _ratios(pairs, key)
+            row[f"{key}, ratio"] = float(np.median(found)) if found.size else None
+        out.append(row)
+    return out
+
+
+def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Success of both methods by kind of cases, and the ratios of time and effort of every case that both solve."""
+    fig = new_figure(PAGE_IN, 2.4)
+    axes, table = fig.subplots(1, 3, sharey=True), compared(rows)[:-1]
+    for y, row in enumerate(table):
+        pairs = _pairs(rows, row["cases"])
+        for k, (method, color) in enumerate(zip(METHODS, (PURPLE, VERMILION), strict=True)):
+            share, label = row[f"{method}, clean"] / row["number"], method if y == 0 else None
+            axes[0].barh(y + 0.36 * (k - 0.5), 100 * share, height=0.32, color=color, label=label)
+        for ax, key in zip(axes[1:], ("cpu_s", "effort"), strict=True):
+            found = _ratios(pairs, key)
+            ax.plot(found, y + np.linspace(-0.3, 0.3, len(found)), ".", color=PURPLE, markersize=2)
+            ax.plot(np.median(found), y, "|", color=VERMILION, markersize=16)
+    axes[0].set(yticks=range(len(table)), yticklabels=[row["cases"] for row in table])
+    axes[0].set(xlabel="clean plans [%]", xlim=(0, 100))
+    axes[0].invert_yaxis()
+    axes[0].legend(loc="lower left")
+    for ax, what in zip(axes[1:], ("CPU time", "effort"), strict=True):
+        ax.axvline(1.0, **REFERENCE_STYLE)
+        ticks = (0.5, 1, 2, 5)
+        ax.set(
+            xscale="log", xlabel=f"{what}, three steps / direct", xticks=ticks, xticklabels=[f"{x:g}" for x in ticks]
+        )
+        ax.minorticks_off()
+    return fig
 
 
 if __name__ == "__main__":
