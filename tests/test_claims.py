@@ -205,8 +205,8 @@ def test_medians_of_a_study_by_hand(tmp_path):
         where = {"kind": kind, "distance_m": 0.5, "height_m": 0.3, "clean": clean}
         return {"number": number, "method": method, "cpu_s": cpu_s, "effort": effort, **where}
 
-    rows = [row(0, "three-step", 2.0, 30.0), row(0, "direct", 1.0, 10.0), row(1, "three-step", 1.0, 20.0),
-            row(1, "direct", 1.0, 10.05), row(2, "three-step", 9.0, None, False), row(2, "direct", 1.0, 40.0)]  # fmt: skip
+    numbers = ((2.0, 30.0), (1.0, 10.0)), ((1.0, 20.0), (1.0, 10.05)), ((9.0, None, False), (1.0, 40.0))
+    rows = [row(k, method, *x) for k, pair in enumerate(numbers) for method, x in zip(METHODS, pair, strict=True)]
     path = tmp_path / "log"
     path.write_text("\n".join(json.dumps(r) for r in reversed(rows)))
     assert hard_cases.read(path) == rows
@@ -250,8 +250,8 @@ def test_the_same_words_everywhere():
         assert said in text, stem
     every = hard_cases.compared(hard_cases.read())[-1]
     counted = (
-        f"Of {every['number']} harder cases three steps end in a clean plan in {every['three-step, clean']}, the direct "
-        f"program in {every['direct, clean']}; where both do, three steps take {every['cpu_s, ratio']:.1f} times the CPU "
-        f"time and {every['effort, ratio']:.1f} times the effort (medians; `10_benchmark` draws them)."
+        f"Of {every['number']} harder cases three steps end in a clean plan in {every['three-step, clean']}, the "
+        f"direct program in {every['direct, clean']}; where both do, three steps take {every['cpu_s, ratio']:.1f} "
+        f"times the CPU time and {every['effort, ratio']:.1f} times the effort (medians; `10_benchmark` draws them)."
     )
     assert counted in readme
