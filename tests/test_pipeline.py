@@ -180,7 +180,7 @@ def test_guess_is_stage_twos_motion(plan):
         assert angle == pytest.approx(own, abs=1e-9)
     arm = pipeline.to_link_angles(robot, plan.joints.q, plan.joints.v, plan.joints.a)[0][-1, 4]
     naive = body.naive_guess(plan.task)["flight"].q[-1, 4]
-    mixed = pipeline.OWN_ARMS * arm + pipeline.NAIVE_ARMS * naive
+    mixed = pipeline.OWN_ARMS * arm + (1 - pipeline.OWN_ARMS) * naive
     assert guess["flight"].q[-1, 4] == pytest.approx(mixed, abs=1e-9)
     velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
     rows = plan.joints.rows("flight")
@@ -188,17 +188,12 @@ def test_guess_is_stage_twos_motion(plan):
 
 
 @pytest.mark.slow
-def test_another_gravity_is_planned_or_refused():
+def test_another_gravity_is_planned():
     """Never a tape whose forces belong to another planet; and no stage that fails because it thinks of 9.8."""
-    task = JumpTask(0.3, 0.3, gravity=7.0)
     for method in METHODS:
-        try:
-            plan = planner().plan(task, method)
-        except InputError:
-            continue
-        residual = np.abs(Replay(plan).residual)
-        assert residual[:, :6].max() < 0.005 * 42.0 * 7.0
-        assert residual[:, 6:].max() < 1e-6
+        residual = np.abs(Replay(planner().plan(JumpTask(0.3, 0.3, gravity=7.0), method)).residual)
+        assert residual[:, :6].max() < 0.02  # [N, N m] of a weight of 294 N: between the nodes
+        assert residual[:, 6:].max() < 1e-9
 
 
 @pytest.mark.slow

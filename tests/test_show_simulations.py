@@ -135,7 +135,11 @@ def body(picture):
 
 
 def test_camera_sees_the_robot_where_the_log_says(result, bhr):
-    """Picture and outlines computed by Pinocchio, with the joints' balls, differ by 4 cm at most: perspective."""
+    """Nothing of the outlines by Pinocchio, with the joints' balls, is missing; what is seen beyond is perspective.
+
+    The camera is 10 m away: a near hand, 0.28 m before the jump's plane and 0.9 m off the middle of the picture, is
+    drawn 3 pixels too far out, and rounding takes one more.
+    """
     camera = render.Camera(width=2.0, bottom=-0.1, top=1.9, pitch_deg=0.0, pixels_per_m=100)
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
@@ -150,7 +154,7 @@ def test_camera_sees_the_robot_where_the_log_says(result, bhr):
         wanted = np.any(inside, axis=0).reshape(seen.shape)
         assert wanted.sum() > 1000
         assert not (seen & ~binary_dilation(wanted, square, iterations=4)).any()
-        assert not (wanted & ~binary_dilation(seen, square, iterations=4)).any()
+        assert not (wanted & ~binary_dilation(seen, square, iterations=1)).any()
 
 
 def test_pictures_are_repeatable_and_move_with_the_robot(studio, bhr):

@@ -249,7 +249,7 @@ def test_the_landing_is_planned_in_flight(bhr, tape):
         return np.max(np.abs(run.tau[late]) / Actuators(bhr).effort), run.foot_wrench[late, :, 2].sum(axis=1).max()
 
     (torque, force), (spring_torque, spring_force) = loads(planned), loads(spring)
-    assert torque < 0.95 * spring_torque and force < 0.8 * spring_force
+    assert torque < 0.85 * spring_torque and force < 0.8 * spring_force  # 0.81; plans of three steps 0.6 to 0.7
 
 
 def test_late_commands_make_no_joint_swing(bhr, tape):

@@ -127,6 +127,9 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     for row in summary["stages"]:
         print(f"{row['stage']:<22}{row['iterations']:>11}{row['build_s']:>8.2f} s{row['solve_s']:>8.2f} s")
     print(f"planned: distance {summary['planned_distance_m']:.3f} m, rise {summary['planned_rise_m']:.3f} m")
+    if followed := summary.get("tracking"):
+        off = (f"{100 * followed[phase]['rho']['relative_rms']:.1f} % in {phase}" for phase in ("launch", "flight"))
+        print(f"inertia off stage 1's by {', '.join(off)} (rms)")
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from eigenpy import PartialPivLU
 
 from jumplab.robot import Robot
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The x of ``matrix`` (n, n) x = ``right`` (n,) or (n, k).
+
+    By Eigen: the last digit of NumPy's own depends on its version, whose newest is not the same on every Python.
+    """
+    return PartialPivLU(matrix).solve(right)
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:

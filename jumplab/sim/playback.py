@@ -16,7 +16,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import planned_pitch
+from jumplab.sim.kinematics import planned_pitch, solved
 
 MODES = ("position", "pd")
 FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
@@ -206,7 +206,7 @@ class Playback:
         upper = pin.crba(self._model, self._data, q)
         whole = np.triu(upper) + np.triu(upper, 1).T
         lever = whole[:6, 6:]
-        return whole[6:, 6:] - lever.T @ np.linalg.solve(whole[:6, :6], lever)
+        return whole[6:, 6:] - lever.T @ solved(whole[:6, :6], lever)
 
     def trunk_pitch(self, step: int) -> float:
         """Planned trunk pitch [rad], continuous through full turns."""

@@ -24,7 +24,7 @@ import pinocchio as pin
 
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge
+from jumplab.sim.kinematics import Gauge, solved
 from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command
 
 
@@ -83,7 +83,7 @@ class Servo:
         kkt[held:, :6], kkt[held:, 6:held] = data.M[:6, :6], -push[:6]
         kkt[:held, held:] = kkt[held:, :held].T
         right[:6], right[held:] = -feet[:, :6].T @ (drift + feet[:, 6:] @ joints), -offset[:6]
-        x = np.linalg.solve(kkt, right)
+        x = solved(kkt, right)
         return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held]
 
     def _rates_after(self, tau: np.ndarray, wish: np.ndarray, v: np.ndarray, push: np.ndarray) -> np.ndarray:
@@ -97,7 +97,7 @@ class Servo:
         kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * step_s
         right[:nv] = data.M @ v - step_s * data.nle
         right[6:nv] += step_s * (tau + self._damping * wish)
-        return np.linalg.solve(kkt, right)[6:nv]
+        return solved(kkt, right)[6:nv]
 
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench against each."""

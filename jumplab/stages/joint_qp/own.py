@@ -3,6 +3,10 @@
 >>> still = jl.Term("still hands", "ours", "m/s^2", "node", lambda p: p.point("left_hand").acceleration, weight=1e-3)
 >>> low = jl.Term("knee", "ours", "N m", "node", lambda p: p.torques.knee, lower=-150, upper=150)
 >>> plan = stages.joint_qp.map_to_joints(srmp, robot, terms={"flight": [still], "launch": [low]})
+
+Every step has its own QP, which sees no later step. So a cost with a larger weight is smaller in every step from the
+same state, but over the roll-out only while no joint is braked before its stop: dearer arms, say, swing on freely, meet
+the stop faster, and are braked harder there than if an earlier step had slowed them.
 """
 
 from __future__ import annotations

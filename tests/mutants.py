@@ -1,0 +1,181 @@
+"""Mutants of modules whose word is trusted: one operator, number, name or sentence changed at a time, in memory.
+
+``python tests/mutants.py audit exports checks`` runs the tests concerned on every mutant, each in a fork of one warm
+process, and prints the share that one of them notices; ``--share 0.1 --seed 1`` takes a sample. No part of the
+collected tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import functools
+import importlib
+import inspect
+import os
+import random
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from types import FunctionType, ModuleType
+
+import pytest
+
+AUDIT = tuple(f"jumplab.auditing.{part}" for part in ("audit", "contact", "dynamics", "motion", "replay", "report"))
+# what is judged: modules, tests, and the least share of mutants that they must notice
+JUDGED = {
+    "audit": (AUDIT, ("tests/test_audit_amounts.py", "tests/test_audit_words.py"), 0.95),
+    "exports": (
+        ("jumplab.io.export", "jumplab.io.motion"),
+        ("tests/test_export_amounts.py", "tests/test_motion.py"),
+        0.95,
+    ),
+    "checks": (("jumplab.sim.checks",), ("tests/test_sim_amounts.py",), 0.90),
+}
+SWAPS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.And: ast.Or,
+         ast.Mod: ast.Div, ast.MatMult: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Or: ast.And,
+         ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+         ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.USub: ast.UAdd}  # fmt: skip
+PAIRS = (("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("any", "all"), ("floor", "ceil"))
+NAMES = dict([*PAIRS, *((b, a) for a, b in PAIRS)])
+NOTICED, BROKEN, SLOWEST_S = 1, 97, 120  # exit codes of a fork; mutants that take longer count as noticed
+
+
+def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
+    """(what is changed, how) of each mutant of one node of a program."""
+    sign, value = getattr(node, "op", None), getattr(node, "value", None)
+    if type(sign) in SWAPS:
+        yield type(sign).__name__, lambda n: setattr(n, "op", SWAPS[type(sign)]())
+    elif isinstance(sign, ast.Not | ast.Invert):
+        yield type(sign).__name__, lambda n: setattr(n, "operand", ast.UnaryOp(type(sign)(), n.operand))
+    for i, sense in enumerate(getattr(node, "ops", ())):
+        new = SWAPS[type(sense)]
+        yield type(sense).__name__, functools.partial(lambda i, new, n: n.ops.__setitem__(i, new()), i, new)
+    if isinstance(node, ast.If | ast.IfExp | ast.While):
+        yield "condition", lambda n: setattr(n, "test", ast.UnaryOp(ast.Not(), n.test))
+    if isinstance(node, ast.Constant) and isinstance(value, bool | int | float | str):
+        new = f"XX{value}XX" if isinstance(value, str) else not value if isinstance(value, bool) else value + 1
+        yield repr(value), lambda n: setattr(n, "value", new)
+    for field in ("id", "attr"):
+        if (name := getattr(node, field, None)) in NAMES:
+            yield name, functools.partial(lambda f, new, n: setattr(n, f, new), field, NAMES[name])
+    if isinstance(node, ast.keyword) and node.arg != "strict":
+        yield f"{node.arg}=", lambda n: setattr(n, "value", ast.Constant(None))
+
+
+def mutants(module: ModuleType) -> Iterator[tuple[str, Callable[[], ast.Module]]]:
+    """(where and what, program) of every mutant of a module, but for annotations, docstrings and zip's strict."""
+    text = inspect.getsource(module)
+    tree, lines = ast.parse(text), text.splitlines()
+    passive = [n.value for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
+    passive += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "strict"]  # a guard
+    passive += [a for n in ast.walk(tree) for f in ("annotation", "returns") if (a := getattr(n, f, None))]
+    alone = {id(n) for a in passive for n in ast.walk(a)}
+    for at, node in enumerate(ast.walk(tree)):
+        for which, (what, _) in enumerate(changes(node) if id(node) not in alone else ()):
+            row = getattr(node, "lineno", 0) or node.value.lineno
+            yield (
+                f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}",
+                lambda at=at, k=which: build(tree, at, k),
+            )
+
+
+def build(tree: ast.Module, at: int, which: int) -> ast.Module:
+    """A copy of a program with one change of its node number ``at``."""
+    new = copy.deepcopy(tree)
+    node = list(ast.walk(new))[at]
+    list(changes(node))[which][1](node)
+    return ast.fix_missing_locations(new)
+
+
+def install(module: ModuleType, tree: ast.Module) -> None:
+    """Let everyone who imported from a module see the mutant: functions get its code, the rest its objects."""
+    usual, mutant = dict(vars(module)), {"__name__": module.__name__, "__file__": module.__file__}
+    exec(compile(tree, module.__file__, "exec"), mutant)
+    others = [m for name, m in sys.modules.items() if name.startswith(("jumplab", "test_", "fixtures"))]
+    for name, new in mutant.items():
+        old = usual.get(name)
+        if (
+            name.startswith("__")
+            or isinstance(old, ModuleType)
+            or getattr(old, "__module__", module.__name__) != (module.__name__)
+        ):
+            continue
+        if isinstance(old, FunctionType):
+            old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__
+            continue
+        for other in others:
+            if old is not None and vars(other).get(name) is old:
+                setattr(other, name, new)
+
+
+class Judge:
+    """A plugin of pytest that runs the tests it collected on every mutant, each in a fork of the warm process."""
+
+    def __init__(self, mutants: list[tuple[ModuleType, str, Callable[[], ast.Module]]]):
+        self.mutants, self.missed = mutants, []
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Instead of running the tests once: first without a mutant, then with each."""
+        if failed(session):
+            raise RuntimeError(f"{failed(session)} fails without any mutant")
+        self.missed = [name for module, name, program in self.mutants if not noticed(session, module, program)]
+        return True
+
+
+def failed(session: pytest.Session) -> str:
+    """The first test that fails, or nothing."""
+    for item, after in zip(session.items, [*session.items[1:], None], strict=True):
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+        if session.testsfailed:
+            return item.nodeid
+    return ""
+
+
+def noticed(session: pytest.Session, module: ModuleType, program: Callable[[], ast.Module]) -> bool:
+    """Whether one of the tests fails on a mutant, or it cannot be loaded, or does not end."""
+    sys.stdout.flush()
+    if (child := os.fork()) == 0:
+        signal.alarm(SLOWEST_S)
+        for stream in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+        code = BROKEN
+        try:
+            tree = program()
+            compile(tree, "mutant", "exec")
+            code = NOTICED
+            install(module, tree)
+            code = NOTICED if failed(session) else 0
+        finally:
+            os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code == BROKEN:
+        raise RuntimeError(f"a mutant of {module.__name__} is no program")
+    return code != 0
+
+
+def main() -> int:
+    """Print what is noticed; 1 if it is less than it must be."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="+", choices=JUDGED)
+    parser.add_argument("--share", type=float, default=1.0, help="of the mutants, drawn at random")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="mutants whose line or place contains this text")
+    asked, short = parser.parse_args(), False
+    for part in asked.parts:
+        modules, tests, least = JUDGED[part]
+        found = [(m, *x) for m in map(importlib.import_module, modules) for x in mutants(m) if asked.only in x[0]]
+        judge = Judge(random.Random(asked.seed).sample(found, round(asked.share * len(found))))
+        if pytest.main(["-q", "-s", "-p", "no:cacheprovider", "--tb=short", *tests], plugins=[judge]):
+            return 2
+        count, missed = len(judge.mutants), len(judge.missed)
+        print("".join(f"  not: {name}\n" for name in sorted(judge.missed)), end="")
+        share = 1 - missed / count
+        print(f"{part}: {count - missed} of {count} mutants noticed, {100 * share:.1f} %", flush=True)
+        short |= share < least
+    return int(short)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
