@@ -299,6 +299,9 @@ def test_quotients_of_almost_nothing():
     fallen = 42.0 * 9.8 * tape.t[11]
     assert statue["linear impulse"].value == pytest.approx(100 * fallen / 1e-9)
     assert statue["mass"].value == pytest.approx(100)  # no force moves nothing
+    for name in ("torsional friction", "CoP at the toe", "friction used"):
+        assert statue[name].value == 0.0
+    assert statue["CoP in the sole"].note.endswith(" (nothing to check)") and statue["CoP in the sole"].passed
     same = audit(dataclasses.replace(tape, q=q, **{**still, "v": np.ones_like(tape.v), "tau": tape.tau}), ROBOT)
     power = tape.tau.sum(axis=1)
     work = np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(tape.t))
