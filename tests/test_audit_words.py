@@ -13,6 +13,7 @@ from fixtures_audit import ROBOT, robot_with
 from test_audit_amounts import JOINTS, random_tape, truth
 
 from jumplab.auditing import AuditReport, Check, audit, write_audit
+from jumplab.auditing.dynamics import available_torque
 from jumplab.auditing.motion import form, mirror
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, METHOD, Limit
@@ -346,6 +347,14 @@ def test_pressure_beyond_each_edge_of_the_sole():
                          (foot.heel + 0.02, 0.01, -20)):  # fmt: skip
         found = pressed(np.array([x, y, 0.0]))["CoP in the sole"]
         assert found.value == pytest.approx(beyond, abs=1e-6) and found.note.endswith("; worst: left_foot")
+
+
+def test_torque_left_counts_the_sign_of_the_power_alone():
+    tape, knee, limits = random_tape(0), JOINTS.index("left_knee"), ROBOT.actuators["left_knee"]
+    v, tau = np.array(tape.v), np.array(tape.tau)
+    v[:3, 6 + knee], tau[:3, knee] = limits["speed"], [1e-3, -1e-3, 0.0]
+    left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), ROBOT, None))[:3, knee]
+    np.testing.assert_allclose(left, limits["effort"] * np.array([0.01, 1.0, 1.0]))
 
 
 def test_symmetry_names_what_is_worst():
