@@ -77,6 +77,7 @@ def random_run(seed: int, substeps: int, n: int = 12) -> SimulationResult:
     motors = Actuators(ROBOT)
     q[:, 7:] = np.clip(q[:, 7:], motors.lower + 0.03, motors.upper - 0.03)
     wrench = rng.normal(0, 30, (n, 2, 6)) * (rng.uniform(size=(n, 2, 1)) > 0.33)
+    wrench[1, 0, 3:] = 0.0  # a force alone
     v = rng.normal(0, 1.0, (1, nv)) + rng.normal(0, 0.01, (n, nv))
     return run(n, substeps, q=q, v=v, tau=rng.normal(0, 20, (n, nv - 6)), foot_wrench=wrench)
 
@@ -136,6 +137,12 @@ def momentum(result: SimulationResult, k: int) -> np.ndarray:
 @pytest.mark.parametrize("substeps", [1, 2, 5])
 def test_what_the_log_does_not_explain(substeps):
     result = random_run(substeps, substeps)
+    explained(result, substeps)
+    for column in (0, 3):  # a force, then a moment that outweighs all else
+        explained(replace(result, foot_wrench=result.foot_wrench + 1e5 * (np.arange(6) == column)), substeps)
+
+
+def explained(result: SimulationResult, substeps: int) -> None:
     base, joints = unexplained(result, ROBOT)
     assert base.shape == (11, 6) and joints.shape == (11, MODEL.nv - 6)
     for k in range(11):
@@ -263,9 +270,18 @@ def test_friction_and_centre_of_pressure():
         light = replace(pushed, foot_wrench=pushed.foot_wrench * factor)
         assert said(light)["friction used, of the stated coefficient"] == pytest.approx(expected)
     both = pushed.foot_wrench.copy()
-    both[row, 0] = [40.0, 0, 49.0, 0, 0, 0]  # beside a loaded foot, one that is not
+    both[row, 0] = [400.0, 0, 50.0, 0, 0, 0]  # beside a loaded foot, one that is not
     both[5, 0] = [900.0, 0, 900.0, 0, 0, 0]  # the last line's wrench acted in no step of the log
     assert said(replace(pushed, foot_wrench=both))["friction used, of the stated coefficient"] == pytest.approx(share)
+
+
+def test_the_last_step_counts():
+    """The last line but one is the last whose wrench acted."""
+    result = run(6)
+    pushed = with_cop(result, 4, 0, np.array([0.0, 0.0, ROBOT.foot.sole_z]), [90.0, 0.0, 300.0])
+    assert said(pushed)["friction used, of the stated coefficient"] == pytest.approx(0.3 / FRICTION)
+    ended = with_cop(result, 5, 0, np.array([0.0, 0.0, ROBOT.foot.sole_z]), [90.0, 0.0, 300.0])
+    assert said(ended)["friction used, of the stated coefficient"] == 0.0
 
 
 def test_a_foot_may_move_within_a_step():
