@@ -17,8 +17,10 @@ import os
 import random
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
-from types import FunctionType, ModuleType
+from dataclasses import dataclass
+from types import CodeType, FunctionType, ModuleType
 
 import pytest
 
@@ -64,21 +66,33 @@ def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
         yield f"{node.arg}=", lambda n: setattr(n, "value", ast.Constant(None))
 
 
-def mutants(module: ModuleType) -> Iterator[tuple[str, Callable[[], ast.Module]]]:
-    """(where and what, program) of every mutant of a module, but for annotations, docstrings and zip's strict."""
+@dataclass(frozen=True)
+class Mutant:
+    """One change of a module: where and what it is, the function that it is in, and what makes the program."""
+
+    module: ModuleType
+    name: str
+    function: int  # first line of the outermost function; 0 outside of all
+    program: Callable[[], ast.Module]
+
+
+def mutants(module: ModuleType) -> Iterator[Mutant]:
+    """Every mutant of a module, but for annotations, docstrings and zip's strict."""
     text = inspect.getsource(module)
     tree, lines = ast.parse(text), text.splitlines()
     passive = [n.value for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
     passive += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "strict"]  # a guard
     passive += [a for n in ast.walk(tree) for f in ("annotation", "returns") if (a := getattr(n, f, None))]
     alone = {id(n) for a in passive for n in ast.walk(a)}
+    inside = {}
+    for n in (n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)):  # outer ones first
+        first = min([n.lineno, *(d.lineno for d in n.decorator_list)])
+        inside |= {row: first for row in range(n.lineno, n.end_lineno + 1) if row not in inside}
     for at, node in enumerate(ast.walk(tree)):
         for which, (what, _) in enumerate(changes(node) if id(node) not in alone else ()):
             row = getattr(node, "lineno", 0) or node.value.lineno
-            yield (
-                f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}",
-                lambda at=at, k=which: build(tree, at, k),
-            )
+            name = f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}"
+            yield Mutant(module, name, inside.get(row, 0), functools.partial(build, tree, at, which))
 
 
 def build(tree: ast.Module, at: int, which: int) -> ast.Module:
@@ -111,29 +125,51 @@ def install(module: ModuleType, tree: ast.Module) -> None:
 
 
 class Judge:
-    """A plugin of pytest that runs the tests it collected on every mutant, each in a fork of the warm process."""
+    """A plugin of pytest that runs the tests it collected on every mutant, each in a fork of the warm process.
 
-    def __init__(self, mutants: list[tuple[ModuleType, str, Callable[[], ast.Module]]]):
+    Only tests that call the function concerned are run, the quickest first.
+    """
+
+    def __init__(self, mutants: list[Mutant]):
         self.mutants, self.missed = mutants, []
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Instead of running the tests once: first without a mutant, then with each."""
-        if failed(session):
-            raise RuntimeError(f"{failed(session)} fails without any mutant")
-        self.missed = [name for module, name, program in self.mutants if not noticed(session, module, program)]
+        called, seconds = {}, {}
+        for item in session.items:
+            called[item], began = set(), time.perf_counter()
+            sys.setprofile(lambda frame, *_, seen=called[item]: seen.add(place(frame.f_code)))
+            failure = failed(session, [item])
+            sys.setprofile(None)
+            seconds[item] = time.perf_counter() - began
+            if failure:
+                raise RuntimeError(f"{item.nodeid} fails without any mutant")
+        for count, m in enumerate(self.mutants):
+            if count % 100 == 0:
+                print(f"  {count} of {len(self.mutants)}, {len(self.missed)} not noticed", flush=True)
+            at = (m.module.__file__, m.function)
+            items = sorted((x for x in session.items if not m.function or at in called[x]), key=seconds.get)
+            if not noticed(session, items, m):
+                self.missed.append(m.name)
+                print(f"  not: {m.name}", flush=True)
         return True
 
 
-def failed(session: pytest.Session) -> str:
-    """The first test that fails, or nothing."""
-    for item, after in zip(session.items, [*session.items[1:], None], strict=True):
+def place(code: CodeType) -> tuple[str, int]:
+    """File and first line of a function."""
+    return code.co_filename, code.co_firstlineno
+
+
+def failed(session: pytest.Session, items: list[pytest.Item]) -> bool:
+    """Whether one of these tests fails; the rest is left out then."""
+    for item, after in zip(items, [*items[1:], None], strict=True):
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
         if session.testsfailed:
-            return item.nodeid
-    return ""
+            return True
+    return False
 
 
-def noticed(session: pytest.Session, module: ModuleType, program: Callable[[], ast.Module]) -> bool:
+def noticed(session: pytest.Session, items: list[pytest.Item], mutant: Mutant) -> bool:
     """Whether one of the tests fails on a mutant, or it cannot be loaded, or does not end."""
     sys.stdout.flush()
     if (child := os.fork()) == 0:
@@ -142,16 +178,16 @@ def noticed(session: pytest.Session, module: ModuleType, program: Callable[[], a
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         code = BROKEN
         try:
-            tree = program()
+            tree = mutant.program()
             compile(tree, "mutant", "exec")
             code = NOTICED
-            install(module, tree)
-            code = NOTICED if failed(session) else 0
+            install(mutant.module, tree)
+            code = NOTICED if failed(session, items) else 0
         finally:
             os._exit(code)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code == BROKEN:
-        raise RuntimeError(f"a mutant of {module.__name__} is no program")
+        raise RuntimeError(f"{mutant.name} is no program")
     return code != 0
 
 
@@ -165,12 +201,11 @@ def main() -> int:
     asked, short = parser.parse_args(), False
     for part in asked.parts:
         modules, tests, least = JUDGED[part]
-        found = [(m, *x) for m in map(importlib.import_module, modules) for x in mutants(m) if asked.only in x[0]]
+        found = [x for m in map(importlib.import_module, modules) for x in mutants(m) if asked.only in x.name]
         judge = Judge(random.Random(asked.seed).sample(found, round(asked.share * len(found))))
         if pytest.main(["-q", "-s", "-p", "no:cacheprovider", "--tb=short", *tests], plugins=[judge]):
             return 2
         count, missed = len(judge.mutants), len(judge.missed)
-        print("".join(f"  not: {name}\n" for name in sorted(judge.missed)), end="")
         share = 1 - missed / count
         print(f"{part}: {count - missed} of {count} mutants noticed, {100 * share:.1f} %", flush=True)
         short |= share < least

@@ -13,6 +13,7 @@ from fixtures_audit import ROBOT, robot_with
 from test_audit_amounts import JOINTS, random_tape, truth
 
 from jumplab.auditing import AuditReport, Check, audit, write_audit
+from jumplab.auditing.dynamics import available_torque
 from jumplab.auditing.motion import form, mirror
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, METHOD, Limit
@@ -299,6 +300,9 @@ def test_quotients_of_almost_nothing():
     fallen = 42.0 * 9.8 * tape.t[11]
     assert statue["linear impulse"].value == pytest.approx(100 * fallen / 1e-9)
     assert statue["mass"].value == pytest.approx(100)  # no force moves nothing
+    for name in ("torsional friction", "CoP at the toe", "friction used"):
+        assert statue[name].value == 0.0
+    assert statue["CoP in the sole"].note.endswith(" (nothing to check)") and statue["CoP in the sole"].passed
     same = audit(dataclasses.replace(tape, q=q, **{**still, "v": np.ones_like(tape.v), "tau": tape.tau}), ROBOT)
     power = tape.tau.sum(axis=1)
     work = np.cumsum((power[1:] + power[:-1]) / 2 * np.diff(tape.t))
@@ -343,6 +347,14 @@ def test_pressure_beyond_each_edge_of_the_sole():
                          (foot.heel + 0.02, 0.01, -20)):  # fmt: skip
         found = pressed(np.array([x, y, 0.0]))["CoP in the sole"]
         assert found.value == pytest.approx(beyond, abs=1e-6) and found.note.endswith("; worst: left_foot")
+
+
+def test_torque_left_counts_the_sign_of_the_power_alone():
+    tape, knee, limits = random_tape(0), JOINTS.index("left_knee"), ROBOT.actuators["left_knee"]
+    v, tau = np.array(tape.v), np.array(tape.tau)
+    v[:3, 6 + knee], tau[:3, knee] = limits["speed"], [1e-3, -1e-3, 0.0]
+    left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), ROBOT, None))[:3, knee]
+    np.testing.assert_allclose(left, limits["effort"] * np.array([0.01, 1.0, 1.0]))
 
 
 def test_symmetry_names_what_is_worst():

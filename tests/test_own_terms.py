@@ -338,6 +338,7 @@ def test_a_weight_of_zero_changes_no_digit(method):
     same(armed(0.1).plan(task, method, weights={"flight/calm arms": 0}), usual)
 
 
+@pytest.mark.slow
 def test_a_weight_of_zero_in_one_plan_drops_that_term_alone():
     task, rod = jl.JumpTask(0.4, 0.3), jl.Term("upright", "ours", "rad", "node", lambda p: p.posture, weight=1.0)
     both = jl.Planner(jl.Robot.load(), terms={"srmp/launch": [rod], "whole body/flight": [calm()]})

@@ -232,7 +232,7 @@ def test_manifest_says_how_the_plan_came_about(method):
     found = jump(1.0, 0.5, 0.0, method).summary["manifest"]
     stages = {"three-step": ["SRMP", "joint map", "whole body"], "direct": ["whole body"]}[method]
     assert list(found["weights"]) == list(found["solvers"]) == stages
-    assert all(w >= 0 for stage in found["weights"].values() for w in stage.values())
+    assert all(0 <= w < 1e5 and any(stage.values()) for stage in found["weights"].values() for w in stage.values())
     for name, told in found["solvers"].items():
         assert told["iterations"] > 0 and 0 <= told["residual"] < 1e-4
         assert name == "joint map" or (told["status"] == "Solve_Succeeded" and told["variables"] > 100)

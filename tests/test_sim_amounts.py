@@ -34,19 +34,22 @@ ASKED = {
     "links that pass through each other": (0.0, 0.0, ""),
     "damping and armature read back": (1e-6, 1e-6, "SI"),
     "mass read back, less the stated": (1e-3, 1e-3, "kg"),
+    "inertia read back, less the stated": (1e-6, 1e-6, "kg m^2"),
+    "gravity read back, less the target's": (1e-6, 1e-6, "m/s^2"),
     "claimed landing, short of 3 s by": (1e-6, 1e-6, "s"),
 }
 CATCHES = (
     *["a pinned or carried base, a force from nowhere"] * 2, "motors stronger than logged", "a reset",
     "a gap in the log", "unlimited torque", "sticky feet", "oversized feet", "friction that never reached the feet",
     "oversized feet", "self-collision switched off", "joints that brake or hold", "a lighter robot",
-    "a landing shorter than 3 s")  # fmt: skip
+    "bodies that turn more easily", "a jump on another planet", "a landing shorter than 3 s")  # fmt: skip
 
 
 def run(n: int = 6, substeps: int = 1, **changes) -> SimulationResult:
     """A robot that hangs in its stance without weight: ``n`` lines of a log, all quiet but for what is changed."""
     engine = {"substeps": substeps, "friction": [FRICTION, FRICTION], "self_collision": True, "beyond_sole_m": 0.0,
-              "damping": 0.0, "mass_kg": ROBOT.total_mass}  # fmt: skip
+              "damping": 0.0, "mass_kg": ROBOT.total_mass, "inertia_error": 0.0,
+              "gravity": [0.0, 0.0, -ROBOT.gravity]}  # fmt: skip
     numbers = {f: 0.0 for f in ("standing_s", "max_torque_ratio", "max_speed_ratio", "self_collision_s",
                                 "max_torque_ratio_before_touchdown", "max_speed_ratio_before_touchdown")}  # fmt: skip
     by_joint = {f: {} for f in ("max_torque_ratio_by_joint", "max_speed_ratio_by_joint", "saturated_s", "overspeed_s")}
@@ -74,6 +77,7 @@ def random_run(seed: int, substeps: int, n: int = 12) -> SimulationResult:
     motors = Actuators(ROBOT)
     q[:, 7:] = np.clip(q[:, 7:], motors.lower + 0.03, motors.upper - 0.03)
     wrench = rng.normal(0, 30, (n, 2, 6)) * (rng.uniform(size=(n, 2, 1)) > 0.33)
+    wrench[1, 0, 3:] = 0.0  # a force alone
     v = rng.normal(0, 1.0, (1, nv)) + rng.normal(0, 0.01, (n, nv))
     return run(n, substeps, q=q, v=v, tau=rng.normal(0, 20, (n, nv - 6)), foot_wrench=wrench)
 
@@ -133,6 +137,12 @@ def momentum(result: SimulationResult, k: int) -> np.ndarray:
 @pytest.mark.parametrize("substeps", [1, 2, 5])
 def test_what_the_log_does_not_explain(substeps):
     result = random_run(substeps, substeps)
+    explained(result, substeps)
+    for column in (0, 3):  # a force, then a moment that outweighs all else
+        explained(replace(result, foot_wrench=result.foot_wrench + 1e5 * (np.arange(6) == column)), substeps)
+
+
+def explained(result: SimulationResult, substeps: int) -> None:
     base, joints = unexplained(result, ROBOT)
     assert base.shape == (11, 6) and joints.shape == (11, MODEL.nv - 6)
     for k in range(11):
@@ -215,12 +225,15 @@ def test_time_torque_and_what_the_engine_says():
     v[2, 6 + 3], tau[2, 3] = Actuators(ROBOT).speed[3], 1.0  # nothing is left at the speed limit
     assert said(replace(result, v=v, tau=tau))["torque beyond the motors"] == pytest.approx(1.0)
     told = {"friction": [0.7, 0.65], "self_collision": False, "beyond_sole_m": 0.02, "damping": 0.3,
-            "mass_kg": ROBOT.total_mass - 0.4}  # fmt: skip
+            "mass_kg": ROBOT.total_mass - 0.4, "inertia_error": 0.02,
+            "gravity": [0.1, 0.0, 0.3 - ROBOT.gravity]}  # fmt: skip
     found = said(run(engine=told))
     assert found["friction read back, less the stated"] == pytest.approx(0.05)
     assert found["contact points outside the sole"] == 0.02 and found["damping and armature read back"] == 0.3
     assert found["links that pass through each other"] == 1.0
     assert found["mass read back, less the stated"] == pytest.approx(0.4)
+    assert found["inertia read back, less the stated"] == 0.02
+    assert found["gravity read back, less the target's"] == pytest.approx(0.3)
     assert quiet["links that pass through each other"] == quiet["mass read back, less the stated"] == 0.0
 
 
@@ -257,9 +270,18 @@ def test_friction_and_centre_of_pressure():
         light = replace(pushed, foot_wrench=pushed.foot_wrench * factor)
         assert said(light)["friction used, of the stated coefficient"] == pytest.approx(expected)
     both = pushed.foot_wrench.copy()
-    both[row, 0] = [40.0, 0, 49.0, 0, 0, 0]  # beside a loaded foot, one that is not
+    both[row, 0] = [400.0, 0, 50.0, 0, 0, 0]  # beside a loaded foot, one that is not
     both[5, 0] = [900.0, 0, 900.0, 0, 0, 0]  # the last line's wrench acted in no step of the log
     assert said(replace(pushed, foot_wrench=both))["friction used, of the stated coefficient"] == pytest.approx(share)
+
+
+def test_the_last_step_counts():
+    """The last line but one is the last whose wrench acted."""
+    result = run(6)
+    pushed = with_cop(result, 4, 0, np.array([0.0, 0.0, ROBOT.foot.sole_z]), [90.0, 0.0, 300.0])
+    assert said(pushed)["friction used, of the stated coefficient"] == pytest.approx(0.3 / FRICTION)
+    ended = with_cop(result, 5, 0, np.array([0.0, 0.0, ROBOT.foot.sole_z]), [90.0, 0.0, 300.0])
+    assert said(ended)["friction used, of the stated coefficient"] == 0.0
 
 
 def test_a_foot_may_move_within_a_step():

@@ -222,7 +222,8 @@ def test_costs_are_listed_with_their_shares(plan):
     rows = plan.solution.cost_shares
     assert sum(row["share"] for row in rows) == pytest.approx(1.0)
     assert {"jerk", "CoM velocity", "turn", "launch time"} <= {row["name"] for row in rows}
-    assert all(row["cost"] >= 0 for row in rows)
+    total = sum(row["cost"] for row in rows)
+    assert all(row["cost"] > -1e-12 and row["share"] == pytest.approx(row["cost"] / total) for row in rows)
     tight = {(r["phase"], r["name"]): r for r in plan.solution.constraint_report}
     assert tight["toe", "rod force zero"]["kind"] == "equality" and abs(tight["toe", "rod force zero"]["slack"]) < 0.1
     assert all(r["slack"] > -1e-3 * max(1.0, abs(r["value"])) - 0.05 for r in tight.values())

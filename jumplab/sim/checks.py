@@ -61,8 +61,9 @@ def _largest_jump(result: SimulationResult, robot: Robot) -> float:
     least = 1 / result.settings["engine"]["substeps"]
     change = np.diff(result.v, axis=0)
     mean, room = result.v[:-1] + (1 + least) / 2 * change, SWING * (1 - least) * np.abs(change).max(axis=1) * STEP_S
-    there = [pin.integrate(robot.model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
-    miss = [pin.difference(robot.model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
+    model = robot.model
+    there = [pin.integrate(model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
+    miss = [pin.difference(model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
     return float(np.max(np.abs(miss).max(axis=1, initial=0.0) - room, initial=0.0))
 
 
@@ -98,15 +99,16 @@ def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:
     model, data, rows = robot.model, robot.model.createData(), []
     frames = [model.getFrameId(name) for name in robot.foot.frames]
     weight = robot.total_mass * model.gravity.linear
-    for q, v, wrenches in zip(result.q, result.v, result.foot_wrench, strict=True):
+    for q, v in zip(result.q, result.v, strict=True):
         pin.ccrba(model, data, q, v)
         pin.framesForwardKinematics(model, data, q)
-        force, moment = weight + wrenches[:, :3].sum(axis=0), np.zeros(3)
-        for frame, wrench in zip(frames, wrenches, strict=True):
-            moment = moment + wrench[3:] + np.cross(data.oMf[frame].translation, wrench[:3])
-        spin = data.hg.angular + np.cross(data.com[0], data.hg.linear)
-        rows.append((data.hg.linear.copy(), spin, force, moment, np.cross(data.com[0], weight)))
-    linear, angular, force, moment, gravity = (np.array(column) for column in zip(*rows, strict=True))
+        feet = [data.oMf[frame].translation.copy() for frame in frames]
+        rows.append((data.hg.linear.copy(), data.hg.angular.copy(), data.com[0].copy(), *feet))
+    linear, spin, com, *feet = (np.array(column) for column in zip(*rows, strict=True))
+    angular, gravity = spin + np.cross(com, linear), np.cross(com, weight)
+    force, moment = weight + result.foot_wrench[:, :, :3].sum(axis=1), result.foot_wrench[:, :, 3:].sum(axis=1)
+    for place, push in zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True):
+        moment = moment + np.cross(place, push)
     moment[:-1] += (gravity[:-1] + gravity[1:]) / 2
     return np.hstack([np.diff(linear, axis=0), np.diff(angular, axis=0)]) / STEP_S - np.hstack([force, moment])[:-1]
 
@@ -119,8 +121,9 @@ def _steps(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarr
     17 N in a flip.
     """
     share = 0.0 if result.settings["engine"]["substeps"] == 1 else 0.5
-    arm = robot.model.inertias[1].lever  # from the base's origin to its CoM, base axes
-    q = np.array([pin.interpolate(robot.model, a, b, share) for a, b in zip(result.q[:-1], result.q[1:], strict=True)])
+    model = robot.model
+    arm = model.inertias[1].lever  # from the base's origin to its CoM, base axes
+    q = np.array([pin.interpolate(model, a, b, share) for a, b in zip(result.q[:-1], result.q[1:], strict=True)])
     turns, turn = (np.array([rotation(quaternion) for quaternion in x[:, 3:7]]) for x in (result.q, q))
     spins, speeds = result.v[:, 3:6], result.v[:, :3]
 
@@ -174,7 +177,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
 
 def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray) -> float:
     """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m]."""
-    moment = wrench[3:] + np.cross(origin.translation - place.translation, wrench[:3])
+    moment = wrench[3:] + pin.skew(origin.translation - place.translation) @ wrench[:3]
     force, moment = place.rotation.T @ wrench[:3], place.rotation.T @ moment
     x, y = (foot.sole_z * force[:2] + [-moment[1], moment[0]]) / force[2]
     return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)

@@ -31,6 +31,7 @@ SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1
 SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
+THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
 FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
 
 
@@ -171,23 +172,28 @@ class MujocoEngine(Engine):
 
     def _feel(self, origins: np.ndarray) -> None:
         """Add the contacts of one substep; moments are about the links' ``origins`` (k, 3) before the step."""
-        model, data, force, points = self._model, self._data, np.zeros(6), ([], [])
-        bodies, places, frames = model.geom_bodyid[data.contact.geom], data.contact.pos, data.contact.frame
-        for number, (one, other) in enumerate(bodies.tolist()):
-            mujoco.mj_contactForce(model, data, number, force)
-            if force[0] <= 0:
+        data, contact = self._data, self._data.contact
+        acting = np.flatnonzero(contact.efc_address >= 0)
+        if not len(acting):
+            return
+        force = data.efc_force[contact.efc_address[acting, None] + THREE]  # along the axes of the contact's frame
+        pairs, places = self._model.geom_bodyid[contact.geom[acting]], contact.pos[acting]
+        pushes = np.einsum("ki,kij->kj", force, contact.frame[acting].reshape(-1, 3, 3))
+        points = ([], [])
+        for k, (one, other) in enumerate(pairs.tolist()):
+            if force[k, 0] <= 0:
                 continue
             if one and other:
                 self._colliding.add((self.links[one - 1], self.links[other - 1]))
                 continue
-            body, sign = (other, 1.0) if one == 0 else (one, -1.0)
+            body = other or one
             self._touching.add(self.links[body - 1])
             side = self._feet.get(body)
             if side is not None:
-                push = sign * force[:3] @ frames[number].reshape(3, 3)
+                push, place = (pushes[k] if other else -pushes[k]), places[k]
                 self._wrench[side, :3] += push
-                self._wrench[side, 3:] += pin.skew(places[number] - origins[body]) @ push
-                points[side].append(places[number])
+                self._wrench[side, 3:] += pin.skew(place - origins[body]) @ push
+                points[side].append(place)
         for body, side in self._feet.items():
             if points[side]:
                 self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))

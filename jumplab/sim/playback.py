@@ -146,7 +146,7 @@ class Playback:
         """Step at which the heels leave the ground."""
         data, frame = self._data, robot.model.getFrameId(robot.foot.frames[0])
         for t, q in zip(tape.t, tape.q, strict=True):
-            pin.framesForwardKinematics(robot.model, data, q)
+            pin.framesForwardKinematics(self._model, data, q)
             if abs(data.oMf[frame].rotation[2, 0]) > HEEL_RAD:
                 return round(float(t) / STEP_S)
         return self.steps

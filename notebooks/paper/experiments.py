@@ -255,6 +255,7 @@ def soft_ground(runs: Mapping[float, SimulationResult], tape: Tape, task: JumpTa
     for ax, y, label in zip((travel, pitch), planned, ("travel of the feet [m]", "trunk pitch [deg]"), strict=True):
         ax.axhline(y, **REFERENCE_STYLE)
         ax.set(xscale="log", xlabel="a penetration fades in [ms]", ylabel=label)
+        ax.xaxis.set_major_formatter("{x:g}")
     panel_letters((travel, pitch))
     return fig
 

@@ -27,7 +27,7 @@ from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, new_figure
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import METHODS, STEPS_S, Planner, guess_from_joints, make_tape
-from jumplab.stages.whole_body import WholeBodyPlan
+from jumplab.stages.whole_body import Weights, WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
@@ -38,7 +38,7 @@ LIMITS = ({"torque_share": 0.6}, {"torque_share": 0.5}, {"speed_share": 0.65})
 ROBOTS = ("heavy trunk", "weak joints", "slow joints")
 NOISE_RAD = (0.1, 0.2, 0.4, 0.8)  # standard deviation of what is added to every link's angle in mid-phase
 NOISE_TARGETS = ((0.3, 0.3), (0.6, 0.4), (0.9, 0.3), (1.0, 0.5), (0.5, 0.5))
-EFFORT = ("joint acceleration", "jerk", "torque")  # costs that both methods have, with the same weights
+EFFORT = {"joint acceleration": Weights().joint_acceleration, "jerk": Weights().jerk, "torque": Weights().torque}
 WITHIN = 1.01  # of the least effort known for a target: the same local solution
 
 
@@ -126,7 +126,8 @@ def solve(case: Case, method: str) -> dict[str, Any]:
     except JumplabError as e:
         return row | {"cpu_s": time.process_time() - began, "effort": None, "reason": str(e)[:160]}
     row |= {"planned": True, "cpu_s": time.process_time() - began, "reason": ""}
-    row["effort"] = sum(r["cost"] for r in body.solution.cost_shares if r["name"] in EFFORT)
+    costs = [r for r in body.solution.cost_shares if r["name"] in EFFORT]
+    row["effort"] = sum(r["cost"] * EFFORT[r["name"]] / r["weight"] for r in costs)  # both methods weighed alike
     found = audit(tape, planner.robot, t, edge_m=platform_edge_m(t, planner.robot, planner.limits))
     return row | {"clean": found.passed}
 

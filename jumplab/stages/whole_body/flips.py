@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -75,10 +76,13 @@ class FlipPlanner(WholeBodyPlanner):
         )
         first = Nlp(rough, {**COARSE, **options})
         self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
-        plain = build_problem(robot, self.mesh, self.limits, self.weights, tracking=tracking)
-        self._usual = None  # without the changes, if they change anything
-        if changes.applied(plain) != plain:
-            self._usual = FlipPlanner(robot, *settings, tracking=tracking, options=options)
+        self._plain = partial(FlipPlanner, robot, *settings, tracking=tracking, options=options)
+
+    @cached_property
+    def _usual(self) -> FlipPlanner | None:
+        """The planner without the changes; None if they change nothing."""
+        plain = build_problem(self.robot, self.mesh, self.limits, self.weights, tracking=self.tracking)
+        return None if self.changes.applied(plain) == plain else self._plain()
 
     def plan(
         self,

@@ -97,6 +97,7 @@ class Weights:
 
     joint_acceleration: float = 4e-3  # [1] / [rad/s^2]^2 / [s]
     jerk: float = 4e-7  # [1] / [rad/s^3]^2 / [s]
+    tracking_jerk: float = 5e-7  # the same where stage 1 is tracked: limbs in haste, which a tape must still follow
     torque: float = 1e-4  # [1] / [N m]^2 / [s]
     track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
     # inertia in shares of the stance's, so that weights mean the same for robots of any size
@@ -113,9 +114,8 @@ class Weights:
 
         Its inertia follows from the turn and from L; stage 1's, of a rod that turns as one, is only a hint.
         """
-        return replace(
-            self, jerk=2.5 * self.jerk, track_inertia=45.4, track_inertia_rate=0.454, track_flight_inertia_rate=0.454
-        )
+        light = {"track_inertia": 45.4, "track_inertia_rate": 0.454, "track_flight_inertia_rate": 0.454}
+        return replace(self, jerk=2.5 * self.jerk, tracking_jerk=2.5 * self.jerk, **light)
 
 
 @dataclass(frozen=True)
