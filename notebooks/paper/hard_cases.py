@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from scipy.stats import qmc
 
 from jumplab.auditing.audit import audit
@@ -24,7 +25,7 @@ from jumplab.errors import JumplabError, SolverError
 from jumplab.io.files import open_log
 from jumplab.ocp import PhaseGuess
 from jumplab.robot import Robot
-from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, new_figure
+from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import METHODS, STEPS_S, Planner, guess_from_joints, make_tape
 from jumplab.stages.whole_body import Weights, WholeBodyPlan
@@ -198,8 +199,8 @@ def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
     for y, row in enumerate(table):
         pairs = _pairs(rows, row["cases"])
         for k, (method, color) in enumerate(zip(METHODS, (PURPLE, VERMILION), strict=True)):
-            share, label = row[f"{method}, clean"] / row["number"], method if y == 0 else None
-            axes[0].barh(y + 0.36 * (k - 0.5), 100 * share, height=0.32, color=color, label=label)
+            share = row[f"{method}, clean"] / row["number"]
+            axes[0].barh(y + 0.36 * (k - 0.5), 100 * share, height=0.32, color=color)
         for ax, key in zip(axes[1:], ("cpu_s", "effort"), strict=True):
             found = _ratios(pairs, key)
             ax.plot(found, y + np.linspace(-0.3, 0.3, len(found)), ".", color=PURPLE, markersize=2)
@@ -207,7 +208,7 @@ def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
     axes[0].set(yticks=range(len(table)), yticklabels=[row["cases"] for row in table])
     axes[0].set(xlabel="clean plans [%]", xlim=(0, 100))
     axes[0].invert_yaxis()
-    axes[0].legend(loc="lower left")
+    legend_above(fig, [Patch(color=c, label=m) for m, c in zip(METHODS, (PURPLE, VERMILION), strict=True)])
     for ax, what in zip(axes[1:], ("CPU time", "effort"), strict=True):
         ax.axvline(1.0, **REFERENCE_STYLE)
         ticks = (0.5, 1, 2, 5)
