@@ -10,7 +10,7 @@ import pytest
 
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim.checks import _worst, check, unexplained
+from jumplab.sim.checks import STOP_RAD, _worst, check, unexplained
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import Metrics, SimulationResult
 
@@ -161,6 +161,7 @@ def test_where_the_log_cannot_say_nothing_is_asked():
     touching[11, LINKS.index("trunk")] = colliding[5] = colliding[11] = True
     q[7, 7 + 2], q[7, 7 + 3] = motors.lower[2] + 0.0199, motors.upper[3] - 0.0199
     q[8, 7 + 2], q[8, 7 + 3] = motors.lower[2] + 0.0201, motors.upper[3] - 0.0201
+    q[9, 7 + 2], q[9, 7 + 3] = motors.lower[2] + STOP_RAD, motors.upper[3] - STOP_RAD
     base, joints = unexplained(replace(result, touching=touching, colliding=colliding, q=q), ROBOT)
     assert not base[3].any() and not joints[3].any()
     assert not joints[5].any() and base[5].all()
@@ -177,7 +178,10 @@ def test_forces_count_by_their_mean_over_a_tenth_of_a_second():
     assert _worst(push) == pytest.approx(5.0)
     push[:, 2] = 7.0 * (-1.0) ** np.arange(300)
     assert _worst(push) == pytest.approx(5.0)
-    assert _worst(np.full((4, 2), 3.0)) == pytest.approx(3.0) and _worst(np.zeros((0, 2))) == 0.0
+    assert (
+        _worst(np.full((4, 2), 3.0)) == pytest.approx(3.0) == _worst(np.full((1, 2), 3.0))
+        and _worst(np.zeros((0, 2))) == 0.0
+    )
     edge = np.zeros((101, 1))
     edge[0] = 100.0
     assert _worst(edge) == pytest.approx(1.0)
