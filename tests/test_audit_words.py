@@ -355,6 +355,11 @@ def test_torque_left_counts_the_sign_of_the_power_alone():
     v[:3, 6 + knee], tau[:3, knee] = limits["speed"], [1e-3, -1e-3, 0.0]
     left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), ROBOT, None))[:3, knee]
     np.testing.assert_allclose(left, limits["effort"] * np.array([0.01, 1.0, 1.0]))
+    steep = robot_with(config=("corner_speed_ratio = 0.5", "corner_speed_ratio = 0.98"))  # 19.6 to 20 rad/s
+    v, tau = v.copy(), tau.copy()
+    v[0, 6 + knee], tau[0, knee] = 0.99 * limits["speed"], 1.0
+    left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), steep, None))[0, knee]
+    assert left == pytest.approx(limits["effort"] / 2)
 
 
 def test_symmetry_names_what_is_worst():
