@@ -298,6 +298,7 @@ def test_quotients_of_almost_nothing():
     q = np.tile(tape.q[:1], (len(tape.t), 1))
     statue = audit(dataclasses.replace(tape, q=q, **still), ROBOT)
     fallen = 42.0 * 9.8 * tape.t[11]
+    assert replay(dataclasses.replace(tape, q=q, **still), ROBOT, None).heading == 1.0  # on the spot
     assert statue["linear impulse"].value == pytest.approx(100 * fallen / 1e-9)
     assert statue["mass"].value == pytest.approx(100)  # no force moves nothing
     for name in ("torsional friction", "CoP at the toe", "friction used"):
