@@ -318,8 +318,8 @@ def test_quotients_of_almost_nothing():
     assert audit(slow, ROBOT)["mass"].note.startswith("the ground force moves 20.000 kg")
 
 
-def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0):
-    """A tape whose only force is 200 N at a point of the left sole [m], in one row; its lower heel end at a height."""
+def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0, force: float = 200.0):
+    """A tape whose only force [N] is at a point of the left sole [m], in one row; its lower heel end at a height [m]."""
     tape, row = random_tape(0), 3
     q, f = np.array(tape.q), np.zeros_like(tape.f)
     q[row] = stance_configuration(ROBOT)
@@ -330,7 +330,7 @@ def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0):
     place = before.foot_rotation[row, 0] @ point
     origin = before.foot[row, 0] + [0, 0, q[row, 2] - before.tape.q[row, 2]]
     place[2] = -origin[2]  # on the ground
-    f[row, 0] = [0, 0, 200.0, *np.cross(place, [0, 0, 200.0])]
+    f[row, 0] = [0, 0, force, *np.cross(place, [0, 0, force])]
     return audit(dataclasses.replace(tape, q=q, f=f), ROBOT)
 
 
@@ -348,6 +348,7 @@ def test_pressure_beyond_each_edge_of_the_sole():
                          (foot.heel + 0.02, 0.01, -20)):  # fmt: skip
         found = pressed(np.array([x, y, 0.0]))["CoP in the sole"]
         assert found.value == pytest.approx(beyond, abs=1e-6) and found.note.endswith("; worst: left_foot")
+    assert pressed(np.array([1.0, 0, 0]), force=50.0)["CoP in the sole"].note.endswith(" (nothing to check)")
 
 
 def test_torque_left_counts_the_sign_of_the_power_alone():
