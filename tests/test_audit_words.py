@@ -319,7 +319,7 @@ def test_quotients_of_almost_nothing():
 
 
 def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0, force: float = 200.0):
-    """A tape whose only force [N] is at a point of the left sole [m], in one row; its lower heel end at a height [m]."""
+    """A tape with one force [N], in one row, at a point of the left sole [m] whose lower heel end is lifted [m]."""
     tape, row = random_tape(0), 3
     q, f = np.array(tape.q), np.zeros_like(tape.f)
     q[row] = stance_configuration(ROBOT)
