@@ -404,6 +404,8 @@ def test_a_folders_target_edge_and_place(tmp_path):
     for other in (None, "far", {"distance_m": 1.0}, [0.4, 0.1]):
         write(tmp_path, other)
         assert write_audit(tmp_path).manifest["target"] is None
+    write(tmp_path, {"distance_m": 0.4, "height_m": 0.1})
+    assert write_audit(tmp_path).manifest["target"] == dataclasses.asdict(JumpTask(0.4, 0.1))
     (tmp_path / "summary.json").unlink()
     assert write_audit(tmp_path).manifest["planner"] == {}
     for name in ("robot.urdf", "robot.toml"):
