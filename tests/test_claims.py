@@ -84,7 +84,7 @@ def test_starts_are_compared_with_the_crouch():
 
 @pytest.mark.slow
 def test_three_starts_end_in_a_jump(bhr):
-    rows = compare_starts([JumpTask(0.5, 0.3)], bhr)
+    rows = compare_starts([JumpTask(1.0, 0.5)], bhr)  # where all lead to one solution; slow jumps have several
     assert [r.start for r in rows] == list(claims.STARTS)
     assert all(r.iterations > 0 and 0 < r.alone_s <= r.total_s for r in rows), rows
     crouch, guess, loose = rows
