@@ -17,7 +17,6 @@ import os
 import random
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import CodeType, FunctionType, ModuleType
@@ -35,11 +34,26 @@ JUDGED = {
     ),
     "checks": (("jumplab.sim.checks",), ("tests/test_sim_amounts.py",), 0.90),
 }
+# mutants that do the same: what is changed, where in its line, the line; and why
+SAME = {
+    ("Sub", 44, "return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)"): "center[1] is 0",
+    ("Sub", 8, "speed = speed - np.cross(spin, arm)"): "a steady speed of the whole robot takes no force",
+    ("Gt", 25, "for k in np.flatnonzero((result.foot_wrench[:-1, :, 2] > LOADED_N).any(axis=1)):"): "asked again below",
+    (
+        "0",
+        48,
+        'blocks.append(pin.GeometryObject("platform", 0, 0, pin.SE3(np.eye(3), centre), coal.Box(size, size, size)))',
+    ): "distances do not ask for the frame",
+    ("1", 53, 'LIMITS["start at rest"].worst(np.abs(tape.v[:1]), t[:1], names),'): "one row has one time",
+    ("Mult", 22, "corners += [place.act(half * signs) for signs in product((-1, 1), repeat=3)]"): "signs are 1 or -1",
+    ("1.0", 63, "share = np.clip((times - self.t[row]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)"): "0 / 1 is 0 / 2",
+}
 SWAPS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.And: ast.Or,
          ast.Mod: ast.Div, ast.MatMult: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Or: ast.And,
          ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
          ast.In: ast.NotIn, ast.NotIn: ast.In, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.USub: ast.UAdd}  # fmt: skip
 PAIRS = (("min", "max"), ("minimum", "maximum"), ("argmin", "argmax"), ("any", "all"), ("floor", "ceil"))
+GUARDS = ("strict", "initial")  # of lengths that differ, and of nothing at all: neither comes that far
 NAMES = dict([*PAIRS, *((b, a) for a, b in PAIRS)])
 NOTICED, BROKEN, SLOWEST_S = 1, 97, 120  # exit codes of a fork; mutants that take longer count as noticed
 
@@ -62,7 +76,7 @@ def changes(node: ast.AST) -> Iterator[tuple[str, Callable[[ast.AST], None]]]:
     for field in ("id", "attr"):
         if (name := getattr(node, field, None)) in NAMES:
             yield name, functools.partial(lambda f, new, n: setattr(n, f, new), field, NAMES[name])
-    if isinstance(node, ast.keyword) and node.arg != "strict":
+    if isinstance(node, ast.keyword) and node.arg not in GUARDS:
         yield f"{node.arg}=", lambda n: setattr(n, "value", ast.Constant(None))
 
 
@@ -77,11 +91,11 @@ class Mutant:
 
 
 def mutants(module: ModuleType) -> Iterator[Mutant]:
-    """Every mutant of a module, but for annotations, docstrings and zip's strict."""
+    """Every mutant of a module, but for annotations, docstrings and guards."""
     text = inspect.getsource(module)
     tree, lines = ast.parse(text), text.splitlines()
     passive = [n.value for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
-    passive += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "strict"]  # a guard
+    passive += [n.value for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg in GUARDS]
     passive += [a for n in ast.walk(tree) for f in ("annotation", "returns") if (a := getattr(n, f, None))]
     alone = {id(n) for a in passive for n in ast.walk(a)}
     inside = {}
@@ -91,7 +105,11 @@ def mutants(module: ModuleType) -> Iterator[Mutant]:
     for at, node in enumerate(ast.walk(tree)):
         for which, (what, _) in enumerate(changes(node) if id(node) not in alone else ()):
             row = getattr(node, "lineno", 0) or node.value.lineno
-            name = f"{module.__name__}:{row} [{what}] {lines[row - 1].strip()}"
+            line = lines[row - 1].strip()
+            column = getattr(node, "col_offset", 0) - lines[row - 1].index(line)
+            name = f"{module.__name__}:{row} [{what} at {column}] {line}"
+            if (what, column, line) in SAME:
+                continue
             yield Mutant(module, name, inside.get(row, 0), functools.partial(build, tree, at, which))
 
 
@@ -110,24 +128,31 @@ def install(module: ModuleType, tree: ast.Module) -> None:
     others = [m for name, m in sys.modules.items() if name.startswith(("jumplab", "test_", "fixtures"))]
     for name, new in mutant.items():
         old = usual.get(name)
-        if (
-            name.startswith("__")
-            or isinstance(old, ModuleType)
-            or getattr(old, "__module__", module.__name__) != (module.__name__)
-        ):
+        ours = getattr(old, "__module__", module.__name__) == module.__name__
+        if name.startswith("__") or old is None or not ours or isinstance(old, ModuleType) or renew(old, new):
             continue
-        if isinstance(old, FunctionType):
-            old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__
-            continue
+        if isinstance(old, type):  # objects that are there already have its methods, too
+            for method, code in vars(new).items():
+                renew(vars(old).get(method), code)
         for other in others:
-            if old is not None and vars(other).get(name) is old:
+            if vars(other).get(name) is old:
                 setattr(other, name, new)
+
+
+def renew(old: object, new: object) -> bool:
+    """Give a function, or what a property or a class method is made of, another's code; whether it is one."""
+    for part in ("fget", "func", "__func__"):
+        old, new = getattr(old, part, old), getattr(new, part, new)
+    if not isinstance(old, FunctionType) or old.__code__.co_freevars != new.__code__.co_freevars:
+        return False
+    old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__
+    return True
 
 
 class Judge:
     """A plugin of pytest that runs the tests it collected on every mutant, each in a fork of the warm process.
 
-    Only tests that call the function concerned are run, the quickest first.
+    Only tests that call the function concerned are run.
     """
 
     def __init__(self, mutants: list[Mutant]):
@@ -135,20 +160,19 @@ class Judge:
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Instead of running the tests once: first without a mutant, then with each."""
-        called, seconds = {}, {}
+        called = {}
         for item in session.items:
-            called[item], began = set(), time.perf_counter()
+            called[item] = set()
             sys.setprofile(lambda frame, *_, seen=called[item]: seen.add(place(frame.f_code)))
             failure = failed(session, [item])
             sys.setprofile(None)
-            seconds[item] = time.perf_counter() - began
             if failure:
                 raise RuntimeError(f"{item.nodeid} fails without any mutant")
         for count, m in enumerate(self.mutants):
             if count % 100 == 0:
                 print(f"  {count} of {len(self.mutants)}, {len(self.missed)} not noticed", flush=True)
             at = (m.module.__file__, m.function)
-            items = sorted((x for x in session.items if not m.function or at in called[x]), key=seconds.get)
+            items = [item for item in session.items if not m.function or at in called[item]]
             if not noticed(session, items, m):
                 self.missed.append(m.name)
                 print(f"  not: {m.name}", flush=True)

@@ -298,6 +298,7 @@ def test_quotients_of_almost_nothing():
     q = np.tile(tape.q[:1], (len(tape.t), 1))
     statue = audit(dataclasses.replace(tape, q=q, **still), ROBOT)
     fallen = 42.0 * 9.8 * tape.t[11]
+    assert replay(dataclasses.replace(tape, q=q, **still), ROBOT, None).heading == 1.0  # on the spot
     assert statue["linear impulse"].value == pytest.approx(100 * fallen / 1e-9)
     assert statue["mass"].value == pytest.approx(100)  # no force moves nothing
     for name in ("torsional friction", "CoP at the toe", "friction used"):
@@ -317,8 +318,8 @@ def test_quotients_of_almost_nothing():
     assert audit(slow, ROBOT)["mass"].note.startswith("the ground force moves 20.000 kg")
 
 
-def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0):
-    """A tape whose only force is 200 N at a point of the left sole [m], in one row; its lower heel end at a height."""
+def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0, force: float = 200.0):
+    """A tape with one force [N], in one row, at a point of the left sole [m] whose lower heel end is lifted [m]."""
     tape, row = random_tape(0), 3
     q, f = np.array(tape.q), np.zeros_like(tape.f)
     q[row] = stance_configuration(ROBOT)
@@ -329,7 +330,7 @@ def pressed(point, pitch: float = 0.0, roll: float = 0.0, lift: float = 0.0):
     place = before.foot_rotation[row, 0] @ point
     origin = before.foot[row, 0] + [0, 0, q[row, 2] - before.tape.q[row, 2]]
     place[2] = -origin[2]  # on the ground
-    f[row, 0] = [0, 0, 200.0, *np.cross(place, [0, 0, 200.0])]
+    f[row, 0] = [0, 0, force, *np.cross(place, [0, 0, force])]
     return audit(dataclasses.replace(tape, q=q, f=f), ROBOT)
 
 
@@ -347,6 +348,7 @@ def test_pressure_beyond_each_edge_of_the_sole():
                          (foot.heel + 0.02, 0.01, -20)):  # fmt: skip
         found = pressed(np.array([x, y, 0.0]))["CoP in the sole"]
         assert found.value == pytest.approx(beyond, abs=1e-6) and found.note.endswith("; worst: left_foot")
+    assert pressed(np.array([1.0, 0, 0]), force=50.0)["CoP in the sole"].note.endswith(" (nothing to check)")
 
 
 def test_torque_left_counts_the_sign_of_the_power_alone():
@@ -355,6 +357,11 @@ def test_torque_left_counts_the_sign_of_the_power_alone():
     v[:3, 6 + knee], tau[:3, knee] = limits["speed"], [1e-3, -1e-3, 0.0]
     left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), ROBOT, None))[:3, knee]
     np.testing.assert_allclose(left, limits["effort"] * np.array([0.01, 1.0, 1.0]))
+    steep = robot_with(config=("corner_speed_ratio = 0.5", "corner_speed_ratio = 0.98"))  # 19.6 to 20 rad/s
+    v, tau = v.copy(), tau.copy()
+    v[0, 6 + knee], tau[0, knee] = 0.99 * limits["speed"], 1.0
+    left = available_torque(replay(dataclasses.replace(tape, v=v, tau=tau), steep, None))[0, knee]
+    assert left == pytest.approx(limits["effort"] / 2)
 
 
 def test_symmetry_names_what_is_worst():
@@ -397,6 +404,8 @@ def test_a_folders_target_edge_and_place(tmp_path):
     for other in (None, "far", {"distance_m": 1.0}, [0.4, 0.1]):
         write(tmp_path, other)
         assert write_audit(tmp_path).manifest["target"] is None
+    write(tmp_path, {"distance_m": 0.4, "height_m": 0.1})
+    assert write_audit(tmp_path).manifest["target"] == dataclasses.asdict(JumpTask(0.4, 0.1))
     (tmp_path / "summary.json").unlink()
     assert write_audit(tmp_path).manifest["planner"] == {}
     for name in ("robot.urdf", "robot.toml"):

@@ -244,6 +244,7 @@ def test_grids():
     motion = short()
     assert list(motion.every(10_000.0).t) == pytest.approx(0.5 + np.arange(206) / 10_000)
     assert len(motion.every(2000.0).t) == 42  # the last sample lies on it
+    assert list(motion.every(0.5).t) == [0.5]
     rounded = replace(motion, t=np.append(motion.t[:-1], 0.5205 - 1e-10))
     assert rounded.every(2000.0).t[-1] == rounded.t[-1]
     for rate in (0.0, -1.0, 10_000.1):

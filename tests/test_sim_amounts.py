@@ -10,7 +10,7 @@ import pytest
 
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim.checks import _worst, check, unexplained
+from jumplab.sim.checks import STOP_RAD, _worst, check, unexplained
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import Metrics, SimulationResult
 
@@ -164,6 +164,7 @@ def test_where_the_log_cannot_say_nothing_is_asked():
     touching[11, LINKS.index("trunk")] = colliding[5] = colliding[11] = True
     q[7, 7 + 2], q[7, 7 + 3] = motors.lower[2] + 0.0199, motors.upper[3] - 0.0199
     q[8, 7 + 2], q[8, 7 + 3] = motors.lower[2] + 0.0201, motors.upper[3] - 0.0201
+    q[9, 7 + 2], q[9, 7 + 3] = motors.lower[2] + STOP_RAD, motors.upper[3] - STOP_RAD
     base, joints = unexplained(replace(result, touching=touching, colliding=colliding, q=q), ROBOT)
     assert not base[3].any() and not joints[3].any()
     assert not joints[5].any() and base[5].all()
@@ -180,7 +181,10 @@ def test_forces_count_by_their_mean_over_a_tenth_of_a_second():
     assert _worst(push) == pytest.approx(5.0)
     push[:, 2] = 7.0 * (-1.0) ** np.arange(300)
     assert _worst(push) == pytest.approx(5.0)
-    assert _worst(np.full((4, 2), 3.0)) == pytest.approx(3.0) and _worst(np.zeros((0, 2))) == 0.0
+    assert (
+        _worst(np.full((4, 2), 3.0)) == pytest.approx(3.0) == _worst(np.full((1, 2), 3.0))
+        and _worst(np.zeros((0, 2))) == 0.0
+    )
     edge = np.zeros((101, 1))
     edge[0] = 100.0
     assert _worst(edge) == pytest.approx(1.0)
@@ -188,9 +192,32 @@ def test_forces_count_by_their_mean_over_a_tenth_of_a_second():
     assert _worst(edge) == pytest.approx(1.0)
 
 
+def test_an_impact_within_a_step_is_no_jump_of_the_state():
+    """A heel that hits first turns the ankle, a toe that hits next turns it back: as far as forces can, and no more."""
+    name, ankle, row = "largest jump of the state", 7 + JOINTS.index("left_ankle_pitch"), 2
+    hit, still = np.zeros((6, 2, 6)), run(substeps=4)
+    hit[row, 0, 2] = 20e3
+    data, frame = MODEL.createData(), MODEL.getFrameId(ROBOT.foot.frames[0])
+    mass, axes = pin.crba(MODEL, data, still.q[row]), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    jacobian = pin.computeFrameJacobian(MODEL, data, still.q[row], frame, axes)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    kicks = [
+        np.linalg.solve(mass, H * jacobian.T @ [0, 0, 20e3, 0, -x * 20e3, 0]) for x in (ROBOT.foot.heel, ROBOT.foot.toe)
+    ]
+    may = 0.75 * H * np.abs(kicks).max(axis=0)[ankle - 1]
+    for moved, left in ((0.9 * may, 0.0), (may + 0.01, 0.01)):
+        q = still.q.copy()
+        q[row + 1 :, ankle] += moved
+        assert said(replace(still, q=q, foot_wrench=hit))[name] == pytest.approx(left, abs=1e-6)
+        assert said(replace(still, q=q))[name] == pytest.approx(moved)
+    q = still.q.copy()
+    q[row + 1 :, 2] += 0.05  # nor does it lift the robot
+    assert said(replace(still, q=q, foot_wrench=hit))[name] > 0.01
+
+
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_jumps_of_the_state(substeps):
-    """A state that its velocities lead to, and one that is 3 mm beyond; what swings within a step is allowed for."""
+    """A state that its velocities lead to, and one that is beyond; what swings within that step is allowed for."""
     rng, n, nv = np.random.default_rng(3), 8, MODEL.nv
     v = rng.normal(0, 1.0, (n, nv))
     v[4] = v[3] + 1e-3 * rng.uniform(-1, 1, nv)  # little room there
@@ -199,13 +226,13 @@ def test_jumps_of_the_state(substeps):
         q.append(pin.integrate(MODEL, q[k], H * (v[k] + (1 + 1 / substeps) / 2 * (v[k + 1] - v[k]))))
     honest = run(n, substeps, q=np.array(q), v=v)
     assert said(honest)["largest jump of the state"] == pytest.approx(0.0, abs=1e-9)
-    for column, amount in ((1, 3e-3), (9, -3e-3)):
+    for at, column, amount in ((4, 1, 3e-3), (4, 9, -3e-3), (6, 9, 0.03)):
         away = np.zeros(nv)
         away[column] = amount
-        moved = [*q[:4], *[pin.integrate(MODEL, x, away) for x in q[4:]]]
-        room = 3.0 * (1 - 1 / substeps) * np.abs(v[4] - v[3]).max() * H
+        moved = [*q[:at], *[pin.integrate(MODEL, x, away) for x in q[at:]]]
+        room = 3.0 * (1 - 1 / substeps) * np.abs(v[at] - v[at - 1]).max() * H
         found = said(replace(honest, q=np.array(moved)))["largest jump of the state"]
-        assert found == pytest.approx(3e-3 - room, abs=2e-7)
+        assert found == pytest.approx(abs(amount) - room, abs=2e-7)
 
 
 def test_time_torque_and_what_the_engine_says():

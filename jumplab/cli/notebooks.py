@@ -200,9 +200,9 @@ def _checked(values: dict[str, Any], declared: Iterable[dict]) -> dict[str, Any]
         robots.Robot.load(values["robot"])
         if Path(values["robot"]).is_file():
             values["robot"] = str(Path(values["robot"]).resolve())
-    values.setdefault("engine", sim.DEFAULT_ENGINE)
-    sim.engine_class(values["engine"])
-    return {**values, "out": "result", "figures": "figures"}
+    if "engine" in values:
+        sim.engine_class(values["engine"])
+    return {"engine": sim.DEFAULT_ENGINE, **values, "out": "result", "figures": "figures"}
 
 
 def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool, failed: Path) -> None:
