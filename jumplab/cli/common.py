@@ -94,7 +94,9 @@ def needing(what: str, fits: Callable[[Any], Any], make: Kind = lambda option, t
 
 def whole(least: int, most: int) -> Kind:
     """Kind of an option that takes a whole number from ``least`` to ``most``."""
-    check = needing(f"be a whole number from {least} to {most}", range(least, most + 1).__contains__, number)
+    check = needing(
+        f"be a whole number from {least} to {most}", lambda x: least <= x <= most and x.is_integer(), number
+    )
     return lambda option, text: int(check(option, text))
 
 
