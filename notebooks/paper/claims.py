@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, JumplabError, SolverError, as_path, quoted, require_type
+from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot.stance import stance_angles
@@ -241,6 +242,15 @@ def trunk_feels(run: SimulationResult, robot: Robot) -> np.ndarray:
     for q, v in zip(run.q, run.v, strict=True):
         velocity.append(pin.Quaternion(q[3:7]).matrix() @ (v[:3] + np.cross(v[3:6], lever)))
     return np.linalg.norm(np.diff(velocity, axis=0) / STEP_S - gravity, axis=1) / np.linalg.norm(gravity)
+
+
+def momentum_error(run: SimulationResult, tape: Tape) -> tuple[float, float]:
+    """Root mean square of simulated less planned L in the launch's first 0.1 s, and after, in shares of the peak."""
+    down = run.t < run.metrics.liftoff_s
+    error = (run.L - np.interp(run.t, tape.t, tape.extra["planar_L"]))[down]
+    start, top = run.t[down] < 0.1, np.abs(tape.extra["planar_L"]).max()
+    first, later = (float(np.sqrt(np.mean(e**2)) / top) for e in (error[start], error[~start]))
+    return first, later
 
 
 def touchdown_postures(plan: JumpPlan) -> list[dict[str, float | str]]:
