@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from jumplab.errors import InputError, quoted
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
+FRICTION = 0.45  # [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not have
 MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
 MAX_HEIGHT_M = 1.5  # beyond any human's CoM rise: surely a typo
 MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump

@@ -52,6 +52,7 @@ def test_counts_and_resumes(folder, fakes):
     whole = landing_basin(folder, jobs=1)
     assert (whole.count, whole.landed, whole.resumed) == (225, 135, 50) and whole.trials[:50] == first.trials
     said = store.read_json(folder / "basin.json")
+    assert "robot" in said["conditions"] and not any(name.startswith("drawn") for name in said["conditions"])
     assert said["counts"] == {"trials": 225, "landed": 135, "failed": 90} and said["states"] == 225
     assert {abs(row["pitch_deg"]) for row in said["failed"]} == {10.0} and len(said["failed"]) == 90
     assert said["reasons"] == {"trunk touched the ground ... s": 90}

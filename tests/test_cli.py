@@ -49,7 +49,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep or bench"
+NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep or bench"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
@@ -330,6 +330,20 @@ def test_real_refusals_and_their_exit_codes(capsys, here, arguments, code, sente
         got, _, err = run(capsys, "plan", "--out", "p", "--debug", *arguments.split())
         assert got == code and "Traceback (most recent call last)" in err and f"\njumplab: {sentence}" in err
     assert names(here) == []
+
+
+def test_without_pybullet_mujoco_plays_the_plan(planned):
+    """A new process that finds no PyBullet: MuJoCo is the default, and who asks for PyBullet is told how to get it."""
+    code = "import sys; sys.modules['pybullet'] = None\nfrom jumplab.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "simulate", str(planned)]
+    before = names(planned)
+    refused = subprocess.run([*command, "--engine", "bullet"], capture_output=True, text=True, cwd=ROOT)
+    assert (refused.returncode, refused.stdout, names(planned)) == (2, "", before)
+    sentence = "jumplab: engine 'bullet': the package pybullet is not installed; take 'mujoco', or pip install "
+    assert refused.stderr.startswith(sentence) and len(refused.stderr.splitlines()) == 1
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "") and "landing: stands" in done.stdout
+    assert store.read_json(planned / "simulation.json")["settings"]["engine"]["name"] == "mujoco"
 
 
 def test_real_simulation_of_the_plan(capsys, planned):

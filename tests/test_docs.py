@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from jumplab.auditing.report import LIMITS
 from jumplab.cli import main as command_line
 from jumplab.cli import notebooks
+from jumplab.sim import Ranges
+from jumplab.stages import joint_qp, srmp, whole_body
+from jumplab.task import FRICTION
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
@@ -109,6 +113,16 @@ def test_readme_points_at_files_that_exist():
     )
     named += ["CITATION.cff", "LICENSE", "CHANGELOG.md", ".pre-commit-config.yaml", ".ci/run"]
     assert len(named) > 8 and all((ROOT / name).exists() for name in named), named
+
+
+def test_readme_says_the_friction_that_plans_obey():
+    """Each stage's, at its nodes; and what the audit refuses between them is the least that trials simulate."""
+    sentence = r"Plans count on a friction of\s+([\d.]+) at their nodes, and between them stay below ([\d.]+)"
+    said = re.search(sentence, README)
+    settings = srmp.settings.SrmpSettings, joint_qp.settings.Limits, whole_body.Limits
+    assert {s().friction for s in settings} == {FRICTION} and whole_body.Limits().of_flip().friction == FRICTION
+    assert float(said[1]) == FRICTION
+    assert float(said[2]) == LIMITS["friction used"].limit == Ranges().friction[0]
 
 
 def test_these_checks_can_fail():

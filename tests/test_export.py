@@ -7,7 +7,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pinocchio as pin
-import pybullet
 import pytest
 from fixtures_core import jump
 from test_cli import one_sentence, run
@@ -151,6 +150,7 @@ def test_clip_orders(flip, bhr, tmp_path):
 
 # replay ---------------------------------------------------------------------------------------------------------
 def test_replay_by_the_script_of_its_readme(flip, bhr, odd_folder, monkeypatch):
+    pybullet = pytest.importorskip("pybullet")
     folder = export.write("urdf-replay", flip, bhr, odd_folder / "replay")
     assert names(folder) == ["README.md", "replay.py", "robot.urdf", "trajectory.npz"]
     script = re.search(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.S)[1]

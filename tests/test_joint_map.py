@@ -1,5 +1,6 @@
 """Stage 2: tracking, limits, drift, agreement of both solution paths, and what the paper's literal forms do."""
 
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from types import SimpleNamespace
@@ -132,7 +133,8 @@ def steps():
     for qp, rows in ((mapper.launch, launch), (flying, flight)):
         for k in np.linspace(0, rows.stop - rows.start - 2, 6).astype(int):
             at = rows.start + k
-            out.append((qp, plan.a[at], *mapper.problem(qp, int(k), plan.state(at))))
+            start = replace(plan.state(at), a=plan.predicted[at])  # as the plan's own QP was made
+            out.append((qp, plan.a[at], *mapper.problem(qp, int(k), start)))
     return out
 
 
@@ -195,7 +197,7 @@ def test_flight_matrices_are_the_written_problem(steps):
 def test_published_accelerations_are_the_optimum(steps):
     for qp, published, _, _, matrices in steps:
         x = DirectSolver(matrices).solve(matrices, qp.name, 0.0).x
-        np.testing.assert_allclose(x[len(x) - 20 :], published, atol=0.1 * np.abs(published).max() + 1.0)
+        np.testing.assert_allclose(x[len(x) - 20 :], published, atol=1e-9)
 
 
 def test_every_row_has_a_name(steps):
@@ -218,13 +220,9 @@ def test_missing_half_halves_the_targets():
 
 def test_three_base_rows_do_not_conserve_angular_momentum():
     loose, form = Options(limits=Limits(torque_share=None)), Form(base_rows=3)
-    try:
-        plan = map_as_read(followable(), Robot.load(), form, options=loose, q0=mapped().q[0])
-    except SolverError as e:
-        assert e.status
-    else:
-        broken = joint_violations(plan, Robot.load())
-        assert broken["base_force"] > 100 or broken["flight_momentum"] > 1
+    plan = map_as_read(followable(), Robot.load(), form, options=loose, q0=mapped().q[0])
+    broken = joint_violations(plan, Robot.load())
+    assert broken["base_force"] > 100 and broken["flight_momentum"] > 1
 
 
 def pressure_behind_toe(plan):

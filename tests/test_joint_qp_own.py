@@ -143,15 +143,21 @@ def test_weight_zero_and_no_change_leave_every_bit():
 
 @pytest.mark.parametrize("target", [TARGETS[0], *(pytest.param(x, marks=pytest.mark.slow) for x in TARGETS[1:])])
 def test_a_growing_weight_lowers_the_terms_own_value(target):
-    """Over the whole roll-out, which looks one step ahead; above 0.1 nothing is left to gain."""
-    columns = [6 + k for k, name in enumerate(jl.Robot.load().joint_names) if "shoulder_pitch" in name]
-    sizes = []
-    for weight in (0.0, 1e-4, 1e-3, 1e-2, 1e-1):
-        own = {"flight": [term(swing, weight=weight)]}
-        plan = map_to_joints(stage1(*target), jl.Robot.load(), method="direct", terms=own)
-        sizes.append(np.mean(plan.a[plan.rows("flight")][:, columns] ** 2))
-    assert all(later < before for before, later in pairwise(sizes)), sizes
-    assert sizes[-1] < 0.5 * sizes[0]
+    """Over the whole roll-out as long as no stop brakes the arms; steps that do, which no QP foresees, add 5 %."""
+    robot, srmp, sizes, free = jl.Robot.load(), stage1(*target), [], []
+    arms = [k for k, name in enumerate(robot.joint_names) if "shoulder_pitch" in name]
+    for weight in (0.0, *10.0 ** np.arange(-4, 4)):
+        plan = map_to_joints(srmp, robot, method="direct", terms={"flight": [term(swing, weight=weight)]})
+        steps = range(plan.rows("flight").start, plan.rows("flight").stop - 1)
+        qp, a = JointMapper(srmp, robot).flight_from(plan.state(steps[0])), plan.a[steps][:, 6:]
+        ends = [qp.joints.acceleration(plan.q[k, 7:], plan.v[k, 6:], qp.step) for k in steps]
+        braked = np.any([np.abs(a - x) < 1e-3 * (1 + np.abs(x)) for x in np.moveaxis(ends, 1, 0)], axis=0)
+        squares = a[:, arms] ** 2
+        sizes.append(squares.sum())
+        free.append(squares[~braked[:, arms]].sum())
+    assert all(later < before for before, later in pairwise(free)), free
+    assert all(later < before for before, later in pairwise(sizes[:5])) and sizes[4] < 0.5 * sizes[0], sizes
+    assert all(size < 1.05 * min(sizes[:k]) for k, size in enumerate(sizes) if k), sizes
 
 
 @pytest.mark.parametrize("solver", [DirectSolver, CvxpySolver])

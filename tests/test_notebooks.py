@@ -372,6 +372,21 @@ def test_chain_lands_where_it_should(chain):
     assert simulation["standing_s"] >= 3.0
 
 
+def test_readme_tells_what_the_run_measured(chain):
+    """Its table to the millimetre and to 10 ms, and the number of checks."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    simulation, (_, _, summary) = store.read_json(chain.out / "simulation.json"), store.read_plan(chain.out)
+    rows = dict(re.findall(r"^\| ([^|]+?) \| [\d.]+ m?s? ?\|(.*)\|$", readme, re.M))
+    said = {name: [float(x) for x in re.findall(r"[\d.]+\d", rest)] for name, rest in rows.items()}
+    assert said["travel of the feet"] == pytest.approx(
+        [summary["planned_distance_m"], simulation["foot_distance_m"]], abs=0.001
+    )
+    assert said["rise of the CoM"] == pytest.approx([summary["planned_rise_m"], simulation["com_rise_m"]], abs=0.001)
+    assert said["on its feet after touchdown"] == pytest.approx([simulation["standing_s"]], abs=0.01)
+    passport = store.read_json(chain.out / "passport.json")
+    assert len(passport["checks"]) == 50 and "passes fifty independent checks" in readme
+
+
 @pytest.mark.parametrize("stem", STEMS)
 def test_executed_notebook_is_quiet(chain, stem):
     """Nothing on stderr, no warning, and pictures that are really embedded."""

@@ -19,11 +19,14 @@ import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.ocp import Nlp, Term, changed
 from jumplab.ocp import cache as kept
+from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.urdf import have_published
 from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.srmp import build_problem as srmp_problem
 from jumplab.stages.whole_body import Limits, Mesh, build_problem
+from jumplab.studies.chain import Course, crouched, run_chain, run_chains
+from jumplab.studies.chain.pilot import Foresight, Rehearsal
 
 SMALL = Mesh(6, 4, 6)
 STAGES = (
@@ -330,8 +333,21 @@ def same(one: jl.JumpPlan, other: jl.JumpPlan) -> None:
 
 @pytest.mark.parametrize("method", ["three-step", "direct"])
 def test_a_weight_of_zero_changes_no_digit(method):
-    task = jl.JumpTask(0.4, 0.3)
-    same(armed(0.0).plan(task, method), planner().plan(task, method))
+    task, usual = jl.JumpTask(0.4, 0.3), planner().plan(jl.JumpTask(0.4, 0.3), method)
+    same(armed(0.0).plan(task, method), usual)
+    same(armed(0.1).plan(task, method, weights={"flight/calm arms": 0}), usual)
+
+
+@pytest.mark.slow
+def test_a_weight_of_zero_in_one_plan_drops_that_term_alone():
+    task, rod = jl.JumpTask(0.4, 0.3), jl.Term("upright", "ours", "rad", "node", lambda p: p.posture, weight=1.0)
+    both = jl.Planner(jl.Robot.load(), terms={"srmp/launch": [rod], "whole body/flight": [calm()]})
+    asked = {"srmp/launch/upright": 0, "calm arms": 0.2}
+    for _ in range(2):
+        plan = both.plan(task, weights=asked)
+        same(plan, armed(0.2).plan(task))
+        assert "toe/upright" not in plan.weights["SRMP"] and plan.weights["whole body"]["flight/calm arms"] == 0.2
+    assert both.plan(task).weights["SRMP"]["toe/upright"] == 1.0
 
 
 def test_a_solved_plan_lists_its_terms():
@@ -402,12 +418,28 @@ def test_a_growing_weight_straightens_stage_one(target):
     assert falls([turning(stage.plan(jl.JumpTask(*target)).solution.phases) for stage in how])
 
 
+# targets, each with one of the methods
+FLIPS = [("three-step", 0.0, 0.5, -1), ("direct", 0.2, 0.5, -1), ("direct", 0.0, 0.4, -1)]
+FLIPS += [("three-step", 0.0, 0.5, 1), ("three-step", 0.2, 0.5, 1), ("direct", 0.2, 0.4, 1)]
+
+
 @pytest.mark.slow
-def test_a_growing_weight_calms_the_arms_of_flips():
-    task = jl.JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi)
-    for method in ("three-step", "direct"):
-        found = [armed(w).plan(task, method) for w in (0.0, 0.1, 1.0)]
-        assert falls([swing(plan.whole_body.solution.phases) for plan in found])
+@pytest.mark.parametrize(("method", "distance_m", "height_m", "turns"), FLIPS)
+def test_a_growing_weight_calms_the_arms_of_flips(method, distance_m, height_m, turns):
+    """A flip has several local solutions; as the weight grows, it stays with one of them."""
+    task = jl.JumpTask(distance_m, height_m, rotation_rad=2 * np.pi * turns)
+    found = [armed(w).plan(task, method) for w in GROWING]
+    assert falls([swing(plan.whole_body.solution.phases) for plan in found])
+
+
+@pytest.mark.slow
+def test_a_flip_with_weights_begins_with_the_one_without():
+    """Weights of one plan are those of a planner, and a weight of zero changes no digit."""
+    task = jl.JumpTask(0.0, 0.4, rotation_rad=-2 * np.pi)
+    usual = planner().plan(task, "direct")
+    same(armed(0.0).plan(task, "direct"), usual)
+    same(armed(0.1).plan(task, "direct", weights={"calm arms": 0}), usual)
+    same(armed(0.1).plan(task, "direct", weights={"calm arms": 1.0}), armed(1.0).plan(task, "direct"))
 
 
 @pytest.mark.slow
@@ -421,10 +453,28 @@ def test_the_resolve_for_jerk_keeps_own_terms():
     assert swing(plans[1].whole_body.solution.phases) < swing(plans[0].whole_body.solution.phases)
 
 
+@cache
+def waiting(weight: float) -> jl.Planner:
+    return jl.Planner(crouched(jl.Robot.load()), terms={"whole body/flight": [calm(weight)]})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_growing_weight_calms_the_arms_of_chains(target):
+    """A chain's first jump: as it is rehearsed, and as it is planned then from a measured posture."""
+    course, found = Course.of([target[0]], target[1]), []
+    for one in map(waiting, GROWING):
+        rehearsal, q = Rehearsal.of(course, one), stance_configuration(one.robot)
+        foresight = Foresight(course, one.robot, one, rehearsal, 0.3)
+        q[7:] += 0.03
+        foresight.learn_posture(q)
+        plans = rehearsal.plans[0], foresight.look(0, 0.5, np.zeros(3)).plan
+        found.append([swing(plan.whole_body.solution.phases) for plan in plans])
+    assert all(falls(values) for values in zip(*found, strict=True)), found
+
+
 @pytest.mark.slow
 def test_chains_plan_with_own_terms():
-    from jumplab.studies.chain import Course, crouched, run_chain, run_chains
-
     robot = jl.Robot.load()
     one = jl.Planner(crouched(robot), terms={"whole body/flight": [calm(1.0)]})
     run = run_chain(Course.of([0.4], 0.3), robot, planner=one, solve_s=0.3)

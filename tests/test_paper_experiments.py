@@ -8,11 +8,10 @@ from fixtures_core import jump
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from paper import experiments as pictures
-from paper import render
 from paper.measurement import measure
 
 from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
-from jumplab.sim import Scene, SensorNoise, simulate_jump
+from jumplab.sim import Engine, Scene, SensorNoise, simulate_jump
 from jumplab.studies.basin import BasinGrid, BasinReport
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
 
@@ -33,7 +32,7 @@ def result(tape, bhr):
 @pytest.fixture(autouse=True)
 def no_simulation(result, monkeypatch):
     """No picture may simulate."""
-    monkeypatch.setattr(render.bullet, "stepSimulation", None)
+    monkeypatch.setattr(Engine, "__init__", None)
 
 
 def smallest_font(fig) -> float:
@@ -92,8 +91,9 @@ def test_exact_sensors_tell_the_truth(result, bhr, tape):
     exact = measure(result, bhr, SensorNoise())
     n = len(exact.t)
     assert set(exact.phase) == {"launch", "flight"} and n == int((result.phase != "landing").sum())
-    assert exact.L == pytest.approx(result.L[:n], abs=1e-6) and exact.rho == pytest.approx(result.rho[:n], abs=1e-6)
-    assert np.abs(exact.com - result.com[:n][:, [0, 2]]).max() < 1e-3
+    assert exact.rho == pytest.approx(result.rho[:n], abs=1e-9)
+    assert exact.L == pytest.approx(result.L[:n], abs=5e-8)  # the spin that is estimated is off by 2e-9 rad/s
+    assert np.abs(exact.com - result.com[:n][:, [0, 2]]).max() < 3e-4
     fig = pictures.measured_jump(exact, tape, bhr)
     assert len(fig.axes) == 4 and smallest_font(fig) >= MIN_FONT_PT
     shown = np.concatenate([line.get_ydata() for line in fig.axes[3].lines[:2]])
@@ -104,7 +104,7 @@ def test_noise_is_seeded_and_of_its_size(result, bhr):
     one, same, other = (measure(result, bhr, seed=s) for s in (1, 1, 2))
     assert np.array_equal(one.L, same.L) and not np.array_equal(one.L, other.L)
     error = one.L - result.L[: len(one.t)]
-    assert abs(error.mean()) < 0.05 and 0.02 < error.std() < 0.3
+    assert abs(error.mean()) < 0.02 and 0.1 < error.std() < 0.15
     place = np.abs(one.com - result.com[: len(one.t)][:, [0, 2]])
     assert 1e-4 < place[one.phase == "launch"].max() < 0.01  # the feet tell it
     assert place[one.phase == "launch"].max() < place.max() < 0.05  # and in the air only the inertial unit

@@ -28,6 +28,20 @@ def test_check_parameters_refuses(injected, sentence):
     assert str(e.value).startswith(sentence)
 
 
+def test_an_engine_is_looked_for_before_anything_runs(tmp_path):
+    from jumplab.sim import INSTALLED
+
+    namespace = {"engine": "ode", "In": ["# Parameters\nengine = 'ode'"]}
+    words = f"^engine 'ode': must be one of {', '.join(INSTALLED)}$"
+    with pytest.raises(InputError, match=words):
+        notebooks.check_parameters(namespace, engine=str)
+    with pytest.raises(InputError, match=r"^unknown notebook parameter 'engine'"):  # a notebook that simulates nothing
+        notebooks.check_parameters(namespace)
+    with pytest.raises(InputError, match=words):
+        notebooks.run_notebooks({"engine": "ode"}, notebooks=notebooks.find_notebooks(["00"]), out=tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
 def test_check_parameters_accepts_what_is_meant():
     notebooks.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
     notebooks.check_parameters({"fast": True, "In": ["# Parameters\nfast = True"]}, fast=bool)

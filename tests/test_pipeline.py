@@ -12,6 +12,9 @@ from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
+from jumplab.stages.joint_qp import Limits as JointLimits
+from jumplab.stages.joint_qp import Options, rollout
+from jumplab.stages.joint_qp.settings import GENTLE
 from jumplab.stages.planner import METHODS, Planner, guess_from_joints, plan_jump
 from jumplab.task import JumpTask
 
@@ -30,6 +33,17 @@ def test_three_steps_and_one(plan):
     assert plan.srmp is not None and plan.joints is not None
     assert direct.srmp is None and direct.joints is None
     assert all(row.iterations > 0 and row.build_s >= 0 and row.solve_s > 0 for row in plan.statistics)
+
+
+def test_a_stage_two_that_follows_gently_says_so(monkeypatch, plan):
+    """Usual weights without the torques for it, and a fallback with them: the plan tells which it was, and why."""
+    weak = Options(limits=JointLimits(torque_share=0.2))
+    monkeypatch.setattr(rollout, "Options", lambda: weak)
+    gentle = planner().plan(JumpTask(0.5, 0.3))
+    assert gentle.statistics[1].stage == "2 joint map, gentle" and gentle.joints.options == GENTLE
+    reason = gentle.summary["manifest"]["solvers"]["joint map"]["gentle"]
+    assert reason == gentle.joints.gentle and reason.startswith("stage 2: at t = ")
+    assert plan.joints.gentle == "" and "gentle" not in plan.summary["manifest"]["solvers"]["joint map"]
 
 
 def test_planned_numbers_are_the_tapes(plan):
@@ -180,7 +194,7 @@ def test_guess_is_stage_twos_motion(plan):
         assert angle == pytest.approx(own, abs=1e-9)
     arm = pipeline.to_link_angles(robot, plan.joints.q, plan.joints.v, plan.joints.a)[0][-1, 4]
     naive = body.naive_guess(plan.task)["flight"].q[-1, 4]
-    mixed = pipeline.OWN_ARMS * arm + pipeline.NAIVE_ARMS * naive
+    mixed = pipeline.OWN_ARMS * arm + (1 - pipeline.OWN_ARMS) * naive
     assert guess["flight"].q[-1, 4] == pytest.approx(mixed, abs=1e-9)
     velocity = [guess["flight"].constants[k] for k in ("vel_x", "vel_z")]
     rows = plan.joints.rows("flight")
@@ -188,17 +202,12 @@ def test_guess_is_stage_twos_motion(plan):
 
 
 @pytest.mark.slow
-def test_another_gravity_is_planned_or_refused():
+def test_another_gravity_is_planned():
     """Never a tape whose forces belong to another planet; and no stage that fails because it thinks of 9.8."""
-    task = JumpTask(0.3, 0.3, gravity=7.0)
     for method in METHODS:
-        try:
-            plan = planner().plan(task, method)
-        except InputError:
-            continue
-        residual = np.abs(Replay(plan).residual)
-        assert residual[:, :6].max() < 0.005 * 42.0 * 7.0
-        assert residual[:, 6:].max() < 1e-6
+        residual = np.abs(Replay(planner().plan(JumpTask(0.3, 0.3, gravity=7.0), method)).residual)
+        assert residual[:, :6].max() < 0.02  # [N, N m] of a weight of 294 N: between the nodes
+        assert residual[:, 6:].max() < 1e-9
 
 
 @pytest.mark.slow
@@ -223,7 +232,7 @@ def test_manifest_says_how_the_plan_came_about(method):
     found = jump(1.0, 0.5, 0.0, method).summary["manifest"]
     stages = {"three-step": ["SRMP", "joint map", "whole body"], "direct": ["whole body"]}[method]
     assert list(found["weights"]) == list(found["solvers"]) == stages
-    assert all(w >= 0 for stage in found["weights"].values() for w in stage.values())
+    assert all(0 <= w < 1e5 and any(stage.values()) for stage in found["weights"].values() for w in stage.values())
     for name, told in found["solvers"].items():
         assert told["iterations"] > 0 and 0 <= told["residual"] < 1e-4
         assert name == "joint map" or (told["status"] == "Solve_Succeeded" and told["variables"] > 100)

@@ -9,7 +9,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pinocchio as pin
-import pybullet
 import pytest
 from fixtures_core import LIMBS
 from paper import bhr_table as table
@@ -41,10 +40,11 @@ def in_mujoco(bhr):
 @pytest.fixture
 def in_pybullet(bhr, tmp_path):
     (tmp_path / "robot.urdf").write_text(bhr.urdf)
-    client = pybullet.connect(pybullet.DIRECT)
-    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-    yield pybullet.loadURDF(str(tmp_path / "robot.urdf"), flags=flags, physicsClientId=client), client
-    pybullet.disconnect(client)
+    bullet = pytest.importorskip("pybullet")
+    client = bullet.connect(bullet.DIRECT)
+    flags = bullet.URDF_USE_INERTIA_FROM_FILE
+    yield bullet, bullet.loadURDF(str(tmp_path / "robot.urdf"), flags=flags, physicsClientId=client), client
+    bullet.disconnect(client)
 
 
 # the file -------------------------------------------------------------------------------------------------------
@@ -72,14 +72,14 @@ def test_counts_and_size(bhr):  # N-4, N-5
 
 
 def test_pybullet_sees_the_same_masses(bhr, in_pybullet):
-    robot, client = in_pybullet
+    bullet, robot, client = in_pybullet
     masses = {}
-    for i in range(-1, pybullet.getNumJoints(robot, physicsClientId=client)):
-        name = "trunk" if i < 0 else pybullet.getJointInfo(robot, i, physicsClientId=client)[12].decode()
-        masses[name] = pybullet.getDynamicsInfo(robot, i, physicsClientId=client)[0]
+    for i in range(-1, bullet.getNumJoints(robot, physicsClientId=client)):
+        name = "trunk" if i < 0 else bullet.getJointInfo(robot, i, physicsClientId=client)[12].decode()
+        masses[name] = bullet.getDynamicsInfo(robot, i, physicsClientId=client)[0]
     assert sum(masses.values()) == pytest.approx(42.0, abs=1e-9)
     assert {name for name, mass in masses.items() if mass > 0.1} == MASSIVE
-    movable = [i for i in range(len(masses) - 1) if pybullet.getJointInfo(robot, i, physicsClientId=client)[2] == 0]
+    movable = [i for i in range(len(masses) - 1) if bullet.getJointInfo(robot, i, physicsClientId=client)[2] == 0]
     assert len(movable) == 14
 
 

@@ -30,7 +30,7 @@ from jumplab.robot.reduction import reduction_error
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
-from jumplab.sim import BulletEngine, Scene, simulate_jump
+from jumplab.sim import INSTALLED, Scene, engine_class, simulate_jump
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
@@ -99,10 +99,11 @@ def test_held_joints_move_their_links(tmp_path):
 @pytest.mark.parametrize("variant", [plain, waist, one_axis_ankle, held_arms], ids=lambda v: v.__name__)
 def test_engines_agree_on_the_lumped_robot(tmp_path, variant):
     robot = load(tmp_path, variant)
-    with BulletEngine(robot, pin.neutral(robot.model)) as world:  # raises unless PyBullet's mass is Pinocchio's
-        q, v = world.state()
-    np.testing.assert_allclose(q, pin.neutral(robot.model), atol=1e-12)
-    assert np.abs(v).max() == 0
+    for engine in INSTALLED:
+        with engine_class(engine)(robot, pin.neutral(robot.model)) as world:  # raises unless its mass is Pinocchio's
+            q, v = world.state()
+        np.testing.assert_allclose(q, pin.neutral(robot.model), atol=1e-12)
+        assert np.abs(v).max() == 0
     base = robot.model.frames[2].name if robot.model.frames[1].name == "root_joint" else "trunk"
     urdf = robot.urdf.replace(f'<link name="{base}">', FREE.format(base) + f'<link name="{base}">', 1)
     there = mujoco.MjModel.from_xml_string(urdf)

@@ -56,7 +56,7 @@ def test_whatever_is_exposed_refuses_to_be_written_to(way):
 def test_the_sentence_that_used_to_poison(bhr):
     with pytest.raises(TypeError):
         bhr.actuators["left_knee"]["effort"] = 1000.0
-    with pytest.raises(ValueError, match="stance is declared with init=False"):
+    with pytest.raises((ValueError, TypeError), match="stance is declared with init=False"):  # the latter from 3.13 on
         replace(bhr, stance={"knee_rad": 1.0})
     with pytest.raises(AttributeError):
         bhr.model = pin.Model()

@@ -8,10 +8,10 @@ from fixtures_core import jump
 from matplotlib.path import Path
 from matplotlib.text import Text
 from paper import diagrams, experiments, render
+from pinocchio import SE3
 from scipy.ndimage import binary_dilation
 
 from jumplab import show as plotting
-from jumplab.errors import RobotError
 from jumplab.robot.stance import stance_configuration
 from jumplab.show.style import MIN_FONT_PT, PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
@@ -124,8 +124,7 @@ def test_trials_sort_robots_by_their_fate(result):
 
 @pytest.fixture(scope="module")
 def studio(bhr):
-    with render.Renderer(bhr, marks=(0.5,)) as studio:
-        yield studio
+    return render.Renderer(bhr, marks=(0.5,))
 
 
 SMALL = render.Camera(pitch_deg=0.0, pixels_per_m=120, bottom=0.01)  # eye level, without the ground's surface
@@ -136,22 +135,26 @@ def body(picture):
 
 
 def test_camera_sees_the_robot_where_the_log_says(result, bhr):
-    """Picture and outlines computed by Pinocchio, with the joints' balls, differ by 4 cm at most: perspective."""
+    """Nothing of the outlines by Pinocchio, with the joints' balls, is missing; what is seen beyond is perspective.
+
+    The camera is 10 m away: a near hand, 0.28 m before the jump's plane and 0.9 m off the middle of the picture, is
+    drawn 3 pixels too far out, and rounding takes one more.
+    """
     camera = render.Camera(width=2.0, bottom=-0.1, top=1.9, pitch_deg=0.0, pixels_per_m=100)
     outlines, square = plotting.Silhouette(bhr), np.ones((3, 3), bool)
     x, z = np.meshgrid((np.arange(200) + 0.5) / 100 - 1.0, 1.9 - (np.arange(200) + 0.5) / 100)
-    with render.Renderer(bhr, scene=Scene("empty", ())) as studio:
-        for row in render.frame_rows(result)[[0, 1, 5, 9]]:
-            q = result.q[row]
-            seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
-            places = np.column_stack([x.ravel() + q[0], z.ravel()])
-            inside = [Path(outline).contains_points(places) for _, outline in outlines.outlines(q)]
-            balls = [p for name, p in outlines.joints(q).items() if "pitch" in name or "knee" in name]
-            inside += [np.hypot(*(places - ball).T) < render.JOINT_RADIUS_M for ball in balls]
-            wanted = np.any(inside, axis=0).reshape(seen.shape)
-            assert wanted.sum() > 1000
-            assert not (seen & ~binary_dilation(wanted, square, iterations=4)).any()
-            assert not (wanted & ~binary_dilation(seen, square, iterations=4)).any()
+    studio = render.Renderer(bhr, scene=Scene("empty", ()))
+    for row in render.frame_rows(result)[[0, 1, 5, 9]]:
+        q = result.q[row]
+        seen = body(studio.picture(q, replace(camera, x=float(q[0]))))
+        places = np.column_stack([x.ravel() + q[0], z.ravel()])
+        inside = [Path(outline).contains_points(places) for _, outline in outlines.outlines(q)]
+        balls = [p for name, p in outlines.joints(q).items() if "pitch" in name or "knee" in name]
+        inside += [np.hypot(*(places - ball).T) < render.JOINT_RADIUS_M for ball in balls]
+        wanted = np.any(inside, axis=0).reshape(seen.shape)
+        assert wanted.sum() > 1000
+        assert not (seen & ~binary_dilation(wanted, square, iterations=4)).any()
+        assert not (wanted & ~binary_dilation(seen, square, iterations=1)).any()
 
 
 def test_pictures_are_repeatable_and_move_with_the_robot(studio, bhr):
@@ -180,8 +183,7 @@ def test_colours_reach_trunk_and_limbs_but_not_the_feet(studio, bhr):
 def test_marks_and_platform_are_drawn_in_their_places(bhr):
     q = stance_configuration(bhr)
     camera = render.Camera(x=0.8, width=1.0, top=0.8, bottom=-0.2, pixels_per_m=200)
-    with render.Renderer(bhr, scene=Scene.platform(0.75, 0.3), marks=(1.1,)) as studio:
-        picture = studio.picture(q, camera)
+    picture = render.Renderer(bhr, scene=Scene.platform(0.75, 0.3), marks=(1.1,)).picture(q, camera)
     solid = body(picture)
     left, right = solid[:, 40], solid[:, 160]  # x = 0.5 and x = 1.1
     top = [0.8 - np.flatnonzero(column)[0] / 200 for column in (left, right)]
@@ -190,23 +192,19 @@ def test_marks_and_platform_are_drawn_in_their_places(bhr):
     assert np.nonzero(red)[1].mean() == pytest.approx(160, abs=3)
 
 
-def test_nothing_is_simulated_and_the_engine_is_freed(bhr, monkeypatch):
-    monkeypatch.setattr(render.bullet, "stepSimulation", None)
-    with render.Renderer(bhr) as studio:
-        client = studio._client
-        studio.picture(stance_configuration(bhr), replace(SMALL, pixels_per_m=20))
-        assert render.bullet.isConnected(client)
-    assert not render.bullet.isConnected(client)
-    studio.close()
-
-
-def test_unreadable_urdf_is_said_in_one_sentence(bhr, monkeypatch):
-    def refuse(*args, **kwargs):
-        raise render.bullet.error("no such shape")
-
-    monkeypatch.setattr(render.bullet, "loadURDF", refuse)
-    with pytest.raises(RobotError, match=r"^robot bhr: PyBullet cannot read the URDF: no such shape$"):
-        render.Renderer(bhr)
+def test_the_nearer_body_hides_the_other_and_sizes_follow_perspective():
+    """A cube of 0.2 m, 10 m away, before a wall of 0.4 m at 11 m, whichever is drawn first."""
+    camera = render.Camera(width=1.0, bottom=-0.5, top=0.5, pitch_deg=0.0, pixels_per_m=100)
+    cube, wall = (render._box((-x, y, -x), (x, y + 0.1, x)) for x, y in ((0.1, 0.0), (0.2, 1.0)))
+    for order in (1, -1):
+        canvas = render._Canvas(camera)
+        for corners, color in [(cube, (1.0, 0.0, 0.0)), (wall, (0.0, 0.0, 1.0))][::order]:
+            canvas.draw(render.Shape(0, corners, color), SE3.Identity(), np.array(color))
+        red, blue = ((canvas.image[..., k] > 0) & (canvas.image[..., 1] == 0) for k in (0, 2))
+        assert red.sum() == pytest.approx(40**2, rel=0.02)
+        assert (red | blue).sum() == pytest.approx((80 / 1.1) ** 2, rel=0.04)
+        towards = 1.6 / np.linalg.norm([0.4, -1.6, 2.4])  # cosine between the faces that are seen, and the lamp
+        assert canvas.image[100, 100, 0] == pytest.approx(0.65 + 0.4 * towards)
 
 
 def test_frame_strip_and_model_can_be_read(result, bhr, tmp_path):

@@ -2,14 +2,13 @@
 
 import json
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
-import pybullet as bullet
 import pytest
 
 from jumplab.cli.common import print_simulation
-from jumplab.sim import BulletEngine, Disturbance, MujocoEngine, Perturbation, simulate_jump, simulate_landing
-from jumplab.sim import bullet as engines
+from jumplab.sim import Disturbance, MujocoEngine, Perturbation, simulate_jump, simulate_landing
 from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
 from jumplab.sim.playback import Motors
@@ -17,6 +16,9 @@ from jumplab.sim.result import STAND_S
 from jumplab.stages.planner import plan_jump
 from jumplab.task import JumpTask
 
+bullet = pytest.importorskip("pybullet", reason="PyBullet, behind whose back most of the cheats go, is not installed")
+engines = import_module("jumplab.sim.bullet")
+BulletEngine = engines.BulletEngine
 SHORT_S = 0.3
 IN_FLIGHT = 1200  # step; the tape takes off a little after one second and flies for half of one
 
@@ -27,7 +29,7 @@ def tape(bhr):
 
 
 def failed(result) -> set[str]:
-    assert len(result.checks) == 14
+    assert len(result.checks) == 16
     return {finding.name for finding in result.checks if not finding.passed}
 
 
@@ -58,7 +60,7 @@ def test_an_honest_jump_passes(bhr, tape, options, capsys):
     said = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert said["honest"] and all(row["passed"] for row in said["honesty"])
     print_simulation(said)
-    assert "honesty: all 14 checks of the run passed" in capsys.readouterr().out
+    assert "honesty: all 16 checks of the run passed" in capsys.readouterr().out
 
 
 def test_a_fall_is_honest_too(bhr, tape):
@@ -225,6 +227,46 @@ def test_self_collision_switched_off(bhr, tape, monkeypatch):
 
     monkeypatch.setattr(bullet, "loadURDF", load)
     assert failed(simulate_jump(tape, bhr, stand_s=SHORT_S)) == {"links that pass through each other"}
+
+
+@pytest.mark.parametrize(
+    ("cheat", "found"),
+    [
+        (lambda model: model.opt.gravity.__setitem__(2, -9.7), "gravity read back, less the target's"),
+        (lambda model: model.body_inertia.__imul__(0.99), "inertia read back, less the stated"),
+        (lambda model: model.body_ipos.__iadd__(1e-4), "inertia read back, less the stated"),
+        (lambda model: model.dof_armature.__setitem__(8, 1e-3), "damping and armature read back"),
+    ],
+)
+def test_what_mujoco_has_is_read_back(bhr, tape, monkeypatch, cheat, found):
+    """Too small to be felt in forces, and read back all the same."""
+    honest = MujocoEngine.read_back
+
+    def read_back(world):
+        cheat(world._model)
+        return honest(world)
+
+    monkeypatch.setattr(MujocoEngine, "read_back", read_back)
+    assert failed(simulate_jump(tape, bhr, engine="mujoco", stand_s=0.01)) == {found}
+
+
+@pytest.mark.parametrize(
+    ("cheat", "found"),
+    [
+        (lambda body, world: bullet.setGravity(0, 0, -9.7, **world), "gravity read back, less the target's"),
+        (lambda body, world: bullet.changeDynamics(body, 3, localInertiaDiagonal=[1e-3] * 3, **world),
+         "inertia read back, less the stated"),
+    ],
+)  # fmt: skip
+def test_what_bullet_has_is_read_back(bhr, tape, monkeypatch, cheat, found):
+    honest = BulletEngine.read_back
+
+    def read_back(world):
+        cheat(world._body, {"physicsClientId": world._client})
+        return honest(world)
+
+    monkeypatch.setattr(BulletEngine, "read_back", read_back)
+    assert failed(simulate_jump(tape, bhr, stand_s=0.01)) == {found}
 
 
 def test_a_landing_shorter_than_three_seconds(bhr, tape):

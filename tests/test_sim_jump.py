@@ -15,7 +15,7 @@ from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import (
-    ENGINES,
+    INSTALLED,
     STEP_S,
     Disturbance,
     LandingReference,
@@ -43,7 +43,7 @@ def tape(bhr):
     return plan_jump(JumpTask(DISTANCE, HEIGHT), bhr, method="direct").tape
 
 
-@pytest.fixture(scope="module", params=[(mode, engine) for engine in ENGINES for mode in ("position", "pd")])
+@pytest.fixture(scope="module", params=[(mode, engine) for engine in INSTALLED for mode in ("position", "pd")])
 def jump(request, bhr, tape):
     mode, engine = request.param
     return simulate(tape, bhr, mode=mode, engine=engine)
@@ -248,7 +248,7 @@ def test_the_landing_is_planned_in_flight(bhr, tape):
         return np.max(np.abs(run.tau[late]) / Actuators(bhr).effort), run.foot_wrench[late, :, 2].sum(axis=1).max()
 
     (torque, force), (spring_torque, spring_force) = loads(planned), loads(spring)
-    assert torque < 0.95 * spring_torque and force < 0.8 * spring_force
+    assert torque < 0.85 * spring_torque and force < 0.8 * spring_force  # 0.81; plans of three steps 0.6 to 0.7
 
 
 def test_late_commands_make_no_joint_swing(bhr, tape):

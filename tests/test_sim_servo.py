@@ -35,7 +35,7 @@ def test_a_stance_takes_what_its_weight_takes(bhr):
 
 def test_on_the_tape_it_asks_for_the_planned_torques_that_it_never_saw(bhr, tape):
     """Flat, on the toes and in the air; but where the tape jumps from one to the next."""
-    servo, player, effort = Servo(bhr), Playback(tape, bhr), Actuators(bhr).effort
+    servo, player, effort = Servo(bhr, substeps=10**6), Playback(tape, bhr), Actuators(bhr).effort
     worst = {FLAT: 0.0, TOE: 0.0, AIR: 0.0}
     for row in range(0, len(tape.t) - 1, 7):
         step = round(float(tape.t[row]) / STEP_S)
@@ -71,6 +71,31 @@ def test_torques_keep_to_the_share_of_the_motors(bhr):
     assert np.array_equal(Servo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
 
 
+def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
+    """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
+    q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
+    for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
+        given = Servo(bhr, substeps=substeps).torque(Command(tau=tau, change=change), q, v)
+        assert given == pytest.approx(tau + share * change, abs=1e-6)
+    takeoff = round(tape.takeoff_time / STEP_S)
+    player, none = Playback(tape, bhr, "pd"), np.zeros(14)
+    changes = [player.command(step, q, v, none).change for step in (100, takeoff - 1)]
+    assert changes[0] == pytest.approx(change, abs=1e-6) and not np.any(changes[1])  # the ground lets go at once
+
+
+def test_joints_whose_rates_are_right_are_where_substeps_bring_them(bhr, tape):
+    """Semi-implicit steps end half a step ahead: there no error is left, and so the damper is all that is felt."""
+    q, rate = stance_configuration(bhr), np.linspace(-2, 2, 14)
+    for substeps in (1, 4):
+        ahead = np.concatenate([q[:7], q[7:] + STEP_S / substeps / 2 * rate])
+        v = np.concatenate([np.zeros(6), rate])
+        here, there = (Servo(bhr, substeps=n).torque(told(bhr, q, rate=rate, feet=AIR), ahead, v)
+                       for n in (substeps, 10**9))  # fmt: skip
+        wish = told(bhr, ahead, rate=rate, feet=AIR)
+        assert here == pytest.approx(Servo(bhr, substeps=10**9).torque(wish, ahead, v), abs=1e-6)
+        assert np.abs(here - there).max() > 0.1
+
+
 def test_a_gain_scales_what_is_delivered(bhr):
     names, tau, still = bhr.joint_names, np.full(14, 10.0), np.zeros(14)
     delivered = Motors(bhr, {names[3]: 0.8, names[9]: 1.1}).deliver(tau, still)
@@ -81,11 +106,34 @@ def test_a_gain_scales_what_is_delivered(bhr):
 
 @pytest.mark.parametrize("mode", ["position", "pd"])
 def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
-    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes."""
+    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes. A delay that is
+    known is led by: no difference is left that anyone would see."""
     weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
-    asked, weakly, late = (
-        simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01).metrics
-        for p in (Perturbation(), weak, Perturbation(delay_s=0.004))
-    )
+    late, known = Perturbation(delay_s=0.004), Perturbation(delay_s=0.004, known_delay_s=0.004)
+    jumps = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
+    asked, weakly, late, known = (jump.metrics for jump in jumps)
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
+    assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
+    assert abs(known.com_rise_m - asked.com_rise_m) < 0.005
+
+
+@pytest.mark.parametrize("mode", ["position", "pd"])
+def test_what_is_sent_ahead_is_what_the_tape_takes_later(bhr, tape, mode):
+    """Commands with a lead are those without it so many steps on: on the tape, and off it by an error that stays."""
+    lead, servo, none = 3, Servo(bhr), np.zeros(14)
+    ahead, plain = Playback(tape, bhr, mode, lead * STEP_S), Playback(tape, bhr, mode)
+    effort, off = Actuators(bhr).effort, np.full(14, 5e-3)
+
+    def sent(player, step, seen, error):
+        row = int(np.searchsorted(tape.t, seen * STEP_S - 1e-9))
+        q, v = tape.q[row].copy(), tape.v[row]
+        q[7:] += error
+        command = player.command(step, q, v, none)
+        return servo.torque(command, *(command.state or (q, v)))
+
+    for step in (100, round(tape.takeoff_time / STEP_S) + 150):
+        for error in (none, off):
+            miss = sent(ahead, step, step, error) - sent(plain, step + lead, step + lead, error)
+            assert np.abs(miss / effort).max() < 1e-6, step
+        assert np.abs((sent(ahead, step, step, off) - sent(ahead, step, step, none)) / effort).max() > 0.01

@@ -1,22 +1,28 @@
 """Every engine against what must be true of any world."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import pybullet as bullet
 import pytest
 
+from jumplab import sim
 from jumplab.errors import InputError, JumplabError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import ENGINES, STEP_S, Perturbation, Scene, base_from_bullet, base_to_bullet, engine_class
+from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, Scene, SensorNoise, engine_class, simulate_jump
+from jumplab.sim import engine as engines
 from jumplab.sim.kinematics import Gauge
 from jumplab.sim.playback import AIR, FLAT, Actuators, Command, Delay, Motors
 from jumplab.sim.servo import Servo
+from jumplab.stages.planner import plan_jump
+from jumplab.task import JumpTask
+
+with_bullet = pytest.mark.skipif("bullet" not in INSTALLED, reason="PyBullet is not installed")
 
 
-@pytest.fixture(params=ENGINES)
+@pytest.fixture(params=INSTALLED)
 def engine(request):
     """Each engine in turn."""
     return engine_class(request.param)
@@ -52,20 +58,22 @@ def momentum(robot, q, v):
     return data.com[0].copy(), data.hg.linear.copy(), data.hg.angular.copy()
 
 
+@with_bullet
 @pytest.mark.parametrize("seed", range(5))
 def test_base_conversion_round_trip(bhr, seed):
     q, v = random_state(bhr, seed)
     lever = np.random.default_rng(seed).normal(size=3)
-    back_q, back_v = base_from_bullet(*base_to_bullet(q, v, lever), lever)
+    back_q, back_v = sim.base_from_bullet(*sim.base_to_bullet(q, v, lever), lever)
     assert back_q == pytest.approx(q[:7], abs=1e-14)
     assert back_v == pytest.approx(v[:6], abs=1e-14)
 
 
+@with_bullet
 def test_base_conversion_by_hand():
     """A base turned by 90 degrees about y, spinning about z in the world, CoM 0.2 m below the link's origin."""
     half = np.sqrt(0.5)
     q, v = np.array([1, 2, 3, 0, half, 0, half]), np.array([0, 0, 0, -5, 0, 0])  # local x is world -z
-    position, _, velocity, rate = base_to_bullet(q, v, np.array([0, 0, -0.2]))
+    position, _, velocity, rate = sim.base_to_bullet(q, v, np.array([0, 0, -0.2]))
     assert position == pytest.approx([0.8, 2, 3])
     assert rate == pytest.approx([0, 0, 5])
     assert velocity == pytest.approx([0, -1, 0])
@@ -105,24 +113,37 @@ def test_a_body_without_mass_is_refused(bhr):
     first = bhr.urdf.index("<inertial>", bhr.urdf.index('name="left_ankle_link"'))
     last = bhr.urdf.index("</inertial>", first) + len("</inertial>")
     robot = Robot.from_text(bhr.urdf[:first] + bhr.urdf[last:], bhr.config_text)
-    with pytest.raises(JumplabError, match=r"PyBullet's robot weighs 42\.9990 kg, Pinocchio's 41\.9990 kg"):
-        engine_class("bullet")(robot, pin.neutral(robot.model))
+    if "bullet" in INSTALLED:
+        with pytest.raises(JumplabError, match=r"PyBullet's robot weighs 42\.9990 kg, Pinocchio's 41\.9990 kg"):
+            engine_class("bullet")(robot, pin.neutral(robot.model))
     with pytest.raises(RobotError, match=r"^robot bhr: MuJoCo cannot read the URDF: .*mass and inertia"):
         engine_class("mujoco")(robot, pin.neutral(robot.model))
 
 
 @pytest.mark.parametrize("name", ["ode", "", None, 3])
 def test_unknown_engines_are_refused(name):
-    with pytest.raises(InputError, match=r"^engine .*: must be one of bullet, mujoco$"):
+    with pytest.raises(InputError, match=rf"^engine .*: must be one of {', '.join(INSTALLED)}$"):
         engine_class(name)
 
 
-def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    monkeypatch.delitem(sys.modules, "jumplab.sim.mujoco", raising=False)
-    words = "engine 'mujoco': the package mujoco is not installed; pip install mujoco"
-    with pytest.raises(InputError, match=f"^{words}$"):
-        engine_class("mujoco")
+@pytest.mark.parametrize(
+    ("engine", "package", "cure"),
+    [
+        ("mujoco", "mujoco", "take 'bullet', or pip install mujoco"),
+        (
+            *("bullet", "pybullet"),
+            "take 'mujoco', or pip install pybullet on Python 3.11, pybullet-arm64 on 3.12 and 3.13 (it is built for "
+            "no later one)",
+        ),
+    ],
+)
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch, engine, package, cure):
+    monkeypatch.setattr(engines, "INSTALLED", ("bullet", "mujoco"))
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"jumplab.sim.{engine}", raising=False)
+    with pytest.raises(InputError) as caught:
+        engine_class(engine)
+    assert str(caught.value) == f"engine {engine!r}: the package {package} is not installed; {cure}"
 
 
 @pytest.mark.parametrize("friction", [0.37, 0.8])
@@ -134,6 +155,7 @@ def test_friction_reaches_every_link(engine, bhr, friction):
 
 def test_friction_that_did_not_arrive_is_refused(bhr, monkeypatch):
     """PyBullet ignores friction in a call that also sets damping; the read-back must notice."""
+    bullet = pytest.importorskip("pybullet")
     real = bullet.changeDynamics
 
     def lossy(body, link, **settings):
@@ -184,6 +206,21 @@ def test_foot_sensors_weigh_the_robot(engine, bhr):
     com = momentum(bhr, end, v)[0]
     assert -moment[1] / total[2] == pytest.approx(com[0], abs=1e-3)
     assert moment[0] / total[2] == pytest.approx(com[1], abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def front_flip(bhr):
+    return plan_jump(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi), bhr).tape
+
+
+def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):
+    """Turning legs pull at the contact (J' v): the ground must neither let go of a loaded toe nor give way to it."""
+    tape, toe = front_flip, Gauge(bhr).toe
+    run, takeoff = simulate_jump(tape, bhr, mode="pd", engine=engine.name, stand_s=0.01), round(1e3 * tape.takeoff_time)
+    push = run.foot_wrench[takeoff - 150 : takeoff - 15, :, 2].sum(axis=1)
+    assert push.min() > 2 * 42 * 9.8 and np.abs(np.diff(push)).max() < 100
+    assert abs(toe(run.q[takeoff - 5])[0] - toe(run.q[0])[0]) < 5e-4
+    assert run.metrics.takeoff_momentum == pytest.approx(tape.extra["planar_L"][tape.takeoff_index], abs=0.15)
 
 
 def test_contact_impulse_is_change_of_momentum(engine, bhr):
@@ -249,7 +286,8 @@ def test_scenes_have_real_edges(engine, bhr):
         (lambda: Scene.ditch(0.5, 1.0, depth=0), "ditch of depth 0 m: the depth must be positive"),
         (lambda: Scene.platform(0.3, -0.1), "platform at 0.3 m, -0.1 m high: both numbers must be positive"),
         (lambda: Perturbation(friction=0.0), "friction = 0 is outside 0 ... 2"),
-        (lambda: Perturbation(delay_s=0.1), "delay = 0.1 s is outside 0 ... 0.02 s"),
+        (lambda: Perturbation(delay_s=0.1), "^delay = 0.1 s is outside 0 ... 0.02 s$"),
+        (lambda: Perturbation(known_delay_s=-0.001), "^known delay = -0.001 s is outside 0 ... 0.02 s$"),
     ],
 )
 def test_impossible_worlds_are_refused(make, words):
@@ -264,7 +302,7 @@ def test_perturbations_are_seeded_and_bounded(engine, bhr):
     assert all(abs(f - 1) <= 0.05 for f in one.mass.values())
     assert all(abs(f - 1) <= 0.10 for f in one.inertia.values())
     assert all(abs(x) <= 0.015 for shift in one.com.values() for x in shift)
-    assert 0.5 <= one.friction <= 1.0 and 0 <= one.delay_s <= 0.004
+    assert 0.5 <= one.friction <= 1.0 and 0 <= one.delay_s <= 0.004 and one.known_delay_s == 0.002
     real = one.robot(bhr)
     model, planned = real.model, bhr.model
     knee = model.getJointId("left_knee")
@@ -275,6 +313,19 @@ def test_perturbations_are_seeded_and_bounded(engine, bhr):
     assert Perturbation().robot(bhr) is bhr
     with engine(real, stance_configuration(bhr), friction=one.friction) as world:  # checks its mass against Pinocchio
         assert set(world.friction.values()) == {one.friction}
+
+
+def test_ranges_and_sensors_say_what_they_are():
+    """Every number, changed, changes the sentence."""
+    said = (
+        "masses ±5 %, centres of mass ±15 mm per axis, inertias ±10 %, motors ±5 %, friction 0.5 ... 1, "
+        "commands 0 ... 4 ms late and sent 2 ms ahead"
+    )
+    assert str(Ranges()) == said and str(SensorNoise()) == "the true state and foot forces"
+    for start in (Ranges(), SensorNoise.typical()):
+        for name, value in vars(start).items():
+            other = (0.1, value[1]) if isinstance(value, tuple) else 2 * value
+            assert str(replace(start, **{name: other})) != str(start), name
 
 
 def test_motors_follow_their_torque_speed_line(bhr):
@@ -299,5 +350,16 @@ def test_read_back_is_what_the_engine_has(engine, bhr):
         said = world.read_back()
         assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
         assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
+        assert said["gravity"] == [0, 0, -9.8] and said["inertia_error"] < 1e-12
         q, v = world.state()  # the probe of the self-collision has left nothing behind
     assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()
+
+
+def test_the_moon_and_another_robot_are_read_back(engine, bhr):
+    """Gravity is the robot's own; inertias are compared with its own, turned and shifted ones included."""
+    other = Perturbation.draw(bhr, 3).robot(bhr).under_gravity(1.62)
+    with engine(other, stance_configuration(bhr)) as world:
+        said, has = world.read_back(), world.inertials
+    assert said["gravity"] == [0, 0, -1.62] and said["inertia_error"] < 1e-12
+    planned = bhr.model.inertias[bhr.model.getJointId("left_knee")]
+    assert np.abs(has["left_shank"].inertia - planned.inertia).max() > 1e-4  # it is the other one's

@@ -1,5 +1,7 @@
 """Solving: a problem with a known answer, what comes out of it, and every way of failing."""
 
+import re
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -185,17 +187,24 @@ def test_parameters_of_the_wrong_kind(nlp, parameters):
 
 
 GUESSES = {
-    "missing": {},
-    "short": {"go": PhaseGuess(1.0, np.zeros((5, 1)))},
-    "nan": {"go": PhaseGuess(1.0, np.full((N + 1, 1), np.nan))},
-    "nan duration": {"go": PhaseGuess(np.nan, *3 * [np.zeros((N + 1, 1))])},
+    "missing": ({}, "the guess has no phase 'go'"),
+    "short": (
+        {"go": PhaseGuess(1.0, np.zeros((5, 1)))},
+        f"guess 'q' of phase 'go' has shape (5, 1), must be ({N + 1}, 1)",
+    ),
+    "nan": ({"go": PhaseGuess(1.0, np.full((N + 1, 1), np.nan))}, "guess 'q' of phase 'go' is not finite"),
+    "nan duration": (
+        {"go": PhaseGuess(np.nan, *3 * [np.zeros((N + 1, 1))])},
+        "guess of phase 'go' has the duration nan s",
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", GUESSES)
 def test_unusable_guesses(nlp, kind):
-    with pytest.raises(JumplabError):
-        nlp.solve({"goal": 1.0}, GUESSES[kind])
+    with pytest.raises(InputError) as e:
+        nlp.solve({"goal": 1.0}, GUESSES[kind][0])
+    assert str(e.value) == f"move: {GUESSES[kind][1]}"
 
 
 def test_bounds_that_exclude_each_other():
@@ -220,12 +229,16 @@ def test_infeasible_names_the_terms_in_conflict():
 
 
 def test_infeasible_in_physical_units():
-    """What is said is in the term's unit, whatever its scale."""
+    """What is said is in the term's unit, whatever its scale: at 1 m/s^2, a quarter of the way is the most there is."""
+    said = set()
     for scale in (0.1, 1.0, 20.0):
         term = Term("push", "-", "N", "node", lambda p: 10 * p.a, lower=-10.0, upper=10.0, scale=scale)
         with pytest.raises(SolverError) as e:
             Nlp(move(term)).solve({"goal": 1.0}, flat_guess())
-        assert any("N at" in line or " m at" in line for line in e.value.violations)
+        said.add(e.value.violations)
+    ((line,),) = said
+    missed = re.fullmatch(r"go/goal by (0\.\d+) m at t = 1\.000 s of the phase", line)
+    assert 0.75 < float(missed[1]) < 0.78
 
 
 def test_too_few_iterations_is_not_an_answer():
@@ -300,8 +313,9 @@ def test_a_good_status_with_wrong_rows_is_not_believed(status):
     nlp.solve({"goal": 1.0}, flat_guess())
     for shift in (1e-3, np.nan):
         nlp._solver = Pretender(honest, status, shift)
-        with pytest.raises(SolverError):
+        with pytest.raises(SolverError, match=rf"^move: no plan \({status} after \d+ iterations\): ") as e:
             nlp.solve({"goal": 1.0}, flat_guess())
+        assert e.value.status == status
 
 
 def test_errors_carry_their_story():

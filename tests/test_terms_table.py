@@ -4,6 +4,7 @@ A weight, a bound, a scale or an equation that changes is a decision: after it, 
 writes the file anew, and the change is read in the diff.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import asdict
 from difflib import unified_diff
@@ -86,6 +87,34 @@ def test_the_table_is_whole():
         and stages.count("joint qp") > 30
         and stages.count("spatial") > 60
     )
+
+
+# the paper's equations that stages 1 and 3 keep, relax or weigh; SL-D1 and WL-K1 are how their models are built
+EQUATIONS = {"SRMP": "SL-J1..J5, SL-E1..E6, SL-P1..P5, SL-B1, SF-J1, SF-D1, SF-E1, SF-L1..L4, SF-B1",
+             "whole body": "WL-J1..J3, WL-D1, WL-K2, WL-E1, WF-J1..J2, WF-D1, WF-L1..L3, WF-E1..E2, SL-E1..E4, SL-E6, "
+             "SL-P2"}  # fmt: skip
+
+
+def equations(text: str) -> set[str]:
+    """Numbers of equations in a text: "SL-E3, E4; SF-L1..L3" names five."""
+    found, group = set(), ""
+    for word in re.split(r"[ ,;:]+", text):
+        if parts := re.fullmatch(r"(?:([SW][LF])-)?([A-Z])(\d)(?:\.\.[A-Z](\d))?", word):
+            group = parts[1] or group
+            found |= {f"{group}-{parts[2]}{i}" for i in range(int(parts[3]), int(parts[4] or parts[3]) + 1)}
+    return found
+
+
+def test_equations_of_the_paper_and_terms_in_force_belong_together():
+    """No equation without a term that weighs or binds something, and no term of an equation that is not known."""
+    for problem in (srmp.build_problem(Robot.load()), whole_body.build_problem(Robot.load())):
+        named, in_force = set(), set()
+        for _, x in (*problem.terms(), *problem.bounds()):
+            named |= equations(x.equation)
+            bounds = (x.lower, x.upper) if isinstance(x, Bound) or not x.is_cost else ()
+            limited = any(callable(b) or np.isfinite(b).any() for b in bounds)
+            in_force |= equations(x.equation) if limited or getattr(x, "weight", None) else set()
+        assert named == in_force == equations(EQUATIONS[problem.name])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Each term's expression at a random state: stage 3's against Pinocchio, stage 1's against formulas written out here.
 
-Every term of both stages is looked at, and so is all that an own term sees by name.
+Every term of both stages is looked at, its weight and all boxes too, and so is all that an own term sees by name.
 """
 
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.stages import srmp, whole_body
 from jumplab.stages.srmp import SrmpSettings
-from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body import Limits, Weights
 
 G, LIM, S = 9.8, Limits(), SrmpSettings()
 SIDES = np.array([1.0, -1.0])
@@ -381,3 +381,57 @@ def test_what_a_term_of_the_rod_sees(bhr, rod):
         (f.com, [0.15 + 0.9 * t, 0.7 + 2.7 * t - G * t * t / 2]),
     ):  # fmt: skip
         np.testing.assert_allclose(numbers(seen), np.ravel(value), rtol=1e-8, atol=1e-7)
+
+
+# weights and boxes ----------------------------------------------------------------------------------------------
+ROD_WEIGHTS = {
+    "posture at take-off": S.w_posture_end,
+    "CoM velocity": S.w_velocity,
+    "L at take-off": S.w_momentum_end,
+    "L rate": S.w_momentum_rate,
+    "usual inertia": S.w_usual_inertia,
+    "crouch depth": S.w_deep_crouch,
+    "turn": S.w_turn,
+    "launch time": S.w_time,
+    "inertia acceleration": S.w_inertia_accel,
+    "inertia jerk": S.w_inertia_jerk,
+    "jerk": 1.0,  # its weights stand in the expression
+}
+
+
+def test_every_weight_is_the_setting_of_its_name(body, rod):
+    """Those of jerk and inertia are the same in all phases; in flight the inertia rate may have its own."""
+    w, same = vars(Weights()) | {"track_durations": Weights().track_duration}, {}
+    for owner, t in body.terms():
+        if t.is_cost and (t.name == "jerk" or "inertia" in t.name):
+            same.setdefault(t.name, {})[owner] = t.weight
+        else:
+            assert not t.is_cost or t.weight == w[t.name.replace(" ", "_")], (owner, t.name)
+    del same["track inertia rate"]["flight"]
+    assert len(same) == 3 and all(len(set(of_phases.values())) == 1 for of_phases in same.values())
+    for owner, t in rod.terms():
+        assert not t.is_cost or t.weight == ROD_WEIGHTS[t.name], (owner, t.name)
+
+
+def test_boxes_are_rest_stance_and_ranges(bhr, body, rod):
+    e, wide, data = reach(bhr), 8.0, {"stance": 0.1 * np.arange(5), "start": 0.2 * np.arange(4)}
+    low, high = np.transpose([S.takeoff_lean, e.length, S.turn_rad, S.radius_m])
+    margin = S.inertia_margin * (e.inertia[1] - e.inertia[0])
+    rest = {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}
+    links = rest | {("flat", "stance"): ("q", "start", data["stance"][1:], data["stance"][1:])}
+    links["flight", "link angles"] = "q", "all", -wide, wide
+    links["toe", "heel not below ground"] = "q", "inner", [0, *4 * [-wide]], [LIM.heel_up_rad, *4 * [wide]]
+    rods = rest | {("flat", "start posture"): ("q", "start", data["start"], data["start"])}
+    rods |= {(phase, "state box"): ("q", "inner", low, high) for phase in ("flat", "toe")}
+    most = e.inertia[0] + S.flight_inertia * (e.inertia[1] - e.inertia[0])  # nearer than the margin
+    rods["flight", "inertia range"] = "q", "all", e.inertia[0] + margin, most
+    rods["flight", "inertia rate range"] = "v", "all", -S.inertia_rate, S.inertia_rate
+    rods["flight", "inertia acceleration range"] = "a", "all", -S.inertia_accel, S.inertia_accel
+    for problem, expected in ((body, links), (rod, rods)):
+        found = {(owner, b.name): b for owner, b in problem.bounds()}
+        assert set(found) == set(expected)
+        for name, (on, where, *ends) in expected.items():
+            b = found[name]
+            assert (b.on, b.where) == (on, where), name
+            for x, end in zip((b.lower, b.upper), ends, strict=True):
+                np.testing.assert_allclose(x(data) if callable(x) else x, end, err_msg=str(name))

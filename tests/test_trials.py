@@ -18,7 +18,7 @@ from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
-from jumplab.sim import Finding, Perturbation, Scene, SensorNoise
+from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise
 from jumplab.studies import trials as monte_carlo
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, run_trials, trial_log, wilson
 
@@ -103,7 +103,7 @@ def test_a_run_that_is_not_honest_is_a_failure(folder, monkeypatch, honesty):
 def test_keys_differ_in_everything_that_matters(folder, monkeypatch):
     summary = store.read_plan(folder)[2]
     base = TrialSettings()
-    others = [TrialSettings("pd"), TrialSettings(reaim=False), TrialSettings(noise=SensorNoise.typical()),
+    others = [TrialSettings("pd"), TrialSettings(reaim=False), TrialSettings(noise=SensorNoise()),
               TrialSettings(ranges=replace(base.ranges, mass=0.06))]  # fmt: skip
     assert len({s.hash for s in (base, *others)}) == 5 and TrialSettings().hash == base.hash
     known = base.hash
@@ -133,6 +133,13 @@ def test_the_code_that_decides_a_trial_is_all_listed(tmp_path):
         known = monte_carlo._code(root)
 
 
+def test_conditions_follow_the_settings():
+    said = TrialSettings("pd", False, SensorNoise(), Ranges(mass=0.2), "mujoco").conditions
+    assert said["playback"] == "pd mode in MuJoCo" and said["re-aim"] == "no"
+    assert "masses ±20 %" in said["drawn uniformly, each link and joint by itself"]
+    assert said["measured (one standard deviation)"] == "the true state and foot forces"
+
+
 def test_bad_mode():
     with pytest.raises(InputError, match=r"^mode 'velocity': must be one of position, pd$"):
         TrialSettings("velocity")
@@ -150,6 +157,14 @@ def test_report_counts(folder, coins):
     assert said["reasons"] == {"arm touched the ground ... s after touchdown": 40 - landed}
     assert set(said["failed"]) == {str(t.key.index) for t in report.trials if not t.landed}
     assert said["settings"]["mode"] == "position" and said["settings"]["reaim"] and said["seed"] == 2
+    assert said["settings"]["noise"] == vars(SensorNoise.typical())  # sensors err unless told otherwise
+    assert said["conditions"] == {
+        "playback": "position mode in PyBullet",
+        "re-aim": "hips and ankles turn in the air against the error of the trunk's pitch",
+        "drawn uniformly, each link and joint by itself": str(Ranges()),
+        "measured (one standard deviation)": str(SensorNoise.typical()),
+        "known exactly": monte_carlo.KNOWN,
+    }
     assert [t.key.index for t in report.trials] == list(range(40))
     lines = (folder / "trials.jsonl").read_text().splitlines()
     assert {Trial.from_json(json.loads(line)).key for line in lines} == {t.key for t in report.trials}

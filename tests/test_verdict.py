@@ -98,8 +98,11 @@ def test_nearest_numbers_pass():
 def test_what_is_refused_stage_1_cannot_solve_either(task):
     message(task)
     reach, s = srmp_planner().reach, SrmpSettings()
-    with pytest.raises(SolverError):
+    with pytest.raises(SolverError) as e:
         small_effort().solve(parameters(task, reach), naive_guess(task, reach, s), off=SYMMETRY_OFF)
+    term, amount = re.match(r"(\w+/[\w -]+) by ([\d.]+) m", e.value.violations[0]).groups()
+    assert term in ("toe/take-off speed", "toe/take-off length", "flight/touchdown height", "SRMP/jump length")
+    assert float(amount) > 0.02  # [m, m/s] far beyond what a few more iterations would mend
 
 
 def test_the_limits_are_near_what_stage_1_can_do():

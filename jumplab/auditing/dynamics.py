@@ -119,7 +119,7 @@ def description(r: Replay) -> list[Check]:
     for link in ET.fromstring(r.robot.urdf).iter("link"):
         mass = link.find("inertial/mass")
         if mass is None or not float(mass.get("value", "0")) > 0:
-            bare.append(link.get("name", "unnamed"))
+            bare.append(link.attrib["name"])
     return [
         LIMITS["sole as in the URDF"].check(float(max(off))),
         LIMITS["links have mass"].check(len(bare), bare=", ".join(bare) or "none"),

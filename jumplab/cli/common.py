@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.sim import DEFAULT_ENGINE, ENGINES
 
 Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
 Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
@@ -72,16 +73,6 @@ def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = 
     return names or (placeholder.lower(),), {"help": text, "default": default, **how}
 
 
-def engine_option() -> argparse.ArgumentParser:
-    """The option ``--engine``."""
-    from jumplab.sim import DEFAULT_ENGINE, ENGINES
-
-    engine = argparse.ArgumentParser(add_help=False)
-    engine.add_argument("--engine", choices=tuple(ENGINES), default=DEFAULT_ENGINE,
-                        help=f"whose physics it is (default {DEFAULT_ENGINE})")  # fmt: skip
-    return engine
-
-
 def number(option: str, text: str) -> float:
     """The number that an option was given."""
     try:
@@ -104,7 +95,9 @@ def needing(what: str, fits: Callable[[Any], Any], make: Kind = lambda option, t
 
 def whole(least: int, most: int) -> Kind:
     """Kind of an option that takes a whole number from ``least`` to ``most``."""
-    check = needing(f"be a whole number from {least} to {most}", range(least, most + 1).__contains__, number)
+    check = needing(
+        f"be a whole number from {least} to {most}", lambda x: least <= x <= most and x.is_integer(), number
+    )
     return lambda option, text: int(check(option, text))
 
 
@@ -112,7 +105,7 @@ folder = needing("name a folder", str.strip)
 DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
 PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
-ENGINE = opt("--engine", "physics engine of the simulation", "bullet", ("bullet", "mujoco"))
+ENGINE = opt("--engine", "physics engine of the simulation", DEFAULT_ENGINE, tuple(ENGINES))
 METHODS = ("three-step", "direct")
 ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
 JUMP = (
@@ -139,6 +132,9 @@ def print_summary(summary: Mapping[str, Any]) -> None:
     side, yaw = summary.get("planned_side_m"), summary.get("planned_yaw_rad")
     away = "" if side is None else f", side {side:.3f} m, turn {math.degrees(yaw):.1f} deg"
     print(f"planned: distance {summary['planned_distance_m']:.3f} m, rise {summary['planned_rise_m']:.3f} m{away}")
+    if followed := summary.get("tracking"):
+        off = (f"{100 * followed[phase]['rho']['relative_rms']:.1f} % in {phase}" for phase in ("launch", "flight"))
+        print(f"inertia off stage 1's by {', '.join(off)} (rms)")
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:

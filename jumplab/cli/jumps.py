@@ -9,6 +9,7 @@ from pathlib import Path
 from jumplab.cli import common
 from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
 from jumplab.errors import InputError
+from jumplab.sim import ENGINES
 from jumplab.task import JumpTask
 
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
@@ -25,12 +26,15 @@ ORDERS = ("depth-first", "breadth-first")
     opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
     opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
+    opt("--engine", "physics engine of the simulations (default: the first that is installed)", None, tuple(ENGINES)),
     opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
 )
 def run(args: Namespace) -> None:
     """Execute the notebooks: plan, audit, simulation, figures."""
     task = JumpTask(args.distance_m, args.height_m)
     values = {"distance_m": task.distance_m, "height_m": task.height_m, "robot": args.robot}
+    if args.engine is not None:
+        values["engine"] = args.engine
     for pair in args.parameter:
         name, equals, text = pair.partition("=")
         if not (equals and name.isidentifier()):

@@ -17,11 +17,11 @@ from typing import Any, NoReturn
 from jumplab.cli.common import DEBUG, declare
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
-from jumplab.cli.studies import bench, chain, envelope, sweep, trials
+from jumplab.cli.studies import bench, certify, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
-COMMANDS = (run, plan, audit, simulate, trials, chain, view, export, robot, envelope, sweep, bench)
+COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -26,7 +26,7 @@ from jumplab.cli.common import Late
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
 
-store, robots = Late("jumplab.io.folder"), Late("jumplab.robot")
+store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 
 STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
 PATTERN = "[0-9][0-9]_*.ipynb"
@@ -38,7 +38,7 @@ def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> Non
 
     papermill merely warns of an unknown name and then runs with the default. Call this in the cell after the
     parameters: ``check_parameters(globals(), samples=range(1, 10_001), fast=bool)``. ``extra`` are parameters beside
-    the ``STANDARD`` ones: a type, or a range for a whole number within it.
+    the ``STANDARD`` ones: a type, or a range for a whole number within it. An ``engine`` must be there.
     """
     known = {**STANDARD, **extra}
     cells = [source for source in namespace.get("In", []) if source.startswith("# Parameters\n")]  # what papermill adds
@@ -48,6 +48,8 @@ def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> Non
     for name, kind in known.items():
         if name in namespace:
             check_value(name, namespace[name], kind)
+    if "engine" in extra:
+        sim.engine_class(namespace.get("engine", sim.DEFAULT_ENGINE))
     if "distance_m" in namespace or "height_m" in namespace:
         JumpTask(namespace.get("distance_m", 0.0), namespace.get("height_m", 0.5))
 
@@ -198,7 +200,9 @@ def _checked(values: dict[str, Any], declared: Iterable[dict]) -> dict[str, Any]
         robots.Robot.load(values["robot"])
         if Path(values["robot"]).is_file():
             values["robot"] = str(Path(values["robot"]).resolve())
-    return {**values, "out": "result", "figures": "figures"}
+    if "engine" in values:
+        sim.engine_class(values["engine"])
+    return {"engine": sim.DEFAULT_ENGINE, **values, "out": "result", "figures": "figures"}
 
 
 def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool, failed: Path) -> None:

@@ -1,4 +1,4 @@
-"""The commands about many jumps: trials, chain, envelope, sweep, bench."""
+"""The commands about many jumps: trials, certify, chain, envelope, sweep, bench."""
 
 import json
 import math
@@ -28,6 +28,7 @@ from jumplab.errors import InfeasibleError, InputError
 from jumplab.task import JumpTask
 
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
+certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab.show.certificate")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
@@ -40,6 +41,7 @@ FILE = needing(
     "name a file in a folder that exists",
     lambda text: text.strip() and not Path(text).is_dir() and Path(text).resolve().parent.is_dir(),
 )
+KEPT = "interrupted; finished trials are kept, and the same command goes on from there"
 VALUES = "FROM:TO:COUNT or A,B,..."
 
 
@@ -66,7 +68,7 @@ def _count(least: int, most: float = math.inf) -> Kind:
     MODE,
     ENGINE,
     opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
-    opt("--noise", "tell the controllers noisy measurements instead of the truth", False),
+    opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
     opt("--jobs J", "processes (default: one per core)", None, _count(1)),
 )
 def trials(args: Namespace) -> None:
@@ -84,8 +86,9 @@ def trials(args: Namespace) -> None:
         else:  # 200: a success rate near 95 % is then known to 3 % on either side
             report = many.run_trials(args.dir, args.n or 200, args.seed or 0, settings, jobs=args.jobs)
     except KeyboardInterrupt:
-        said = "interrupted; finished trials are kept, and the same command goes on from there"
-        raise KeyboardInterrupt(said) from None
+        raise KeyboardInterrupt(KEPT) from None
+    for what, said in report.conditions.items():
+        print(f"{what}: {said}")
     low, high = report.interval
     print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
     for reason, count in report.reasons.items():
@@ -96,6 +99,38 @@ def trials(args: Namespace) -> None:
             print(f"{name} of those that landed: {values.min():.3f} ... {values.max():.3f} m")
     kept = f"{'basin' if args.basin else 'trials'}.json in {args.dir}, {report.resumed} trials from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
+
+
+@command(
+    opt("DIR", "folder of a plan; trials.jsonl, certificate.json and certificate.html are written there"),
+    opt("--n N", "number of perturbed robots, in each engine and mode (default 10)", "10", _count(1, MOST)),
+    opt("--seed S", "seed of the robots (default 0)", "0", _count(0)),
+    opt("--jobs J", "processes (default: one per core)", None, _count(1)),
+)
+def certify(args: Namespace) -> None:
+    """Do two physics agree on a plan? Audit, both engines, both modes."""
+    start = time.perf_counter()
+    store.read_plan(args.dir)  # refuses a damaged folder
+    store.ensure_writable(args.dir)
+    page = certificate_pages.certificate_page
+    try:
+        found = certificates.certify(args.dir, args.n, args.seed, page=lambda c: page(c).html, jobs=args.jobs)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(KEPT) from None
+    columns = {"name": "as planned", **{name: name for name in sim.ENGINES}, "apart": "apart", "limit": "at most"}
+    for mode in found.modes:
+        rows = [d.to_json() for d in mode.differences]
+        rows = [row | {"name": row["name"] + (", share" if row["relative"] else f" [{row['unit']}]")} for row in rows]
+        print(f"{mode.mode} mode")
+        print(tables.table(rows, columns))
+        landed = ", ".join(f"{sum(t.landed for t in jumps)} in {name}" for name, jumps in mode.robots.items())
+        print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
+    kept = f"certificate.json and certificate.html in {args.dir}, {found.resumed} simulations from an earlier run"
+    print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
+    if found.failures:
+        more = f"; and {len(found.failures) - 1} more" if len(found.failures) > 1 else ""
+        raise InfeasibleError(f"not certified: {found.failures[0]}{more}; see certificate.html in {args.dir!r}")
+    print(f"certified: all {len(found.audit.checks)} checks of the audit passed, and the engines agree that it lands")
 
 
 @command(

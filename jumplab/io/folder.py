@@ -36,13 +36,15 @@ Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
 PLANNING = ("casadi", "pin", "cvxpy", "clarabel", "proxsuite")
 PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy", "matplotlib")
+BUILDS = {"pybullet": "pybullet-arm64"}  # the same sources, built for later Pythons under another name
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
 EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
 RESULTS = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json")
-OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *EXPORTS, *OF_SIMULATION)
+CERTIFICATE = ("certificate.json", "certificate.html")
+OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *CERTIFICATE, *EXPORTS, *OF_SIMULATION)
 _STAGING, _COMMIT = ".staging", ".commit"
 
 
@@ -99,10 +101,10 @@ def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+        for build in (name, BUILDS.get(name, name)):
+            with contextlib.suppress(metadata.PackageNotFoundError):
+                found.setdefault(name, metadata.version(build))
+        found.setdefault(name, "not installed")
     return found
 
 
@@ -179,10 +181,17 @@ def write_simulation(folder: str | Path, result: Simulation, summary: Summary) -
         result.save(staging, extra=planned)
 
 
-def write_trials(folder: str | Path, report: Mapping[str, Any], summary: Summary, name: str) -> None:
-    """Write file ``name`` beside the plan that ``summary`` was read with; raises as :func:`write_simulation`."""
+def write_trials(
+    folder: str | Path, report: Mapping[str, Any], summary: Summary, name: str, pages: Mapping[str, str] | None = None
+) -> None:
+    """Write file ``name``, and ``pages`` of text by name, beside the plan that ``summary`` was read with.
+
+    Raises as :func:`write_simulation`.
+    """
     with transaction(folder) as staging:
         _same_plan(Path(folder), summary)
+        for file, text in (pages or {}).items():
+            (staging / file).write_text(text, encoding="utf-8")
         (staging / name).write_text(to_json(report), encoding="utf-8")
 
 

@@ -121,18 +121,19 @@ def _digest(problem: Problem, owner: str, term: Term) -> str:
             f"term {term.name!r} of {problem.place(owner)!r}: it uses symbols that are not its point's ({free})"
         )
     for t, rows in e.rows:
-        if t is term:
-            _check_bounds(problem.place(owner), term, rows)
+        if t is term and not (callable(term.lower) or callable(term.upper)):  # those are read when solving
+            ends(f"term {term.name!r} of {problem.place(owner)!r}", term, rows)
     return hashlib.sha256(made.serialize().encode()).hexdigest()
 
 
-def _check_bounds(place: str, term: Term, rows: int) -> None:
-    """Refuse bounds that are no numbers, do not fit the rows of the expression, or exclude each other."""
-    who, values = f"term {term.name!r} of {place!r}", []
-    for side in ("lower", "upper"):
-        bound = getattr(term, side)
-        if callable(bound):
-            return  # read when solving
+def ends(who: str, term: Term, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bound (rows,) of an own term, both numbers.
+
+    ``who`` is the term in sentences. Raises InputError for bounds that are no numbers, do not fit the ``rows`` of its
+    expression, or exclude each other.
+    """
+    values = []
+    for side, bound in (("lower", term.lower), ("upper", term.upper)):
         try:
             value = np.asarray(bound, float).ravel()
         except (TypeError, ValueError):
@@ -141,6 +142,8 @@ def _check_bounds(place: str, term: Term, rows: int) -> None:
             raise InputError(
                 f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {rows} row{'s' * (rows > 1)}"
             )
-        values.append(value)
-    if np.any(values[0] > values[1]):
+        values.append(np.broadcast_to(value, (rows,)))
+    low, high = values
+    if np.any(low > high):
         raise InputError(f"{who}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}")
+    return low, high

@@ -307,7 +307,8 @@ class Robot:
     @cached_property
     def total_mass(self) -> float:
         """Mass of the robot [kg]."""
-        return float(sum(inertia.mass for inertia in self._model.inertias))
+        masses = [inertia.mass for inertia in self._model.inertias]
+        return float(np.cumsum(masses)[-1])  # from 3.12 on, sum() rounds otherwise, and the last digit moves plans
 
     @cached_property
     def hash(self) -> str:

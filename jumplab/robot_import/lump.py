@@ -210,7 +210,8 @@ def _sum(tree: Tree, placed: dict[str, pin.SE3], links: list[str], place: np.nda
 def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
     """Bodies without mass get a gram, taken off the trunk."""
     bare = {b.name: replace(b, inertia=DUMMY) for b in bodies if b.inertia.mass < DUMMY.mass}
-    grams, trunk = sum(DUMMY.mass - b.inertia.mass for b in bodies if b.name in bare), bodies[0].inertia
+    given, trunk = [DUMMY.mass - b.inertia.mass for b in bodies if b.name in bare], bodies[0].inertia
+    grams = float(np.cumsum([0.0, *given])[-1])  # rounds alike on every Python
     if bare:
         changed["mass given to bodies without any"] = (1e3 * grams, "g")
     lighter = replace(bodies[0], inertia=pin.Inertia(trunk.mass - grams, trunk.lever, trunk.inertia))

@@ -18,8 +18,9 @@ import lazy_loader as lazy
 _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
     "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum envelope_map",
-    # the jump in 3-D, tables
+    # the jump in 3-D, the page of a certificate, tables
     "viewer": "Page page",
+    "certificate": "certificate_page",
     "tables": "Table table versions",
     # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "

@@ -3,15 +3,21 @@
 Names are loaded when they are first used: a scene or a perturbation needs no engine.
 """
 
+from importlib.util import find_spec
+
 import lazy_loader as lazy
 
 STEP_S = 0.001  # [s] of the simulation, the paper's control cycle (Sec. VI-A)
-# name -> (module here, class, what to install); the first is the default
+# name -> (module here, class, package it imports, how to get that)
 ENGINES = {
-    "bullet": ("bullet", "BulletEngine", "pybullet"),
-    "mujoco": ("mujoco", "MujocoEngine", "mujoco"),
+    "bullet": (
+        *("bullet", "BulletEngine", "pybullet"),
+        "pip install pybullet on Python 3.11, pybullet-arm64 on 3.12 and 3.13 (it is built for no later one)",
+    ),
+    "mujoco": ("mujoco", "MujocoEngine", "mujoco", "pip install mujoco"),
 }
-DEFAULT_ENGINE = next(iter(ENGINES))
+INSTALLED = tuple(name for name, (_, _, package, _) in ENGINES.items() if find_spec(package))
+DEFAULT_ENGINE = (*INSTALLED, *ENGINES)[0]  # the first that is installed: PyBullet, or MuJoCo where that is not there
 
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,

@@ -17,7 +17,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine
-from jumplab.sim.kinematics import rotation
+from jumplab.sim.kinematics import inertial, rotation
 from jumplab.sim.scene import REACH_M, Block, Contacts
 
 
@@ -29,7 +29,6 @@ class EngineSettings:
     contact_erp: float = 0.1  # [1] a deep penetration fades in 10 ms; with the default 0.2, feet bounce off an impact
     contact_slop_m: float = 1e-4  # boxes rest this deep; at zero, rounding breaks the contact of a light toe
     ground_friction: float = 1.0  # friction combines as a product: the robot's coefficient is the effective one
-    tangles: int = 20  # postures tried until links are in each other; for a humanoid the first one does
     fastest: float = 1e3  # [rad/s] lifts Bullet's silent cap of 100 rad/s
 
 
@@ -170,21 +169,22 @@ class BulletEngine(Engine):
         for joint, angle, speed in zip(self._joints, q[7:], v[6:], strict=True):
             self._bullet.resetJointState(self._body, joint, float(angle), float(speed))
 
-    def _feels_itself(self) -> bool:
-        rng = np.random.default_rng(0)
+    def _tangled(self, angles: np.ndarray) -> bool:
         self._bullet.resetBasePositionAndOrientation(self._body, [0.0, 0.0, REACH_M], [0.0, 0.0, 0.0, 1.0])
-        for _ in range(SETTINGS.tangles):
-            for joint, angle in zip(self._joints, rng.uniform(-np.pi, np.pi, len(self._joints)), strict=True):
-                self._bullet.resetJointState(self._body, joint, angle)
-            self._bullet.performCollisionDetection()
-            if self._bullet.getContactPoints(bodyA=self._body, bodyB=self._body):
-                return True
-        return False
+        for joint, angle in zip(self._joints, angles, strict=True):
+            self._bullet.resetJointState(self._body, joint, angle)
+        self._bullet.performCollisionDetection()
+        return bool(self._bullet.getContactPoints(bodyA=self._body, bodyB=self._body))
 
     @property
-    def mass_kg(self) -> float:
-        """Mass of the robot as the engine has it."""
-        return sum(row[0] for row in self._dynamics())
+    def inertials(self) -> dict[str, pin.Inertia]:
+        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
+        return {k: inertial(r[0], r[3], r[4], r[2]) for k, r in zip(self.links, self._dynamics(), strict=True)}
+
+    @property
+    def gravity(self) -> list[float]:
+        """Gravity (3,) as the engine has it [m/s^2]."""
+        return [self._bullet.getPhysicsEngineParameters()[f"gravityAcceleration{axis}"] for axis in "XYZ"]
 
     @property
     def friction(self) -> dict[str, float]:

@@ -56,14 +56,33 @@ def _mechanics(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
 def _largest_jump(result: SimulationResult, robot: Robot) -> float:
     """How far a state is from where its velocities lead [m, rad].
 
-    Within a step of n semi-implicit ones, the velocity that moves the robot lies about v + (1 + 1 / n) / 2 dv.
+    Within a step of n semi-implicit ones, the velocity that moves the robot lies about v + (1 + 1 / n) / 2 dv, and
+    further away only by what the logged forces of the ground may do to it within the step and undo.
     """
-    least = 1 / result.settings["engine"]["substeps"]
+    least, model = 1 / result.settings["engine"]["substeps"], robot.model
     change = np.diff(result.v, axis=0)
     mean, room = result.v[:-1] + (1 + least) / 2 * change, SWING * (1 - least) * np.abs(change).max(axis=1) * STEP_S
-    there = [pin.integrate(robot.model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
-    miss = [pin.difference(robot.model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
-    return float(np.max(np.abs(miss).max(axis=1, initial=0.0) - room, initial=0.0))
+    there = [pin.integrate(model, q, v * STEP_S) for q, v in zip(result.q[:-1], mean, strict=True)]
+    miss = [pin.difference(model, a, b) for a, b in zip(there, result.q[1:], strict=True)]
+    left = np.abs(miss) - room[:, None]
+    for k in np.flatnonzero(left.max(axis=1, initial=0.0) > JUMP_M) if least < 1 else ():
+        left[k] -= (1 - least) * STEP_S * _kick(result, robot, k)
+    return float(left.max(initial=0.0))
+
+
+def _kick(result: SimulationResult, robot: Robot, row: int) -> np.ndarray:
+    """By how much (nv,) one step's forces change velocities at most, wherever along the soles they act first."""
+    model, data, q = robot.model, robot.model.createData(), result.q[row]
+    mass = pin.crba(model, data, q)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    kick, ends = np.zeros(model.nv), (robot.foot.heel, robot.foot.toe)
+    for name, wrench in zip(robot.foot.frames, result.foot_wrench[row], strict=True):
+        jacobian = pin.getFrameJacobian(model, data, model.getFrameId(name), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        places = [wrench, *(np.array([*wrench[:3], wrench[3], -x * wrench[2], wrench[5]]) for x in ends)]
+        kick += np.abs(np.linalg.solve(mass, STEP_S * jacobian.T @ np.array(places).T)).max(axis=1)
+    return kick
 
 
 def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -98,15 +117,16 @@ def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:
     model, data, rows = robot.model, robot.model.createData(), []
     frames = [model.getFrameId(name) for name in robot.foot.frames]
     weight = robot.total_mass * model.gravity.linear
-    for q, v, wrenches in zip(result.q, result.v, result.foot_wrench, strict=True):
+    for q, v in zip(result.q, result.v, strict=True):
         pin.ccrba(model, data, q, v)
         pin.framesForwardKinematics(model, data, q)
-        force, moment = weight + wrenches[:, :3].sum(axis=0), np.zeros(3)
-        for frame, wrench in zip(frames, wrenches, strict=True):
-            moment = moment + wrench[3:] + np.cross(data.oMf[frame].translation, wrench[:3])
-        spin = data.hg.angular + np.cross(data.com[0], data.hg.linear)
-        rows.append((data.hg.linear.copy(), spin, force, moment, np.cross(data.com[0], weight)))
-    linear, angular, force, moment, gravity = (np.array(column) for column in zip(*rows, strict=True))
+        feet = [data.oMf[frame].translation.copy() for frame in frames]
+        rows.append((data.hg.linear.copy(), data.hg.angular.copy(), data.com[0].copy(), *feet))
+    linear, spin, com, *feet = (np.array(column) for column in zip(*rows, strict=True))
+    angular, gravity = spin + np.cross(com, linear), np.cross(com, weight)
+    force, moment = weight + result.foot_wrench[:, :, :3].sum(axis=1), result.foot_wrench[:, :, 3:].sum(axis=1)
+    for place, push in zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True):
+        moment = moment + np.cross(place, push)
     moment[:-1] += (gravity[:-1] + gravity[1:]) / 2
     return np.hstack([np.diff(linear, axis=0), np.diff(angular, axis=0)]) / STEP_S - np.hstack([force, moment])[:-1]
 
@@ -119,8 +139,9 @@ def _steps(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarr
     17 N in a flip.
     """
     share = 0.0 if result.settings["engine"]["substeps"] == 1 else 0.5
-    arm = robot.model.inertias[1].lever  # from the base's origin to its CoM, base axes
-    q = np.array([pin.interpolate(robot.model, a, b, share) for a, b in zip(result.q[:-1], result.q[1:], strict=True)])
+    model = robot.model
+    arm = model.inertias[1].lever  # from the base's origin to its CoM, base axes
+    q = np.array([pin.interpolate(model, a, b, share) for a, b in zip(result.q[:-1], result.q[1:], strict=True)])
     turns, turn = (np.array([rotation(quaternion) for quaternion in x[:, 3:7]]) for x in (result.q, q))
     spins, speeds = result.v[:, 3:6], result.v[:, :3]
 
@@ -174,7 +195,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
 
 def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray) -> float:
     """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m]."""
-    moment = wrench[3:] + np.cross(origin.translation - place.translation, wrench[:3])
+    moment = wrench[3:] + pin.skew(origin.translation - place.translation) @ wrench[:3]
     force, moment = place.rotation.T @ wrench[:3], place.rotation.T @ moment
     x, y = (foot.sole_z * force[:2] + [-moment[1], moment[0]]) / force[2]
     return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)
@@ -185,12 +206,16 @@ def _engine(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     engine, stated = result.settings["engine"], result.settings["perturbation"]["friction"]
     miss = max(abs(friction - stated) for friction in engine["friction"])
     through, lost = float(not engine["self_collision"]), abs(engine["mass_kg"] - robot.total_mass)
+    falls = float(np.abs(np.subtract(engine["gravity"], [0.0, 0.0, -robot.gravity])).max())
+    turns = engine["inertia_error"]
     return (
         Finding("friction read back, less the stated", miss, NUMERIC, "", "friction that never reached the feet"),
         Finding("contact points outside the sole", engine["beyond_sole_m"], SOLE_M, "m", "oversized feet"),
         Finding("links that pass through each other", through, 0.0, "", "self-collision switched off"),
         Finding("damping and armature read back", engine["damping"], NUMERIC, "SI", "joints that brake or hold"),
         Finding("mass read back, less the stated", lost, 1e-3, "kg", "a lighter robot"),
+        Finding("inertia read back, less the stated", turns, NUMERIC, "kg m^2", "bodies that turn more easily"),
+        Finding("gravity read back, less the target's", falls, NUMERIC, "m/s^2", "a jump on another planet"),
     )
 
 

@@ -11,14 +11,16 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
-from jumplab.sim import DEFAULT_ENGINE, ENGINES
+from jumplab.sim import DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import Contacts, Scene
 
 MASS_KG, ROUNDING = 1e-6, 1e-9  # by how much an engine's mass, and its friction, may differ from what was asked for
+TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 
 
 class Engine(ABC):
@@ -73,8 +75,12 @@ class Engine(ABC):
         """Make scene and robot, without damping, armature or joint friction of the engine's own."""
 
     @abstractmethod
+    def _tangled(self, angles: np.ndarray) -> bool:
+        """Whether the engine finds links in each other, high above the ground, with joints at ``angles`` (nv - 6,)."""
+
     def _feels_itself(self) -> bool:
-        """Whether the engine notices links in each other: tangles the robot, before it is placed for the run."""
+        rng, joints = np.random.default_rng(0), len(self.robot.joint_names)
+        return any(self._tangled(rng.uniform(-np.pi, np.pi, joints)) for _ in range(TANGLES))
 
     @abstractmethod
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
@@ -86,8 +92,13 @@ class Engine(ABC):
 
     @property
     @abstractmethod
-    def mass_kg(self) -> float:
-        """Mass of the robot as the engine has it."""
+    def inertials(self) -> dict[str, pin.Inertia]:
+        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
+
+    @property
+    @abstractmethod
+    def gravity(self) -> list[float]:
+        """Gravity (3,) as the engine has it [m/s^2]."""
 
     @property
     @abstractmethod
@@ -124,12 +135,30 @@ class Engine(ABC):
     def contacts(self) -> Contacts:
         """What touched, and how hard, in the last step."""
 
+    @property
+    def mass_kg(self) -> float:
+        """Mass of the robot as the engine has it."""
+        return float(sum(link.mass for link in self.inertials.values()))
+
+    def inertia_error(self) -> float:
+        """Largest error of the engine's bodies, each with what is fixed to it: mass [kg], times place of its centre
+        [kg m], inertia [kg m^2] about the joint."""
+        model = self.robot.model
+        bodies = [pin.Inertia.Zero() for _ in model.inertias]
+        for name, inertia in self.inertials.items():
+            frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+            bodies[frame.parentJoint] += frame.placement.act(inertia)
+        pairs = zip(bodies[1:], list(model.inertias)[1:], strict=True)
+        return float(max(np.abs(a.toDynamicParameters() - b.toDynamicParameters()).max() for a, b in pairs))
+
     def read_back(self) -> dict[str, Any]:
-        """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg],
-        damping in the joints, whether links collide, and how far beyond the stated sole a foot ever touched [m]."""
+        """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg], how
+        wrong inertias are, damping in the joints, gravity [m/s^2], whether links collide, and how far beyond the stated
+        sole a foot ever touched [m]."""
         feet = [self.friction[foot] for foot in self.robot.foot.frames]
         friction = sorted({foot * block for foot in feet for block in self.ground_friction})
-        read = dict(friction=friction, mass_kg=self.mass_kg, damping=self.damping, self_collision=self._solid)
+        read = dict(friction=friction, mass_kg=self.mass_kg, inertia_error=self.inertia_error(), damping=self.damping)
+        read |= dict(gravity=self.gravity, self_collision=self._solid)
         return dict(name=self.name, substeps=self.substeps, **read, beyond_sole_m=self.beyond_sole_m)
 
     def _compare(self, friction: float) -> None:
@@ -151,11 +180,12 @@ class Engine(ABC):
 def engine_class(name: str = DEFAULT_ENGINE) -> type[Engine]:
     """The class of an engine, imported now; raises :class:`InputError` if it is unknown or not installed."""
     if not isinstance(name, str) or name not in ENGINES:
-        raise InputError(f"engine {quoted(name)}: must be one of {', '.join(ENGINES)}")
-    module, kind, package = ENGINES[name]
+        raise InputError(f"engine {quoted(name)}: must be one of {', '.join(INSTALLED)}")
+    module, kind, package, cure = ENGINES[name]
     try:
         return getattr(import_module(f"jumplab.sim.{module}"), kind)
     except ModuleNotFoundError as e:
         if e.name != package:
             raise
-        raise InputError(f"engine {name!r}: the package {package} is not installed; pip install {package}") from e
+        others = "".join(f"take {other!r}, or " for other in INSTALLED if other != name)
+        raise InputError(f"engine {name!r}: the package {package} is not installed; {others}{cure}") from e

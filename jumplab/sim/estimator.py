@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, rotation, turned
+from jumplab.sim.kinematics import Gauge, rotation, solved, turned
 from jumplab.sim.perturbation import SensorNoise
 from jumplab.task import GRAVITY
 
@@ -167,7 +167,7 @@ class Estimator:
         sense[:, TURN], sense[:, PLACE], sense[:, FEET[side]] = pin.skew(arm), -np.eye(3), np.eye(3)
         missed = arm - (self._foot[side] - self._place)
         seen = self._cov @ sense.T  # (SIZE, 3)
-        gain = np.linalg.solve(sense @ seen + (self._noise.joint_rad * LEG_M) ** 2 * np.eye(3), seen.T).T
+        gain = solved(sense @ seen + (self._noise.joint_rad * LEG_M) ** 2 * np.eye(3), seen.T).T
         error = gain @ missed
         self._cov -= gain @ seen.T
         self._cov = (self._cov + self._cov.T) / 2

@@ -4,14 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from eigenpy import PartialPivLU
 
 from jumplab.robot import Robot
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The x of ``matrix`` (n, n) x = ``right`` (n,) or (n, k).
+
+    By Eigen: the last digit of NumPy's own depends on its version, whose newest is not the same on every Python.
+    """
+    return PartialPivLU(matrix).solve(right)
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of a quaternion (4,), x y z w."""
     x, y, z, w = quaternion
     return pin.Quaternion(w, x, y, z).toRotationMatrix()
+
+
+def inertial(mass: float, com: np.ndarray, quaternion: np.ndarray, moments: np.ndarray) -> pin.Inertia:
+    """Inertia of a link in its frame, from its CoM (3,) there [m], and moments (3,) about axes that are turned."""
+    turn = rotation(np.asarray(quaternion))
+    return pin.Inertia(float(mass), np.asarray(com), turn @ np.diag(moments) @ turn.T)
 
 
 def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -56,9 +56,10 @@ class Run:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        servo, motors, delay = Servo(self.robot), Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
+        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
         with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
+            servo = Servo(self.robot, late_s=how.known_delay_s, substeps=engine.substeps)
             contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
                 q, v = engine.state()
@@ -66,7 +67,7 @@ class Run:
                 command = pilot.command(step, *seen)
                 if pilot.part == len(self.recorders):
                     self.recorders.append(Recorder(self.real, pilot.goal, engine.links))
-                engine.set_torque(motors.deliver(delay(servo.torque(command, *seen[:2])), v[6:]))
+                engine.set_torque(motors.deliver(delay(servo.torque(command, *(command.state or seen[:2]))), v[6:]))
                 engine.step()
                 contacts = engine.contacts()
                 self.recorders[-1].add(q, v, engine.applied(), contacts)
@@ -139,7 +140,7 @@ def simulate_jump(
         at touchdown (None: it found none).
     stand_s : how long to watch after touchdown [s]; less than the default is never called a landing.
     disturbance : begin at the apex of the flight, in a state that differs so; time, distance and rise count from there.
-    engine : "bullet" or "mujoco", whose physics it is.
+    engine : "bullet" or "mujoco", whose physics it is; where PyBullet is not installed, "mujoco" is the default.
 
     Returns
     -------
@@ -153,7 +154,8 @@ def simulate_jump(
     """
     _check(tape, robot, perturbation, scene, reference, stand_s)
     run = Run(robot, perturbation, scene, engine)
-    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s)
+    known_delay_s = run.perturbation.known_delay_s
+    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s)
     step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
     run.play(pilot, q, v, step)
     said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine
-from jumplab.sim.kinematics import rotation
+from jumplab.sim.kinematics import inertial, rotation
 from jumplab.sim.scene import REACH_M, Contacts
 
 
@@ -19,16 +19,19 @@ from jumplab.sim.scene import REACH_M, Contacts
 class Softness:
     """How a contact gives way; MuJoCo's names are those of its solref and solimp."""
 
-    time_s: float = 0.002  # [s] a penetration fades; eight of the engine's steps, it wants two at least
+    time_s: float = 0.001  # [s] a penetration fades; of the engine's steps it takes four, with two feet would bounce
     damping_ratio: float = 1.0  # [1] nothing bounces
-    impedance: tuple[float, float] = (0.95, 0.99)  # [1] share of a contact's acceleration that is held off
+    # [1] share of a contact's acceleration that is held off, at the surface and ``depth_m`` below. MuJoCo's contacts do
+    # not see what turning legs add to it (J' v): a share of 0.95 at the surface lets loaded toes lift off and fall back
+    impedance: tuple[float, float] = (0.5, 0.95)
+    depth_m: float = 1e-4  # [m] as deep as feet stand in Bullet's ground
 
 
-SOFTNESS = Softness()  # as hard as Bullet's ground: launches slip by less than a millimetre; by default, 7 mm
+SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm
 SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
-TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
+THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
 FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
 
 
@@ -54,7 +57,7 @@ class MujocoEngine(Engine):
         for geom in spec.geoms:
             geom.condim, geom.margin = 3, 0.0
             geom.solref = [self.softness.time_s, self.softness.damping_ratio]
-            geom.solimp = [*self.softness.impedance, 0.001, 0.5, 2.0]
+            geom.solimp = [*self.softness.impedance, self.softness.depth_m, 0.5, 2.0]
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         for own in (self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss):
@@ -91,15 +94,11 @@ class MujocoEngine(Engine):
         """Free the engine."""
         self._data = self._model = None
 
-    def _feels_itself(self) -> bool:
-        rng, data = np.random.default_rng(0), mujoco.MjData(self._model)
-        data.qpos[2] = REACH_M
-        for _ in range(TANGLES):
-            data.qpos[self._angles] = rng.uniform(-np.pi, np.pi, len(self._angles))
-            mujoco.mj_forward(self._model, data)
-            if data.ncon:
-                return True
-        return False
+    def _tangled(self, angles: np.ndarray) -> bool:
+        data = mujoco.MjData(self._model)
+        data.qpos[2], data.qpos[self._angles] = REACH_M, angles
+        mujoco.mj_forward(self._model, data)
+        return bool(data.ncon)
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
         data = self._data
@@ -107,9 +106,16 @@ class MujocoEngine(Engine):
         data.qvel[:3], data.qvel[3:6], data.qvel[self._rates] = rotation(q[3:7]) @ v[:3], v[3:6], v[6:]
 
     @property
-    def mass_kg(self) -> float:
-        """Mass of the robot as the engine has it."""
-        return float(self._model.body_mass.sum())
+    def inertials(self) -> dict[str, pin.Inertia]:
+        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
+        has = self._model
+        rows = zip(has.body_mass, has.body_ipos, has.body_iquat[:, [1, 2, 3, 0]], has.body_inertia, strict=True)
+        return dict(zip(self.links, (inertial(*row) for row in list(rows)[1:]), strict=True))
+
+    @property
+    def gravity(self) -> list[float]:
+        """Gravity (3,) as the engine has it [m/s^2]."""
+        return self._model.opt.gravity.tolist()
 
     @property
     def friction(self) -> dict[str, float]:
@@ -166,23 +172,28 @@ class MujocoEngine(Engine):
 
     def _feel(self, origins: np.ndarray) -> None:
         """Add the contacts of one substep; moments are about the links' ``origins`` (k, 3) before the step."""
-        model, data, force, points = self._model, self._data, np.zeros(6), ([], [])
-        bodies, places, frames = model.geom_bodyid[data.contact.geom], data.contact.pos, data.contact.frame
-        for number, (one, other) in enumerate(bodies.tolist()):
-            mujoco.mj_contactForce(model, data, number, force)
-            if force[0] <= 0:
+        data, contact = self._data, self._data.contact
+        acting = np.flatnonzero(contact.efc_address >= 0)
+        if not len(acting):
+            return
+        force = data.efc_force[contact.efc_address[acting, None] + THREE]  # along the axes of the contact's frame
+        pairs, places = self._model.geom_bodyid[contact.geom[acting]], contact.pos[acting]
+        pushes = np.einsum("ki,kij->kj", force, contact.frame[acting].reshape(-1, 3, 3))
+        points = ([], [])
+        for k, (one, other) in enumerate(pairs.tolist()):
+            if force[k, 0] <= 0:
                 continue
             if one and other:
                 self._colliding.add((self.links[one - 1], self.links[other - 1]))
                 continue
-            body, sign = (other, 1.0) if one == 0 else (one, -1.0)
+            body = other or one
             self._touching.add(self.links[body - 1])
             side = self._feet.get(body)
             if side is not None:
-                push = sign * force[:3] @ frames[number].reshape(3, 3)
+                push, place = (pushes[k] if other else -pushes[k]), places[k]
                 self._wrench[side, :3] += push
-                self._wrench[side, 3:] += pin.skew(places[number] - origins[body]) @ push
-                points[side].append(places[number])
+                self._wrench[side, 3:] += pin.skew(place - origins[body]) @ push
+                points[side].append(place)
         for body, side in self._feet.items():
             if points[side]:
                 self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))

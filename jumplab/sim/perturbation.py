@@ -26,6 +26,18 @@ class Ranges:
     delay_s: tuple[float, float] = (0.0, 0.004)  # [s], from ... to
     motor_gain: float = 0.05  # [1], relative error of every torque, typical of current-controlled drives
 
+    @property
+    def known_delay_s(self) -> float:
+        """What a laboratory measures beforehand [s]: the middle of the delays. What a robot is off it, nobody knows."""
+        return sum(self.delay_s) / 2
+
+    def __str__(self) -> str:
+        links = f"masses ±{100 * self.mass:g} %, centres of mass ±{1000 * self.com_m:g} mm per axis, "
+        links += f"inertias ±{100 * self.inertia:g} %, motors ±{100 * self.motor_gain:g} %, "
+        slow, late = (1000 * x for x in self.delay_s)
+        delay = f"commands {slow:g} ... {late:g} ms late and sent {1000 * self.known_delay_s:g} ms ahead"
+        return links + f"friction {self.friction[0]:g} ... {self.friction[1]:g}, " + delay
+
 
 # a "slight" difference: about a fifth of a workshop's uncertainty
 SLIGHT = Ranges(0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01)
@@ -53,6 +65,16 @@ class SensorNoise:
         """16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
         return cls(5e-4, 0.05, 1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3, accel=0.2, accel_bias=0.05, force=3.0)
 
+    def __str__(self) -> str:
+        if self == SensorNoise():
+            return "the true state and foot forces"
+        joints = (
+            f"joint angles (±{1000 * self.joint_rad:g} mrad in steps of {1000 * self.encoder_step_rad:g}) and rates "
+        )
+        inertial = f"gyro (±{self.gyro:g}, bias ±{self.gyro_bias:g} rad/s), accelerometer (±{self.accel:g}, bias "
+        rest = f"±{self.accel_bias:g} m/s^2), foot forces (±{self.force:g} N), tilt before the jump "
+        return joints + f"(±{self.joint_rate:g} rad/s), " + inertial + rest + f"(±{1000 * self.tilt_rad:g} mrad)"
+
 
 @dataclass(frozen=True)
 class Perturbation:
@@ -64,20 +86,27 @@ class Perturbation:
     com: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # link -> shift in its frame [m]
     friction: float = FRICTION  # lateral coefficient of the whole robot against ground of 1 [1]
     delay_s: float = 0.0  # age of a command when it reaches the motors, rounded to milliseconds
+    known_delay_s: float = (
+        0.0  # what it is believed to be, rounded likewise; the tape's commands are sent so much ahead
+    )
     motor_gain: dict[str, float] = field(default_factory=dict)  # joint -> torque delivered per torque commanded [1]
     noise: SensorNoise = SensorNoise()  # on measurements
 
     def __post_init__(self):
         if not 0 < self.friction <= 2:
             raise InputError(f"friction = {self.friction:g} is outside 0 ... 2")
-        if not 0 <= self.delay_s <= 0.02:
-            raise InputError(f"delay = {self.delay_s:g} s is outside 0 ... 0.02 s")
+        for name, delay_s in (("delay", self.delay_s), ("known delay", self.known_delay_s)):
+            if not 0 <= delay_s <= 0.02:
+                raise InputError(f"{name} = {delay_s:g} s is outside 0 ... 0.02 s")
 
     @classmethod
     def draw(
         cls, robot: Robot, seed: int, ranges: Ranges = Ranges(), noise: SensorNoise = SensorNoise()
     ) -> Perturbation:
-        """Draw every number uniformly and independently from ``ranges``; the same seed gives the same robot."""
+        """Draw every number uniformly and independently from ``ranges``; the same seed gives the same robot.
+
+        Nothing that is drawn is known to the controllers; of the delay they know the middle of its range.
+        """
         rng = np.random.default_rng(seed)
         masses = ((link.get("name"), link.find("inertial/mass")) for link in ET.fromstring(robot.urdf).iter("link"))
         names = [name for name, mass in masses if mass is not None and float(mass.get("value")) > LIGHT_KG]
@@ -92,6 +121,7 @@ class Perturbation:
             {name: tuple(around(ranges.com_m, 3).tolist()) for name in names},
             float(rng.uniform(*ranges.friction)),
             float(rng.uniform(*ranges.delay_s)),
+            ranges.known_delay_s,
             {name: 1 + float(around(ranges.motor_gain)) for name in robot.joint_names},
             noise,
         )

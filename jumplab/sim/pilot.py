@@ -36,7 +36,7 @@ class Pilot:
     """Decides the command of each step: playback until touchdown, landing controller afterwards.
 
     Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
-    :func:`jumplab.sim.simulate_jump`.
+    :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead.
 
     Attributes
     ----------
@@ -57,12 +57,14 @@ class Pilot:
         reference: LandingSource | None = None,
         reaim: bool = True,
         stand_s: float = STAND_S,
+        lead_s: float = 0.0,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
         self.goal, self._heading = tape.q[-1], Gauge(robot).heading(tape.q[-1])
         tape, scene = replace(tape, q=headed(tape.q, self._heading)), scene.seen_along(self._heading, robot, self.goal)
-        self._robot, self._playback, self.forecast = robot, Playback(tape, robot, mode), Forecast(robot, tape, scene)
+        self._robot, self.playback = robot, Playback(tape, robot, mode, lead_s)
+        self.forecast = Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         self._landing = LandingController(robot, reference=None if callable(reference) else reference)
         self.ahead = LandingAhead(landing if reference is None else "given")
@@ -73,14 +75,14 @@ class Pilot:
         self._tuck = Tuck(robot, tape) if reaim and flip else None
         # other jumps land flat, within a centimetre or two of what was planned for them
         self._replan = Replan(robot) if flip else None
-        self._yield_s = FLIP_YIELD_S if flip else YIELD_S
+        self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + lead_s
         self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
         self._tape_until = self._earliest
         if self._tuck is not None:
             self._tape_until = min(self._earliest, round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S))
         self._none = self._tau = np.zeros(len(robot.joint_names))
         self._stand_s = stand_s
-        self.last_step = self._playback.steps + round(WAIT_S / STEP_S)
+        self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
         self.touchdown: int | None = None
 
     def _prepare(self) -> None:
@@ -113,7 +115,7 @@ class Pilot:
         q = headed(q, self._heading)
         if self.touchdown is None:
             if step < self._tape_until:
-                return self._playback.command(step, q, v, self._none)
+                return self.playback.command(step, q, v, self._none)
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, q, v)
             self._touch(step, q, v)
@@ -132,9 +134,9 @@ class Pilot:
         if self._reaim is not None:
             aimed = self._reaim.correction(q, v, self._error(step, q), None if self._tuck is None else left)
         if shift is None:
-            command = self._playback.command(step, q, v, aimed)
+            command = self.playback.command(step, q, v, aimed)
         else:
-            command = self._playback.shifted(step, *shift, q, v, aimed)
+            command = self.playback.shifted(step, *shift, q, v, aimed)
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
 
     def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
@@ -150,7 +152,7 @@ class Pilot:
 
     def _error(self, step: int, q: np.ndarray) -> float:
         """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
-        error = self._playback.attitude_error(step, q)[1] if self._tuck is None else self._tuck.miss
+        error = self.playback.attitude_error(step, q)[1] if self._tuck is None else self._tuck.miss
         return float(np.arctan2(np.sin(error), np.cos(error)))
 
     def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import rotation
+from jumplab.sim.kinematics import rotation, solved
 
 MODES = ("position", "pd")
 FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
@@ -56,8 +56,10 @@ class Command:
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
+    change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
     share: float = 1.0  # of the torque limit, for the servo
+    state: tuple[np.ndarray, np.ndarray] | None = None  # (q, v) that it is expected to arrive in; as measured if None
 
 
 class Delay:
@@ -115,32 +117,36 @@ class Playback:
     In ``mode`` "position" the servo law of :mod:`.servo` follows its angles, rates and accelerations and sees no
     planned torque; in "pd" the planned torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown
     or the tape belongs to another robot.
+
+    Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot is expected to be
+    as far off the tape then as it is measured to be now: the plan is sent ahead, errors are met late.
     """
 
-    def __init__(self, tape: Tape, robot: Robot, mode: str = "position"):
+    def __init__(self, tape: Tape, robot: Robot, mode: str = "position", lead_s: float = 0.0):
         if not isinstance(mode, str) or mode not in MODES:
             raise InputError(f"mode {quoted(mode)}: must be one of {', '.join(MODES)}")
         names = tuple(str(n) for n in tape.joint_names)
         if names != robot.joint_names:
             raise InputError(f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}")
         self.mode = mode
-        self.steps = round(float(tape.t[-1]) / STEP_S)
+        self.steps, self.lead = round(float(tape.t[-1]) / STEP_S), round(lead_s / STEP_S)
         grid = np.arange(self.steps + 1) * STEP_S
-        # steps are semi-implicit: a joint whose rate is right at every step runs half a step ahead
-        self._ahead = _resample(grid + STEP_S / 2, tape.t, tape.q[:, 7:])
-        self._q, self._rate, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v[:, 6:], tape.tau))
+        self._q, self._v, self._tau = (_resample(grid, tape.t, x) for x in (tape.q[:, 7:], tape.v, tape.tau))
+        self._rate = self._v[:, 6:]
         self._attitude = _resample(grid, tape.t, tape.q[:, 3:7])
         self._rest = self._corrected = np.zeros(len(names))
         self._kp, self._kd = GAINS.of(robot)
         self._model, self._data = robot.model, robot.model.createData()
         self._takeoff = round(tape.takeoff_time / STEP_S)
+        self._change = np.vstack([np.diff(self._tau, axis=0), self._rest])
+        self._change[self._takeoff - 1] = 0.0  # what the ground held ends there at once
         self._heel_off = self._first_tilt(robot, tape)
 
     def _first_tilt(self, robot: Robot, tape: Tape) -> int:
         """Step at which the heels leave the ground."""
         data, frame = self._data, robot.model.getFrameId(robot.foot.frames[0])
         for t, q in zip(tape.t, tape.q, strict=True):
-            pin.framesForwardKinematics(robot.model, data, q)
+            pin.framesForwardKinematics(self._model, data, q)
             if abs(data.oMf[frame].rotation[2, 0]) > HEEL_RAD:
                 return round(float(t) / STEP_S)
         return self.steps
@@ -153,30 +159,43 @@ class Playback:
         self, step: int, shift_s: float, pace: float, q: np.ndarray, v: np.ndarray, correction: np.ndarray
     ) -> Command:
         """As :meth:`command` in flight, the tape read ``shift_s`` beyond ``step``, and ``1 + pace`` times as fast."""
-        at = min(max(step + shift_s / STEP_S, 0.0), float(self.steps))
+        at = min(max(step + self.lead + shift_s / STEP_S, 0.0), float(self.steps))
         if at >= self.steps:
             return self.command(self.steps, q, v, correction)
-        ahead, angles, rate, tau = (_between(x, at) for x in (self._ahead, self._q, self._rate, self._tau))
-        change = (_between(self._rate, at + 1.0) - rate) / STEP_S
+        q, v = self._arriving(at, q, v)
+        angles, rate, tau, change = (_between(x, at) for x in (self._q, self._rate, self._tau, self._change))
+        due = (_between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate
         if self.mode == "position":
-            return Command(q=ahead + correction, rate=rate, acceleration=(1 + pace) ** 2 * change)
+            return Command(q=angles + correction, rate=rate, acceleration=(1 + pace) ** 2 * due, state=(q, v))
         wish = GAINS.flight_corner * (angles + correction - q[7:]) + rate + self._correction_rate(correction) - v[6:]
-        return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish))
+        return Command(tau=tau + self._inertia(q) @ (GAINS.flight_bandwidth * wish), change=change)
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
-        """Command for one step; the measured state is read in "pd" mode only, ``correction`` is added to the angles."""
+        """Command to send at one step, from the measured state; ``correction`` is added to the angles."""
+        step += self.lead
         now, holding = min(step, self.steps), step >= self.steps
+        q, v = self._arriving(step, q, v)
         if self.mode == "position":
             rate = self._rest if holding else self._rate[now]
             due = (self._rate[min(now + 1, self.steps)] - self._rate[now]) / STEP_S
-            return Command(q=self._ahead[now] + correction, rate=rate, acceleration=due, feet=self.stands(step))
+            moves = dict(q=self._q[now] + correction, rate=rate, acceleration=due)
+            return Command(**moves, feet=self.stands(step), state=(q, v))
         rate = self._rest if holding else self._rate[now]
         error, rate_error = self._q[now] + correction - q[7:], rate + self._correction_rate(correction) - v[6:]
         if step < self._takeoff:
-            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error)
+            return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error, change=self._change[now])
         wish = GAINS.flight_bandwidth * (GAINS.flight_corner * error + rate_error)
-        return Command(tau=self._tau[now] + self._inertia(q) @ wish)
+        return Command(tau=self._tau[now] + self._inertia(q) @ wish, change=self._change[now])
+
+    def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as now."""
+        if self.lead == 0:
+            return q, v
+        due, now = (min(max(x, 0.0), self.steps) for x in (at, at - self.lead))
+        moved, gained = (_between(x, due) - _between(x, now) for x in (self._q, self._v))
+        base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
+        return pin.integrate(self._model, q, np.concatenate([base, moved])), v + gained
 
     def _correction_rate(self, correction: np.ndarray) -> np.ndarray:
         change, self._corrected = (correction - self._corrected) / STEP_S, correction
@@ -187,7 +206,7 @@ class Playback:
         upper = pin.crba(self._model, self._data, q)
         whole = np.triu(upper) + np.triu(upper, 1).T
         lever = whole[:6, 6:]
-        return whole[6:, 6:] - lever.T @ np.linalg.solve(whole[:6, :6], lever)
+        return whole[6:, 6:] - lever.T @ solved(whole[:6, :6], lever)
 
     def attitude_error(self, step: int, q: np.ndarray) -> np.ndarray:
         """How far the trunk is turned away from the plan: rotation vector (3,) in the axes of ``q`` and tape [rad]."""

@@ -13,7 +13,7 @@ import pinocchio as pin
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitch_of, pitched, planned_pitch
+from jumplab.sim.kinematics import Gauge, pitch_of, pitched, planned_pitch, solved
 from jumplab.sim.scene import Scene
 
 # The paper prints none of these numbers.
@@ -104,7 +104,7 @@ class Reaim:
                 probe = guess.copy()
                 probe[rows] += PROBE_RAD * signs
                 slope[:, column] = (self._aim(probe) - here)[:2] / PROBE_RAD
-            turns = np.linalg.solve(slope, goal - here[:2])
+            turns = solved(slope, goal - here[:2])
             for rows, signs, angle in zip(self._rows, self._signs, turns, strict=True):
                 guess[rows] += angle * signs
         return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles

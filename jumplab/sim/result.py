@@ -27,6 +27,7 @@ CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-
 STILL_SPEED = 0.05  # [m/s] a CoM slower than this at the end stands
 LEVEL_TOLERANCE_M = 0.05  # soles this close to the planned height stand on the planned surface
 IMPACT_S = 0.1  # the landing impulse is summed over this time after touchdown
+SMOOTHING_S = 0.02  # longer than an impact, whose force is a matter of the engine's step, shorter than the catch
 SATURATED = 0.999  # share of the available torque that counts as "at the limit"
 MIN_FLIGHT_S = 0.05  # a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
 REPORT_NAME = "simulation.json"
@@ -85,10 +86,12 @@ class Metrics:
     liftoff_s: float | None = None
     touchdown_s: float | None = None
     touchdown_trunk_pitch_rad: float | None = None  # whole turns counted
+    touchdown_trunk_rate: float | None = None  # about the trunk's own pitch axis [rad/s]
     touchdown_com_velocity: tuple[float, float] | None = None  # [m/s]
     sole_ahead_m: float | None = None  # middle of the soles minus CoM at touchdown
     launch_impulse: tuple[float, float]  # of the ground until lift-off [N s]
     landing_impulse: tuple[float, float] | None = None  # of the ground in the 0.1 s after touchdown [N s]
+    landing_force_n: float | None = None  # largest mean over 20 ms of what presses on both feet then [N]
     qp_solves: int  # of the landing controller
     qp_failures: int
 
@@ -265,9 +268,11 @@ class Recorder:
                 side_m=float(end[1] - start[1]),
                 yaw_rad=yaw + 2 * np.pi * round((_turned(q) - yaw) / (2 * np.pi)),
                 touchdown_trunk_pitch_rad=_counted(pitch_of(q[: touchdown + 1])),
+                touchdown_trunk_rate=float(log["v"][touchdown, 4]),
                 touchdown_com_velocity=_xz(velocity[touchdown]),
                 sole_ahead_m=float(self._gauge.soles(q[touchdown])[0] - com[touchdown, 0]),
-                landing_impulse=_xz(force[touchdown:][: round(IMPACT_S / STEP_S)].sum(axis=0) * STEP_S),
+                landing_impulse=_xz((impact := force[touchdown:][: round(IMPACT_S / STEP_S)]).sum(axis=0) * STEP_S),
+                landing_force_n=_largest_mean(impact[:, 2]),
             )
         collisions = STEP_S * float(log["colliding"].sum())
         return Metrics(**found, self_collision_s=collisions, qp_solves=solves[0], qp_failures=solves[1])
@@ -324,6 +329,12 @@ def _events(force: np.ndarray) -> tuple[int | None, int | None]:
         return None, None
     liftoff, touchdown = int(edges[flights[0]]) + 1, int(edges[flights[0] + 1])
     return liftoff, touchdown if touchdown < len(force) else None
+
+
+def _largest_mean(force: np.ndarray) -> float:
+    """Largest mean over :data:`SMOOTHING_S` of a force (N,), which is none before it."""
+    window = round(SMOOTHING_S / STEP_S)
+    return float(np.convolve(force, np.full(window, 1 / window))[: len(force)].max())
 
 
 def _xz(vector: np.ndarray) -> tuple[float, float]:

@@ -11,7 +11,8 @@ what is computed from the velocity before the step,
 
     tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f   and   J v+ = 0,
 
-and the wished rate is the due one plus corner times the error of the angle.
+and the wished rate is the due one plus corner times the error of the angle. Where torques are known to arrive late, the
+step is longer by as much: a light limb whose error is asked away within a millisecond overshoots until that is seen.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import pinocchio as pin
 
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge
+from jumplab.sim.kinematics import Gauge, solved
 from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command
 
 
@@ -43,9 +44,15 @@ PITCH = 4  # row of a foot's twist that is free while it stands on its toe
 
 
 class Servo:
-    """Torques for commands of position mode, from the measured state; ``robot`` is as planned."""
+    """Torques for commands, from the measured state.
 
-    def __init__(self, robot: Robot, gains: ServoGains = GAINS):
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. They act for a whole step, which an engine
+    takes in ``substeps`` semi-implicit ones: they are felt at the beginnings of these, on average (1 - 1/substeps) / 2
+    of the step late, and planned ones change meanwhile. Joints whose rates are right run ahead by half a substep.
+    """
+
+    def __init__(self, robot: Robot, gains: ServoGains = GAINS, late_s: float = 0.0, substeps: int = 1):
+        self._step_s, self._late, self._ahead_s = STEP_S + late_s, (1 - 1 / substeps) / 2, STEP_S / substeps / 2
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
@@ -53,14 +60,15 @@ class Servo:
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]; those of the command, if it has any."""
         if command.tau is not None:
-            return command.tau
+            return command.tau + self._late * command.change
         model, data = self._gauge.model, self._gauge.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
         feet, drift, units = self._feet(command.feet)
         push = feet.T * units
         tau = self._feed_forward(command.acceleration, feet, drift, push)
-        wish = command.rate + STEP_S * command.acceleration + self._gains.corner * (command.q - q[7:])
+        error = command.q + self._ahead_s * command.rate - q[7:]
+        wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
         tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
@@ -75,7 +83,7 @@ class Servo:
         kkt[held:, :6], kkt[held:, 6:held] = data.M[:6, :6], -push[:6]
         kkt[:held, held:] = kkt[held:, :held].T
         right[:6], right[held:] = -feet[:, :6].T @ (drift + feet[:, 6:] @ joints), -offset[:6]
-        x = np.linalg.solve(kkt, right)
+        x = solved(kkt, right)
         return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held]
 
     def _rates_after(self, tau: np.ndarray, wish: np.ndarray, v: np.ndarray, push: np.ndarray) -> np.ndarray:
@@ -83,12 +91,13 @@ class Servo:
         data, nv, held = self._gauge.data, len(v), push.shape[1]
         kkt, right, joints = np.zeros((nv + held, nv + held)), np.zeros(nv + held), range(6, nv)
         kkt[:nv, :nv] = data.M
-        kkt[joints, joints] += STEP_S * self._damping
+        step_s = self._step_s
+        kkt[joints, joints] += step_s * self._damping
         kkt[:nv, nv:], kkt[nv:, :nv] = -push, -push.T
-        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * STEP_S
-        right[:nv] = data.M @ v - STEP_S * data.nle
-        right[6:nv] += STEP_S * (tau + self._damping * wish)
-        return np.linalg.solve(kkt, right)[6:nv]
+        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * step_s
+        right[:nv] = data.M @ v - step_s * data.nle
+        right[6:nv] += step_s * (tau + self._damping * wish)
+        return solved(kkt, right)[6:nv]
 
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench against each."""

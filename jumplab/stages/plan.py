@@ -19,6 +19,7 @@ from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
+TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}  # names on the tape
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -43,7 +44,7 @@ class JumpPlan:
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
     whole_body : result of stage 3 or of the direct planner, out of the plane of the spatial program, which began with
         their motion; None if the plan was read from a result folder.
-    statistics : one row per stage.
+    statistics : one row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less closely.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
     """
@@ -134,7 +135,23 @@ class JumpPlan:
             s = self.joints.statistics
             found["joint map"] = {"solver": s.method, "problems": s.steps, "iterations": s.iterations,
                                   "residual": s.worst_residual}  # fmt: skip
+            if self.joints.gentle:
+                found["joint map"]["gentle"] = self.joints.gentle
         return {**found, "whole body": _solver(self.whole_body.solution.statistics)}
+
+    @property
+    def tracking(self) -> dict[str, dict[str, dict[str, float | None]]] | None:
+        """How far the tape is from stage 1's trajectories, compared at the same share of each phase (WL-J1, WF-J1).
+
+        Returns
+        -------
+        phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
+        -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
+        zero). None for a plan without stage 1.
+        """
+        if self.stored is not None:
+            return self.stored.get("tracking")
+        return None if self.srmp is None else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:
@@ -156,10 +173,27 @@ class JumpPlan:
             "platform_edge_m": platform_edge_m(self.task, self.robot, body.limits) if not away else body.edge_m,
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
+            **({"tracking": self.tracking} if self.srmp else {}),
             "stages": [vars(row) for row in self.statistics],
             **({"skipped": self.skipped} if self.skipped else {}),
             "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
         }
+
+
+def _tracking(tape: Tape, srmp: SrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
+    k, toe = tape.takeoff_index, float(tape.extra["planar_toe_phase_start"])
+    launch = np.interp(tape.t[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
+    air = tape.t[k:] - tape.takeoff_time
+    found = {}
+    for name, rows, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
+        part, found[name] = getattr(srmp, name), {}
+        for key, column in TRACKED.items():
+            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
+            done = np.atleast_2d(tape.extra[f"planar_{column}"][rows].T)
+            rms = float(np.sqrt(np.mean(np.sum((done - asked) ** 2, axis=0))))
+            size = float(np.mean(np.linalg.norm(asked, axis=0)))
+            found[name][key] = {"rms": rms, "relative_rms": rms / size if size else None}
+    return found
 
 
 def _solver(s: Statistics) -> dict:

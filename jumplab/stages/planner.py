@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -34,7 +35,7 @@ from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS = ("three-step", "direct")
-OWN_ARMS, NAIVE_ARMS = 0.25, 0.75  # shares of the arms' swing in stage 3's guess: stage 2's arms swing too far
+OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
 SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
@@ -64,7 +65,8 @@ class Planner:
     mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
 
-    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too.
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
+    terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
 
     Raises
     ------
@@ -144,6 +146,23 @@ class Planner:
                 changes.applied(stage.nlp.problem)
         return asked
 
+    def _less(self, asked: Mapping[str, StageChanges]) -> Planner:
+        """This planner; where one plan gives an own term the weight 0, one that has these weights and not that term.
+
+        In the problem it would still move the last digits.
+        """
+        own = {(stage, t.name) for stage, c in self.changes.items() for terms in c.terms.values() for t in terms}
+        now = {stage: dict(c.weights) for stage, c in asked.items()}
+        if not own & {(stage, n.rpartition("/")[2]) for stage in now for n, w in now[stage].items() if w == 0}:
+            return self
+        if (key := repr(now)) not in self._stages:
+            less = self._stages[key] = copy(self)
+            less._stages, less.changes = {}, {}
+            for stage, c in self.changes.items():
+                before = {n: w for n, w in c.weights.items() if n not in now[stage]}
+                less.changes[stage] = replace(c, weights=before | now[stage])
+        return self._stages[key]
+
     def _joint_options(self, weights: Mapping[str, float] = MappingProxyType({})) -> Options:
         """Stage 2's options with what is changed about it; refuses what does not fit."""
         own = self.changes["joint qp"]
@@ -178,7 +197,8 @@ class Planner:
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
-        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`.
+        weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
+            left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
             None. Not for flips.
 
@@ -196,6 +216,8 @@ class Planner:
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
         asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
+        if (less := self._less(asked)) is not self:
+            return less.plan(task, method, start=start)
         where = {} if start is None else {"start": start}
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
@@ -361,7 +383,7 @@ def _row(stage: str, s: Statistics) -> StageRow:
 
 def _joint_row(joints: JointPlan) -> StageRow:
     s = joints.statistics
-    return StageRow("2 joint map", s.iterations, s.total_s - s.solve_s, s.solve_s)
+    return StageRow("2 joint map" + ", gentle" * bool(joints.gentle), s.iterations, s.total_s - s.solve_s, s.solve_s)
 
 
 def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
@@ -377,13 +399,14 @@ def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> Ju
 
 
 def guess_from_joints(
-    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float
+    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float, own_arms: float | None = None
 ) -> dict[str, PhaseGuess]:
     """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
 
-    The arms swing mostly as in :meth:`WholeBodyPlanner.naive_guess`, see :data:`OWN_ARMS`. ``toe_s`` is the length of
-    the toe phase [s].
+    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`; ``own_arms`` is stage 2's share of them, by
+    default :data:`OWN_ARMS`. ``toe_s`` is the length of the toe phase [s].
     """
+    share = (OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS) if own_arms is None else own_arms
     motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
     takeoff, naive, out = float(joints.t[row]), planner.naive_guess(task), {}
     now, names = (x[row : row + 1] for x in motion), ("com", "com_velocity")
@@ -396,15 +419,15 @@ def guess_from_joints(
         if name == "toe":
             q[:, 0] = np.maximum(q[:, 0], 0.0)
         body = PhaseGuess(t[-1] - t[0], q, v, a, None, ballistic if name == "flight" else {})
-        out[name] = _with_arms(body, naive[name])
+        out[name] = _with_arms(body, naive[name], share)
     return out
 
 
-def _with_arms(body: PhaseGuess, arms: PhaseGuess) -> PhaseGuess:
-    """One phase of a guess, its last link swinging partly as in another guess, in its own time."""
+def _with_arms(body: PhaseGuess, arms: PhaseGuess, own: float) -> PhaseGuess:
+    """One phase of a guess, its last link swinging by a share of its ``own``, and as in another guess in its time."""
     pace, joined = arms.duration / body.duration, []
     for k, (x, y) in enumerate(((body.q, arms.q), (body.v, arms.v), (body.a, arms.a))):
-        arm = OWN_ARMS * x[:, -1] + NAIVE_ARMS * (y[:, -1] * pace**k)
+        arm = own * x[:, -1] + (1 - own) * (y[:, -1] * pace**k)
         joined.append(np.column_stack([x[:, :-1], arm]))
     return replace(body, q=joined[0], v=joined[1], a=joined[2])
 

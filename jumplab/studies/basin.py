@@ -54,6 +54,12 @@ class BasinReport(TrialReport):
 
     grid: BasinGrid = field(default_factory=BasinGrid)
 
+    @property
+    def conditions(self) -> dict[str, str]:
+        """As of any trials, but the robot is as planned."""
+        said = {"robot": "as planned, put into its flight's apex with a wrong state"}
+        return {name: text for name, text in super().conditions.items() if not name.startswith("drawn")} | said
+
     def to_json(self) -> dict[str, Any]:
         """The content of ``basin.json``."""
         said = super().to_json()

@@ -47,6 +47,7 @@ from jumplab.sim.playback import MODES
 
 SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
 CONFIDENCE = 0.95
+KNOWN = "plan, planned robot, lengths of links, ground, gravity, time, where the jump begins and its heading"
 LOOK_S = 0.5  # how often a worker looks whether its parent still lives
 # whose versions decide a trial's outcome, and which sources of this package do: trials of others are not these trials
 SHAPING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet", "mujoco")
@@ -80,7 +81,7 @@ class TrialSettings:
 
     mode: str = "position"  # or "pd": how the tape is played until touchdown
     reaim: bool = True  # turn the legs in the air against the trunk's measured pitch error
-    noise: SensorNoise = field(default_factory=SensorNoise)  # on what the controllers are told
+    noise: SensorNoise = field(default_factory=SensorNoise.typical)  # on what the controllers are told
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
 
@@ -88,6 +89,18 @@ class TrialSettings:
         if self.mode not in MODES:
             raise InputError(f"mode {self.mode!r}: must be one of {', '.join(MODES)}")
         engine_class(self.engine)
+
+    @property
+    def conditions(self) -> dict[str, str]:
+        """In sentences: what differs from robot to robot, what corrects it, what is measured, what is known exactly."""
+        aim = "hips and ankles turn in the air against the error of the trunk's pitch" if self.reaim else "no"
+        return {
+            "playback": f"{self.mode} mode in {engine_class(self.engine).title}",
+            "re-aim": aim,
+            "drawn uniformly, each link and joint by itself": str(self.ranges),
+            "measured (one standard deviation)": str(self.noise),
+            "known exactly": KNOWN,
+        }
 
     @property
     def hash(self) -> str:
@@ -194,6 +207,11 @@ class TrialReport:
     resumed: int = 0  # how many were taken from an earlier run
 
     @property
+    def conditions(self) -> dict[str, str]:
+        """Under which they jumped, in sentences: those of :class:`TrialSettings`."""
+        return self.settings.conditions
+
+    @property
     def count(self) -> int:
         """Number of trials."""
         return len(self.trials)
@@ -244,6 +262,7 @@ class TrialReport:
             "target": self.target,
             "seed": self.seed,
             "settings": {**asdict(self.settings), "hash": self.trials[0].key.settings},
+            "conditions": self.conditions,
             "plan": self.plan,
             "versions": store.versions(),
         }

@@ -14,11 +14,15 @@ import coal  # noqa: F401  (its shapes are what Pinocchio's geometry objects hol
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
+from jumplab.errors import InputError, JumplabError, SolverError, as_path, quoted, require_type
+from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
-from jumplab.robot import Robot
+from jumplab.robot import SAGITTAL_JOINTS, Robot
+from jumplab.robot.stance import stance_angles
+from jumplab.sim import STEP_S, SimulationResult
 from jumplab.stages.joint_qp import map_to_joints
-from jumplab.stages.planner import guess_from_joints
+from jumplab.stages.plan import JumpPlan
+from jumplab.stages.planner import STEPS_S, guess_from_joints, to_link_angles
 from jumplab.stages.reconstruction import expand, planar_quantities
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
@@ -28,6 +32,7 @@ HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "
 STARTS = ("crouch", "stage 2", "looser stage 3")
 LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
+SAME_COST = 1.01  # more than this times the least cost known is another jump
 READINGS = ("the paper says", "we do", "because", "effect")
 HEADING = "## Differences from the paper"
 
@@ -137,7 +142,7 @@ class Start:
 
 
 def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
-    """Stage 3 from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
+    """Stage 3, as it plans, from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
 
     Returns
     -------
@@ -148,9 +153,8 @@ def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
     InputError, InfeasibleError, SolverError
         If stage 1 refuses a target; what fails later is a row without numbers.
     """
-    # by ipopt alone, so that iterations are of one kind and as the paper counts them
-    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot, approach=False)
-    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE, approach=False)
+    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot)
+    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE)
     rows = []
     for task in tasks:
         first = stage1.plan(task)
@@ -166,7 +170,11 @@ def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlan
     began = time.process_time()
     guess = None  # the planner's own: four postures joined by straight lines
     if name == "stage 2":
-        motion = map_to_joints(first, whole.robot.under_gravity(task.gravity), method="direct")
+        there = whole.robot.under_gravity(task.gravity)
+        try:  # as the planner does it
+            motion = map_to_joints(first, there, STEPS_S, "direct")
+        except SolverError:
+            motion = map_to_joints(first, there, method="direct")
         guess = guess_from_joints(motion, whole, task, first.toe_s)
     elif name == "looser stage 3":
         guess = loose.plan(task, first).solution.guess(asdict(whole.mesh))
@@ -181,9 +189,11 @@ def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlan
 def against_crouch(rows: Sequence[Start]) -> list[dict]:
     """One row per start: solved targets, and medians of iterations and time as shares of the crouch's.
 
-    Only targets count that the crouch has solved too; shares are None where there is none.
+    Only targets count that the crouch has solved too; shares are None where there is none. ``costlier`` counts the
+    jumps that cost more than :data:`SAME_COST` times the cheapest one found for their target, from whatever start.
     """
     crouch = {r.task: r for r in rows if r.start == STARTS[0] and r.iterations is not None}
+    least = {t: min((r.cost for r in rows if r.task == t and r.cost is not None), default=0.0) for t in crouch}
     out = []
     for name in dict.fromkeys(r.start for r in rows):
         here = [r for r in rows if r.start == name]
@@ -195,9 +205,65 @@ def against_crouch(rows: Sequence[Start]) -> list[dict]:
         }
         out.append(
             {"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
+            | {"costlier": sum(r.cost > SAME_COST * least[r.task] for r, _ in both)}
             | {key: float(np.median(x)) if x else None for key, x in shares.items()}
         )
     return out
+
+
+def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:
+    """Pitch inertia in a simulated flight [kg m^2], and what limbs alone do to it (Sec. VI-B, inertia shaping).
+
+    Returns
+    -------
+    ``lift-off``, ``least``, ``greatest``, ``touchdown``; ``legs`` and ``arms``, by how much the inertia changes if of
+    the posture where it is greatest only the legs, or only the arms, go to where they are when it is least after that.
+    """
+    at = np.searchsorted(run.t, [run.metrics.liftoff_s, run.metrics.touchdown_s])
+    rho, body = run.rho[at[0] : at[1]], FullBody(robot)
+    high = int(np.argmax(rho))
+    low = high + int(np.argmin(rho[high:]))
+    opened, folded = run.q[at[0] + high], run.q[at[0] + low]
+    arm, change, rest = np.array(["shoulder" in name for name in robot.joint_names]), {}, np.zeros(body.nv)
+    for name, moved in (("legs", ~arm), ("arms", arm)):
+        q = opened.copy()
+        q[7:][moved] = folded[7:][moved]
+        change[name] = float(body.motion(q, rest).rho - body.motion(opened, rest).rho)
+    ends = {"lift-off": rho[0], "least": rho.min(), "greatest": rho.max(), "touchdown": rho[-1]}
+    return {**{name: float(x) for name, x in ends.items()}, **change}
+
+
+def trunk_feels(run: SimulationResult, robot: Robot) -> np.ndarray:
+    """What an accelerometer at the trunk's centre of mass reads in each control cycle (N - 1,) [g].
+
+    The change of the simulated velocity over a cycle, less gravity; whatever turns with the robot has the same size.
+    """
+    lever, gravity, velocity = robot.model.inertias[1].lever, robot.model.gravity.linear, []
+    for q, v in zip(run.q, run.v, strict=True):
+        velocity.append(pin.Quaternion(q[3:7]).matrix() @ (v[:3] + np.cross(v[3:6], lever)))
+    return np.linalg.norm(np.diff(velocity, axis=0) / STEP_S - gravity, axis=1) / np.linalg.norm(gravity)
+
+
+def momentum_error(run: SimulationResult, tape: Tape) -> tuple[float, float]:
+    """Root mean square of simulated less planned L in the launch's first 0.1 s, and after, in shares of the peak."""
+    down = run.t < run.metrics.liftoff_s
+    error = (run.L - np.interp(run.t, tape.t, tape.extra["planar_L"]))[down]
+    start, top = run.t[down] < 0.1, np.abs(tape.extra["planar_L"]).max()
+    first, later = (float(np.sqrt(np.mean(e**2)) / top) for e in (error[start], error[~start]))
+    return first, later
+
+
+def touchdown_postures(plan: JumpPlan) -> list[dict[str, float | str]]:
+    """Posture at touchdown in stage 2 and in stage 3, beside the stance [deg]: four joints, trunk and foot (Fig. 7)."""
+    sagittal, joints = plan.robot.sagittal, plan.joints
+    links = {
+        "stage 2": to_link_angles(plan.robot, joints.q, joints.v, joints.a)[0][-1],
+        "stage 3": plan.tape.extra["planar_angles"][-1],
+        "stance": stance_angles(plan.robot),
+    }
+    names = (*SAGITTAL_JOINTS, "trunk", "foot")
+    found = {who: np.degrees([*sagittal.joint_angles(x), x[3], x[0]]) for who, x in links.items()}
+    return [{"what": name} | {who: float(x[i]) for who, x in found.items()} for i, name in enumerate(names)]
 
 
 # ---------------------------------------------------------------------------------------------- readings

@@ -224,10 +224,9 @@ def simulation_model(robot: Robot) -> Figure:
     axes = fig.subplots(1, 2)
     q = stance_configuration(robot)
     side = Camera(width=1.0, bottom=-0.22, x=float(q[0]), pixels_per_m=480)
-    with Renderer(robot) as studio:
-        for ax, camera in zip(axes, (replace(side, yaw_deg=40.0, pitch_deg=-14.0), side), strict=True):
-            ax.imshow(studio.picture(q, camera))
-            bare(ax)
+    for ax, camera in zip(axes, (replace(side, yaw_deg=40.0, pitch_deg=-14.0), side), strict=True):
+        ax.imshow(Renderer(robot).picture(q, camera))
+        bare(ax)
     return fig
 
 

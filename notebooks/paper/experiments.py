@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -152,8 +152,8 @@ def experiment_frames(runs: Sequence[tuple[str, SimulationResult, Scene]], robot
     fig = new_figure(PAGE_IN, sum(heights))
     axes = fig.subplots(len(runs), len(FRAMES), squeeze=False, height_ratios=heights)
     for (name, result, scene), line, camera in zip(runs, axes, cameras, strict=True):
-        with Renderer(robot, scene=scene) as studio:
-            draw_frames(line, studio, result, frame_rows(result)[list(FRAMES)], camera, fontsize=7)
+        rows = frame_rows(result)[list(FRAMES)]
+        draw_frames(line, Renderer(robot, scene=scene), result, rows, camera, fontsize=7)
         line[0].text(-0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center", fontsize=8)
     return fig
 
@@ -215,6 +215,48 @@ def landing_loads(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     _torque_shares(bars, result, robot)
     panel_letters((pitch, force, bars))
     legend_above(fig, phase_handles(*PHASE_COLORS, reference="plan", limit="weight, torque limit"))
+    return fig
+
+
+# Two engines ---------------------------------------------------------------------------------------------------
+@styled
+def engines_compared(runs: Mapping[str, SimulationResult], tape: Tape, robot: Robot) -> Figure:
+    """The same jump by several engines, and the plan: height of the CoM, trunk pitch, force of the ground."""
+    fig = new_figure(PAGE_IN, 2.3)
+    axes = fig.subplots(1, 3)
+    labels = ("height of the CoM [m]", "trunk pitch [deg]", "mean vertical force [kN]")
+    for (name, run), color, style in zip(runs.items(), (LAUNCH, VERMILION, PURPLE), ("-", "--", "-."), strict=False):
+        seen, step = run.t <= tape.t[-1] + STANDING_UP_S, float(run.t[1] - run.t[0])
+        force = smooth(run.foot_wrench[:, :, 2].sum(axis=1), step) / 1000
+        for ax, y in zip(axes, (run.com[:, 2], np.degrees(trunk_pitch(run.q)), force), strict=True):
+            ax.plot(run.t[seen], y[seen], style, color=color, label=name)
+    force = smooth(tape.f[:, :, 2].sum(axis=1), float(tape.t[1] - tape.t[0])) / 1000
+    for ax, y in zip(axes, (tape.extra["planar_com"][:, 1], np.degrees(trunk_pitch(tape.q)), force), strict=True):
+        ax.plot(tape.t, y, ":", color=INK, linewidth=1.0, label="plan")
+    limits(axes[2], robot.total_mass * GRAVITY / 1000)
+    for ax, label in zip(axes, labels, strict=True):
+        ax.set(xlabel="time [s]", ylabel=label)
+    panel_letters(axes)
+    legend_above(fig, axes[0].get_legend_handles_labels()[0])
+    return fig
+
+
+@styled
+def soft_ground(runs: Mapping[float, SimulationResult], tape: Tape, task: JumpTask) -> Figure:
+    """Travel of the feet and pitch of the trunk over how long a penetration takes to fade; open marks fell."""
+    fig = new_figure(PAGE_IN, 2.2)
+    travel, pitch = fig.subplots(1, 2)
+    planned = task.distance_m, np.degrees(trunk_pitch(tape.q)[-1])
+    for time_s, run in runs.items():
+        k, look = run.metrics, dict(marker="o", color=LAUNCH, fillstyle="full" if run.landed else "none")
+        for ax, y in ((travel, k.foot_distance_m), (pitch, k.touchdown_trunk_pitch_rad)):
+            if y is not None:
+                ax.plot(1000 * time_s, y if ax is travel else np.degrees(y), **look)
+    for ax, y, label in zip((travel, pitch), planned, ("travel of the feet [m]", "trunk pitch [deg]"), strict=True):
+        ax.axhline(y, **REFERENCE_STYLE)
+        ax.set(xscale="log", xlabel="a penetration fades in [ms]", ylabel=label)
+        ax.xaxis.set_major_formatter("{x:g}")
+    panel_letters((travel, pitch))
     return fig
 
 

@@ -1,17 +1,15 @@
 """Rendered pictures of logged states: the frame strip of a jump (Fig. 11), and what others are made with.
 
-PyBullet's software renderer draws the shapes that the simulation collides with; neither a display nor a graphics driver
-is needed. Nothing here is simulated: a state is taken from a log, the robot is put there, the camera looks.
+Drawn here, ray by ray: no physics engine, display or graphics library is needed. Nothing is simulated: a state
+is taken from a log, the robot is put there, the camera looks.
 
->>> with Renderer(robot) as studio:
-...     picture = studio.picture(result.q[0], Camera(x=0.5))
+>>> picture = Renderer(robot).picture(result.q[0], Camera(x=0.5))
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,28 +17,32 @@ import matplotlib.colors as mcolors
 import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
 
 from jumplab.robot import Robot
 from jumplab.show.bodies import ABOVE_M, JOINT_RADIUS_M, LIMB_SHARE, ROD_RADIUS_M, skeleton
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
-from jumplab.sim.bullet import base_to_bullet, bullet, load_urdf
 from jumplab.sim.scene import Scene
 
 if TYPE_CHECKING:
     from jumplab.sim import SimulationResult
 
-OVERSAMPLING = 2  # the renderer does not smooth edges, so pictures are drawn larger and averaged
+OVERSAMPLING = 2  # pictures are drawn larger and averaged, which smooths edges
 STRIPE_M = 0.25  # the ground is striped, so that distances can be counted
 SEEN_M, HALF_WIDTH_M = (-4.5, 4.5), 0.45  # what is built of the ground; the longest jump allowed is 3 m
 GREYS, JOINT_GREY = (0.87, 0.76), 0.35
 COLUMNS = 6  # frames per line of a page-wide strip, each then 1.2 in wide
 TITLE_IN = 0.17  # room for a frame's title
 MARK_M = 0.015  # width of a line on the ground
-LIGHT = {"lightDirection": (0.4, -1.6, 2.4), "lightColor": (1, 1, 1), "lightDistance": 4.0, "shadow": 0}
-SHINE = {"lightAmbientCoeff": 0.65, "lightDiffuseCoeff": 0.4, "lightSpecularCoeff": 0.0}
+LIGHT = np.array([0.4, -1.6, 2.4]) / np.linalg.norm([0.4, -1.6, 2.4])  # towards the lamp
+AMBIENT, DIFFUSE = 0.65, 0.4  # share of its colour that a face has anyway, and that the lamp adds
 DISTANCE_M = 10.0  # far away, so that near and far legs look equally large
+EDGE_ON_M = 1e-9  # the plane of a face goes through the camera
 BELOW_M = 0.14  # seen below the ground
+TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+RING = np.stack([np.cos(TURN), np.sin(TURN), 0 * TURN], -1)  # (24, 3), of a rod
+GLOBE = np.vstack([RING * np.cos(a) + [0, 0, np.sin(a)] for a in np.linspace(-np.pi / 2, np.pi / 2, 13)[1:-1]])
 
 
 @dataclass(frozen=True)
@@ -60,105 +62,133 @@ class Camera:
         """Width and height in pixels."""
         return round(self.width * self.pixels_per_m), round((self.top - self.bottom) * self.pixels_per_m)
 
-    def matrices(self) -> tuple[list[float], list[float]]:
-        """View and projection as PyBullet wants them."""
-        target = (self.x, 0.0, (self.top + self.bottom) / 2)
-        opening = 2 * np.degrees(np.arctan((self.top - self.bottom) / 2 / DISTANCE_M))
-        width, height = self.size
-        view = bullet.computeViewMatrixFromYawPitchRoll(target, DISTANCE_M, self.yaw_deg, self.pitch_deg, 0.0, 2)
-        return view, bullet.computeProjectionMatrixFOV(opening, width / height, 1.0, 2 * DISTANCE_M)
+    @property
+    def axes(self) -> np.ndarray:
+        """Where right, up and away from the camera point (3, 3), world axes, one per row."""
+        (cy, sy), (cp, sp) = ((np.cos(a), np.sin(a)) for a in np.radians([self.yaw_deg, self.pitch_deg]))
+        right, away = np.array([cy, sy, 0.0]), np.array([-sy * cp, cy * cp, sp])
+        return np.array([right, np.cross(right, away), away])
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Place of the camera (3,) [m]."""
+        return np.array([self.x, 0.0, (self.top + self.bottom) / 2]) - DISTANCE_M * self.axes[2]
 
 
-class Renderer(AbstractContextManager):
+class Shape:
+    """The convex hull of ``corners`` (n, 3) [m], which moves with a joint (0: the ground).
+
+    ``part`` is "trunk" or "limb" where the colour of a phase replaces its own ``color`` (3,).
+    """
+
+    def __init__(self, joint: int, corners: np.ndarray, color: Sequence[float], part: str = ""):
+        self.joint, self.corners, self.color, self.part = joint, corners, np.array(color[:3]), part
+        faces = ConvexHull(corners).equations
+        self.normals, self.offsets = faces[:, :3], faces[:, 3]
+
+
+class Renderer:
     """A robot on the ground of a scene (flat if None), with lines across at ``marks`` [m].
 
-    Use as a context manager, or call :meth:`close`.
+    Boxes are drawn as in the URDF, its other shapes as their bounding boxes.
     """
 
     def __init__(self, robot: Robot, *, scene: Scene | None = None, marks: Sequence[float] = ()):
         self.robot, self._data = robot, robot.model.createData()
-        self._client = bullet.connect(bullet.DIRECT)
-        self._here = {"physicsClientId": self._client}
-        self._marks: list[tuple[int, int, pin.SE3]] = []  # shape, the joint that carries it, its place there
-        try:
-            self._body = load_urdf(robot.urdf, robot.name, self._client)
-            self._lever = np.array(bullet.getDynamicsInfo(self._body, -1, **self._here)[3])
-            count = bullet.getNumJoints(self._body, **self._here)
-            info = [bullet.getJointInfo(self._body, i, **self._here) for i in range(count)]
-            self._joints = {row[1].decode(): i for i, row in enumerate(info)}
-            self._paint = {row[1]: row[7] for row in bullet.getVisualShapeData(self._body, **self._here)}
-            feet = {i for i, row in enumerate(info) if row[12].decode() in robot.foot.frames}
-            self._limbs = set(self._paint) - feet - {-1}
-            self._lay_ground(scene or Scene.flat(), marks)
-            self._add_skeleton()
-        except BaseException:
-            self.close()
-            raise
-
-    def __exit__(self, *exc) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the engine."""
-        if self._client is not None:
-            bullet.disconnect(**self._here)
-            self._client = None
+        self._shapes = [*_ground(scene or Scene.flat(), marks), *_links(robot), *_skeleton(robot)]
 
     def picture(self, q: np.ndarray, camera: Camera, color: str | None = None) -> np.ndarray:
         """The robot at configuration ``q`` (nq,), in its own colours or in ``color``: (height, width, 3), 0 ... 1."""
-        self._pose(np.asarray(q, float))
-        for link, own in self._paint.items():
-            painted = color is not None and (link == -1 or link in self._limbs)
-            paint = (*tint(color, 1.0 if link == -1 else LIMB_SHARE), 1.0) if painted else own
-            bullet.changeVisualShape(self._body, link, rgbaColor=paint, **self._here)
-        width, height = (OVERSAMPLING * n for n in camera.size)
-        look = {"renderer": bullet.ER_TINY_RENDERER, **LIGHT, **SHINE}
-        shot = bullet.getCameraImage(width, height, *camera.matrices(), **look, **self._here)
-        image = np.reshape(shot[2], (height, width, 4))[:, :, :3] / 255.0
-        image[np.reshape(shot[4], (height, width)) < 0] = 1.0  # where no body is: white
-        return image.reshape(camera.size[1], OVERSAMPLING, camera.size[0], OVERSAMPLING, 3).mean(axis=(1, 3))
+        pin.forwardKinematics(self.robot.model, self._data, np.asarray(q, float))
+        canvas = _Canvas(camera)
+        for shape in self._shapes:
+            paint = shape.color
+            if color is not None and shape.part:
+                paint = np.array(mcolors.to_rgb(tint(color, 1.0 if shape.part == "trunk" else LIMB_SHARE)))
+            canvas.draw(shape, self._data.oMi[shape.joint], paint)
+        width, height = camera.size
+        return canvas.image.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3).mean(axis=(1, 3))
 
-    def _add(self, kind: int, place: Sequence[float], color: Sequence[float], **shape) -> int:
-        visual = bullet.createVisualShape(kind, rgbaColor=(*color, 1.0), **shape, **self._here)
-        return bullet.createMultiBody(0, -1, visual, basePosition=place, **self._here)
 
-    def _slab(self, start: float, end: float, top: float, thickness: float, color: Sequence[float]) -> None:
-        half = [(end - start) / 2, HALF_WIDTH_M, thickness / 2]
-        self._add(bullet.GEOM_BOX, [(start + end) / 2, 0.0, top - thickness / 2], color, halfExtents=half)
+class _Canvas:
+    """A picture in the making: for every pixel the colour, and how near it is (one over the depth; 0: nothing)."""
 
-    def _lay_ground(self, scene: Scene, marks: Sequence[float]) -> None:
-        lowest = min((block.top for block in scene.blocks), default=0.0)
-        for block in scene.blocks:
-            start, end = max(block.x_from, SEEN_M[0]), min(block.x_to, SEEN_M[1])
-            cuts = [start, *np.arange(np.floor(start / STRIPE_M) + 1, np.ceil(end / STRIPE_M)) * STRIPE_M, end]
-            depth = block.top - lowest or 0.05  # walls of ditches and platforms reach down to the lowest ground
-            for a, b in itertools.pairwise(cuts):
-                if b - a > 1e-9:
-                    grey = GREYS[int(np.floor((a + b) / 2 / STRIPE_M)) % 2]
-                    self._slab(a, b, block.top, depth, (grey,) * 3)
-        for x in marks:
-            top = scene.top_at(x) + 0.002
-            self._slab(x - MARK_M / 2, x + MARK_M / 2, top, 0.004, mcolors.to_rgb(VERMILION))
+    def __init__(self, camera: Camera):
+        self._camera, self._size = camera, OVERSAMPLING * np.array(camera.size)
+        self._per_depth = OVERSAMPLING * camera.pixels_per_m * DISTANCE_M  # [1] pixels per ratio of width to depth
+        self.image, self._near = np.ones((*self._size[::-1], 3)), np.zeros(self._size[::-1])
 
-    def _add_skeleton(self) -> None:
-        place, grey = (0, 0, 0), (JOINT_GREY,) * 3
-        for joint, rod in skeleton(self.robot, (0, 0, 1)):
-            ball = self._add(bullet.GEOM_SPHERE, place, grey, radius=JOINT_RADIUS_M)
-            self._marks.append((ball, joint, pin.SE3.Identity()))
-            if rod:
-                above, length, at = rod
-                shape = self._add(bullet.GEOM_CYLINDER, place, grey, radius=ROD_RADIUS_M, length=length)
-                self._marks.append((shape, above, at))
+    def draw(self, shape: Shape, at: pin.SE3, color: np.ndarray) -> None:
+        """``shape``, where nothing nearer is drawn.
 
-    def _pose(self, q: np.ndarray) -> None:
-        place, attitude, *_ = base_to_bullet(q, np.zeros(6), self._lever)
-        bullet.resetBasePositionAndOrientation(self._body, place, attitude, **self._here)
-        for name, angle in zip(self.robot.joint_names, q[7:], strict=True):
-            bullet.resetJointState(self._body, self._joints[name], float(angle), **self._here)
-        pin.forwardKinematics(self.robot.model, self._data, q)
-        for shape, joint, at in self._marks:
-            pose = pin.SE3ToXYZQUAT(self._data.oMi[joint] * at)
-            bullet.resetBasePositionAndOrientation(shape, pose[:3], pose[3:], **self._here)
+        Along a ray, one over the depth of a face's plane is linear in the pixel. A ray is inside of a convex body from
+        the last plane that it enters, on the camera's side, to the first that it leaves.
+        """
+        right, up, away = self._camera.axes
+        sight = shape.corners @ at.rotation.T + at.translation - self._camera.eye
+        shown = np.column_stack([sight @ right, sight @ -up]) / (sight @ away)[:, None] * self._per_depth
+        low, high = np.floor(shown.min(axis=0) + self._size / 2), np.ceil(shown.max(axis=0) + self._size / 2)
+        (left, top), (end, bottom) = (np.clip(x, 0, self._size).astype(int) for x in (low, high))
+        x, y = (np.arange(*of) + 0.5 - n / 2 for of, n in zip(((left, end), (top, bottom)), self._size, strict=True))
+        if not (len(x) and len(y)):
+            return
+        normals = shape.normals @ at.rotation.T
+        outside = shape.offsets + normals @ (self._camera.eye - at.translation)  # [m] of the camera, before each face
+        outside = np.where(np.abs(outside) < EDGE_ON_M, EDGE_ON_M, outside)
+        faces, window = outside > 0, np.s_[top:bottom, left:end]
+        rays = away + (x[None, :, None] * right - y[:, None, None] * up) / self._per_depth
+        near = -rays @ (normals / outside[:, None]).T
+        enters = near[..., faces].min(axis=-1)
+        seen = (enters >= near[..., ~faces].max(axis=-1)) & (enters > self._near[window])
+        light = AMBIENT + DIFFUSE * np.maximum(normals[faces] @ LIGHT, 0.0)
+        face = near[..., faces].argmin(axis=-1)[seen]
+        self._near[window][seen] = enters[seen]
+        self.image[window][seen] = np.minimum(light[:, None] * color, 1.0)[face]
+
+
+def _box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Corners (8, 3) of a box."""
+    return np.array(list(itertools.product(*zip(low, high, strict=True))), float)
+
+
+def _ground(scene: Scene, marks: Sequence[float]) -> list[Shape]:
+    lowest, out = min((block.top for block in scene.blocks), default=0.0), []
+    for block in scene.blocks:
+        start, end = max(block.x_from, SEEN_M[0]), min(block.x_to, SEEN_M[1])
+        cuts = [start, *np.arange(np.floor(start / STRIPE_M) + 1, np.ceil(end / STRIPE_M)) * STRIPE_M, end]
+        depth = block.top - lowest or 0.05  # walls of ditches and platforms reach down to the lowest ground
+        for a, b in itertools.pairwise(cuts):
+            if b - a > 1e-9:
+                grey = GREYS[int(np.floor((a + b) / 2 / STRIPE_M)) % 2]
+                slab = _box((a, -HALF_WIDTH_M, block.top - depth), (b, HALF_WIDTH_M, block.top))
+                out.append(Shape(0, slab, (grey,) * 3))
+    for x in marks:
+        low = (x - MARK_M / 2, -HALF_WIDTH_M, scene.top_at(x) - 0.002)
+        line = _box(low, (x + MARK_M / 2, HALF_WIDTH_M, scene.top_at(x) + 0.002))
+        out.append(Shape(0, line, mcolors.to_rgb(VERMILION)))
+    return out
+
+
+def _links(robot: Robot) -> list[Shape]:
+    out = []
+    for g in pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL).geometryObjects:
+        g.geometry.computeLocalAABB()
+        corners = _box(g.geometry.aabb_local.min_, g.geometry.aabb_local.max_)
+        foot = robot.model.frames[g.parentFrame].name in robot.foot.frames
+        part = "trunk" if g.parentJoint == 1 else "" if foot else "limb"
+        out.append(Shape(g.parentJoint, corners @ g.placement.rotation.T + g.placement.translation, g.meshColor, part))
+    return out
+
+
+def _skeleton(robot: Robot) -> list[Shape]:
+    out, grey = [], (JOINT_GREY,) * 3
+    for joint, rod in skeleton(robot, (0, 0, 1)):
+        out.append(Shape(joint, JOINT_RADIUS_M * GLOBE, grey))
+        if rod:
+            above, length, at = rod
+            ends = [ROD_RADIUS_M * RING + [0.0, 0.0, end] for end in (-length / 2, length / 2)]
+            out.append(Shape(above, np.vstack(ends) @ at.rotation.T + at.translation, grey))
+    return out
 
 
 def frame_rows(result: SimulationResult) -> np.ndarray:
@@ -211,6 +241,5 @@ def frame_strip(
     width, lines = PAGE_IN / COLUMNS, len(rows) // COLUMNS
     fig = new_figure(PAGE_IN, lines * (width * camera.size[1] / camera.size[0] + TITLE_IN))
     axes = fig.subplots(lines, COLUMNS)
-    with Renderer(robot, scene=scene, marks=marks) as studio:
-        draw_frames(axes.flat, studio, result, rows, camera)
+    draw_frames(axes.flat, Renderer(robot, scene=scene, marks=marks), result, rows, camera)
     return fig

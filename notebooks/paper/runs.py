@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import joblib
 
 from jumplab.io import folder as store
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
 from jumplab.sim import SimulationResult, simulate_jump
 from jumplab.sim.result import STAND_S
 from jumplab.studies.basin import BasinGrid, state_keys
@@ -48,6 +51,24 @@ def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = 
     """
     work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
     return dict(zip(jumps, in_parallel(work, jobs, "list"), strict=True))
+
+
+def on_softer_ground(
+    tape: Tape, robot: Robot, times_s: Sequence[float], *, jobs: int | None = None
+) -> dict[float, SimulationResult]:
+    """Simulate ``tape`` in MuJoCo, on grounds in which a penetration fades in each of ``times_s`` [s]."""
+    work = [joblib.delayed(_on_ground)(tape, robot, time_s) for time_s in times_s]
+    return dict(zip(times_s, in_parallel(work, jobs, "list"), strict=True))
+
+
+def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
+    from jumplab.sim.mujoco import SOFTNESS, MujocoEngine
+
+    MujocoEngine.softness = replace(SOFTNESS, time_s=time_s)
+    try:
+        return simulate_jump(tape, robot, engine="mujoco")
+    finally:
+        MujocoEngine.softness = SOFTNESS
 
 
 def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), grid: BasinGrid | None = None) -> int:

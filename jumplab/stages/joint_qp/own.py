@@ -3,6 +3,10 @@
 >>> still = jl.Term("still hands", "ours", "m/s^2", "node", lambda p: p.point("left_hand").acceleration, weight=1e-3)
 >>> low = jl.Term("knee", "ours", "N m", "node", lambda p: p.torques.knee, lower=-150, upper=150)
 >>> plan = stages.joint_qp.map_to_joints(srmp, robot, terms={"flight": [still], "launch": [low]})
+
+Every step has its own QP, which sees no later step. So a cost with a larger weight is smaller in every step from the
+same state, but over the roll-out only while no joint is braked before its stop: dearer arms, say, swing on freely, meet
+the stop faster, and are braked harder there than if an earlier step had slowed them.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import pinocchio as pin
 from jumplab.errors import InputError, quoted
 from jumplab.models.full import FullBody, FullTerms, skew
 from jumplab.ocp import Term
+from jumplab.ocp.changes import ends
 from jumplab.robot import SAGITTAL_JOINTS
 
 SIDES = ("left", "right")
@@ -261,18 +266,14 @@ class OwnRows:
         seen, self._sides = point(start, 0.0) if terms else None, {}
         for term in self.terms:
             size = len(self._rows(term, seen))
-            low, high = (self._bound(term, side, size) for side in ("lower", "upper"))
-            if np.any(low > high):
-                raise InputError(
-                    f"{self._who(term)}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}"
-                )
+            low, high = ends(self._who(term), term, size)
             matrix = "A" if term.is_cost else "E" if np.array_equal(low, high) else "G"
             self._sides[term.name] = matrix, low, high, np.isfinite(low), np.isfinite(high)
-            ends = [str(k) for k in range(size)]
+            names = [str(k) for k in range(size)]
             if matrix == "G":
-                ends = [f"{k} low" for k in np.flatnonzero(np.isfinite(low))]
-                ends += [f"{k} high" for k in np.flatnonzero(np.isfinite(high))]
-            self.blocks[matrix].append((term.name, ends))
+                names = [f"{k} low" for k in np.flatnonzero(np.isfinite(low))]
+                names += [f"{k} high" for k in np.flatnonzero(np.isfinite(high))]
+            self.blocks[matrix].append((term.name, names))
 
     def fill(self, matrices: dict[str, tuple[np.ndarray, np.ndarray]], layout: Any, terms: FullTerms, t: float) -> None:
         """Write the rows into A, b and E, e and G, h (by "A", "E" and "G") of a step with these quantities."""
@@ -304,15 +305,3 @@ class OwnRows:
         if not (np.all(np.isfinite(x.matrix)) and np.all(np.isfinite(x.offset))):
             raise InputError(f"{self._who(term)}: its expression is not finite at t = {seen.time:.3f} s")
         return x
-
-    def _bound(self, term: Term, side: str, size: int) -> np.ndarray:
-        bound = getattr(term, side)
-        try:
-            value = np.asarray(bound, float).ravel()
-        except (TypeError, ValueError):
-            raise InputError(f"{self._who(term)}: {side} = {quoted(bound)} is no number") from None
-        if value.size not in (1, size) or np.any(np.isnan(value)):
-            raise InputError(
-                f"{self._who(term)}: {side} = {quoted(bound)} does not fit its expression, which has {size} rows"
-            )
-        return np.broadcast_to(value, (size,))

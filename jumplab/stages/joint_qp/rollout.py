@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -91,6 +91,7 @@ class JointPlan:
     tracking: dict[str, float]  # summary of errors, see the function
     statistics: Statistics
     options: Options  # of the QPs that made it
+    gentle: str = ""  # why it follows stage 1 less closely than usual: what the usual weights ended in
 
     def rows(self, phase: str) -> slice:
         """Rows of one phase."""
@@ -295,7 +296,8 @@ def map_to_joints(
     srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
     robot : the robot.  step_s : step of the roll-out [s], or one each for flat feet, toes and flight.
     method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
-    options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``.
+    options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``; the
+        plan's ``gentle`` then says why.
     q0 : (nq,) start at rest; the robot's stance by default.
     terms : "launch" or "flight" -> own terms, costs or constraints on a :class:`.own.StepPoint`.
     weights : "block" or "phase/block" -> factor on its weight.  off : "block" or "phase/block" to leave out.
@@ -312,6 +314,7 @@ def map_to_joints(
         return JointMapper(srmp_plan, robot, step_s, Options(), **changes).run(method)
     except SolverError as firm:
         try:
-            return JointMapper(srmp_plan, robot, step_s, GENTLE, **changes).run(method)
+            plan = JointMapper(srmp_plan, robot, step_s, GENTLE, **changes).run(method)
         except SolverError:
             raise firm from None
+        return replace(plan, gentle=str(firm))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jumplab.ocp import Term
+from jumplab.task import FRICTION
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class FlightWeights:
 class Limits:
     """What the motion may use of ground and joints. ``None`` switches a family of rows off."""
 
-    friction: float | None = 0.45  # below the lowest friction that the trials simulate (0.5)
+    friction: float | None = FRICTION
     cop_margin_m: float | None = 0.0  # inside the sole's edges
     unilateral: bool = True  # F_z >= 0 at each foot
     torque_share: float | None = 1.0  # of the peak torque, with the speed line of the actuator

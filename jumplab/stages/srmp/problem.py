@@ -267,8 +267,9 @@ def _launch_phases(mass: float, reach: Reach, s: SrmpSettings) -> tuple[Phase, P
 def _flight_phase(reach: Reach, s: SrmpSettings) -> Phase:
     stance, (low, high) = reach.start[1], reach.inertia
     margin = s.inertia_margin * (high - low)
+    most = min(high - margin, low + s.flight_inertia * (high - low))
     bounds = (
-        Bound("inertia range", "SF-B1", "kg m^2", "q", low + margin, high - margin),
+        Bound("inertia range", "SF-B1", "kg m^2", "q", low + margin, most),
         Bound("inertia rate range", "SF-B1", "kg m^2/s", "v", -s.inertia_rate, s.inertia_rate),
         Bound("inertia acceleration range", "SF-B1", "kg m^2/s^2", "a", -s.inertia_accel, s.inertia_accel),
     )

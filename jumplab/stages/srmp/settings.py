@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from jumplab.task import FRICTION
+
 
 @dataclass(frozen=True)
 class SrmpSettings:
     """Weights and bounds of stage 1; the paper prints none of these numbers. Weights are integrated over time."""
 
     intervals: tuple[int, int, int] = (28, 12, 40)  # flat foot, toe, flight
-    friction: float = 0.45  # as in stage 3
+    friction: float = FRICTION
     cop_margin_m: float = 0.015  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     toe_band_m: float = 0.0015  # heel up: the CoP is this close to the toe edge; less, and solves take longer
     toe_slack_n_m: float = 2.0  # added there, where force and torque vanish together and their quotient bends
@@ -21,6 +23,9 @@ class SrmpSettings:
     corner_speed: float = 0.5  # share of the extension speed up to which the full leg force is there
     momentum: tuple[float, float] = (-45.0, 45.0)  # box on L [kg m^2/s]: a backflip needs about -35
     inertia_margin: float = 0.05  # share of the envelope's width kept free on either side
+    flight_inertia: float = (
+        0.76  # share of its width up to which a flight goes: more takes straight legs and raised arms
+    )
     takeoff_lean: tuple[float, float] = (-0.5, 0.7)  # [rad]
     takeoff_length: float = 0.95  # share of the standing phi at most: knees still bent, far from the straight leg
     inertia_rate: float = 40.0  # box on d rho/dt [kg m^2/s]: all limbs at half of their speed limits
@@ -56,4 +61,4 @@ class SrmpSettings:
         Trunk and arms swing upward with the legs' extension, so a flip leaves the ground faster than legs alone would;
         the turn is had by folding, not by more momentum in an open body.
         """
-        return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0))
+        return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0), flight_inertia=1.0)

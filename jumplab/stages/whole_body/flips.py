@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
-EFFORT = {"max_iter": 150, "max_wall_time": 15.0}  # a solve that needs more is lost
+EFFORT = {"max_iter": 150}  # a solve that needs more is lost; a count, so that a busy machine plans the same
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}  # the second search, where the adaptive barrier wanders
 # Postures of the guess: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip of 0.6 m on
 # the spot; six of the flat foot, three of the toe phase, six of the flight. Back: the arms swing up and forward, the
@@ -49,6 +50,9 @@ class FlipPlanner(WholeBodyPlanner):
 
     A jump without rotation is another planner's and stays the same problem whatever flips need. Mesh, limits and
     weights are by default those of a flip (``of_flip``).
+
+    A flip has several local solutions. With ``changes``, or with weights of one plan, the solve begins with the
+    solution without them: so it keeps to that one as a weight grows, and what two weights lead to can be compared.
     """
 
     def __init__(
@@ -72,6 +76,13 @@ class FlipPlanner(WholeBodyPlanner):
         )
         first = Nlp(rough, {**COARSE, **options})
         self._searches = (first, first.with_options({**COARSE, **MONOTONE, **options}))
+        self._plain = partial(FlipPlanner, robot, *settings, tracking=tracking, options=options)
+
+    @cached_property
+    def _usual(self) -> FlipPlanner | None:
+        """The planner without the changes; None if they change nothing."""
+        plain = build_problem(self.robot, self.mesh, self.limits, self.weights, tracking=self.tracking)
+        return None if self.changes.applied(plain) == plain else self._plain()
 
     def plan(
         self,
@@ -95,6 +106,19 @@ class FlipPlanner(WholeBodyPlanner):
         SolverError
             After some seconds, if a search ends without a plan; it says at which height.
         """
+        usual = self._usual or (self if weights or off else None)
+        if usual is not None:
+            asked = Asked(task, srmp, self.parameters(task, srmp), weights or {}, off)
+            try:
+                near = usual.plan(task, srmp, guess=guess, stage1=stage1)
+                return replace(near, solution=self._run(self._warm.solve, asked, near.solution, explain=False))
+            except SolverError:  # perhaps only with the changes there is a solution
+                if guess is not None:  # without them the postures would be next, so they are
+                    raise
+        return self._searched(task, srmp, guess, weights, off, stage1)
+
+    def _searched(self, task: JumpTask, srmp: SrmpPlan | None, guess, weights, off, stage1) -> WholeBodyPlan:
+        """The plan as :meth:`plan` makes it from a guess."""
         way = [task] if guess is not None or (self.tracking and stage1 is None) else climb(task)
         plans = [srmp if t is task or not self.tracking else stage1(t) for t in way]
         asked = [Asked(t, one, self.parameters(t, one), weights or {}, off) for t, one in zip(way, plans, strict=True)]

@@ -99,6 +99,7 @@ def build_problem(
     tracking: bool = True,
 ) -> Problem:
     """Flat foot, toe and flight in one problem: stage 3 with ``tracking``, the direct planner without."""
+    weights = replace(weights, jerk=weights.tracking_jerk) if tracking else weights
     terms = flat, toe, flight = [WholeBodyTerms(robot, limits, weights, contact) for contact in Contact]
     phases = [_flat_phase(flat, mesh, limits), _toe_phase(toe, mesh, limits), _flight_phase(flight, mesh)]
     phases = [replace(p, view=partial(BodyView, b)) for b, p in zip(terms, phases, strict=True)]

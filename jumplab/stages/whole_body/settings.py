@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from jumplab.errors import InputError, quoted
+from jumplab.task import FRICTION
 
 JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
@@ -30,7 +31,7 @@ class Limits:
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
-    friction: float = 0.45  # below the lowest friction that the trials simulate (0.5)
+    friction: float = FRICTION
     cop_margin_m: float = 0.01  # ahead of the heel; at the toe none, because the CoP ends there before the heel rises
     range_margin_rad: float = 0.03  # to the joint stops
     hand_clearance_m: float = 0.05  # above the ground in launch
@@ -96,18 +97,25 @@ class Weights:
 
     joint_acceleration: float = 4e-3  # [1] / [rad/s^2]^2 / [s]
     jerk: float = 4e-7  # [1] / [rad/s^3]^2 / [s]
+    tracking_jerk: float = 5e-7  # the same where stage 1 is tracked: limbs in haste, which a tape must still follow
     torque: float = 1e-4  # [1] / [N m]^2 / [s]
     track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
-    track_inertia: float = 2.0  # [1] / [kg m^2]^2 / [s]
-    track_inertia_rate: float = 0.02  # [1] / [kg m^2/s]^2 / [s]
+    # inertia in shares of the stance's, so that weights mean the same for robots of any size
+    track_inertia: float = 6800.0  # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
+    track_inertia_rate: float = 23.0  # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
+    track_flight_inertia_rate: float = 136.0  # the same in flight; less, and arms swing the other way and miss by 6 %
     track_momentum: float = 2.0  # [1] / [kg m^2/s]^2 / [s]
     heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
     ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
     track_duration: float = 50.0  # [1] / [s]^2
 
     def of_flip(self) -> Weights:
-        """The same for a jump that turns over: limbs in haste, whose jerk must not jump between nodes."""
-        return replace(self, jerk=2.5 * self.jerk)
+        """The same for a jump that turns over: limbs in haste, whose jerk must not jump between nodes.
+
+        Its inertia follows from the turn and from L; stage 1's, of a rod that turns as one, is only a hint.
+        """
+        light = {"track_inertia": 45.4, "track_inertia_rate": 0.454, "track_flight_inertia_rate": 0.454}
+        return replace(self, jerk=2.5 * self.jerk, tracking_jerk=2.5 * self.jerk, **light)
 
 
 @dataclass(frozen=True)

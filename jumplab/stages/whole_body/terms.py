@@ -11,6 +11,8 @@ import numpy as np
 from jumplab.models.planar import PlanarState
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
+from jumplab.robot.reach import rod_of
+from jumplab.robot.stance import stance_angles
 from jumplab.stages.whole_body.settings import JERK_SCALE, RESERVE_SHARE, Contact, Limits, Weights
 from jumplab.task import GRAVITY
 
@@ -48,6 +50,7 @@ class WholeBodyTerms:
         self.model, self.limits, self.weights, self.contact = robot.sagittal, limits, weights, contact
         self.flying = contact is Contact.FLIGHT
         self.mg = self.model.total_mass * GRAVITY  # nominal size of forces
+        self.stance_inertia = self.model.total_mass * rod_of(robot, stance_angles(robot))[3] ** 2  # [kg m^2]
 
     # model on a point -------------------------------------------------------------------------------------------
     def links(self, x: ca.SX) -> ca.SX:
@@ -146,15 +149,11 @@ class WholeBodyTerms:
         Heel up, the heel stays quiet besides, and L at take-off is stage 1's (WL-D1).
         """
         w, s, origin, spin = self.weights, self.state, "WF-J1" if self.flying else "WL-J1", "WL-D1, as a cost on L"
+        rates = w.track_flight_inertia_rate if self.flying else w.track_inertia_rate
+        inertia, rate = (float(x / self.stance_inertia**2) for x in (w.track_inertia, rates))
         rows = [
-            cost("track inertia", origin, "kg m^2", lambda p: s(p).inertia - p.ref.rho, w.track_inertia),
-            cost(
-                "track inertia rate",
-                origin,
-                "kg m^2/s",
-                lambda p: s(p).inertia_rate - p.ref.rho_rate,
-                w.track_inertia_rate,
-            ),
+            cost("track inertia", origin, "kg m^2", lambda p: s(p).inertia - p.ref.rho, inertia),
+            cost("track inertia rate", origin, "kg m^2/s", lambda p: s(p).inertia_rate - p.ref.rho_rate, rate),
         ]
         if self.flying:
             return [*rows, cost("ankle rate", "WF-J2", "rad/s", lambda p: s(p).joint_rates[2], w.ankle_rate)]

@@ -160,11 +160,19 @@ class Foresight:
 
 class ChainPilot:
     """Commands of a whole chain, as its :class:`Foresight` plans it; ``landing``, ``look_s`` and ``revise_s`` are those
-    of :func:`jumplab.studies.chain.run_chain`."""
+    of :func:`jumplab.studies.chain.run_chain`, ``lead_s`` that of each jump's :class:`jumplab.sim.pilot.Pilot`."""
 
-    def __init__(self, foresight: Foresight, scene: Scene, landing: str, look_s: float, revise_s: float | None):
+    def __init__(
+        self,
+        foresight: Foresight,
+        scene: Scene,
+        landing: str,
+        look_s: float,
+        revise_s: float | None,
+        lead_s: float = 0.0,
+    ):
         self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
-        self._landing, self._look_s, self._revise_s = landing, look_s, revise_s
+        self._landing, self._look_s, self._revise_s, self._lead_s = landing, look_s, revise_s, lead_s
         self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
         self._tau = np.zeros(len(self._robot.joint_names))
         self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
@@ -220,7 +228,7 @@ class ChainPilot:
         command = pilot.command(now, q, v, force)
         if pilot.touchdown is None and now > pilot.last_step:
             self.reason = self.reason or f"jump {len(self.began)} never touched down"
-        return command if command.q is None else self._blended(command, now * STEP_S)
+        return command if command.q is None else self._blended(command, (now + pilot.playback.lead) * STEP_S)
 
     def _think(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
         """Plan the next jump when it is time to, and begin it when plan and robot are ready."""
@@ -294,7 +302,7 @@ class ChainPilot:
             self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
         self._from, self._offset = float(toe[0]), (q[7:] - tape.q[0, 7:], v[6:].copy())
         self.used.append(ahead)
-        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing))
+        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, lead_s=self._lead_s))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:

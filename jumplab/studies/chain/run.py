@@ -59,7 +59,7 @@ def run_chain(
     revise_s : when a plan made in the air is made again, after touchdown [s]; never if None. The robot waits for
         neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
-    engine : "bullet" or "mujoco".
+    engine : as in :func:`jumplab.sim.simulate_jump`.
     method : "three-step" or "direct".
     """
     _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
@@ -72,7 +72,7 @@ def run_chain(
         rehearsal = Rehearsal.of(course, planner, method)
     run = Run(waiting, perturbation, course.scene(waiting), engine)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s, method)
-    pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s)
+    pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s, run.perturbation.known_delay_s)
     run.play(pilot, stance_configuration(waiting), np.zeros(waiting.model.nv))
     settings = dict(look_s=look_s, revise_s=revise_s, landing=landing, solve_s=solve_s, method=method)
     drawn, rehearsed = run.perturbation.to_json(), rehearsal is not None

@@ -1,0 +1,230 @@
+"""Certificates: what counts as agreement, what is said where there is none, and that nothing is written by halves."""
+
+import json
+import re
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fixtures_core import jump
+from test_store import names
+
+from jumplab.cli import main as cli
+from jumplab.errors import InputError, RobotError
+from jumplab.io import folder as store
+from jumplab.show.certificate import certificate_page
+from jumplab.sim import ENGINES, INSTALLED, Metrics
+from jumplab.studies import certify as certificates
+from jumplab.studies import trials as series
+from jumplab.studies.certify import QUANTITIES, Limits, certify
+
+pytestmark = pytest.mark.skipif(set(INSTALLED) != set(ENGINES), reason="a certificate needs every engine")
+LAID = {"plan.npz", "robot.toml", "robot.urdf", "summary.json"}
+WRITTEN = {"certificate.json", "certificate.html", "trials.jsonl"}
+
+
+def held(folder) -> set[str]:
+    return set(names(folder))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    plan = jump(0.6, 0.3, method="direct")
+    store.write_plan(tmp_path / "plan", plan.tape, plan.robot, plan.summary)
+    return tmp_path / "plan"
+
+
+def measured(**changed) -> Metrics:
+    """A landing as it might be measured."""
+    none = dict(max_torque_ratio_by_joint={}, max_speed_ratio_by_joint={}, saturated_s={}, overspeed_s={})
+    loads = dict.fromkeys(("max_torque_ratio", "max_speed_ratio"), 0.5)
+    loads |= {f"{name}_before_touchdown": 0.5 for name in loads}
+    known = dict(standing_s=3.05, landed=True, reason="stood for 3.05 s on its feet alone", self_collision_s=0.0)
+    known |= dict(stray_contacts=(), launch_impulse=(30.0, 500.0), qp_solves=1500, qp_failures=0)
+    known |= dict(touchdown_s=1.5, foot_distance_touchdown_m=0.6, foot_distance_m=0.6, com_rise_m=0.3)
+    known |= dict(touchdown_trunk_pitch_rad=0.3, touchdown_trunk_rate=0.1, landing_force_n=2000.0)
+    return Metrics(**(none | loads | known | dict(landing_impulse=(-20.0, 120.0)) | changed))
+
+
+@pytest.fixture
+def physics(monkeypatch):
+    """Stands in for the simulation: what each engine measures, which may be changed; calls are listed."""
+    world = SimpleNamespace(say=lambda engine, mode, perturbed: {}, calls=[])
+
+    def simulate(tape, robot, *, engine, mode, perturbation=None, **options):
+        world.calls.append((engine, mode, perturbation and perturbation.seed))
+        m = measured(**world.say(engine, mode, perturbation))
+        return SimpleNamespace(landed=m.landed, reason=m.reason, metrics=m, checks_passed=True)
+
+    monkeypatch.setattr(certificates, "simulate_jump", simulate)
+    monkeypatch.setattr(series, "simulate_jump", simulate)
+    return world
+
+
+def test_engines_that_measure_the_same_certify_a_plan(folder, physics, capsys):
+    assert cli.main(["certify", str(folder), "--n", "3", "--jobs", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "certified: all 50 checks of the audit passed, and the engines agree that it lands" in said
+    assert held(folder) == LAID | WRITTEN
+    found = store.read_json(folder / "certificate.json")
+    assert found["passed"] and found["failures"] == [] and found["audit"]["passed"]
+    assert set(found["modes"]) == {"position", "pd"} and found["limits"]["place_m"] == 0.01
+    pd = found["modes"]["pd"]["perturbed"]
+    assert pd["count"] == pd["same_verdict"] == 3 and pd["landed"] == {"bullet": 3, "mujoco": 3}
+    seeds = [
+        {s for e, m, s in physics.calls if (e, m) == (engine, mode)} for engine in ENGINES for mode in found["modes"]
+    ]
+    assert all(s == seeds[0] and len(s) == 4 for s in seeds)  # the same robots everywhere, and the planned one
+    again = certify(folder, 3, jobs=1)
+    assert again.resumed == len(physics.calls) == 16 and again.passed  # nothing was simulated twice
+    text = (folder / "certificate.html").read_text()
+    assert not re.search(r"<script|https?:|src=|@import", text) and 'name="viewport"' in text
+
+
+def off(**changed):
+    return lambda engine, mode, drawn: changed if (engine, mode, drawn) == ("mujoco", "pd", None) else {}
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"touchdown_s": 1.506}, "0.006 s apart in time of touchdown, at most 0.005 s"),
+        ({"foot_distance_touchdown_m": 0.589}, "0.011 m apart in toes at touchdown, at most 0.01 m"),
+        ({"foot_distance_m": 0.611}, "0.011 m apart in toes in the end, at most 0.01 m"),
+        ({"com_rise_m": 0.32}, "0.02 m apart in rise of the CoM, at most 0.01 m"),
+        ({"touchdown_trunk_pitch_rad": 0.32}, "0.02 rad apart in trunk pitch at touchdown, at most 0.0175 rad"),
+        ({"touchdown_trunk_rate": -0.2}, "0.3 rad/s apart in trunk pitch rate at touchdown, at most 0.2 rad/s"),
+        ({"landing_impulse": (-20.0, 150.0)}, "0.222 apart in vertical impulse of landing, at most 0.1"),
+        ({"landing_force_n": 3000.0}, "0.4 apart in largest force of landing, at most 0.15"),
+    ],
+)
+def test_each_limit_can_be_failed(folder, physics, changed, sentence):
+    physics.say = off(**changed)
+    found = certify(folder, 1, jobs=1)
+    assert found.failures == [f"pd mode: the engines are {sentence}"] and not found.passed
+    assert sentence in certificate_page(found).html
+
+
+def test_a_jump_that_does_not_get_so_far_is_no_agreement(folder, physics):
+    fall = "trunk touched the ground 0.40 s after touchdown"
+    physics.say = off(touchdown_s=None, landed=False, reason=fall)
+    missing = "pd mode: time of touchdown was not measured in every engine"
+    assert certify(folder, 1, jobs=1).failures == [f"pd mode: mujoco does not land it: {fall}", missing]
+
+
+def test_perturbed_robots_must_fare_alike(folder, physics, capsys):
+    """One of four falls in one engine alone: that is more than 3 %; and exit code and sentence say it."""
+    unlucky = series.TrialKey(0, 2, "", "").robot_seed
+
+    def say(engine, mode, drawn):
+        fell = (engine, mode, drawn and drawn.seed) == ("bullet", "position", unlucky)
+        return {"landed": False, "reason": "trunk touched the ground 0.30 s after touchdown"} if fell else {}
+
+    physics.say = say
+    assert cli.main(["certify", str(folder), "--n", "4", "--jobs", "1"]) == 3
+    said = capsys.readouterr()
+    verdict = "position mode: 3 of 4 perturbed robots fare alike, at least 97 % are asked for"
+    assert said.err == f"jumplab: not certified: {verdict}; see certificate.html in {str(folder)!r}\n"
+    assert store.read_json(folder / "certificate.json")["failures"] == [verdict]
+    told = "robot 2: PyBullet: trunk touched the ground 0.30 s after touchdown; MuJoCo: stood for 3.05 s"
+    assert told in (folder / "certificate.html").read_text()
+    lenient = certify(folder, 4, limits=Limits(verdict_share=0.75), jobs=1)
+    assert lenient.passed and lenient.resumed == 20
+    many = lenient.modes[0].to_json()["perturbed"]["robots"]
+    assert [row["same"] for row in many] == [True, True, False, True]
+
+
+def test_the_median_of_perturbed_robots_is_held_to_the_limits(folder, physics):
+    """One of three may be far off; with a second one the engines disagree."""
+    far = [series.TrialKey(0, index, "", "").robot_seed for index in (0, 2)]
+
+    def say(engine, mode, drawn):
+        return {"foot_distance_m": 0.7} if engine == "mujoco" and drawn and drawn.seed in odd else {}
+
+    physics.say, odd = say, far[:1]
+    assert certify(folder, 3, jobs=1).passed
+    odd = far
+    (folder / "trials.jsonl").unlink()
+    words = "{} mode: perturbed robots are 0.1 m apart in toes in the end (median), at most 0.01"
+    assert certify(folder, 3, jobs=1).failures == [words.format("position"), words.format("pd")]
+
+
+def test_a_plan_that_fails_its_audit_is_not_certified(folder, physics, monkeypatch):
+    bad = SimpleNamespace(name="torque", passed=False)
+    audit = SimpleNamespace(passed=False, checks=(bad,), failed=(bad,))
+    monkeypatch.setattr(certificates, "audit", lambda *args, **options: audit)
+    found = certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
+    assert found.failures == ["the plan fails the audit's check torque"]
+    assert "Not certified." in (folder / "certificate.html").read_text()
+
+
+def test_interrupted_it_goes_on(folder, physics, capsys):
+    """Finished simulations are kept, no certificate is there, and the rest is made later."""
+    honest = physics.say
+
+    def stop(engine, mode, drawn):
+        if len(physics.calls) > 5:
+            raise KeyboardInterrupt
+        return honest(engine, mode, drawn)
+
+    physics.say = stop
+    assert cli.main(["certify", str(folder), "--n", "2", "--jobs", "1"]) == 130
+    assert "finished trials are kept, and the same command goes on from there" in capsys.readouterr().err
+    assert held(folder) == LAID | {"trials.jsonl"}
+    physics.say, physics.calls = honest, []
+    assert certify(folder, 2, jobs=1).resumed == 5 and len(physics.calls) == 7
+
+
+def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys):
+    with pytest.raises(InputError, match=r"^n = 0 is too small; it must be at least 1$"):
+        certify(folder, 0)
+    assert cli.main(["certify", str(folder), "--n", "0"]) == 2
+    assert capsys.readouterr().err == "jumplab: --n must be at least 1, got 0\n"
+
+    def refuse(engine, mode, drawn):
+        if engine == "mujoco":
+            raise RobotError("robot bhr: MuJoCo cannot read the URDF: mass and inertia must be positive")
+        return {}
+
+    physics.say = refuse
+    assert cli.main(["certify", str(folder), "--n", "1", "--jobs", "1"]) == 2
+    words = "jumplab: robot bhr: MuJoCo cannot read the URDF: mass and inertia must be positive\n"
+    assert capsys.readouterr().err == words and held(folder) == LAID | {"trials.jsonl"}
+    (folder / "trials.jsonl").unlink()
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.delitem(sys.modules, "jumplab.sim.mujoco", raising=False)
+    with pytest.raises(InputError, match=r"^engine 'mujoco': the package mujoco is not installed; "):
+        certify(folder, 1, jobs=1)
+    assert held(folder) == LAID
+
+
+def test_a_new_plan_takes_the_certificate_away(folder, physics):
+    certify(folder, 1, jobs=1, page=lambda c: certificate_page(c).html)
+    plan = jump(0.6, 0.3, method="direct")
+    store.write_plan(folder, plan.tape, plan.robot, plan.summary)
+    assert held(folder) == LAID
+
+
+def test_the_page_shows_every_quantity_in_its_place(folder, physics):
+    """Half a limit apart lies at a quarter of the scale, ten limits at its end."""
+    physics.say = off(touchdown_s=1.5025, com_rise_m=0.4)
+    found = certify(folder, 2, jobs=1)
+    page = certificate_page(found).html
+    rows = page.split("<h2>pd mode</h2>")[1].split('<div class="row">')[1:]
+    assert [q.name for q in QUANTITIES] == [re.search("<div>(.*?)<small>", row)[1] for row in rows]
+    at = [float(re.search(r'd="M([\d.]+) 4l', row)[1]) for row in rows]
+    assert at[0] == pytest.approx(8 + 204 / 4, abs=0.1) and at[3] == pytest.approx(212) and at[1] == 8
+    assert "2.5 of 5 ms" in rows[0] and 'class="apart beyond">1e+02 of 10 mm' in rows[3]
+    assert all(row.count("<circle") == 2 for row in rows)
+
+
+@pytest.mark.slow
+def test_a_plain_jump_is_certified(folder):
+    """All engines, for real."""
+    found = certify(folder, 1, page=lambda c: certificate_page(c).html)
+    assert found.passed, found.failures
+    assert all(t.metrics.landed for mode in found.modes for pair in mode.pairs for t in pair.values())
+    impulses = [d.values for d in found.modes[0].differences if d.quantity.name == "vertical impulse of landing"]
+    assert all(np.array(list(impulses[0].values())) > 42 * 9.8 * 0.1)
+    assert json.loads((folder / "certificate.json").read_text())["passed"]

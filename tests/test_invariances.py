@@ -1,0 +1,337 @@
+"""What must not change, or change in a known way: worlds moved, turned, mirrored and scaled, flights run backwards.
+
+Drawn by hypothesis, the same cases in every run. Tapes of random numbers obey these laws as well as good ones do.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_robots import child
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from test_audit_amounts import JOINTS, random_tape
+from test_cli import one_sentence
+from test_export_amounts import short
+
+from jumplab.auditing import AuditReport, audit
+from jumplab.cli import main as command_line
+from jumplab.cli.studies import values_of
+from jumplab.errors import InputError
+from jumplab.io.files import open_log
+from jumplab.io.folder import read_json, to_json
+from jumplab.io.motion import Motion
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_angles, stance_configuration
+from jumplab.task import JumpTask
+
+ROBOT = Robot.load()
+FEW = settings(deadline=None, derandomize=True, max_examples=8, database=None, phases=[Phase.generate])
+MANY = settings(FEW, max_examples=40)
+SEEDS, FACTORS = st.integers(0, 99), st.floats(0.5, 2.0)
+HEIGHTS, FINITE = st.floats(0.1, 1.0), st.floats(-1e6, 1e6)
+ALONG_X = {"left/right posture", "left/right effort", "penetration", "foot clearance", "body clearance"}
+
+
+@cache
+def judged(seed: int) -> AuditReport:
+    return audit(random_tape(seed), ROBOT)
+
+
+def same(found: AuditReport, known: AuditReport, factor=lambda name: 1.0, but=()) -> None:
+    """Every check but those named says the same amount, times its factor, at the same sample."""
+    for one, other in zip(found.checks, known.checks, strict=True):
+        if one.name not in but:
+            expected = factor(one.name) * other.value
+            assert one.value == pytest.approx(expected, rel=1e-6, abs=1e-8), one.name
+
+
+# task -----------------------------------------------------------------------------------------------------------
+@MANY
+@given(HEIGHTS, FACTORS, st.floats(0.8, 20.0), st.floats(-0.9, 0.9))
+def test_jumps_of_giants_and_of_dwarfs(height, size, gravity, share):
+    """Froude: lengths times a factor take its root as long, at its root times the speed; gravity the other way."""
+    one, other = JumpTask(0.5, height, gravity=gravity), JumpTask(0.5, height * size * 0.7, gravity=gravity)
+    size, rise = other.height_m / one.height_m, share * one.height_m
+    assert other.takeoff_speed == pytest.approx(math.sqrt(size) * one.takeoff_speed)
+    assert other.flight_time(size * rise) == pytest.approx(math.sqrt(size) * one.flight_time(rise))
+    heavy = JumpTask(0.5, height, gravity=1.5 * gravity)
+    assert heavy.flight_time(rise) == pytest.approx(one.flight_time(rise) / math.sqrt(1.5))
+
+
+@MANY
+@given(HEIGHTS, st.floats(-0.9, 0.9), st.floats(-1.0, 1.0))
+def test_a_jump_run_backwards(height, share, distance):
+    """From the platform back to the ground, through the same apex: as long in the air."""
+    rise = share * min(height, 0.9)
+    back = JumpTask(-distance, height - rise, platform_m=-rise)
+    assert back.flight_time(-rise) == pytest.approx(JumpTask(distance, height, rise).flight_time(rise))
+
+
+# robot ----------------------------------------------------------------------------------------------------------
+@FEW
+@given(st.sampled_from(["thigh", "foot", "arm"]), FACTORS, st.floats(0.3, 1.5))
+def test_left_and_right_count_alike(part, mass, effort):
+    left, right = (
+        ROBOT.with_mass(f"{side}_{part}", factor=mass).with_limits(effort={f"{side}_knee": effort}).sagittal
+        for side in ("left", "right")
+    )
+    for name in ("mass", "inertia", "effort", "speed", "lower", "upper", "span"):
+        np.testing.assert_allclose(getattr(left, name), getattr(right, name), rtol=1e-12, err_msg=name)
+
+
+@FEW
+@given(FACTORS)
+def test_a_robot_of_another_size(size):
+    """Every length, mass and inertia of the five links, and the stance's angles, of the same material."""
+    other, one = Robot.from_text(*child(size)), ROBOT
+    for name, power in (("span", 1), ("mass", 3), ("inertia", 5), ("effort", 4)):
+        expected = size**power * np.array(getattr(one.sagittal, name))
+        np.testing.assert_allclose(getattr(other.sagittal, name), expected, rtol=1e-8, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(stance_angles(other), stance_angles(one), atol=1e-8)
+    assert other.foot.toe == pytest.approx(size * one.foot.toe) and other.total_mass == pytest.approx(42.0 * size**3)
+
+
+# tape -----------------------------------------------------------------------------------------------------------
+def placed(x: Tape, place: pin.SE3) -> Tape:
+    """A tape in another place of the world, turned about the vertical."""
+    q = np.array(x.q)
+    turn = pin.Quaternion(place.rotation)
+    for row in q:
+        row[:3], row[3:7] = place.act(row[:3]), (turn * pin.Quaternion(row[3:7])).coeffs()
+    f = np.einsum("ij,nkcj->nkci", place.rotation, x.f.reshape(*x.f.shape[:2], 2, 3)).reshape(x.f.shape)
+    return replace(x, q=q, f=f)
+
+
+@FEW
+@given(SEEDS, FINITE.map(lambda x: x / 1e5), FINITE.map(lambda x: x / 1e5))
+def test_the_world_moved(seed, x, y):
+    same(audit(placed(random_tape(seed), pin.SE3(np.eye(3), np.array([x, y, 0.0]))), ROBOT), judged(seed))
+
+
+@FEW
+@given(SEEDS, st.floats(-3.1, 3.1))
+def test_the_world_turned(seed, yaw):
+    """Where a platform begins is counted along x, and a tilt to the left from the x-z plane; nothing else is."""
+    place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
+    found = audit(placed(random_tape(seed), place), ROBOT)
+    same(found, judged(seed), but=ALONG_X)
+
+
+def mirror_image(x: Tape) -> Tape:
+    """Left is right: y of vectors, x and z of axial vectors, and the joints that turn about x or z change signs."""
+    other = [JOINTS.index(n.replace("left_", "*").replace("right_", "left_").replace("*", "right_")) for n in JOINTS]
+    sign = np.array([-1.0 if n.endswith(("yaw", "roll")) else 1.0 for n in JOINTS])
+    vector, axial = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+    twist = np.concatenate([vector, axial])
+    q, joints = np.array(x.q), sign * x.q[:, 7:][:, other]
+    q[:, :7] *= [*vector, *axial, 1.0]
+    v, a = (np.hstack([twist * y[:, :6], sign * y[:, 6:][:, other]]) for y in (x.v, x.a))
+    tau, f = sign * x.tau[:, other], twist * x.f[:, ::-1]
+    return replace(x, q=np.hstack([q[:, :7], joints]), v=v, a=a, tau=tau, f=f)
+
+
+@FEW
+@given(SEEDS)
+def test_left_and_right_exchanged(seed):
+    found = audit(mirror_image(random_tape(seed)), ROBOT)
+    same(found, judged(seed))
+    swap = {"left_foot": "right_foot", "right_foot": "left_foot"}
+    for name in ("friction used", "CoP in the sole", "toe slip", "no force in flight"):
+        (there,), (here,) = (re.findall(r"worst: (\w+)$", report[name].note) for report in (found, judged(seed)))
+        assert there == swap[here], name
+
+
+@FEW
+@given(SEEDS, FACTORS)
+def test_all_masses_scaled(seed, factor):
+    """With forces and torques that grow alike, all that is a share or a motion stays, and momentum grows alike."""
+    tape, links = random_tape(seed), re.findall(r'<link name="(\w+)"', ROBOT.urdf)
+    robot = ROBOT.with_mass(links, factor=factor).with_limits(effort=factor)
+    grows = {"angular impulse", "angular momentum in flight", "no force in flight", "ground only pushes"}
+    by_size = {"CoP in the sole", "CoP at the toe", "torsional friction", "friction used"}  # count from some newtons on
+    found = audit(replace(tape, f=factor * tape.f, tau=factor * tape.tau), robot)
+    same(found, judged(seed), lambda name: factor if name in grows else 1.0, but=by_size)
+
+
+SHARES = ("base force residual", "joint torque consistency", "linear impulse", "gravity in flight",
+          "zero force at take-off", "free fall at take-off", "energy balance", "mass", "joint speed", "joint torque",
+          "torque at speed", "joint range", "unit quaternion")  # fmt: skip
+LENGTHS = ("ballistic CoM", "toe slip", "toe on the ground", "base moment residual", "zero moment at take-off")
+
+
+@FEW
+@given(SEEDS, FACTORS)
+def test_a_giants_tape(seed, size):
+    """Froude: lengths grow, times by the root, masses by the cube; shares stay, lengths grow."""
+    x, slow = random_tape(seed), math.sqrt(size)
+    q = np.array(x.q)
+    q[:, :3] *= size
+    v = np.hstack([x.v[:, :3] * slow, x.v[:, 3:] / slow])
+    a = np.hstack([x.a[:, :3], x.a[:, 3:] / size])
+    f = x.f * size ** np.array([3, 3, 3, 4, 4, 4])
+    grown = replace(x, t=x.t * slow, q=q, v=v, a=a, tau=x.tau * size**4, f=f)
+    found = audit(grown, Robot.from_text(*child(size)).with_limits(speed=1 / slow))
+    for name in (*SHARES, *LENGTHS):
+        expected = judged(seed)[name].value * (size if name in LENGTHS else 1.0)
+        assert found[name].value == pytest.approx(expected, rel=1e-6, abs=1e-8), name
+
+
+def top(speed, spin) -> Tape:
+    """A stiff robot that is thrown: 40 ms in the air, after a launch that is none."""
+    model, middle, n = ROBOT.model, stance_configuration(ROBOT), 41
+    com = pin.centerOfMass(model, model.createData(), middle)
+    speed, omega, fall = np.array(speed), np.array([0.0, spin, 0.0]), np.array([0.0, 0.0, -9.8])
+    tape = random_tape(0)
+    t = np.concatenate([tape.t[:12], tape.t[11] + np.arange(n) / 1000])
+    q, v, a = np.tile(middle, (12 + n, 1)), np.zeros((12 + n, model.nv)), np.zeros((12 + n, model.nv))
+    for i in range(n):
+        since, rest = i / 1000, pin.Quaternion(middle[3:7])
+        turn = pin.Quaternion(pin.exp3(omega * since))
+        r, body = turn.matrix() @ (middle[:3] - com), (turn * rest).matrix().T
+        now = speed + fall * since + np.cross(omega, r)
+        q[12 + i, :3], q[12 + i, 3:7] = com + speed * since + fall * since**2 / 2 + r, (turn * rest).coeffs()
+        v[12 + i, :3], v[12 + i, 3:6] = body @ now, body @ omega
+        a[12 + i, :3] = body @ (fall + np.cross(omega, np.cross(omega, r)) - np.cross(omega, now))
+    phase, still = np.array(["launch"] * 12 + ["flight"] * n), (12 + n, model.nv - 6)
+    return replace(tape, t=t, q=q, v=v, a=a, tau=np.zeros(still), f=np.zeros((12 + n, 2, 6)), phase=phase)
+
+
+@FEW
+@given(st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.floats(-15.0, 15.0))
+def test_a_flight_run_backwards(speed, spin):
+    """Free flight is free flight in both directions of time, and what bends it is found in both."""
+    flight, there = top(speed, spin), slice(12, None)
+    back = {name: np.array(getattr(flight, name)) for name in ("q", "v", "a")}
+    for name, sign in (("q", 1.0), ("v", -1.0), ("a", 1.0)):
+        back[name][there] = sign * back[name][there][::-1]
+    names = ("ballistic CoM", "gravity in flight", "angular momentum in flight")
+    for tape in (flight, replace(flight, **back)):
+        found = audit(tape, ROBOT)
+        assert all(found[name].value < 1e-6 for name in names) and found["re-integrated positions"].passed
+        bent = np.array(tape.q)
+        bent[there, 2] += 0.5 * np.arange(41) ** 2 * 1e-6  # as if it fell with 8.8 m/s^2
+        bent = audit(replace(tape, q=bent), ROBOT)
+        assert bent["gravity in flight"].value == pytest.approx(100 / 9.8, rel=1e-3)
+        assert bent["ballistic CoM"].value == pytest.approx(0.5 * 1.6, rel=1e-3)
+
+
+@FEW
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8), st.floats(-3.1, 3.1), st.floats(-5.0, 5.0))
+def test_motions_backwards_and_elsewhere(shares, yaw, x):
+    """Between its samples a motion is the same backwards, and where it is moved to; later by any time."""
+    motion, times = short(), 0.5 + 0.0205 * np.array(sorted(shares))
+    keep = np.arange(len(motion.t)) != 10  # each instant once
+    once = Motion(*(getattr(motion, k)[keep] for k in ("t", "q", "v", "tau", "phase")), "plan")
+    known = once.at(times)
+    ends = once.t[0] + once.t[-1]
+    back = replace(once, t=ends - once.t[::-1], q=once.q[::-1], v=once.v[::-1], tau=once.tau[::-1])
+    mirrored = back.at(np.clip(ends - times[::-1], back.t[0], back.t[-1]))
+    place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.array([x, 1.0, 0.0]))
+    moved = replace(once, q=np.array([[*pin.SE3ToXYZQUAT(place * pin.XYZQUATToSE3(q[:7])), *q[7:]] for q in once.q]))
+    late = replace(once, t=once.t + 2.0).at(times + 2.0)
+    for i, q in enumerate(known.q):
+        for other, expected in ((mirrored.q[-1 - i], q), (late.q[i], q), (moved.at(times).q[i], None)):
+            if expected is None:
+                expected = [*pin.SE3ToXYZQUAT(place * pin.XYZQUATToSE3(q[:7])), *q[7:]]
+            np.testing.assert_allclose(pin.difference(ROBOT.model, np.array(expected), other), 0.0, atol=1e-8)
+    np.testing.assert_allclose(mirrored.tau[::-1], known.tau, atol=1e-6)
+
+
+# store ----------------------------------------------------------------------------------------------------------
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda x: st.lists(x, max_size=3) | st.dictionaries(st.text(), x, max_size=3),
+    max_leaves=8,
+)
+
+
+@MANY
+@given(data=st.dictionaries(st.text(), PLAIN, max_size=4))
+def test_what_is_stored_comes_back(tmp_path_factory, data):
+    """Whatever JSON can say, in numbers that are bit for bit the same."""
+    path = tmp_path_factory.getbasetemp() / "data.json"
+    path.write_text(to_json(data), encoding="utf-8", errors="surrogatepass")
+    assert read_json(path) == json.loads(json.dumps(data))
+
+
+@FEW
+@given(names=st.lists(st.from_regex(r"own_[a-z]{1,9}", fullmatch=True), unique=True, max_size=4), seed=SEEDS)
+def test_a_tape_comes_back_bit_for_bit(tmp_path_factory, names, seed):
+    rng, path = np.random.default_rng(seed), tmp_path_factory.getbasetemp() / "plan.npz"
+    tape = replace(random_tape(seed), extra={name: rng.normal(size=rng.integers(0, 4, 2)) for name in names})
+    tape.save(path)
+    back, known = Tape.load(path).arrays(), tape.arrays()
+    assert list(back) == list(known)
+    for name, values in known.items():
+        np.testing.assert_array_equal(back[name], values)
+
+
+@MANY
+@given(rows=st.lists(st.integers(0, 5), max_size=6), share=st.floats(0.0, 1.0), more=st.integers(0, 5))
+def test_a_log_that_was_cut_loses_its_last_line_at_most(tmp_path_factory, rows, share, more):
+    path = tmp_path_factory.getbasetemp() / "work.jsonl"
+    path.unlink(missing_ok=True)
+
+    def opened():
+        return open_log(path, "work", lambda x: (x["key"], x["value"]))
+
+    with opened() as log:
+        for i, key in enumerate(rows):
+            log.add({"key": key, "value": [i, "ü"]})
+    whole = path.read_bytes() if rows else b""
+    cut = whole[: round(share * len(whole))]
+    path.write_bytes(cut)
+    with opened() as log:
+        left = {key: [i, "ü"] for i, key in enumerate(rows[: cut.count(b"\n")])}
+        assert log.done == left
+        log.add({"key": more, "value": "new"})
+    with opened() as log:
+        assert log.done == left | {more: "new"}
+
+
+# command line ---------------------------------------------------------------------------------------------------
+BAD = st.one_of(
+    st.floats(3.001, 1e300).map(repr), st.floats(-1e300, -3.001).map(repr), st.sampled_from(["nan", "inf", "-inf"]),
+    st.text(st.characters(categories=["L", "P", "Zs"], exclude_characters="-"), min_size=1).filter(
+        lambda x: not re.fullmatch(r"(?i)\s*(nan|inf(inity)?)\s*", x)),
+)  # fmt: skip
+
+
+@settings(MANY, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(text=BAD)
+def test_a_distance_that_cannot_be_meant(capsys, tmp_path_factory, text):
+    """One sentence: that the text is no number, or what the target itself says about the number."""
+    out = tmp_path_factory.getbasetemp() / "no_plan"
+    code = command_line.main(["plan", f"--distance-m={text}", "--height-m", "0.5", "--out", str(out)])
+    said = one_sentence(code, *capsys.readouterr())
+    try:
+        expected = f"--distance-m must be a number, got {text!r}" if not is_number(text) else ""
+        JumpTask(float(text) if not expected else 0.0, 0.5)
+    except InputError as e:
+        expected = str(e)
+    assert said == " ".join(expected.split()) and not out.exists()
+
+
+def is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+@MANY
+@given(st.floats(-3, 3), st.floats(-3, 3), st.integers(1, 30))
+def test_a_grid_is_read_as_it_is_written(first, last, count):
+    found = values_of("--distance-m", f"{first!r}:{last!r}:{count}")
+    np.testing.assert_allclose(found, np.linspace(first, last, count), atol=1e-9)
+    assert values_of("--distance-m", ",".join(map(repr, found))) == found
