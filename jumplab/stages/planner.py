@@ -64,6 +64,8 @@ class Planner:
     settings : of stage 1: :class:`jumplab.stages.srmp.SrmpSettings`, or a mapping of some of its fields.
     mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
+    atlas : of plans with the same robot, terms and limits: a :class:`jumplab.Atlas`. Direct plans begin with it where
+        it has something close by; other methods refuse it.
 
     Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
     terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
@@ -86,9 +88,10 @@ class Planner:
         settings: SrmpSettings | Mapping[str, Any] | None = None,
         mesh: Mesh | Mapping[str, int] | None = None,
         keep: bool = False,
+        atlas: Any | None = None,
     ):
         require_type(robot, Robot, "the robot to plan for")
-        self.robot, self.keep, self.changes = robot, keep, sorted_out(terms, weights, off)
+        self.robot, self.keep, self.changes, self.atlas = robot, keep, sorted_out(terms, weights, off), atlas
         self._given = limits, settings, mesh
         self.limits, self.mesh = settled(Limits, limits), self._mesh()
         settled(SrmpSettings, settings)  # refuses what does not fit
@@ -210,6 +213,8 @@ class Planner:
         require_type(task, JumpTask, "the target")
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
+        if self.atlas is not None and method != "direct":
+            raise InputError(f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave it away")
         if not task.in_plane:
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
@@ -222,6 +227,9 @@ class Planner:
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
+            if self.atlas is not None and not asked["whole body"]:
+                if (body := self.atlas.solve(self.stage("direct"), task, start)) is not None:
+                    return self._finished(method, body)
             return self._finished(method, planner.plan(task, weights=asked["whole body"].weights, **where))
         if task.rotation_rad:
             return self._flip(task, asked)
@@ -346,9 +354,10 @@ class Planner:
     def replan(self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None) -> JumpPlan:
         """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
 
-        Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
+        Stages 1 and 3 begin with their previous solutions; a target within :data:`jumplab.task.NEAR` takes a few steps
+        from there, see :meth:`jumplab.ocp.nlp.Nlp.settled`. Stage 2, whose result is only a start for stage 3, is left
         out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
-        ``start`` as in :meth:`plan`.
+        A flip is planned anew. ``start`` as in :meth:`plan`.
 
         Raises
         ------
@@ -366,6 +375,8 @@ class Planner:
             except SolverError:
                 return self.plan(task, previous.method)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
+        if task.rotation_rad:
+            return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
         srmp, last = None, "direct"
