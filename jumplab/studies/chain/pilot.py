@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jumplab.errors import InfeasibleError, JumplabError, SolverError
+from jumplab.models.full import FullBody
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.sim import STEP_S
@@ -175,6 +176,7 @@ class ChainPilot:
         self._landing, self._look_s, self._revise_s, self._lead_s = landing, look_s, revise_s, lead_s
         self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
         self._tau = np.zeros(len(self._robot.joint_names))
+        self._uneven = _antisymmetry(self._robot)
         self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
         self.plans: list[list[Ahead]] = []  # made for each jump, in their order
         self.used: list[Ahead] = []  # plan of each jump that began, and its pilot and first step
@@ -300,18 +302,43 @@ class ChainPilot:
         ahead.began_s, toe, tape = step * STEP_S, self._gauge.toe(q), ahead.plan.tape
         if self.used:
             self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
-        self._from, self._offset = float(toe[0]), (q[7:] - tape.q[0, 7:], v[6:].copy())
+        error, rate = q[7:] - tape.q[0, 7:], v[6:]
+        uneven, uneven_rate = self._uneven @ error, self._uneven @ rate
+        self._from, self._takeoff_s = float(toe[0]), tape.takeoff_time
+        self._offset = (error - uneven, rate - uneven_rate), (uneven, uneven_rate)
         self.used.append(ahead)
         self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, lead_s=self._lead_s))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:
-        """The tape's command plus what was left of posture and rates when it began, fading smoothly."""
-        if time >= BLEND_S:
-            return command
-        s, (error, rate) = time / BLEND_S, self._offset
-        angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
-        speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
-        push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
-        moved = dict(q=command.q + angle, rate=command.rate + speed, acceleration=command.acceleration + push)
-        return replace(command, **moved)
+        """The tape's command plus what was left of posture and rates when it began, fading smoothly.
+
+        What differs between left and right is how the feet stand, and fades in the air: legs that were made even on
+        feet that are not would twist the robot, and turn it further in every jump.
+        """
+        (error, rate), (uneven, uneven_rate) = self._offset
+        moved = np.array([command.q, command.rate, command.acceleration])
+        moved += _fading(error, rate, time) + _fading(0.0 * uneven, uneven_rate, time)
+        moved += _fading(uneven, 0.0 * uneven, max(time - self._takeoff_s, 0.0))
+        return replace(command, q=moved[0], rate=moved[1], acceleration=moved[2])
+
+
+def _fading(error: np.ndarray, rate: np.ndarray, time: float) -> np.ndarray:
+    """A cubic from ``error`` and ``rate`` at time 0 to rest at zero: its value, rate and acceleration (3, ...)."""
+    if time >= BLEND_S:
+        return np.zeros((3, *error.shape))
+    s = time / BLEND_S
+    angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
+    speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
+    push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
+    return np.array([angle, speed, push])
+
+
+def _antisymmetry(robot: Robot) -> np.ndarray:
+    """Projection (nv - 6, nv - 6) of joint angles on what differs between left and right."""
+    out = np.zeros((len(robot.joint_names),) * 2)
+    for left, right, sign in FullBody(robot).pairs:
+        row = np.zeros(len(out))
+        row[left - 6], row[right - 6] = 1.0, -sign
+        out += np.outer(row, row) / 2
+    return out
