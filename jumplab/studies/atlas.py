@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -313,7 +314,7 @@ def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tu
     for distance in distances:
         task = JumpTask(distance, height)
         try:
-            plan = body.plan(task, near=plan)
+            plan = body.plan(task, near=plan, settle=False)
         except (SolverError, InfeasibleError):
             plan, failed = None, failed + 1
             if failed >= GIVE_UP:
@@ -331,7 +332,8 @@ def _cheaper(body: WholeBodyPlanner, node: Node, near: Node) -> Node | None:
         plan = body.settled(task, near.phases, jerk=near.jerk)
         if plan.solution.statistics.objective >= CHEAPER * node.cost:
             return None
-        return _node(body, body.plan(task, near=plan))
+        found = _node(body, body.plan(task, near=plan, settle=False))
+        return found if found.cost < CHEAPER * node.cost else None
     except JumplabError:
         return None
 
@@ -356,7 +358,7 @@ def _loaded(path: Path) -> tuple[Atlas, set[float]]:
         return Atlas(head["robot"], head["distances"], head["heights"], nodes, head["key"]), set(head["done"])
     except FileNotFoundError:
         raise InputError(f"{str(path.parent)!r} has no {FILE}; build one with 'jumplab atlas'") from None
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as e:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as e:
         said = f"{str(path)!r} is damaged or no atlas ({type(e).__name__}); delete it and build it again"
         raise InputError(said) from None
 

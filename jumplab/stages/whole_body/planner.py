@@ -148,6 +148,7 @@ class WholeBodyPlanner:
         off: tuple[str, ...] = (),
         near: WholeBodyPlan | None = None,
         start: np.ndarray | None = None,
+        settle: bool = True,
     ) -> WholeBodyPlan:
         """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
 
@@ -158,6 +159,8 @@ class WholeBodyPlanner:
         near : this planner's plan for a target close by, to begin with instead of ``guess``; if that leads nowhere, the
             target is solved from ``guess`` all the same.
         start : absolute link angles (5,) in which the robot waits at rest, soles flat; the stance if None.
+        settle : take a few steps from ``near`` if it is close enough, see :meth:`jumplab.ocp.nlp.Nlp.settled`; the
+            least cost is found without.
 
         Raises
         ------
@@ -165,7 +168,7 @@ class WholeBodyPlanner:
             If there is no plan; names the terms in conflict.
         """
         asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
-        return replace(self._evened(self._begun(asked, guess, near), asked), limits=self.limits)
+        return replace(self._evened(self._begun(asked, guess, near, settle), asked), limits=self.limits)
 
     def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
         """Call an NLP's ``solve`` or ``approach`` with start values, or with a solution on any mesh.
@@ -197,9 +200,9 @@ class WholeBodyPlanner:
             found = replace(found, solution=even, uneven=(*found.uneven, found.solution.statistics))
         return found
 
-    def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None) -> WholeBodyPlan:
+    def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None, settle: bool) -> WholeBodyPlan:
         """The solution, from the plan for a target close by, from the coarse mesh or from the guess itself."""
-        if near is not None and asked.task.is_near(near.task):
+        if near is not None and settle and asked.task.is_near(near.task):
             try:
                 return self._beside(asked, near.solution)
             except SolverError:
