@@ -9,6 +9,7 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
+from jumplab.cli import common
 from jumplab.cli.common import (
     ENGINE,
     JUMP,
@@ -97,6 +98,8 @@ def trials(args: Namespace) -> None:
         values = report.values(unit)
         if len(values) and not args.basin:  # they would count from the apex
             print(f"{name} of those that landed: {values.min():.3f} ... {values.max():.3f} m")
+    if not (args.basin or report.in_plane) and report.landed:
+        print(f"errors of those that landed: {common.misses(report.target, report.values)}")
     kept = f"{'basin' if args.basin else 'trials'}.json in {args.dir}, {report.resumed} trials from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
 
@@ -125,6 +128,11 @@ def certify(args: Namespace) -> None:
         print(tables.table(rows, columns))
         landed = ", ".join(f"{sum(t.landed for t in jumps)} in {name}" for name, jumps in mode.robots.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
+        for engine in () if found.task.in_plane else mode.planned:
+            stood = [t.metrics for t in (mode.planned[engine], *mode.robots[engine]) if t.landed]
+            if stood:
+                errors = common.misses(asdict(found.task), lambda name, stood=stood: [getattr(m, name) for m in stood])
+                print(f"errors in {engine} of those that landed: {errors}")
     kept = f"certificate.json and certificate.html in {args.dir}, {found.resumed} simulations from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
     if found.failures:

@@ -122,21 +122,23 @@ class SpatialPlanner:
         flat = self.terms["flat"]
         values = dict(stance=flat.stance, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
-        return values | dict(edge=self._edge(task), gravity=task.gravity)
+        ways = np.cos(task.along_rad), np.sin(task.along_rad)
+        return values | dict(edge=self._edge(task, np.array(ways)), along=ways, gravity=task.gravity)
 
-    def _edge(self, task: JumpTask) -> float:
-        """Where the ground steps up or down [m], from the world's origin."""
+    def _edge(self, task: JumpTask, along: np.ndarray) -> float:
+        """Where the ground steps up or down [m], from the world's origin ``along`` (2,) the travel."""
         c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
         soles = self.robot.foot.corners - self.robot.foot.center
-        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)
-        landed = task.distance_m + corners[:, 0] * c - corners[:, 1] * s
-        room, first = self.limits.edge_before_heel_m, float(corners[:, 0].max())
+        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)[:, :2]
+        landed = ([task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])) @ along
+        room, first = self.limits.edge_before_heel_m, float((corners @ along).max())
         up, down = float(landed.min()) - room, first + room
         edge = down if task.platform_m < 0 else up
         apart = up - first if task.platform_m > 0 else float(landed.min()) - down
         if task.platform_m and apart < 0:
+            way = float(np.hypot(task.distance_m, task.side_m))
             raise InfeasibleError(
-                f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-                f"under a sole of {self.robot.name}; ask for a distance of {task.distance_m - apart:.2f} m or more"
+                f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
+                f"sole of {self.robot.name}; ask for a distance of {way - apart:.2f} m or more"
             )
         return edge
