@@ -146,6 +146,8 @@ def certify(args: Namespace) -> None:
     opt("--distances-m M+", "travel of the feet, per jump [m]", None, number, required=True),
     opt("--height-m M+", "rise of the CoM in flight [m], for all jumps or per jump (default 0.3)", [0.3], number),
     opt("--platforms-m M+", "height of each landing surface above the first ground [m] (default: level)", None, number),
+    opt("--sides-m M+", "travel of the feet to the left, per jump [m] (default 0)", None, number),
+    opt("--turns-deg DEG+", "turn about the vertical to the left, per jump (default 0)", None, number),
     opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(0, 2**31 - 1)),
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
     opt("--ranges", "how much they differ", "slight", ("slight", "wide")),
@@ -164,7 +166,9 @@ def chain(args: Namespace) -> None:
     how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method", "engine")}
     how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
-    course, robot = chains.Course.of(args.distances_m, args.height_m, args.platforms_m), robots.Robot.load(args.robot)
+    turns = None if args.turns_deg is None else [math.radians(x) for x in args.turns_deg]
+    course = chains.Course.of(args.distances_m, args.height_m, args.platforms_m, args.sides_m, turns)
+    robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     ranges = chains.RANGES[args.ranges]
     drawn = None if seed is None else sim.Perturbation.draw(robot, seed, ranges)
@@ -194,6 +198,8 @@ def _print_chain(result, report) -> None:
     for row in result.rows():
         cells = ("-" if row[n] is None else f"{row[n]:.3f} {n[-1]}" for n in names)
         print(f"{row['jump']:<5}" + "".join(f"{cell:>9}" for cell in cells))
+    if not result.course.in_plane:
+        print("heading off by " + ", ".join(f"{math.degrees(x):+.1f}" for x in result.heading_errors_rad) + " deg")
     ready = f"{result.in_time} of {len(result.replans)}"
     print(f"plans made on the way: {ready} were there when the robot was ready for them")
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
@@ -202,6 +208,9 @@ def _print_chain(result, report) -> None:
     (low, high), errors = report.interval, report.errors_m
     worst = f"{abs(errors).max():.3f} m" if len(errors) else "none"
     print(f"{report.stood} of {len(report.trials)} robots stand to the end, 95 % interval {low:.1%} ... {high:.1%}")
+    if not report.course.in_plane:
+        off = [abs(x) for t in report.trials if t.stood for x in t.heading_errors_rad]
+        print(f"largest heading error {math.degrees(max(off, default=math.nan)):.1f} deg")
     print(f"largest distance error {worst}; {report.in_time} of {report.replans} plans in time")
     print(f"{(report.waits_s <= 0).sum()} of {len(report.waits_s)} next jumps began without waiting for a plan")
     for trial in (t for t in report.trials if not t.stood):
