@@ -82,6 +82,11 @@ class JumpTask:
         return same and all(abs(getattr(self, n) - getattr(other, n)) <= most + 1e-9 for n, most in NEAR.items())
 
     @property
+    def along_rad(self) -> float:
+        """Direction of the travel seen from above [rad], along which a platform begins; zero straight ahead or back."""
+        return math.atan2(self.side_m, self.distance_m) if self.side_m else 0.0
+
+    @property
     def takeoff_speed(self) -> float:
         """Vertical CoM speed at take-off, sqrt(2 g h) [m/s] (v_z^exp, Sec. III)."""
         return math.sqrt(2 * self.gravity * self.height_m)
