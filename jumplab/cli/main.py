@@ -11,16 +11,16 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NoReturn
 
 from jumplab.cli.common import DEBUG, declare
+from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_process
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
 from jumplab.cli.studies import bench, certify, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
-INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
+INTERNAL = 4
 COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench)
 
 
@@ -62,19 +62,12 @@ def _work(argv: Sequence[str]) -> None:
     sys.stdout.flush()
 
 
-def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
-    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
-    seen.append(signum)
-    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
-
-
-def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
+def _tell(e: BaseException, heard: Interrupts, debug: bool) -> int:
     """Say in one sentence what has ended a command; returns the exit code."""
-    if isinstance(e, KeyboardInterrupt) or seen[-1:] == [signal.SIGINT]:
-        said = isinstance(e, KeyboardInterrupt) and str(e)
-        code, said = INTERRUPTED, said or "interrupted; what was there before is unchanged"
-    elif seen:
-        return TERMINATED
+    if heard.number == signal.SIGTERM:
+        return heard.code
+    if isinstance(e, KeyboardInterrupt) or heard.number is not None:
+        code, said = CODES[signal.SIGINT], isinstance(e, KeyboardInterrupt) and str(e) or UNCHANGED
     elif isinstance(e, JumplabError):
         code, said = e.exit_code, str(e)
     else:
@@ -82,26 +75,27 @@ def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
         hint = "" if debug else "; run it again with --debug for the traceback"
         code, said = INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
     if debug:
-        traceback.print_exc()
+        traceback.print_exception(e)
     print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
     return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else list(argv)
+    """Run one command; returns the exit code. Without ``argv`` it is the process's own, which an interrupt then ends."""
+    alone, argv = argv is None, sys.argv[1:] if argv is None else list(argv)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored Ctrl-C stays ignored
-    numbers, seen = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,), []
-    before = {number: signal.signal(number, partial(_stop, seen)) for number in numbers}
+    heard = Interrupts(alone)
     try:
-        _work(argv)
+        with heard.heeded():
+            _work(argv)
+            if heard.number is not None:  # and lost
+                raise KeyboardInterrupt
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
     except (KeyboardInterrupt, Exception) as e:
-        return _tell(e, seen, "--debug" in argv)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        code = _tell(e, heard, "--debug" in argv)
+        if alone and heard.number is not None:
+            end_process(code)
+        return code
     return 0

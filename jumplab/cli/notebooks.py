@@ -12,14 +12,17 @@ import math
 import os
 import re
 import shutil
+import signal
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any
+from typing import Any, ClassVar
 
 from jumplab import errors
 from jumplab.cli.common import Late
@@ -211,16 +214,42 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool
 
     executed = work.parent / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
-        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": _kernel(scratch, notebook)}
+        manager = _kernel(scratch, notebook)
+        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": manager}
         files = literal(notebook), literal(executed)
+        execute = partial(papermill.execute_notebook, *files, given, cwd=str(work), progress_bar=bar, **kernel)
         try:
-            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=bar, **kernel)
+            _aside(execute, manager.started)
         except papermill.PapermillExecutionError as e:
             failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, failed)
             raise _explained(notebook.name, e, place) from e
         except DeadKernelError as e:
             raise JumplabError(f"notebook {notebook.name}: its Python process died; is there enough memory?") from e
+
+
+def _aside(execute: Callable[[], Any], started: list[int]) -> None:
+    """Do it in a thread, where the notebooks' client takes no signals; interrupted, its kernels are killed."""
+    raised: list[Exception] = []
+
+    def work() -> None:
+        try:
+            execute()
+        except Exception as e:
+            raised.append(e)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        thread.join()
+    except BaseException:
+        for group in started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(group, signal.SIGKILL)
+        thread.join(1.0)
+        raise
+    if raised:
+        raise raised[0]
 
 
 def _explained(name: str, e: Any, place: str) -> JumplabError:
@@ -255,14 +284,17 @@ def _kernel(scratch: str, notebook: Path) -> type:
     class ThisInterpreter(AsyncKernelManager):
         kernel_spec = KernelSpec(**spec, display_name="Python of jumplab")
         connection_file = Unicode(f"{scratch}/kernel.json")
+        started: ClassVar[list[int]] = []  # process groups
 
         async def start_kernel(self, **kwargs: Any) -> None:
             await super().start_kernel(stdout=DEVNULL, stderr=DEVNULL, **kwargs)  # cells print another way
+            self.started.append(self.provisioner.pid)
 
     return ThisInterpreter
 
 
 def _publish(work: Path, out: Path, figures: Path) -> None:
+    store.settle()
     with store.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():
