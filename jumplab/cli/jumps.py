@@ -1,10 +1,12 @@
 """The commands about one jump and its folder: run, plan, audit, simulate, view, export."""
 
 import ast
+import json
 import math
 import time
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
 from jumplab.cli import common
 from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
@@ -46,11 +48,15 @@ def run(args: Namespace) -> None:
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             values[name] = text
     chosen = notebooks.find_notebooks(args.notebook)
-    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen)
+    shown = "quiet" not in args
+    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen, progress=shown)
+    args.found |= {name: getattr(report, name) for name in ("out", "figures", "notebooks", "wall_s")}
     if (report.out / "plan.npz").is_file():
-        common.print_summary(store.read_plan(report.out)[2])
+        common.print_summary(summary := store.read_plan(report.out)[2])
+        args.found["plan"] = summary
     if (report.out / "simulation.json").is_file():
-        common.print_simulation(store.read_json(report.out / "simulation.json"))
+        common.print_simulation(simulated := store.read_json(report.out / "simulation.json"))
+        args.found["simulation"] = simulated
     print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
     if (report.out / "jump.html").is_file():
         print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")
@@ -75,6 +81,7 @@ def plan(args: Namespace) -> None:
     store.ensure_writable(args.out)
     found = planner.plan_jump(task, robot, method=args.method)
     report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
+    args.found |= {"out": args.out, "plan": found.summary, "audit": _audited(report)}
     common.print_summary(found.summary)
     print(f"plan in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     common.judge(report, args.out)
@@ -87,8 +94,13 @@ def audit(args: Namespace) -> None:
     folder = store.ensure_writable(args.dir)
     with store.transaction(folder) as staging:
         report = auditing.write_audit(folder, into=staging)
+    args.found |= _audited(report)
     print(report.table())
     common.judge(report, args.dir)
+
+
+def _audited(report: Any) -> dict[str, Any]:
+    return json.loads(report.to_json())
 
 
 @command(PLAN, MODE, ENGINE)
@@ -99,6 +111,7 @@ def simulate(args: Namespace) -> None:
     scene = sim.Scene.of_plan(summary, robot)
     result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine)
     store.write_simulation(args.dir, result, summary)
+    args.found |= result.to_json()
     common.print_simulation(result.to_json())
 
 
@@ -130,13 +143,19 @@ def view(args: Namespace) -> None:
     ),
     opt("--out PATH", "file, or folder of a urdf-replay (default: in DIR)", None, folder),
     opt("--simulated", "the simulated jump instead of the planned one"),
-    opt("--fps N", "frames per second of a motion-clip (default 50)", "50", number),
-    opt("--order", "of joints and bodies in a clip: MuJoCo's, or Isaac Lab's (breadth-first)", ORDERS[0], ORDERS),
+    opt("--fps N", "frames per second of a motion-clip (default 50)", None, number),
+    opt(
+        "--order", "of a motion-clip's joints and bodies: MuJoCo's depth-first (default), or Isaac Lab's", None, ORDERS
+    ),
 )
 def export(args: Namespace) -> None:
     """A jump for other programs."""
+    if args.format != "motion-clip":
+        common.without(args, f"is of a motion-clip, not of {args.format}", fps=None, order=None)
+    clip = {"fps": 50.0 if args.fps is None else args.fps, "order": args.order or ORDERS[0]}
     tape, robot, _ = store.read_plan(args.dir)
     motion = motions.Motion.of_simulation_file(args.dir, robot) if args.simulated else motions.Motion.of(tape)
     path = Path(args.out or Path(args.dir, exports.default_name(args.format, motion.source)))
-    exports.write(args.format, motion, robot, path, fps=args.fps, order=args.order)
+    exports.write(args.format, motion, robot, path, **clip)
+    args.found |= {"file": path, "format": args.format, "source": motion.source, "duration_s": motion.duration}
     print(f"{motion.source}, {motion.duration:.3f} s, as {args.format}: {path}")

@@ -8,8 +8,8 @@ interrupted map goes on where it stopped.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import joblib
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.io.files import Log, append, open_log
+from jumplab.io.files import Log, append, made, open_log
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot.reach import Reach
@@ -119,11 +119,13 @@ def envelope(
     for distance in distances:
         for height in heights:
             JumpTask(distance, height)  # refuses what no task may ask
+    from jumplab.studies.trials import in_parallel  # the simulator, which pictures of a map do without
+
     path, rows = None if folder is None else Path(folder) / CELLS, []
     with nullcontext() if path is None else _opened(path, robot) as log:
         done = {} if log is None else log.done
-        run = joblib.Parallel(n_jobs=workers, return_as="generator")
-        for row in run(joblib.delayed(_row)(robot, height, tuple(distances), done, path) for height in heights):
+        work = [joblib.delayed(_row)(robot, height, tuple(distances), done, path) for height in heights]
+        for row in in_parallel(work, workers, "generator"):
             rows.append(row)
             if tell is not None:
                 good = [c.distance_m for c in row if c.solved]
@@ -183,15 +185,16 @@ def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> 
 
 
 # finished cells on file -----------------------------------------------------------------------------------------
-def _opened(path: Path, robot: Robot) -> AbstractContextManager[Log[Place, Cell]]:
+@contextmanager
+def _opened(path: Path, robot: Robot) -> Iterator[Log[Place, Cell]]:
     def entry(line: dict[str, Any]) -> tuple[Place, Cell]:
         if (owner := line.pop("robot")) != robot.hash:
             raise InputError(f"{path}: belongs to another robot ({owner}, not {robot.hash}); choose another folder")
         cell = Cell(**{k: math.nan if v is None else v for k, v in line.items()})
         return (cell.distance_m, cell.height_m), cell
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return open_log(path, "envelope", entry)
+    with made(path.parent), open_log(path, "envelope", entry) as log:
+        yield log
 
 
 def _keep(cell: Cell, robot: Robot, path: Path | None) -> None:
