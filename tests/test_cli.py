@@ -49,7 +49,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep or bench"
+NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench or completion"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),

@@ -17,16 +17,18 @@ from jumplab.task import JumpTask
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
+movies = Late("jumplab.show.movies")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
+MOVIE = needing("name a file that ends in .gif or .mp4", lambda text: text.lower().endswith((".gif", ".mp4")))
 ORDERS = ("depth-first", "breadth-first")
 
 
 @command(
     *JUMP,
     opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
-    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
+    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout, else here)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
     opt("--engine", "physics engine of the simulations (default: the first that is installed)", None, tuple(ENGINES)),
     opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
@@ -118,17 +120,27 @@ def simulate(args: Namespace) -> None:
 @command(
     opt("DIR", "folder of a plan, simulated or not"),
     opt("--out FILE.html", "file to write (default: DIR/jump.html)", None, HTML),
+    opt("--movie FILE", "a moving picture instead of the page: a file that ends in .gif or .mp4", None, MOVIE),
 )
 def view(args: Namespace) -> None:
-    """A jump in 3-D, as one HTML file."""
+    """A jump in 3-D, as one HTML file, or as a moving picture."""
+    if args.movie:
+        common.without(args, "names the page, and --movie is given instead of it", out=None)
     tape, robot, summary = store.read_plan(args.dir)
-    path = Path(args.out or Path(args.dir, "jump.html"))
+    path = Path(args.movie or args.out or Path(args.dir, "jump.html"))
     store.ensure_writable(path.parent)
     simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
     simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None
     task, scene = JumpTask(**summary["target"]), sim.Scene.of_plan(summary, robot)
+    if args.movie:
+        made = movies.write_movie(path, robot, simulation or tape, scene)
+        size = path.stat().st_size
+        args.found |= {"file": path, "bytes": size, "frames": made.frames, "drawn_by": made.drawn_by}
+        print(f"{made.frames} frames, {made.seconds:.1f} s at half speed: {path}, {size / 1e6:.1f} MB")
+        return
     page = pages.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
     page.save(path)
+    args.found |= {"file": path, "bytes": path.stat().st_size, "title": page.title}
     print(f"{page.title}: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 

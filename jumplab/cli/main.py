@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jumplab.cli.common import DEBUG, JSON, QUIET, declare
+from jumplab.cli.common import DEBUG, JSON, QUIET, command, declare, opt
 from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_process
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
@@ -23,7 +23,18 @@ from jumplab.cli.studies import bench, certify, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL = 4
-COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench)
+
+
+@command(opt("SHELL", "bash, zsh or fish", None, ("bash", "zsh", "fish")))
+def completion(args: argparse.Namespace) -> None:
+    """Completion of commands and options: eval "$(jumplab completion bash)"."""
+    import shtab
+
+    args.found["script"] = shtab.complete(_parser(), args.shell)
+    print(args.found["script"])
+
+
+COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench, completion)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -33,7 +33,8 @@ store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jum
 
 STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
 PATTERN = "[0-9][0-9]_*.ipynb"
-_PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
+_PACKAGE = Path(__file__).resolve().parent.parent
+_PACKAGE_PARENT = _PACKAGE.parent
 
 
 def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> None:
@@ -115,16 +116,16 @@ class RunReport:
 
 
 def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
-    """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
+    """The package's notebooks in their order: beside the package (a checkout), else those that it was installed with.
 
     ``names`` says which ones, by number or whole name ("02", "02_srmp"); all if empty. Raises InputError if there are
-    none, since an installed package carries no notebooks, or none of a name.
+    none, or none of a name.
     """
-    places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
+    places = [root / "notebooks" for root in (_PACKAGE_PARENT, _PACKAGE)]
     found = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
     if found is None:
         there = " nor in ".join(repr(str(p)) for p in places)
-        raise InputError(f"no notebooks in {there}; run this in a clone of the repository")
+        raise InputError(f"no notebooks in {there}; install jumplab anew")
     for name in names:
         if not any(name in (p.stem, p.stem[:2]) for p in found):
             raise InputError(f"no notebook {name!r}; there are {', '.join(p.stem for p in found)}")
@@ -148,9 +149,9 @@ def run_notebooks(
     Parameters
     ----------
     parameters : name -> value, for instance ``{"distance_m": 0.8}``.
-    out : result folder; ``executed`` in the checkout if None.
-    figures : their folder; if None, ``figures`` in ``out`` if that is given, else in the checkout (or in its result
-        folder where the checkout is read-only).
+    out : result folder; if None, ``executed`` in the checkout, or where one is if there is no checkout.
+    figures : their folder; if None, ``figures`` in ``out`` if that is given or there is no checkout, else in the
+        checkout (or in its result folder where the checkout is read-only).
     progress : show a bar per notebook on stderr.
     """
     start = time.perf_counter()
@@ -159,12 +160,12 @@ def run_notebooks(
     notebooks = [as_path(n, "a notebook").resolve() for n in notebooks or find_notebooks()]
     declared = {n: declared_parameters(n) for n in notebooks}
     values = _checked(dict(parameters or {}), declared.values())
-    root = notebooks[0].parent.parent
+    root, installed = notebooks[0].parent.parent, notebooks[0].is_relative_to(_PACKAGE)
     asked = out is not None
-    out = store.ensure_writable(out if asked else root / "executed").resolve()
+    out = store.ensure_writable(out if asked else (Path.cwd() if installed else root) / "executed").resolve()
     if figures is None:
         figures = out / "figures"
-        if not asked:
+        if not (asked or installed):
             with contextlib.suppress(InputError):
                 figures = store.ensure_writable(root / "figures")
     figures = store.ensure_writable(figures).resolve()
