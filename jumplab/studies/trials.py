@@ -33,6 +33,7 @@ from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
+from jumplab.shown import Shown
 from jumplab.sim import (
     DEFAULT_ENGINE,
     Metrics,
@@ -196,8 +197,8 @@ def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
 
 
 # a series of trials ------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class TrialReport:
+@dataclass(frozen=True, repr=False)
+class TrialReport(Shown):
     """A series of trials, and what they share."""
 
     trials: tuple[Trial, ...]  # in the order of their numbers
@@ -206,6 +207,11 @@ class TrialReport:
     plan: str  # its hash
     target: dict[str, float]  # of the plan, as its summary says it
     resumed: int = 0  # how many were taken from an earlier run
+
+    def line(self) -> str:
+        """How many landed."""
+        low, high = self.interval
+        return f"{self.landed} of {self.count} land, 95 % interval {low:.1%} ... {high:.1%}"
 
     @property
     def conditions(self) -> dict[str, str]:

@@ -12,6 +12,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
 from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
@@ -29,8 +30,8 @@ IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_co
 IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3, "acceptable_iter": 2}
 
 
-@dataclass(frozen=True)
-class SpatialPlan:
+@dataclass(frozen=True, repr=False)
+class SpatialPlan(Shown):
     """Result of the spatial program."""
 
     task: JumpTask

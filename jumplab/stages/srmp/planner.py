@@ -16,6 +16,7 @@ from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach, shipped_reach
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.stages.srmp.reachable import check_reachable, nearest
@@ -65,8 +66,8 @@ class SrmpFlight(SrmpMotion):
     foot_com_accel: np.ndarray  # (n, 2) [m/s^2]
 
 
-@dataclass(frozen=True)
-class SrmpPlan:
+@dataclass(frozen=True, repr=False)
+class SrmpPlan(Shown):
     """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept in, the target."""
 
     task: JumpTask

@@ -12,6 +12,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.problem import build_problem
@@ -51,8 +52,8 @@ class Asked:
     off: tuple[str, ...] = ()  # terms left out
 
 
-@dataclass(frozen=True)
-class WholeBodyPlan:
+@dataclass(frozen=True, repr=False)
+class WholeBodyPlan(Shown):
     """Result of stage 3 or of the direct planner."""
 
     task: JumpTask
