@@ -161,7 +161,8 @@ def planner(bhr, monkeypatch):
     """A planner and an audit that answer at once; tests may change what they say."""
     said = types.SimpleNamespace(error=None, checks=[types.SimpleNamespace(name="slip", passed=True)], task=None)
 
-    def plan_jump(task, robot, method):
+    def plan_jump(planner, task, method):
+        robot = planner.robot
         said.task, said.method = task, method
         if said.error:
             raise said.error
@@ -173,7 +174,7 @@ def planner(bhr, monkeypatch):
         ((into or folder) / "passport.json").write_text("{}")
         return types.SimpleNamespace(checks=said.checks, table=lambda: "the table", to_json=lambda: "{}")
 
-    monkeypatch.setattr("jumplab.stages.planner.plan_jump", plan_jump)
+    monkeypatch.setattr("jumplab.studies.advice.plan_or_advise", plan_jump)
     monkeypatch.setattr("jumplab.auditing.write_audit", write_audit)
     return said
 

@@ -21,7 +21,7 @@ def test_cells_are_plans_within_the_limits(bhr, tmp_path):
     found = envelope(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
     near, far, *refused = found.cells
     assert near.solved and far.solved and all(0.3 < c.share < 1.05 for c in (near, far))
-    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "ask for" in refused[0].reason
+    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "no plan is higher than" in refused[0].reason
     assert far.iterations <= near.iterations  # warm
     assert (found.highest, found.farthest) == (far, far)
     assert told[0] == "height 0.30 m: 2 of 2 cells, up to 0.60 m"

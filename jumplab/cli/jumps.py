@@ -17,6 +17,7 @@ from jumplab.task import JumpTask
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
+advice = Late("jumplab.studies.advice")
 movies = Late("jumplab.show.movies")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
@@ -81,7 +82,7 @@ def plan(args: Namespace) -> None:
     task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    found = planner.plan_jump(task, robot, method=args.method)
+    found = advice.plan_or_advise(planner.Planner(robot, keep=True), task, args.method)
     report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": found.summary, "audit": _audited(report)}
     common.print_summary(found.summary)

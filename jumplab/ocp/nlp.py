@@ -201,7 +201,7 @@ def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteratio
         violations = _conflicts(a, posed)
         if violations:
             said += f": the best compromise still violates {'; '.join(violations)}"
-            said += "; ask for less, or give these terms more room"
+            said += "; they leave each other no room"
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
     return SolverError(said, stage=name, status=status, violations=violations)

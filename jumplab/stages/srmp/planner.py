@@ -19,7 +19,7 @@ from jumplab.robot.reach import Reach, reach, shipped_reach
 from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
-from jumplab.stages.srmp.reachable import check_reachable, nearest
+from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import JumpTask
 
@@ -193,7 +193,7 @@ class SrmpPlanner:
         InfeasibleError
             Before solving, if closed forms already say that the robot cannot do it.
         SolverError
-            If there is no solution; names the violated terms, and a target close by that has one.
+            If there is no solution; names the violated terms.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
         if near is not None:
@@ -201,10 +201,7 @@ class SrmpPlanner:
                 return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)
             except SolverError:
                 pass  # as if there had been none
-        try:
-            return self._solve(task, guess, weights, off, start=start)
-        except SolverError as failure:
-            raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
+        return self._solve(task, guess, weights, off, start=start)
 
     def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
