@@ -53,7 +53,7 @@ def test_a_frame_needs_pandas(plan):
     try:
         import pandas  # noqa: F401
     except ImportError:
-        with pytest.raises(InputError, match="^a frame needs pandas: pip install pandas$"):
+        with pytest.raises(InputError, match=r"^a frame needs pandas: pip install pandas$"):
             plan.to_frame()
     else:
         frame = plan.to_frame()

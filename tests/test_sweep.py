@@ -148,7 +148,8 @@ REFUSALS = [
     ("sweep --out s --jobs many", "--jobs must be a number, got 'many'"),
     (
         "sweep --out s --method magic",
-        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); 'jumplab sweep --help' shows what is possible",
+        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); "
+        "'jumplab sweep --help' shows what is possible",
     ),
     ("sweep --out s --distance-m 0.1,0.1", "the sweep has the same case twice; give every value once"),
     (

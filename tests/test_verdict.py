@@ -65,8 +65,8 @@ def test_platforms_drops_flips_and_backward_jumps_pass(task):
     (JumpTask(1.0, 1.2), r"height = 1\.2 m: take-off at 4\.85 m/s, on average \d+ N over 0\.\d\d m of leg stroke"),
     (JumpTask(2.8, 0.5), r"distance = 2\.8 m: .* at most \d\.\d\d m forward .* cover more than \d\.\d\d m"),
     (JumpTask(-2.9, 0.2), r"distance = -2\.9 m: .* at most \d\.\d\d m backward"),
-    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* no such plan lands above 0\.\d\d m, and none lands on this one from a height of"),
-    (JumpTask(0.0, 0.2, rotation_rad=-4 * math.pi), r"rotation = -720 deg: .* heights of less than 0\.\d\d m leave less time"),
+    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* no such plan lands above 0\.\d\d m, and none lands on this one"),
+    (JumpTask(0.0, 0.2, rotation_rad=-4 * math.pi), r"rotation = -720 deg: .* heights of less than 0\.\d\d m"),
 ])  # fmt: skip
 def test_the_absurd_is_refused_in_words(task, words):
     assert re.search(words, message(task)), message(task)

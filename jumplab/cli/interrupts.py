@@ -15,7 +15,8 @@ from jumplab.io import files
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 UNCHANGED = "interrupted; what was there before is unchanged"
 AGAIN_S = 0.05  # how often it is looked whether the exception got lost
-PATIENCE_S = 1.4  # after this long without an end, the process is ended from outside of what it is doing
+LEAVE_S = 0.5  # for what libraries do at the end of a process
+PATIENCE_S = 1.2  # after this long without an end, the process is ended from outside of what it is doing
 
 
 class Stopped(KeyboardInterrupt):
@@ -90,11 +91,23 @@ class Interrupts:
         if self._alone and not self._over:
             if self.number == signal.SIGINT:
                 print(f"jumplab: {UNCHANGED}", file=self._stderr, flush=True)
-            end_process(self.code)
+            end_children()
+            os._exit(self.code)
 
 
-def end_process(code: int) -> None:
-    """End this process at once, and those that it has started."""
+def end_soon(code: int) -> None:
+    """Let the process end by itself, without those that it has started; at once, if it has not ended soon."""
+
+    def end() -> None:
+        time.sleep(LEAVE_S)
+        os._exit(code)
+
+    end_children()
+    threading.Thread(target=end, daemon=True).start()
+
+
+def end_children() -> None:
+    """Kill the processes that this one has started."""
     import psutil
 
     children = psutil.Process().children(recursive=True)
@@ -102,6 +115,3 @@ def end_process(code: int) -> None:
         with contextlib.suppress(psutil.Error):
             if "resource_tracker" not in " ".join(child.cmdline()):  # tidies up behind the others, then ends by itself
                 child.kill()
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdout.flush()
-    os._exit(code)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from jumplab.cli.common import DEBUG, JSON, QUIET, command, declare, opt
-from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_process
+from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
 from jumplab.cli.status import Status
@@ -126,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--json" in argv:
             _print_json({**found, "exit_code": code, "error": said})
         if alone and heard.number is not None:
-            end_process(code)
+            end_soon(code)
         return code
     if "--json" in argv:
         _print_json({**found, "exit_code": 0, "error": None})

@@ -187,7 +187,8 @@ def _check_height(task: JumpTask, can: Capability, name: str) -> None:
         raise InfeasibleError(
             f"height = {task.height_m:g} m: take-off at {task.takeoff_speed:.2f} m/s, on average "
             f"{needed_force(can, task.height_m):.0f} N over {can.stroke:.2f} m of leg stroke; the legs of {name} reach "
-            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); no plan is higher than {_below(limit)} m",
+            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); no plan is higher than "
+            f"{_below(limit)} m",
             number="height_m",
             bound=limit,
         )
