@@ -8,7 +8,7 @@ from typing import Any
 
 from jumplab.io.progress import told_to
 
-FIRST_S, REDRAW_S = 0.6, 0.2  # what ends sooner says nothing; later, the line is kept up to date
+FIRST_S, REDRAW_S = 0.4, 0.2  # what ends sooner says nothing; later, the line is kept up to date
 WIDTH = 110  # longer ones would wrap on most terminals, and could not be redrawn
 
 

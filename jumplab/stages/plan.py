@@ -162,11 +162,11 @@ class JumpPlan(Shown, Named):
         -------
         phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
         -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
-        zero). None for a plan without stage 1.
+        zero). None for a plan without stage 1, or out of the plane.
         """
         if self.stored is not None:
             return self.stored.get("tracking")
-        return None if self.srmp is None else _tracking(self.tape, self.srmp)
+        return None if self.srmp is None or not self.task.in_plane else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:
