@@ -45,10 +45,13 @@ def plan(
     Raises
     ------
     InputError, InfeasibleError, SolverError
-        If a stage refuses the target or finds no motion; the sentence says which, and what to ask for instead.
+        If a stage refuses the target or finds no motion; the sentence says which, and ends with an easier target
+        that has a plan, if one was found.
     """
+    from jumplab.studies.advice import plan_or_advise
+
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
-    return Planner(robot, keep=True, **changes).plan(task, method)
+    return plan_or_advise(Planner(robot, keep=True, **changes), task, method)
 
 
 def audit(plan: JumpPlan) -> AuditReport:

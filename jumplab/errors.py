@@ -30,9 +30,16 @@ class RobotError(InputError):
 
 
 class InfeasibleError(JumplabError):
-    """The question is well posed, but this robot cannot do it (or no plan was found within the limits)."""
+    """The question is well posed, but this robot cannot do it (or no plan was found within the limits).
+
+    ``number`` names what of the target is beyond its limit ("height_m"), ``bound`` is one that no plan passes [m].
+    """
 
     exit_code = 3
+
+    def __init__(self, message: str, *, number: str = "", bound: float | None = None):
+        super().__init__(message)
+        self.number, self.bound = number, bound
 
 
 class SolverError(JumplabError):

@@ -143,8 +143,10 @@ def test_start_and_platform_that_cannot_be_are_refused():
     assert str(e.value) == "a jump to the side or with a turn begins in the stance; leave its start away"
     with pytest.raises(InfeasibleError) as e:
         planner().plan(replace(SIDE, platform_m=0.2), "direct")
-    said = "platform = 0.2 m at a distance of 0 m: the two surfaces would meet under a sole of bhr; ask for a distance "
-    assert str(e.value) == said + "of 0.29 m or more"
+    said = (
+        "platform = 0.2 m at a distance of 0 m: the two surfaces would meet under a sole of bhr; that takes a distance "
+    )
+    assert str(e.value) == said + "of at least 0.29 m"
 
 
 def test_targets_out_of_the_plane_are_checked():

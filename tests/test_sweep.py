@@ -13,7 +13,8 @@ import pytest
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab.cli.studies import values_of, weights_of
+from jumplab.cli.common import values_of
+from jumplab.cli.studies import weights_of
 from jumplab.errors import InputError
 from jumplab.robot.description import SHIPPED
 from jumplab.studies import sweep
@@ -133,20 +134,30 @@ def test_another_sweep_is_not_mixed_in(tmp_path, monkeypatch):
 
 REFUSALS = [
     ("sweep", "the following arguments are required: --out; 'jumplab sweep --help' shows what is possible"),
-    ("sweep --out s --distance-m 0:1", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1'"),
-    ("sweep --out s --distance-m 0:1:x", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1:x'"),
+    (
+        "sweep --out s --distance-m 0:1",
+        "--distance-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '0:1'",
+    ),
+    (
+        "sweep --out s --distance-m 0:1:x",
+        "--distance-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '0:1:x'",
+    ),
     ("sweep --out s --height-m low", "--height-m must be a number, got 'low'"),
     ("sweep --out s --height-m 9", "height = 9 m is outside 0.02 ... 1.5 m"),
     ("sweep --out s --weight torque", "--weight must be TERM=A,B,..., got 'torque'"),
-    ("sweep --out s --jobs many", "--jobs must be a number of processes, or -1 for all processors, got 'many'"),
-    ("sweep --out s --method magic", "method 'magic': choose one of three-step, direct"),
+    ("sweep --out s --jobs many", "--jobs must be a number, got 'many'"),
+    (
+        "sweep --out s --method magic",
+        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); "
+        "'jumplab sweep --help' shows what is possible",
+    ),
     ("sweep --out s --distance-m 0.1,0.1", "the sweep has the same case twice; give every value once"),
     (
         "sweep --out s --robot asimo",
         f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
     ),
-    ("bench --repeats 0", "--repeats must be a number from 1 to 1000, got '0'"),
-    ("bench --repeats 1 --json no/such/file", "--json must name a file in a folder that exists, got 'no/such/file'"),
+    ("bench --repeats 0", "--repeats must be a whole number from 1 to 1000, got '0'"),
+    ("bench --repeats 1 --out no/such/file", "--out must name a file in a folder that exists, got 'no/such/file'"),
     ("bench --distance-m far", "--distance-m must be a number, got 'far'"),
 ]
 

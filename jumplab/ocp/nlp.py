@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from jumplab.errors import InputError, SolverError
+from jumplab.io.progress import tell
 from jumplab.ocp.assembly import Assembled, Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
 from jumplab.ocp.derivatives import JERK_CHAIN, scatter
@@ -69,6 +70,7 @@ class Nlp:
         self, problem: Problem, options: Mapping | None = None, key: str | None = None, like: Nlp | None = None
     ):
         began = time.perf_counter()
+        tell(f"building {problem.name}")
         self.problem, self._options = problem, {**IPOPT, **(options or {})}
         self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
         self.build_s = time.perf_counter() - began
@@ -147,6 +149,7 @@ class Nlp:
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}
         if multipliers is not None:
             start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, multipliers), strict=True))
+        tell(f"solving {a.problem.name}")
         began = time.perf_counter()
         answer = self._solver(x0=posed.x0, p=posed.p, lbx=lbx, ubx=ubx, lbg=lbg, ubg=ubg, **start)
         solve_s, stats = time.perf_counter() - began, self._solver.stats()
@@ -236,7 +239,7 @@ def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteratio
         violations = _conflicts(a, posed)
         if violations:
             said += f": the best compromise still violates {'; '.join(violations)}"
-            said += "; ask for less, or give these terms more room"
+            said += "; they leave each other no room"
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
     return SolverError(said, stage=name, status=status, violations=violations)

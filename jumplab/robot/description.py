@@ -22,6 +22,7 @@ from jumplab.robot.sagittal import SagittalModel, read_only, reduce
 from jumplab.robot.stance import check_stance
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
 from jumplab.robot_import.urdf import locate, read_urdf
+from jumplab.shown import Shown
 from jumplab.task import GRAVITY
 
 if TYPE_CHECKING:
@@ -74,8 +75,8 @@ class Foot:
         return read_only([(self.heel + self.toe) / 2, 0.0, self.sole_z])
 
 
-@dataclass(frozen=True)
-class Robot:
+@dataclass(frozen=True, repr=False)
+class Robot(Shown):
     """A humanoid: the texts of its URDF and of its TOML file, and all that follows from them; made by :meth:`load`.
 
     Everything is read-only, so that :attr:`hash` names what is planned with; :meth:`with_limits`, :meth:`with_mass` and
@@ -90,6 +91,11 @@ class Robot:
     foot: Foot = field(init=False)
     stance: Mapping[str, float] = field(init=False)  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
     corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
+
+    def line(self) -> str:
+        """Name, mass, joints, hash."""
+        arms = "" if self.joints["shoulder_pitch"] else ", arms held"
+        return f"{self.name}, {self.total_mass:.1f} kg, {len(self.joint_names)} joints{arms}, hash {self.hash}"
 
     @classmethod
     def load(cls, name_or_path: str | Path = "bhr", *, repair: tuple[str, ...] = ()) -> Robot:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from jumplab.io.columns import com_height
 from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.show import style
@@ -207,12 +208,13 @@ def envelope_map(envelope: Envelope) -> Figure:
 
 # simulations ----------------------------------------------------------------------------------------------------
 @style.styled
-def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
-    """F-1: the simulated jump in one picture, launch, flight and landing in their colours, with the CoM's path.
+def jump_strobe(result: SimulationResult | Tape, robot: Robot) -> Figure:
+    """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's path.
 
     Heights are true; sideways the frames are evenly spaced, so that none hides another.
     """
-    rows = _strip_rows(result)
+    height = com_height(result)
+    rows = _strip_rows(result, height)
     fig = style.new_figure(style.PAGE_IN, 2.6)
     ax = fig.subplots()
     places = STRIP_M * np.arange(len(rows))
@@ -221,25 +223,25 @@ def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(style.shade(color, 0.8))
     air = (result.phase == "flight") & (result.t >= result.t[rows[0]])
-    draw_path(ax, np.interp(result.t[air], result.t[rows], places), result.com[air, 2])  # linear in time between frames
+    draw_path(ax, np.interp(result.t[air], result.t[rows], places), height[air])  # linear in time between frames
     left, right = ax.get_xlim()
     draw_ground(ax, left, right)
     ax.set_xlim(left, right)
-    style.legend_above(fig, style.phase_handles(*style.PHASE_COLORS))
+    style.legend_above(fig, style.phase_handles(*dict.fromkeys(map(str, result.phase))))
     style.bare(ax)
     return fig
 
 
-def _strip_rows(result: SimulationResult) -> np.ndarray:
+def _strip_rows(result: SimulationResult | Tape, height: np.ndarray) -> np.ndarray:
     """Rows of the frames: start, crouch, lift-off, some of the flight, touchdown, deepest, end."""
     flight = np.flatnonzero(result.phase == "flight")
     if not len(flight):  # it never left the ground
         return np.linspace(0, len(result.t) - 1, 5).astype(int)
     off, on = int(flight[0]), int(flight[-1])
-    rows = [0, int(np.argmin(result.com[:off, 2])), off - 1] if off else []
+    rows = [0, int(np.argmin(height[:off])), off - 1] if off else []
     rows += [off + int(share * (on - off)) for share in FLIGHT_SHARES]
     if on + 1 < len(result.t):
-        rows += [on + 1, on + 1 + int(np.argmin(result.com[on + 1 :, 2])), len(result.t) - 1]
+        rows += [on + 1, on + 1 + int(np.argmin(height[on + 1 :])), len(result.t) - 1]
     return np.array(rows)
 
 

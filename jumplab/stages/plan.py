@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
+from jumplab.shown import Shown
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
 from jumplab.stages.spatial import SpatialPlan
@@ -33,8 +36,8 @@ class StageRow:
     solve_s: float
 
 
-@dataclass(frozen=True)
-class JumpPlan:
+@dataclass(frozen=True, repr=False)
+class JumpPlan(Shown, Named):
     """A finished plan.
 
     Attributes
@@ -67,6 +70,18 @@ class JumpPlan:
         task = JumpTask(**{f.name: target[f.name] for f in fields(JumpTask) if f.name in target})
         rows = tuple(StageRow(**row) for row in summary["stages"])
         return cls(task, robot, summary["method"], tape, None, None, None, rows, summary.get("skipped"), summary)
+
+    def line(self) -> str:
+        """Robot, target and duration."""
+        turned = "" if self.task.in_plane else f", {self.planned_side_m:.2f} m to the left"
+        turned += f", turned by {round(math.degrees(self.task.rotation_rad))} deg" if self.task.rotation_rad else ""
+        jump = f"{self.planned_distance_m:.2f} m far{turned}, rise {self.planned_rise_m:.2f} m"
+        return f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time (N,) of the tape [s]; take-off appears twice."""
+        return self.tape.t
 
     @property
     def planned_distance_m(self) -> float:
@@ -147,11 +162,11 @@ class JumpPlan:
         -------
         phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
         -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
-        zero). None for a plan without stage 1.
+        zero). None for a plan without stage 1, or out of the plane.
         """
         if self.stored is not None:
             return self.stored.get("tracking")
-        return None if self.srmp is None else _tracking(self.tape, self.srmp)
+        return None if self.srmp is None or not self.task.in_plane else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
+from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
 from jumplab.ocp import PhaseGuess, Statistics, Term
@@ -38,7 +38,6 @@ METHODS = ("three-step", "direct")
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
-SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
 
@@ -306,18 +305,7 @@ class Planner:
     def _first_two(
         self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
     ) -> tuple[SrmpPlan, JointPlan]:
-        """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
-        try:
-            return self._pass(task, start, asked)
-        except SolverError as e:
-            nearest = self._nearest(task, asked) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
-            if not nearest:
-                raise
-            raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
-
-    def _pass(
-        self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
-    ) -> tuple[SrmpPlan, JointPlan]:
+        """Stages 1 and 2."""
         q0 = None if start is None else self._standing(start)
         srmp = self._pendulum(task, start, weights=asked["srmp"].weights)
         try:
@@ -339,21 +327,6 @@ class Planner:
     def _pendulum(self, task: JumpTask, start: np.ndarray | None, **how: Any) -> SrmpPlan:
         """Stage 1, from the rod of a posture in which the robot waits."""
         return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **how)
-
-    def _nearest(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> str:
-        """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
-        for share in SHORTER if task.distance_m else ():
-            less = replace(task, distance_m=round(share * task.distance_m, 2))
-            try:
-                self._pass(less, None, asked)
-            except InfeasibleError:
-                continue
-            except SolverError as e:
-                if e.stage != "joint_map":
-                    break
-            else:
-                return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
-        return ""
 
     def replan(self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None) -> JumpPlan:
         """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.

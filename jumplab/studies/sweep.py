@@ -25,9 +25,11 @@ from tqdm import tqdm
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError, JumplabError
-from jumplab.io.files import Log, ensure_writable, locked, open_log, write_file
+from jumplab.io.files import Log, ensure_writable, locked, made, open_log, settle, write_file
+from jumplab.io.progress import tell
 from jumplab.robot import Robot
 from jumplab.stages.planner import METHODS, Planner
+from jumplab.studies.trials import served
 from jumplab.task import JumpTask
 
 CASES, TABLE = "cases.jsonl", "table.csv"
@@ -129,17 +131,20 @@ def run(
     _check_weights(cases)
     hashes = {name: Robot.load(name).hash for name in sorted({case.robot for case in cases})}
     folder = ensure_writable(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with _opened(folder, cases, hashes) as log, _backend(cluster):
+    with _backend(cluster), made(folder), _opened(folder, cases, hashes) as (log, head):
         done = {case.key(): log.done.get(case.key()) for case in cases}
         left = [case for case in cases if done[case.key()] is None]
         hide = None if progress is None else not progress
         with tqdm(total=len(cases), initial=len(cases) - len(left), unit="plan", disable=hide) as bar:
             work = joblib.Parallel(jobs, return_as="generator_unordered")
             for key, row in work(joblib.delayed(_keyed)(case) for case in left):
+                if log.empty:
+                    log.add(head)
                 log.add({"case": key, "row": row})
                 done[key] = row
                 bar.update()
+                tell("planned", len(cases) - list(done.values()).count(None), len(cases))
+        settle()
         write_file(folder / TABLE, _csv(list(done.values())).encode())
     return list(done.values())
 
@@ -158,7 +163,7 @@ def _check_weights(cases: list[Case]) -> None:
 def _backend(cluster: str | None) -> AbstractContextManager:
     """Where joblib sends the work: processes of this machine, or a Dask cluster."""
     if not cluster:
-        return joblib.parallel_config("loky", inner_max_num_threads=1)
+        return joblib.parallel_config("loky", inner_max_num_threads=1, **served())
     try:
         from distributed import Client
     except ImportError:
@@ -171,8 +176,10 @@ def _backend(cluster: str | None) -> AbstractContextManager:
 
 
 @contextmanager
-def _opened(folder: Path, cases: list[Case], hashes: Mapping[str, str]) -> Iterator[Log[str, dict[str, Any]]]:
-    """The folder's log, if it is one of this very sweep."""
+def _opened(
+    folder: Path, cases: list[Case], hashes: Mapping[str, str]
+) -> Iterator[tuple[Log[str, dict[str, Any]], dict]]:
+    """The folder's log, if it is one of this very sweep, and the line that it begins with."""
 
     def entry(line: Any) -> tuple[str, dict[str, Any]]:
         return (line["case"], line["row"]) if "case" in line else (_HEAD, {k: line[k] for k in ("sweep", "robots")})
@@ -180,14 +187,12 @@ def _opened(folder: Path, cases: list[Case], hashes: Mapping[str, str]) -> Itera
     wanted = "\n".join(case.key() for case in cases)
     head = {"sweep": hashlib.sha256(wanted.encode()).hexdigest(), "robots": dict(hashes)}
     with locked(folder), open_log(folder / CASES, "sweep", entry) as log:
-        if log.empty:
-            log.add(head)
-        elif _HEAD not in log.done:
+        if not log.empty and _HEAD not in log.done:
             raise InputError(f"{str(folder / CASES)!r} is no log of a sweep; choose another folder")
-        elif log.done[_HEAD] != head:
+        if not log.empty and log.done[_HEAD] != head:
             other = "a sweep of other targets, robots or weights"
             raise InputError(f"{str(folder)!r} holds {other}; choose another folder")
-        yield log
+        yield log, head
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:

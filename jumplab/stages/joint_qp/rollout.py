@@ -15,6 +15,7 @@ from jumplab.models.full import FullBody, FullMotion, FullTerms
 from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
+from jumplab.shown import Shown
 from jumplab.stages.joint_qp.changes import changed
 from jumplab.stages.joint_qp.flight import FlightQp
 from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
@@ -68,8 +69,8 @@ class Statistics:
     worst_residual: float
 
 
-@dataclass(frozen=True)
-class JointPlan:
+@dataclass(frozen=True, repr=False)
+class JointPlan(Shown):
     """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once per phase.
 
     Wrenches and torques are those in the middle of the step that begins at the node. ``actual`` and ``reference`` say

@@ -12,6 +12,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
 from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
@@ -33,8 +34,8 @@ IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3,
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
 
 
-@dataclass(frozen=True)
-class SpatialPlan:
+@dataclass(frozen=True, repr=False)
+class SpatialPlan(Shown):
     """Result of the spatial program."""
 
     task: JumpTask
@@ -174,7 +175,7 @@ class SpatialPlanner:
             way = float(np.hypot(task.distance_m, task.side_m))
             raise InfeasibleError(
                 f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
-                f"sole of {self.robot.name}; ask for a distance of {way - apart:.2f} m or more"
+                f"sole of {self.robot.name}; that takes a distance of at least {way - apart:.2f} m"
             )
         return edge
 

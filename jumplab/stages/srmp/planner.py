@@ -16,9 +16,10 @@ from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach, shipped_reach
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
-from jumplab.stages.srmp.reachable import check_reachable, nearest
+from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import JumpTask
 
@@ -65,8 +66,8 @@ class SrmpFlight(SrmpMotion):
     foot_com_accel: np.ndarray  # (n, 2) [m/s^2]
 
 
-@dataclass(frozen=True)
-class SrmpPlan:
+@dataclass(frozen=True, repr=False)
+class SrmpPlan(Shown):
     """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept in, the target."""
 
     task: JumpTask
@@ -192,7 +193,7 @@ class SrmpPlanner:
         InfeasibleError
             Before solving, if closed forms already say that the robot cannot do it.
         SolverError
-            If there is no solution; names the violated terms, and a target close by that has one.
+            If there is no solution; names the violated terms.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
         spread = self.changes.spread(self.nlp.problem, weights)
@@ -208,10 +209,7 @@ class SrmpPlanner:
                 return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)
             except SolverError:
                 pass  # as if there had been none
-        try:
-            return self._solve(task, guess, weights, off, start=start)
-        except SolverError as failure:
-            raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
+        return self._solve(task, guess, weights, off, start=start)
 
     def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)

@@ -12,6 +12,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
+from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.problem import build_problem
@@ -51,8 +52,8 @@ class Asked:
     off: tuple[str, ...] = ()  # terms left out
 
 
-@dataclass(frozen=True)
-class WholeBodyPlan:
+@dataclass(frozen=True, repr=False)
+class WholeBodyPlan(Shown):
     """Result of stage 3 or of the direct planner."""
 
     task: JumpTask
@@ -98,8 +99,8 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
     if task.distance_m < least:
         raise InfeasibleError(
             f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-            f"under a sole of {robot.name}; ask for a distance of {least:.2f} m or more (backward jumps only on the "
-            f"level)"
+            f"under a sole of {robot.name}; that takes a distance of at least {least:.2f} m (backward jumps only on "
+            f"the level)"
         )
 
 
