@@ -35,6 +35,7 @@ from jumplab.task import JumpTask
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab.show.certificate")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
+memory = Late("jumplab.studies.atlas")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
@@ -246,6 +247,26 @@ def envelope(args: Namespace) -> None:
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
+@command(
+    ROBOT,
+    opt("--out DIR", "folder for atlas.npz; an interrupted one goes on", None, folder, required=True),
+    opt("--distance-m M", f"of the nodes: {VALUES} [m] (default 0:1.2:7)", "0:1.2:7", values_of),
+    opt("--height-m M", f"of the nodes: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
+    JOBS,
+)
+def atlas(args: Namespace) -> None:
+    """Plan a grid once: any target between its nodes is then a few steps away."""
+    began, robot = time.perf_counter(), robots.Robot.load(args.robot)
+    store.ensure_writable(args.out)
+    axes, jobs = (args.distance_m, args.height_m), args.jobs or os.cpu_count() or 1
+    found = memory.Atlas.build(robot, *axes, folder=args.out, jobs=jobs, tell=print)
+    args.found |= {"out": args.out, "planned": len(found.nodes), "of": math.prod(map(len, axes))}
+    if not found.nodes:
+        raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
+    print(f"{found} in {args.out}; 'jumplab plan --atlas {args.out} --method direct' begins with it")
+    print(f"whole atlas: {time.perf_counter() - began:.1f} s")
+
+
 def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     """All combinations of the weights that were given."""
     found: list[dict[str, float]] = [{}]
@@ -267,6 +288,8 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
     JOBS,
     opt("--cluster ADDRESS", "Dask scheduler that does the work, tcp://HOST:PORT"),
+    opt("--atlas", "build a small atlas of every robot first, and begin direct plans with it"),
+    opt("--tapes HZ", "also keep the motions, so many rows a second, in DIR/tapes", None, number),
 )
 def sweep(args: Namespace) -> None:
     """Plans for a grid of targets, robots and weights, in one table."""
@@ -275,7 +298,15 @@ def sweep(args: Namespace) -> None:
         without(args, "is for processes of this machine, and --cluster does the work elsewhere", jobs=None)
     axes = (args.distance_m, args.height_m, args.platform_m)
     cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
-    rows = sweeps.run(cases, args.out, jobs=args.jobs or -1, cluster=args.cluster, progress=bars(args))
+    rows = sweeps.run(
+        cases,
+        args.out,
+        jobs=args.jobs or -1,
+        cluster=args.cluster,
+        progress=bars(args),
+        atlas=args.atlas,
+        tapes_hz=args.tapes,
+    )
     args.found |= {"table": Path(args.out, sweeps.TABLE), "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
     outcome = f"{planned} planned, {clean} of them clean in the audit"

@@ -116,7 +116,7 @@ class Atlas:
         folder : where ``atlas.npz`` is written, row by row; an unfinished one is gone on with, and a finished one read.
         jobs : processes that share the rows.
         tell : called with a line per finished row.
-        how : further arguments of :class:`jumplab.Planner`: terms, weights, off, limits, mesh.
+        how : further arguments of :class:`jumplab.Planner`: terms, weights, off, limits, mesh, keep (True).
 
         Raises
         ------
@@ -129,7 +129,7 @@ class Atlas:
             raise InputError(f"the atlas has {len(distances)} x {len(heights)} nodes, at most {MAX_NODES}")
         for distance, height in product(distances, heights):
             JumpTask(distance, height)  # refuses what no task may ask
-        planner = Planner(robot, **how)
+        planner = Planner(robot, **{"keep": True} | how)
         body, tell = planner.stage("direct"), tell or (lambda line: None)
         atlas, done = cls(robot.name, distances, heights, {}, key_of(body)), set()
         if folder is not None and (Path(folder) / FILE).exists():
@@ -308,8 +308,12 @@ def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
     )
 
 
+_here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew
+
+
 def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tuple[float, list[Node]]:
     """Nodes of one height, from near to far, each from its neighbour's solution."""
+    planner = _here.setdefault(planner.token, planner)
     body, plan, row, failed = planner.stage("direct"), None, [], 0
     for distance in distances:
         task = JumpTask(distance, height)
