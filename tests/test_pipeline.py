@@ -83,6 +83,8 @@ def test_summary_is_plain_and_true(plan):
         "platform_m": 0.0,
         "rotation_rad": 0.0,
         "gravity": 9.8,
+        "side_m": 0.0,
+        "yaw_rad": 0.0,
     }
     assert summary["robot"]["hash"] == plan.robot.hash and summary["robot"]["mass_kg"] == pytest.approx(42.0)
     assert summary["planned_distance_m"] == plan.planned_distance_m

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +23,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
     from jumplab.studies.trials import TrialReport
 
-DPI = 96  # of a card's picture: sharp enough, and some 30 kB
-Card = tuple[Table, Figure | None]
+Card = tuple[Table, style.Picture | None]
 
 
 def card(x: Shown) -> str | None:
@@ -34,13 +32,13 @@ def card(x: Shown) -> str | None:
     if make is None:
         return None
     rows, figure = make(x)
-    picture = "" if figure is None else f'<img src="data:image/png;base64,{_png(figure)}" style="max-width: 100%">'
+    picture = "" if figure is None else _image(figure)
     return f"<div><b>{html.escape(f'{type(x).__name__}: {x.line()}')}</b>{rows._repr_html_()}{picture}</div>"
 
 
-def _png(figure: Figure) -> str:
-    figure.savefig(buffer := io.BytesIO(), format="png", dpi=DPI)
-    return base64.b64encode(buffer.getvalue()).decode()
+def _image(figure: style.Picture) -> str:
+    png = base64.b64encode(figure._repr_png_()).decode()
+    return f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
 
 
 def _of_plan(plan: JumpPlan) -> Card:
