@@ -62,3 +62,17 @@ class SrmpSettings:
         the turn is had by folding, not by more momentum in an open body.
         """
         return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0), flight_inertia=1.0)
+
+
+@dataclass(frozen=True)
+class SpatialSrmpSettings(SrmpSettings):
+    """The same out of the plane, and what only matters there."""
+
+    spatial_intervals: tuple[int, int, int] = (12, 4, 10)  # flat feet, toes, flight
+    friction: float = 0.42  # as in the spatial program
+    foot_share: float = 0.15  # of the weight, on each foot at least, as there
+    roll_rad: float = 0.3  # of the body in launch, either way
+    yaw_rad: float = 0.6  # of the body over the standing feet, either way: what hips and arms give
+    side_window_m: float = 0.02  # at touchdown, ahead and aside of the place that catches the robot
+    w_inertia_jerk_launch: float = 1e-6  # SL-J1, of both inertias: the barbell's radius, told in inertia
+    w_usual: float = 60.0  # [1 / (kg m^2)^2 / s] inertias that postures of this leg length usually have
