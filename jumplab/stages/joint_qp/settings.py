@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jumplab.ocp import Term
 from jumplab.task import FRICTION
@@ -52,6 +52,7 @@ class LaunchWeights:
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
+    heels: float = 0.1  # [cost] / [rad/s^2]^2, out of the plane: else one heel rises, and its leg is spent
     acceleration: float = 1e-5  # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
 
 
@@ -107,3 +108,8 @@ GENTLE = Options(
         com=3.0, force=3e-3, com_x=3.0, force_x=3e-3, moment=1.0, inertia=3e-3, inertia_toe=6e-5, inertia_fade_s=0.01
     ),
 )
+
+
+def in_space(o: Options) -> Options:
+    """The same out of the plane: without mirror rows, posture and trunk keep arms and pelvis from swinging idly."""
+    return replace(o, launch=replace(o.launch, posture=1e-3, trunk=2e-2))

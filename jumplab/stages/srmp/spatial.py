@@ -113,11 +113,14 @@ class Body:
 def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
     """Costs and constraints of the launch, SL-*; flat feet, or heels up with the CoP at the toes."""
     now, mg, reach = partial(at, mass=b.mass), b.mass * GRAVITY, b.reach
-    jerk = ca.DM(np.sqrt([s.w_jerk[1]] * 3 + [s.w_jerk[0]] * 3 + [s.w_inertia_jerk_launch] * 2))
+    jerk = ca.DM(np.sqrt([s.w_level_jerk] * 2 + [s.w_jerk[1]] + [s.w_jerk[2]] * 3 + [s.w_inertia_jerk_launch] * 2))
 
     def room(p):
         low, high = b.range_of(now(p).length, s.inertia_margin)
         return ca.vertcat(now(p).inertia - low, high - now(p).inertia)
+
+    def unusual(p):
+        return now(p).inertia - b.usual(now(p).length, heel_up)
 
     def cone(p):
         f = now(p).force
@@ -157,7 +160,8 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
         node("CoM velocity", "SL-J2", "m/s", lambda p: now(p).com_velocity, s.w_velocity),
         node("L rate", "SL-J3", "N m", lambda p: now(p).L_rate, s.w_momentum_rate),
         node("turn", "SL-J4: against the leg", "rad", turn, s.w_turn),
-        node("usual inertia", "ours", "kg m^2", lambda p: now(p).inertia - b.usual(now(p).length, heel_up), s.w_usual),
+        node("usual inertia", "ours: rho(phi)", "kg m^2", lambda p: unusual(p)[0], s.w_usual_inertia),
+        node("usual yaw inertia", "ours: rho(phi)", "kg m^2", lambda p: unusual(p)[1], s.w_usual_yaw_inertia),
         limit("inertia envelope", "SL-P4: rho(phi)", "kg m^2", "node", room, 0.0),
         limit("unilateral", "ours", "N", "node", lambda p: now(p).force[2], 0.0, **air),
         limit("friction", "ours", "N", "node", cone, 0.0, **air),
@@ -173,11 +177,11 @@ def squat_terms(b: Body, s: SpatialSrmpSettings) -> list[Term]:
     (slope, offset), easy = b.reach.low_com_fit, ca.DM(b.reach.easy_com_fit)
 
     def deep(p):
-        below = ca.polyval(easy, p.q[0]) - p.q[2]
+        below = ca.polyval(easy, p.q[0]) + s.crouch_room_m - p.q[2]
         return (below + ca.sqrt(below**2 + s.crouch_smoothing_m**2)) / 2
 
     def height(p):
-        return p.q[2] - slope * p.q[0] - offset
+        return p.q[2] - slope * p.q[0] - offset - s.crouch_room_m
 
     return [
         Term("crouch depth", "ours: flat feet", "m", "node", deep, weight=s.w_deep_crouch),
