@@ -266,7 +266,9 @@ def yaw_reach(robot: Robot, count: int = 2**12) -> YawReach:
         for x in (s.edge, 1 - s.edge)
     )
     low, high = _around_stance(low, high, float(_rod(robot.sagittal, stance_angles(robot))[0][1]), own)
-    return YawReach(low, high, np.polyfit(phi[easy], inertia[easy], 1), tuple(map(float, ends)), float(own), abs(left - right) / 2)
+    return YawReach(
+        low, high, np.polyfit(phi[easy], inertia[easy], 1), tuple(map(float, ends)), float(own), abs(left - right) / 2
+    )
 
 
 def shipped_reach(robot: Robot) -> Reach | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.io.tape import RATE_HZ, Tape
+from jumplab.models.full import TurningBody
 from jumplab.models.planar import evaluator
 from jumplab.ocp import PhaseSolution
 from jumplab.robot import Robot
@@ -36,6 +37,13 @@ def planar_quantities(
         known[names] = known[whole].factory("some", known[whole].name_in(), list(names))
     out = known[names].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
     return {k: v.full().T.squeeze() for k, v in out.items()}
+
+
+def turning_inertias(robot: Robot, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inertia across the heading and about the vertical at n instants, and their rates (n, 2) [kg m^2, kg m^2/s]."""
+    body = TurningBody(robot)
+    seen = [body.motion(*state) for state in zip(q, v, strict=True)]
+    return np.array([x.rho for x in seen]), np.array([x.rho_rate for x in seen])
 
 
 def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:

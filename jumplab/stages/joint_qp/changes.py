@@ -45,7 +45,6 @@ BLOCKS = {  # phase -> name -> block; "inertia" as in the paper only in flight
         "moment": Block("Sec. IV-A: A_f F - B_f, angular rows", "N m", ("moment",)),
         "inertia": Block("ours: J_rho theta'' + drift - rho''_ref", "kg m^2/s^2", ("inertia", "inertia_toe")),
         "wrench": Block("ours: regulariser", "N, N m", ("wrench",)),
-        "heels": Block("ours, out of the plane: both rise alike", "rad/s^2", ("heels",)),
         "tiptoe": Block("Sec. IV-A: J theta'' + drift = p''_foot", "m/s^2, rad/s^2"),
         "foot pitch or toe moment": Block("ours: flat foot, or no moment about the toe", "rad/s^2, N m"),
         "ground": Block("ours: F_z >= 0, friction, CoP in the sole", "N, N m"),

@@ -21,7 +21,7 @@ class FlightTarget:
     foot_accel: np.ndarray  # p''_rd of the soles relative to the CoM (2, 3), feed-forward + PD
     inertia_accel: float  # rho''_ref [kg m^2/s^2], feed-forward + PD
     base_force: np.ndarray  # on the base (6,), cancels numerical drift of the momentum [N, N m]; physically zero
-    foot_turn: np.ndarray  # angular, of the feet towards level (2,); about all axes out of the plane (6,)
+    foot_pitch: np.ndarray  # of the feet towards level (2,); out of the plane about all axes (6,)
     floor: np.ndarray  # least vertical acceleration of left toe, left heel, right toe, right heel (4,); -inf where off
     joints: np.ndarray  # towards the posture (nv - 6,)
     trunk: np.ndarray  # the same (3,)
@@ -77,7 +77,7 @@ class FlightQp(PhaseQp):
         return FlightTarget(*own, self._mirror(terms), float(self.t[k]))
 
     def _turning(self, k: int, terms: FullMotion) -> tuple[np.ndarray, ...]:
-        """Of a target: ``foot_turn``, ``floor``, ``joints`` and ``trunk``."""
+        """Of a target: ``foot_pitch``, ``floor``, ``joints`` and ``trunk``."""
         gain = self.options.gains
         turn, turn_rate = self.reference.turn[k], (self.reference.turn[k + 1] - self.reference.turn[k]) / self.step
         off_level = np.angle(np.exp(1j * (turn - terms.foot_pitch)))  # the short way round
@@ -117,7 +117,7 @@ class FlightQp(PhaseQp):
         root = np.sqrt(w.foot_level)
         at, axes = lay.at("foot level"), self.foot_axes
         A[at] = root * terms.J_toe[:, axes].reshape(-1, len(terms.v))
-        b[at] = root * (target.foot_turn - terms.drift_toe[:, axes].ravel())
+        b[at] = root * (target.foot_pitch - terms.drift_toe[:, axes].ravel())
         root, at = np.sqrt(w.inertia), lay.at("inertia")
         A[at], b[at] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
         E[:6], e[:6] = terms.M[:6], target.base_force - terms.H[:6]

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, SolverError
+from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody, FullMotion, FullTerms, TurningBody
 from jumplab.ocp import Term
 from jumplab.robot import Robot
@@ -21,8 +22,8 @@ from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
 from jumplab.stages.joint_qp.problem import State, StepQp
 from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference, is_spatial
 from jumplab.stages.joint_qp.settings import GENTLE, Options, in_space
-from jumplab.stages.joint_qp.space import SpatialFlightQp, SpatialLaunchQp
 from jumplab.stages.joint_qp.solve import SOLVERS, Answer
+from jumplab.stages.joint_qp.space import SpatialFlightQp, SpatialLaunchQp
 
 CORRECTIONS = (1.0, 0.5, 0.0)  # shares of a misprediction that the next guess takes over; the second one is damped
 PREDICTED_RATE = 0.4  # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
@@ -35,7 +36,8 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
 
     Keys: ``takeoff_velocity`` (share of the take-off speed), ``takeoff_momentum`` and ``launch_momentum`` (share of the
     peak of L in the launch; at take-off, and the largest), ``launch_inertia_rms``, ``flight_inertia_rms`` (share of the
-    mean of rho), of the worse component where there are several, ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and ``touchdown_foot`` [m].
+    mean of rho, of the worse one of two), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and
+    ``touchdown_foot`` [m].
     """
     off = {k: x - reference[k] for k, x in actual.items()}
     speed, foot = reference["com_velocity"][n - 1], np.linalg.norm(off["foot_com"], axis=1)
@@ -98,6 +100,11 @@ class JointPlan:
         """Rows of one phase."""
         inside = np.flatnonzero(self.phase == phase)
         return slice(int(inside[0]), int(inside[-1]) + 1)
+
+    def tape(self, robot: Robot) -> Tape:
+        """The motion as a tape, at its own nodes."""
+        frames, names = np.array(robot.foot.frames), np.array(robot.joint_names)
+        return Tape(self.t, self.q, self.v, self.a, self.tau, self.phase, frames, self.f, names)
 
     def state(self, k: int) -> State:
         """State at row ``k``, as :meth:`JointMapper.problem` wants it."""

@@ -52,7 +52,6 @@ class LaunchWeights:
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
-    heels: float = 0.1  # [cost] / [rad/s^2]^2, out of the plane: else one heel rises, and its leg is spent
     acceleration: float = 1e-5  # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
 
 

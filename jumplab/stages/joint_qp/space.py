@@ -16,6 +16,7 @@ from jumplab.stages.joint_qp.reference import Track
 from jumplab.stages.srmp.planner import leg_between
 
 YAW_SHARE = 0.1  # [1] square root of the weight of the inertia about the vertical over that of the other
+HEELS = 0.1  # [cost] / [rad/s^2]^2, weight of heels that rise alike: else one rises alone, and its leg is spent
 INERTIAS = ("rho", "rho about the vertical")
 
 
@@ -41,9 +42,9 @@ class SpatialLaunchQp(LaunchQp):
     def matrices(self, terms: FullTerms, target: LaunchTarget, start: State) -> StepQp:
         """The QP of one step: heels alike, and the inertia about the vertical followed less closely, arms are for L."""
         qp, at, gain = super().matrices(terms, target, start), self.layout.at("heels"), self.options.gains.contact
-        root, apart = np.sqrt(self.options.launch.heels), np.array([1.0, -1.0])
+        root, apart = np.sqrt(HEELS), np.array([1.0, -1.0])
         asked = -gain.stiffness * terms.foot_pitch - gain.damping * terms.foot_spin[:, 1] - terms.drift_toe[:, 4]
-        if target.on_toes and "launch/heels" not in self.options.off:
+        if target.on_toes:
             qp.A[at, WRENCH:], qp.b[at] = root * (apart @ terms.J_toe[:, 4]), root * (apart @ asked)
         row = self.layout.at("inertia").start + 1
         qp.A[row] *= YAW_SHARE
@@ -78,7 +79,7 @@ class SpatialFlightQp(FlightQp):
         return Track.of(self.t, foot.value[:, None] + apart, foot.rate[:, None] + speed)
 
     def _turning(self, k: int, terms: FullMotion) -> tuple[np.ndarray, ...]:
-        """Of a target: ``foot_turn`` (6,), ``floor``, ``joints`` and ``trunk``."""
+        """Of a target: ``foot_pitch`` (6,), ``floor``, ``joints`` and ``trunk``."""
         gain, (heading, rate, accel) = self.options.gains, (x[k] for x in self.heading)
         goal, up, feet = pin.rpy.rpyToMatrix(0.0, 0.0, heading), np.array([0.0, 0.0, 1.0]), []
         for turn, spin in zip(terms.foot_rotation, terms.foot_spin, strict=True):

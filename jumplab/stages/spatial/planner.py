@@ -80,6 +80,7 @@ class SpatialPlanner:
         start: Tape | None = None,
         toe_phase_s: float = 0.0,
         *,
+        ramps: bool = True,
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
     ) -> SpatialPlan:
@@ -87,7 +88,8 @@ class SpatialPlanner:
 
         Parameters
         ----------
-        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
 
@@ -108,7 +110,7 @@ class SpatialPlanner:
             except SolverError:
                 if start is None:
                     raise
-        guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
+        guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task, ramps)
         return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, self.limits)
 
     def tape(self, plan: SpatialPlan) -> Tape:

@@ -1,10 +1,10 @@
 """Stage 1 in three dimensions: CoM, momentum and inertias of a jump to the side and with a turn (Sec. III, by analogy).
 
-The rod of the paper becomes a point mass at c, the barbell a body with the angles roll, pitch and yaw, one inertia about
-all level axes and one about the vertical: L = (rho_p roll', rho_p pitch', rho_y yaw'), as L = rho (omega_l + omega_pl)
-in the plane. The ground acts with a force, at a CoP, and with a spin torque about it. In flight L stays, and body and
-legs turn with omega = L / rho about all three axes. Places count from the middle between the standing soles, x forward,
-y to the left, z up. Weights, limits and the robot's reach are those of the plane (:mod:`.settings`).
+The rod of the paper becomes a point mass at c, the barbell a body with the angles roll, pitch and yaw, one inertia
+about all level axes and one about the vertical: L = (rho_p roll', rho_p pitch', rho_y yaw'), as in the plane
+L = rho (omega_l + omega_pl). The ground acts with a force, at a CoP, and with a spin torque about it. In flight L stays,
+and body and legs turn with omega = L / rho about all three axes. Places count from the middle between the standing
+soles, x forward, y to the left, z up. Weights, limits and reach are those of the plane (:mod:`.settings`).
 """
 
 from __future__ import annotations
@@ -165,7 +165,9 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
         limit("inertia envelope", "SL-P4: rho(phi)", "kg m^2", "node", room, 0.0),
         limit("unilateral", "ours", "N", "node", lambda p: now(p).force[2], 0.0, **air),
         limit("friction", "ours", "N", "node", cone, 0.0, **air),
-        limit("spin torque", "ours: feet twist, times F_z", "N^2 m", "node", twist, 0.0, scale=0.1 * mg**2, skip=(0, 1)),
+        limit(
+            "spin torque", "ours: feet twist, times F_z", "N^2 m", "node", twist, 0.0, scale=0.1 * mg**2, skip=(0, 1)
+        ),
         limit("leg force", "SL-B1; ours: from the joint torques", "N", "node", strength, 0.0, **every),
         limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, 0.0),
         limit("CoP", "SL-P2, times F_z", "N m", "node", sole, 0.0, scale=0.1 * mg, skip=(0, 1)),
@@ -220,7 +222,9 @@ def flight_terms(b: Body, s: SpatialSrmpSettings) -> list[Term]:
 
     def capture(p):
         c, n = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
-        ahead = (p.c.leg * p.z[1:] - s.capture_slope_s * Flight(p).com_velocity)[:2] - s.capture_offset_m * ca.vertcat(c, n)
+        ahead = (p.c.leg * p.z[1:] - s.capture_slope_s * Flight(p).com_velocity)[:2] - s.capture_offset_m * ca.vertcat(
+            c, n
+        )
         return ca.vertcat(c * ahead[0] + n * ahead[1], c * ahead[1] - n * ahead[0])
 
     def end(name, equation, unit, of, low, high, **more):
@@ -275,8 +279,9 @@ def _phases(b: Body, s: SpatialSrmpSettings) -> tuple[Phase, ...]:
     low = [-free, -free, 0.0, -s.roll_rad, reach.posture[0], -s.yaw_rad, 0.0, 0.0]
     high = [free, free, free, s.roll_rad, reach.posture[1], s.yaw_rad, free, free]
     box = Bound("state box", "SL-B1, SL-P1", "rad, m", "q", low, high, "inner")
-    rest = Bound("start", "SL-P3: the stance", "rad, m", "q", start, start, "start"), *(
-        Bound(f"at rest ({k})", "ours", "scaled", k, 0.0, 0.0, "start") for k in "va"
+    rest = (
+        Bound("start", "SL-P3: the stance", "rad, m", "q", start, start, "start"),
+        *(Bound(f"at rest ({k})", "ours", "scaled", k, 0.0, 0.0, "start") for k in "va"),
     )
     flat, tip = ((*launch_terms(b, s, up), *more(b, s)) for up, more in ((False, squat_terms), (True, takeoff_terms)))
     shared = dict(scales=SCALES, view=partial(at, mass=b.mass))
@@ -424,7 +429,9 @@ class SpatialSrmpPlanner:
         """Coordinates (8,) of the stance."""
         lean, length, turn, radius = self.body.reach.start
         level = self.body.mass * radius**2
-        return np.array([length * np.sin(lean), 0, length * np.cos(lean), 0, lean + turn, 0, level, self.body.yaw.stance])
+        return np.array(
+            [length * np.sin(lean), 0, length * np.cos(lean), 0, lean + turn, 0, level, self.body.yaw.stance]
+        )
 
     def guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
         """Crouch and rise on a straight line, constant inertias, steady turning."""
@@ -484,7 +491,8 @@ def _flown(flight, length: float, gravity: float) -> SpatialSrmpFlight:
     fall, ones, level = np.array([0.0, 0.0, -gravity]), np.ones((len(t), 1)), [0, 0, 1]
     omega, alpha = L / rho[:, level], -L * rate[:, level] / rho[:, level] ** 2
     nodes = L / flight.q[:, level]
-    z = [cubic(flight.t, x, dx, t) for x, dx in zip(flight.z.T, [nodes[:, 2], *np.cross(nodes, flight.z[:, 1:]).T])]
+    slopes = [nodes[:, 2], *np.cross(nodes, flight.z[:, 1:]).T]
+    z = [cubic(flight.t, x, dx, t) for x, dx in zip(flight.z.T, slopes, strict=True)]
     foot = np.stack(z[1:], -1)
     foot /= np.linalg.norm(foot, axis=1, keepdims=True)
     foot1 = np.cross(omega, foot)
