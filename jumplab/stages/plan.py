@@ -13,7 +13,6 @@ from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
-from jumplab.stages.reconstruction import turning_inertias
 from jumplab.stages.spatial import SpatialPlan
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.srmp.spatial import SpatialSrmpPlan
@@ -21,7 +20,6 @@ from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
-SPARSE = 5  # every so manieth row of the tape is compared out of the plane
 # what is compared -> stage 1's column, and which part of it
 TRACKED = {"rho": ("rho", ...), "rho_rate": ("rho_rate", ...), "velocity": ("com_velocity", ...), "L": ("L", ...)}
 TRACKED_IN_SPACE = TRACKED | {"rho": ("rho", 0), "rho_rate": ("rho_rate", 0)}
@@ -158,7 +156,7 @@ class JumpPlan:
         """
         if self.stored is not None:
             return self.stored.get("tracking")
-        return None if self.srmp is None else _tracking(self.tape, self.srmp, self.robot)
+        return None if self.srmp is None else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:
@@ -187,10 +185,8 @@ class JumpPlan:
         }
 
 
-def _tracking(
-    tape: Tape, srmp: SrmpPlan | SpatialSrmpPlan, robot: Robot
-) -> dict[str, dict[str, dict[str, float | None]]]:
-    rows, toe, done = _moved(tape, robot)
+def _tracking(tape: Tape, srmp: SrmpPlan | SpatialSrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
+    rows, toe, done = _moved(tape)
     time, k = tape.t[rows], int(np.argmax(tape.phase[rows] == "flight"))
     launch = np.interp(time[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
     air, found = time[k:] - tape.takeoff_time, {}
@@ -205,15 +201,14 @@ def _tracking(
     return found
 
 
-def _moved(tape: Tape, robot: Robot) -> tuple[np.ndarray | slice, float, dict[str, np.ndarray]]:
+def _moved(tape: Tape) -> tuple[np.ndarray | slice, float, dict[str, np.ndarray]]:
     """Rows of the tape, when its heels rise [s], and what the robot does there by stage 1's names."""
     e = tape.extra
     if "planar_rho" in e:
         columns = {column: e[f"planar_{column}"] for column, _ in TRACKED.values()}
         return slice(None), float(e["planar_toe_phase_start"]), columns
-    rows = np.unique([*range(0, len(tape.t), SPARSE), tape.takeoff_index - 1, tape.takeoff_index, len(tape.t) - 1])
-    rho, rate = turning_inertias(robot, tape.q[rows], tape.v[rows])
-    columns = {"rho": rho, "rho_rate": rate, "com_velocity": e["com_velocity"][rows], "L": e["angular_momentum"][rows]}
+    rows, columns = e["inertia_rows"], {column: e[column] for column in ("rho", "rho_rate")}
+    columns |= {"com_velocity": e["com_velocity"][rows], "L": e["angular_momentum"][rows]}
     return rows, float(e["toe_phase_start"]), columns
 
 

@@ -24,7 +24,7 @@ from jumplab.stages.changes import StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
-from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
+from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities, turning_inertias
 from jumplab.stages.spatial import SpatialPlan, SpatialPlanner
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
@@ -319,7 +319,7 @@ class Planner:
     ) -> JumpPlan:
         """The plan of a spatial solution; ``rows`` are its stages', the first two those of three steps."""
         tape, robot = self.stage("spatial").tape(body), self.robot.under_gravity(body.task.gravity)
-        tape = replace(tape, extra=tape.extra | _of_stage1(srmp))
+        tape = replace(tape, extra=tape.extra | turning_inertias(robot, tape) | _of_stage1(srmp))
         return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, skipped)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:

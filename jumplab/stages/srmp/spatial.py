@@ -2,8 +2,8 @@
 
 The rod of the paper becomes a point mass at c, the barbell a body with the angles roll, pitch and yaw, one inertia
 about all level axes and one about the vertical: L = (rho_p roll', rho_p pitch', rho_y yaw'), as in the plane
-L = rho (omega_l + omega_pl). The ground acts with a force, at a CoP, and with a spin torque about it. In flight L stays,
-and body and legs turn with omega = L / rho about all three axes. Places count from the middle between the standing
+L = rho (omega_l + omega_pl). The ground acts with a force, at a CoP, and with a spin torque about it. In flight L stays
+while body and legs turn with omega = L / rho about all three axes. Places count from the middle between the standing
 soles, x forward, y to the left, z up. Weights, limits and reach are those of the plane (:mod:`.settings`).
 """
 
