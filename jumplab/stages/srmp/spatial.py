@@ -39,6 +39,11 @@ SIGNS = np.array([[x, y] for x in (1.0, -1.0) for y in (1.0, -1.0)])
 class Pendulum:
     """The pendulum at one instant of the launch, as CasADi expressions of its coordinates (8,) and their rates."""
 
+    __slots__ = (
+        *("mass", "com", "com_velocity", "com_acceleration", "attitude", "inertia", "inertia_rate", "inertia_accel"),
+        *("L", "L_rate", "force", "moment", "length", "length_rate"),
+    )
+
     def __init__(self, mass: float, q: ca.SX, v: ca.SX, a: ca.SX, gravity: float | ca.SX = GRAVITY):
         self.mass, self.com, self.com_velocity, self.com_acceleration = mass, q[:3], v[:3], a[:3]  # [kg], [m], ...
         self.attitude, spin, level = q[3:6], v[3:6], [6, 6, 7]
@@ -75,6 +80,8 @@ def at(p: Point, mass: float) -> Pendulum:
 
 class Flight:
     """The same in flight: what the constants and the inertias say at a point."""
+
+    __slots__ = ("L", "com", "com_velocity", "foot", "inertia", "inertia_rate", "yaw")
 
     def __init__(self, p: Point):
         c, t = p.c, p.time
@@ -171,6 +178,7 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
         limit("leg force", "SL-B1; ours: from the joint torques", "N", "node", strength, 0.0, **every),
         limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, 0.0),
         limit("CoP", "SL-P2, times F_z", "N m", "node", sole, 0.0, scale=0.1 * mg, skip=(0, 1)),
+        limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", sole, 0.0, scale=0.1 * mg),
     ]
 
 
