@@ -13,16 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from scipy.integrate import cumulative_trapezoid
 
 from jumplab.auditing import audit
 from jumplab.errors import JumplabError
 from jumplab.io.files import open_log
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.show.style import LANDING, PAGE_IN, new_figure, tint
+from jumplab.show.style import FLIGHT, LANDING, LAUNCH, LIMIT, PAGE_IN, REFERENCE_STYLE, VERMILION, new_figure, tint
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import METHODS, Planner
+from jumplab.stages.srmp.spatial import SpatialSrmpPlan
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("three_dimensions.jsonl")
@@ -137,6 +141,94 @@ def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         ax.grid(False)
     axes[0].set(xlabel="ahead [m]", ylabel="to the left [m]", title="(a) rise 0.4 m, no turn")
     axes[1].set(xlabel="turn [deg]", ylabel="rise of the CoM [m]", title="(b) on the spot")
+    return fig
+
+
+# one turn --------------------------------------------------------------------------------------------------------
+def yaw_sources(tape: Tape, robot: Robot) -> dict[str, dict[str, np.ndarray]]:
+    """Where the angular momentum about the vertical is, and where it comes from.
+
+    Returns
+    -------
+    "limbs" : of legs, arms and trunk about the CoM, moving with it (n,) [kg m^2/s]; their sum is L_z.
+    "ground" : impulse since the start (n,) [kg m^2/s] of the couple of the feet's horizontal forces, of the spin in the
+        soles, and of the common push that passes the CoM; their sum is L_z again.
+    """
+    model, data = robot.model, robot.model.createData()
+    legs = {j for n in robot.foot.frames for j in model.supports[model.frames[model.getFrameId(n)].parentJoint]}
+    limbs = {j: "trunk" if j == 1 else "legs" if j in legs else "arms" for j in range(1, model.njoints)}
+    carried = {name: np.zeros(len(tape.t)) for name in ("legs", "arms", "trunk")}
+    moments = np.zeros((len(tape.t), 3))
+    for k, (q, v) in enumerate(zip(tape.q, tape.v, strict=True)):
+        pin.centerOfMass(model, data, q, v)
+        com, speed = data.com[0], data.vcom[0]
+        for j, name in limbs.items():
+            h = data.oMi[j].act(model.inertias[j] * data.v[j])
+            arm = data.oMi[j].act(model.inertias[j].lever) - com
+            about = h.angular - np.cross(com, h.linear) - np.cross(arm, model.inertias[j].mass * speed)
+            carried[name][k] += about[2]
+        if tape.phase[k] == "launch":
+            pin.updateFramePlacements(model, data)
+            places = [data.oMf[model.getFrameId(n)].translation for n in robot.foot.frames]
+            moments[k] = _about_vertical(np.array(places), tape.f[k], com)
+    impulse = cumulative_trapezoid(moments, tape.t, axis=0, initial=0.0)
+    names = "opposite forces of the feet", "spin in the soles", "push past the CoM"
+    return {"limbs": carried, "ground": dict(zip(names, impulse.T, strict=True))}
+
+
+def _about_vertical(places: np.ndarray, f: np.ndarray, com: np.ndarray) -> np.ndarray:
+    """Moment about the vertical through the CoM (3,) [N m] by its sources, of wrenches (2, 6) at ``places`` (2, 3)."""
+    force, total = f[:, :3], f[:, :3].sum(axis=0)
+    down = np.maximum(f[:, 2], 1e-9)
+    cop = places[:, :2] + (np.stack([-f[:, 4], f[:, 3]], -1) - places[:, 2:] * force[:, :2]) / down[:, None]
+    loaded = f[:, 2:3] > 1.0
+    cop = np.where(loaded, cop, places[:, :2])
+    spin = f[:, 5] - _turn(cop - places[:, :2], force)
+    middle = cop.mean(axis=0)
+    return np.array([_turn(cop - middle, force).sum(), spin.sum(), float(_turn(middle - com[:2], total))])
+
+
+def _turn(arm: np.ndarray, force: np.ndarray) -> np.ndarray:
+    return arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0]
+
+
+def yaw_momentum(tape: Tape, sources: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """L_z by the limbs that carry it, and by what the ground did for it."""
+    fig = new_figure(PAGE_IN, 2.6)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, (kind, parts) in zip(axes, sources.items(), strict=True):
+        shown = tape.t <= (tape.takeoff_time if kind == "ground" else np.inf)
+        for color, (name, values) in zip((LAUNCH, VERMILION, FLIGHT), parts.items(), strict=True):
+            ax.plot(tape.t[shown], values[shown], color=color, label=name)
+        ax.plot(tape.t[shown], sum(parts.values())[shown], **REFERENCE_STYLE, label="sum")
+        ax.axvline(tape.takeoff_time, color=LIMIT, linewidth=0.6)
+        ax.set_xlabel("time [s]")
+        ax.legend(fontsize=6.5, frameon=False)
+    axes[0].set(title="(a) limbs that carry it", ylabel="$L_z$ [kg m$^2$/s]")
+    axes[1].set_title("(b) impulses of the ground")
+    return fig
+
+
+def turning_pendulum(plan: SpatialSrmpPlan) -> Figure:
+    """Stage 1 out of the plane: L_z and L_y, both inertias, how far the body has turned, spin torque."""
+    fig, up, air = new_figure(PAGE_IN, 3.3), plan.launch, plan.flight
+    axes, start = fig.subplots(2, 2, sharex=True).ravel(), up.t[-1]
+    for part, shift, color in ((up, 0.0, LAUNCH), (air, start, FLIGHT)):
+        for ax, values, pale in (
+            (axes[0], part.L[:, 2], part.L[:, 1]),
+            (axes[1], part.rho[:, 1], part.rho[:, 0]),
+            (axes[2], np.degrees(part.yaw), None),
+        ):
+            ax.plot(part.t + shift, values, color=color)
+            if pale is not None:
+                ax.plot(part.t + shift, pale, color=color, alpha=0.4)
+    axes[3].plot(up.t, up.spin_torque, color=LAUNCH)
+    labels = "$L_z$, pale $L_y$ [kg m$^2$/s]", "$\\rho$ yaw, pale pitch [kg m$^2$]"
+    for ax, label in zip(axes, (*labels, "turned [deg]", "spin torque [N m]"), strict=True):
+        ax.set_ylabel(label)
+        ax.axvline(start, color=LIMIT, linewidth=0.6)
+    for ax in axes[2:]:
+        ax.set_xlabel("time [s]")
     return fig
 
 
