@@ -118,8 +118,8 @@ class Body:
 
 
 def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
-    """Costs and constraints of the launch, SL-*; flat feet, or heels up with the CoP at the toes."""
-    now, mg, reach = partial(at, mass=b.mass), b.mass * GRAVITY, b.reach
+    """Costs of the launch, SL-J*, and what legs and postures can do."""
+    now, reach = partial(at, mass=b.mass), b.reach
     jerk = ca.DM(np.sqrt([s.w_level_jerk] * 2 + [s.w_jerk[1]] + [s.w_jerk[2]] * 3 + [s.w_inertia_jerk_launch] * 2))
 
     def room(p):
@@ -128,16 +128,6 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
 
     def unusual(p):
         return now(p).inertia - b.usual(now(p).length, heel_up)
-
-    def cone(p):
-        f = now(p).force
-        return s.friction * f[2] - ca.DM(SIGNS) @ f[:2]
-
-    def twist(p):
-        # friction that is used up by the horizontal force turns nothing; times F_z, as the CoP
-        f, turn = now(p).force, ca.dot(now(p).force, now(p).moment)
-        left = b.yaw.half_stance_m * f[2] * cone(p)
-        return ca.vertcat(left - turn, left + turn)
 
     def strength(p):
         force, speed = (ca.polyval(ca.DM(fit), now(p).length) for fit in (reach.force_fit, reach.speed_fit))
@@ -151,17 +141,10 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
         c = now(p).com
         return ca.vertcat(p.q[3] + ca.atan2(c[1], c[2]), p.q[4] - ca.atan2(c[0], c[2]))
 
-    low, high = reach.cop[1] - s.toe_band_m if heel_up else reach.cop[0] + s.cop_margin_m, reach.cop[1]
-    wide, slack = (1 - 2 * s.foot_share) * b.yaw.half_stance_m, s.toe_slack_n_m if heel_up else 0.0
-
-    def sole(p):
-        f, m = now(p).force, now(p).moment
-        return ca.vertcat(slack - m[1] - low * f[2], slack + high * f[2] + m[1], wide * f[2] - m[0], wide * f[2] + m[0])
-
     def node(name, equation, unit, of, weight):
         return Term(name, equation, unit, "node", of, weight=weight)
 
-    every, air = {"scale": mg}, {"scale": mg, "skip": (0, 1)}
+    scale = b.mass * GRAVITY
     return [
         Term("jerk", "SL-J1", "weighted", "mid", lambda p: jerk * p.j, weight=1.0),
         node("CoM velocity", "SL-J2", "m/s", lambda p: now(p).com_velocity, s.w_velocity),
@@ -170,14 +153,39 @@ def launch_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
         node("usual inertia", "ours: rho(phi)", "kg m^2", lambda p: unusual(p)[0], s.w_usual_inertia),
         node("usual yaw inertia", "ours: rho(phi)", "kg m^2", lambda p: unusual(p)[1], s.w_usual_yaw_inertia),
         limit("inertia envelope", "SL-P4: rho(phi)", "kg m^2", "node", room, 0.0),
-        limit("unilateral", "ours", "N", "node", lambda p: now(p).force[2], 0.0, **air),
-        limit("friction", "ours", "N", "node", cone, 0.0, **air),
-        limit(
-            "spin torque", "ours: feet twist, times F_z", "N^2 m", "node", twist, 0.0, scale=0.1 * mg**2, skip=(0, 1)
-        ),
-        limit("leg force", "SL-B1; ours: from the joint torques", "N", "node", strength, 0.0, **every),
+        limit("leg force", "SL-B1; ours: from the joint torques", "N", "node", strength, 0.0, scale=scale),
         limit("leg speed", "SL-B1; ours: from the joint speeds", "m/s", "node", extension, 0.0),
-        limit("CoP", "SL-P2, times F_z", "N m", "node", sole, 0.0, scale=0.1 * mg, skip=(0, 1)),
+    ]
+
+
+def ground_terms(b: Body, s: SpatialSrmpSettings, heel_up: bool) -> list[Term]:
+    """What the ground can do: push, within friction, under flat feet or, heels up, at the toes."""
+    now, mg, cop = partial(at, mass=b.mass), b.mass * GRAVITY, b.reach.cop
+    low, high = cop[1] - s.toe_band_m if heel_up else cop[0] + s.cop_margin_m, cop[1]
+    wide, slack = (1 - 2 * s.foot_share) * b.yaw.half_stance_m, s.toe_slack_n_m if heel_up else 0.0
+
+    def cone(p):
+        f = now(p).force
+        return s.friction * f[2] - ca.DM(SIGNS) @ f[:2]
+
+    def twist(p):
+        # friction that is used up by the horizontal force turns nothing; times F_z, as the CoP
+        f, turn = now(p).force, ca.dot(now(p).force, now(p).moment)
+        left = b.yaw.half_stance_m * f[2] * cone(p)
+        return ca.vertcat(left - turn, left + turn)
+
+    def sole(p):
+        f, m = now(p).force, now(p).moment
+        return ca.vertcat(slack - m[1] - low * f[2], slack + high * f[2] + m[1], wide * f[2] - m[0], wide * f[2] + m[0])
+
+    def node(name, equation, unit, of, scale):
+        return limit(name, equation, unit, "node", of, 0.0, scale=scale, skip=(0, 1))
+
+    return [
+        node("unilateral", "ours", "N", lambda p: now(p).force[2], mg),
+        node("friction", "ours", "N", cone, mg),
+        node("spin torque", "ours: feet twist, times F_z", "N^2 m", twist, 0.1 * mg**2),
+        node("CoP", "SL-P2, times F_z", "N m", sole, 0.1 * mg),
         limit("CoP (mid)", "SL-P2, between nodes", "N m", "mid", sole, 0.0, scale=0.1 * mg),
     ]
 
@@ -291,7 +299,10 @@ def _phases(b: Body, s: SpatialSrmpSettings) -> tuple[Phase, ...]:
         Bound("start", "SL-P3: the stance", "rad, m", "q", start, start, "start"),
         *(Bound(f"at rest ({k})", "ours", "scaled", k, 0.0, 0.0, "start") for k in "va"),
     )
-    flat, tip = ((*launch_terms(b, s, up), *more(b, s)) for up, more in ((False, squat_terms), (True, takeoff_terms)))
+    flat, tip = (
+        (*launch_terms(b, s, up), *ground_terms(b, s, up), *more(b, s))
+        for up, more in ((False, squat_terms), (True, takeoff_terms))
+    )
     shared = dict(scales=SCALES, view=partial(at, mass=b.mass))
     width, lowest = reach.inertia[1] - reach.inertia[0], np.array([reach.inertia[0], b.yaw.range[0]])
     top = np.array([reach.inertia[0] + s.flight_inertia * width, b.yaw.range[1]])
