@@ -138,7 +138,6 @@ class JointMapper:
     flight_qp: Callable[..., FlightQp] = FlightQp
     body_of: Callable[..., FullBody] = FullBody
     about: int | slice = 4  # rows of the momentum that stage 1 speaks of
-    usual: tuple[Options, Options] = (Options(), GENTLE)  # if none are given: first, and where these find no way
 
     def __init__(
         self,
@@ -161,7 +160,7 @@ class JointMapper:
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.options = options or self.usual[0]
+        self.options = options or self.usual()[0]
         if terms or weights or off:
             self.options = changed(self.options, self.body, self.q0, terms, weights, off)
         self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
@@ -169,6 +168,11 @@ class JointMapper:
         toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
         launch = LaunchReference.sample(srmp_plan, parts[0], toe)
         self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)
+
+    @staticmethod
+    def usual() -> tuple[Options, Options]:
+        """Options if none are given, and those for where these find no way."""
+        return Options(), GENTLE
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
@@ -292,7 +296,11 @@ class SpatialMapper(JointMapper):
     """The same out of the plane: no mirror rows, three momenta, two inertias."""
 
     launch_qp, flight_qp, body_of, about = SpatialLaunchQp, SpatialFlightQp, TurningBody, slice(3, 6)
-    usual = in_space(Options()), in_space(GENTLE)
+
+    @staticmethod
+    def usual() -> tuple[Options, Options]:
+        """Options if none are given, and those for where these find no way."""
+        return in_space(Options()), in_space(GENTLE)
 
 
 def map_to_joints(
@@ -329,11 +337,12 @@ def map_to_joints(
     changes: dict[str, Any] = {"q0": q0, "terms": terms, "weights": weights, "off": off}
     if options is not None:
         return mapper(srmp_plan, robot, step_s, options, **changes).run(method)
+    usual, gentle = mapper.usual()
     try:
-        return mapper(srmp_plan, robot, step_s, mapper.usual[0], **changes).run(method)
+        return mapper(srmp_plan, robot, step_s, usual, **changes).run(method)
     except SolverError as firm:
         try:
-            plan = mapper(srmp_plan, robot, step_s, mapper.usual[1], **changes).run(method)
+            plan = mapper(srmp_plan, robot, step_s, gentle, **changes).run(method)
         except SolverError:
             raise firm from None
         return replace(plan, gentle=str(firm))
