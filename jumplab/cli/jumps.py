@@ -64,7 +64,12 @@ def run(args: Namespace) -> None:
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
     opt("--side-m M", "travel of the feet to the left [m] (default 0)", "0", number),
     opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
-    opt("--method", "the paper's three steps, usual in the plane, or the whole-body problem alone", None, METHODS),
+    opt(
+        "--method",
+        "the paper's three steps, usual in the plane, or the whole-body problem",
+        "usual",
+        ("usual", *METHODS),
+    ),
 )
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""

@@ -35,7 +35,7 @@ from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, 
 from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
-METHODS = ("three-step", "direct")
+METHODS, USUAL = ("three-step", "direct"), "usual"
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
@@ -202,7 +202,7 @@ class Planner:
     def plan(
         self,
         task: JumpTask,
-        method: str | None = None,
+        method: str = USUAL,
         *,
         weights: Mapping[str, float] | None = None,
         start: np.ndarray | None = None,
@@ -213,7 +213,7 @@ class Planner:
         ----------
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold; with side or
-            yaw the spatial program, begun from a jump ahead with ramps). The default is "three-step" in the plane and
+            yaw the spatial program, begun from a jump ahead with ramps). "usual" is "three-step" in the plane and
             "direct" out of it, which there takes less time (``notebooks/13_three_dimensions`` measures it).
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
@@ -226,7 +226,8 @@ class Planner:
             If a stage refuses or fails; no later stage is run.
         """
         require_type(task, JumpTask, "the target")
-        method = method or METHODS[0 if task.in_plane else 1]
+        if isinstance(method, str) and method == USUAL:
+            method = METHODS[0 if task.in_plane else 1]
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
         if not task.in_plane:
@@ -441,7 +442,7 @@ def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
     return (*coarse, *uneven, _row(stage, body.solution.statistics))
 
 
-def plan_jump(task: JumpTask, robot: Robot, *, method: str | None = None) -> JumpPlan:
+def plan_jump(task: JumpTask, robot: Robot, *, method: str = USUAL) -> JumpPlan:
     """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
     return Planner(robot, keep=True).plan(task, method)
 

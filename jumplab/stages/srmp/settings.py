@@ -78,4 +78,4 @@ class SpatialSrmpSettings(SrmpSettings):
     crouch_room_m: float = 0.04  # above the plane's deepest crouch: hips at their stops could not turn or roll
     w_level_jerk: float = 2e-4  # SL-J1, of x and y: that of the lean, told at the usual leg length
     w_inertia_jerk_launch: float = 1e-6  # SL-J1, of both inertias: the barbell's radius, told in inertia
-    w_usual_yaw_inertia: float = 2.0  # [1 / (kg m^2)^2 / s] arms say more about it than the leg length does
+    w_usual_yaw_inertia: float = 8.0  # [1 / (kg m^2)^2 / s] arms say more about it than the leg length does
