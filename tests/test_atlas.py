@@ -96,7 +96,7 @@ def test_other_kinds_of_jumps_are_not_its_business(other):
 
 def test_refusals():
     with pytest.raises(InputError) as e:
-        planner().plan(JumpTask(0.6, 0.4))
+        planner().plan(JumpTask(0.6, 0.4), "three-step")
     assert str(e.value) == "method 'three-step': an atlas holds direct plans; choose 'direct', or leave it away"
     with pytest.raises(InputError) as e:
         Planner(Robot.load(), limits={"torque_share": 0.8}, atlas=atlas()).plan(JumpTask(0.6, 0.4), "direct")

@@ -263,7 +263,7 @@ def atlas(args: Namespace) -> None:
     args.found |= {"out": args.out, "planned": len(found.nodes), "of": math.prod(map(len, axes))}
     if not found.nodes:
         raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
-    print(f"{found} in {args.out}; 'jumplab plan --atlas {args.out} --method direct' begins with it")
+    print(f"{found} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
     print(f"whole atlas: {time.perf_counter() - began:.1f} s")
 
 
