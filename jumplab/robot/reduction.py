@@ -17,8 +17,9 @@ if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
 
 SAMPLES = 24  # fixed random postures over the whole joint range
 RATE_RAD_S = 3.0  # of every link, for the momentum
-COM_LIMIT_M = 2e-3  # twice what the audit allows the CoM in flight; canted axes beyond it are refused
+COM_LIMIT_M = 2e-3  # twice what the audit allows the CoM in flight; canted axes go beyond it
 SHARE_LIMIT = 0.01  # [1] of pitch inertia, and of momentum
+SAME_M, EXACT_M = 0.02, 1e-6  # between a joint and the mirror image of its counterpart: built alike; evened out
 
 
 @dataclass(frozen=True)
@@ -70,15 +71,42 @@ def _velocity(robot: Robot, angles: np.ndarray, rates: np.ndarray) -> np.ndarray
     return v
 
 
-def check_reduction(robot: Robot) -> ReductionError:
-    """The error, or :class:`RobotError` where the sagittal plane is no model of this robot."""
-    error = reduction_error(robot)
-    worst = max(error.inertia_share, error.momentum_share)
-    if error.com_m > COM_LIMIT_M or worst > SHARE_LIMIT:
-        raise RobotError(
-            f"robot {robot.name}: its legs do not move in the sagittal plane: against the full robot the CoM is off by "
-            f"{1e3 * error.com_m:.2f} mm, inertia or momentum by {100 * worst:.2f} %, at most {1e3 * COM_LIMIT_M:g} mm "
-            f"and {100 * SHARE_LIMIT:g} % can be planned with; hold canted joints with [locked], or straighten "
-            f"their axes"
-        )
-    return error
+def mirror(model: pin.Model, most_m: float = SAME_M) -> list[tuple[int, int, float]]:
+    """Joints that mirror each other in the x-z plane of the neutral pose: (index, index, sign), indices into v[6:].
+
+    A joint in the middle is its own counterpart; one without any is left out. Mirrored motions have
+    ``v[6 + other] = sign * v[6 + one]``. Places may differ by ``most_m`` [m], axes by as many radians.
+    """
+    data, flip, found = model.createData(), np.array([1.0, -1.0, 1.0]), []
+    jacobian = pin.computeJointJacobians(model, data, pin.neutral(model))
+    axis = [jacobian[3:, model.idx_vs[j]] for j in range(2, model.njoints)]
+    place = [data.oMi[j].translation for j in range(2, model.njoints)]
+    for i in range(len(axis)):
+        gaps = []
+        for k in range(len(axis)):
+            sign = 1.0 if -flip * axis[i] @ axis[k] > 0 else -1.0
+            off = np.abs(flip * place[i] - place[k]).max(), np.abs(-sign * flip * axis[i] - axis[k]).max()
+            gaps.append((max(off), k, sign))
+        gap, k, sign = min(gaps)
+        if gap < most_m and k >= i:
+            found.append((i, k, sign))
+    return found
+
+
+def in_plane(robot: Robot) -> bool:
+    """Whether five links describe a robot: its moving joints are those of legs and swinging arms, left and right are
+    alike, and mass, CoM, inertia and momentum are those of the full robot."""
+    model = robot.model
+    in_legs = {
+        j for name in robot.foot.frames for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
+    }
+    others = {model.names[j] for j in range(2, model.njoints) if j not in in_legs}
+    if others - set(robot.joints["shoulder_pitch"]) or len({i for row in mirror(model, EXACT_M) for i in row[:2]}) < (
+        model.nv - 6
+    ):
+        return False
+    try:
+        error = reduction_error(robot)
+    except RobotError:
+        return False
+    return error.com_m <= COM_LIMIT_M and max(error.inertia_share, error.momentum_share) <= SHARE_LIMIT

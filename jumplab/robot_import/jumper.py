@@ -232,10 +232,22 @@ def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, floa
         out[knee.name] = _limb(knee, knee.place, ankle.place, width["shank"])
         centre = [(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2]
         out[foot.name] = [(np.array(centre), np.array([sole["toe"] - sole["heel"], 2 * sole["half"], width["foot"]]))]
-    for arm in arms:
-        lever = arm.inertia.lever
-        out[arm.name] = [(lever, np.maximum(ARM_REACH * np.abs(lever), width["arm"]))]
+    legs = {b.name for hip in hips for b in [hip, *beyond(lumped.bodies, hip)]}
+    for body in lumped.bodies[1:]:
+        if body.name not in legs and (boxes := _arm(lumped, body, width["arm"])):
+            out[body.name] = boxes
     return out
+
+
+def _arm(lumped: Lumped, body: Body, width: float) -> Boxes:
+    """A box around a body of an arm, none where it is short, or carries the rest of the arm beside the trunk."""
+    further, lever = beyond(lumped.bodies, body), body.inertia.lever
+    if not further:
+        return [(lever, np.maximum(ARM_REACH * np.abs(lever), width))]
+    way = further[0].place - body.place
+    if body.parent == lumped.bodies[0].name or np.linalg.norm(way) < 2 * width:
+        return []
+    return [(way / 2, np.maximum((1 - 2 * GAP) * np.abs(way), width))]
 
 
 def _limb(body: Body, start: np.ndarray, end: np.ndarray, width: float) -> Boxes:
@@ -271,6 +283,16 @@ def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], 
         joints="\n".join(f"{role} = {texts(pair)}" for role, pair in roles.items()),
         links=texts(feet),
         sole=sole,
-        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
+        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE) + _rest(config, lumped),
         corner=entry(config, "actuators", "corner_speed_ratio"),
     )
+
+
+def _rest(config: dict, lumped: Lumped) -> str:
+    """The table [rest] of joints that move besides those with a role, if it says anything."""
+    told = {name: entry(config, "rest", name) for name in table(config, "rest")}
+    unknown = sorted(told.keys() - {b.joint for b in lumped.bodies})
+    if unknown:
+        raise RobotError(f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move")
+    rows = "".join(f"{texts([name])[1:-1]} = {angle:.12g}\n" for name, angle in told.items())
+    return f"\n\n[rest]\n{rows.rstrip()}" if rows else ""

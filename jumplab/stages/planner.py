@@ -210,7 +210,7 @@ class Planner:
         require_type(task, JumpTask, "the target")
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
-        if not task.in_plane:
+        if not (task.in_plane and self.robot.planar):
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
@@ -250,7 +250,10 @@ class Planner:
         )
 
     def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
-        """A jump out of the plane: the planar jump of the same distance and rise, then the spatial program."""
+        """A jump out of the plane, or of a robot that no plane describes, by the spatial program.
+
+        It begins with the planar jump of the same distance and rise, where there is one.
+        """
         if start is not None:
             raise InputError("a jump to the side or with a turn begins in the stance; leave its start away")
         last, asked = self.stage("spatial"), sorted_out(weights=weights)
@@ -260,10 +263,13 @@ class Planner:
         rest = {
             f"{stage}/{name}": w for stage, x in asked.items() if stage != "spatial" for name, w in x.weights.items()
         }
-        first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest)
-        body = last.plan(task, first.tape, first.toe_phase_s, weights=asked["spatial"].weights)
-        name = "4 spatial" if method == "three-step" else "spatial"
-        rows = (*first.statistics, _row(name, body.solution.statistics))
+        first, begun = None, ()
+        if self.robot.planar:
+            first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest)
+            begun = first.tape, first.toe_phase_s
+        body = last.plan(task, *begun, weights=asked["spatial"].weights)
+        name = "4 spatial" if first and method == "three-step" else "spatial"
+        rows = (*(first.statistics if first else ()), _row(name, body.solution.statistics))
         return self._placed(method, body, rows, first)
 
     def _placed(
@@ -357,7 +363,7 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
-        if not task.in_plane:
+        if not (task.in_plane and self.robot.planar):
             near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
             if near is None or start is not None:
                 return self.plan(task, previous.method, start=start)

@@ -15,6 +15,7 @@ from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
 from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -87,7 +88,7 @@ class SpatialPlanner:
 
         Parameters
         ----------
-        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
 
@@ -108,6 +109,9 @@ class SpatialPlanner:
             except SolverError:
                 if start is None:
                     raise
+        if start is None:
+            start = generic(self.terms["flat"], task)
+            toe_phase_s = float(start.extra["toe_phase_start"])
         guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
         return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, self.limits)
 
@@ -120,6 +124,8 @@ class SpatialPlanner:
         flat = self.terms["flat"]
         values = dict(stance=flat.stance, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
+        if not self.robot.planar:
+            values["straight"] = float(task.in_plane)
         return values | dict(edge=self._edge(task), gravity=task.gravity)
 
     def _edge(self, task: JumpTask) -> float:

@@ -41,7 +41,7 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     start = [stood, _flight(b.model, flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
     q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
     wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
-    f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
+    f, tau, com, spin = forces(robot, q, v, a, wrench, len(t))
     phase = np.repeat(["launch", "flight"], [len(t), len(late)])
     extra = {
         "com": com[:, :3],
@@ -231,7 +231,7 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
     return q, v, a
 
 
-def _forces(robot, q, v, a, wrench, standing: int):
+def forces(robot, q, v, a, wrench, standing: int):
     """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
     What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
