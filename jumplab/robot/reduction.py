@@ -20,6 +20,7 @@ RATE_RAD_S = 3.0  # of every link, for the momentum
 COM_LIMIT_M = 2e-3  # twice what the audit allows the CoM in flight; canted axes go beyond it
 SHARE_LIMIT = 0.01  # [1] of pitch inertia, and of momentum
 SAME_M, EXACT_M = 0.02, 1e-6  # between a joint and the mirror image of its counterpart: built alike; evened out
+EXACT_SHARE = 1e-5  # of a body's mass, and of its centre [m], to its counterpart's
 
 
 @dataclass(frozen=True)
@@ -96,17 +97,22 @@ def mirror(model: pin.Model, most_m: float = SAME_M) -> list[tuple[int, int, flo
 def in_plane(robot: Robot) -> bool:
     """Whether five links describe a robot: its moving joints are those of legs and swinging arms, left and right are
     alike, and mass, CoM, inertia and momentum are those of the full robot."""
-    model = robot.model
-    in_legs = {
-        j for name in robot.foot.frames for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
-    }
+    model, pairs = robot.model, mirror(robot.model, EXACT_M)
+    feet = [model.frames[model.getFrameId(name)].parentJoint for name in robot.foot.frames]
+    in_legs = {j for foot in feet for j in model.supports[foot]}
     others = {model.names[j] for j in range(2, model.njoints) if j not in in_legs}
-    if others - set(robot.joints["shoulder_pitch"]) or len({i for row in mirror(model, EXACT_M) for i in row[:2]}) < (
-        model.nv - 6
-    ):
+    bodies = [(model.inertias[2 + i], model.inertias[2 + k]) for i, k, _ in pairs]
+    even = all(_alike(a, b) for a, b in [(model.inertias[1], model.inertias[1]), *bodies])
+    if others - set(robot.joints["shoulder_pitch"]) or len({i for row in pairs for i in row[:2]}) < model.nv - 6:
         return False
     try:
         error = reduction_error(robot)
     except RobotError:
         return False
-    return error.com_m <= COM_LIMIT_M and max(error.inertia_share, error.momentum_share) <= SHARE_LIMIT
+    return even and error.com_m <= COM_LIMIT_M and max(error.inertia_share, error.momentum_share) <= SHARE_LIMIT
+
+
+def _alike(left: pin.Inertia, right: pin.Inertia) -> bool:
+    """Whether two bodies, in parallel frames, have mirrored masses and centres."""
+    off = np.abs(left.lever * [1.0, -1.0, 1.0] - right.lever).max() * left.mass
+    return abs(left.mass - right.mass) <= EXACT_SHARE * left.mass and off <= EXACT_SHARE * left.mass
