@@ -232,7 +232,9 @@ def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, floa
         out[knee.name] = _limb(knee, knee.place, ankle.place, width["shank"])
         centre = [(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2]
         out[foot.name] = [(np.array(centre), np.array([sole["toe"] - sole["heel"], 2 * sole["half"], width["foot"]]))]
-    legs = {b.name for hip in hips for b in [hip, *beyond(lumped.bodies, hip)]}
+    legs = {b.name for ankle in ankles for b in [ankle, *beyond(lumped.bodies, ankle)]}
+    for body in lumped.bodies[:0:-1]:
+        legs |= {body.parent} if body.name in legs else set()
     for body in lumped.bodies[1:]:
         if body.name not in legs and (boxes := _arm(lumped, body, width["arm"])):
             out[body.name] = boxes
