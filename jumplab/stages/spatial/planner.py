@@ -28,6 +28,8 @@ IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_cpu_time": 60.0, "max_wall_tim
 # by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
 IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3, "acceptable_iter": 2}
+# the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
+IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
 
 
 @dataclass(frozen=True)
