@@ -14,7 +14,7 @@ from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.problem import build_problem
-from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
@@ -61,7 +61,7 @@ class SpatialPlanner:
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = SPATIAL_MESH,
+        mesh: Mesh | None = None,
         limits: SpatialLimits = SpatialLimits(),
         weights: SpatialWeights = SpatialWeights(),
         *,
@@ -69,10 +69,11 @@ class SpatialPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.mesh, self.limits, self.weights, self.changes = robot, mesh, limits, weights, changes
+        self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
+        self.limits, self.weights, self.changes = limits, weights, changes
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
         options = dict(options or {})
-        problem = changes.applied(build_problem(robot, mesh, limits, weights))
+        problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})

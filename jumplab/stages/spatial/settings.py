@@ -52,3 +52,4 @@ class SpatialWeights:
 
 
 SPATIAL_MESH = Mesh(12, 12, 16)  # coarse: the tape is exact between the nodes
+TREE_MESH = Mesh(20, 12, 16)  # of robots that no plane describes: weak ankles pass their limits between fewer nodes
