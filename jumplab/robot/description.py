@@ -245,10 +245,10 @@ class Robot:
     ) -> Robot:
         """Another robot, some links of which weigh otherwise: each ``mass_kg`` [kg], or ``factor`` times as much.
 
-        The inertia scales with the mass, the CoM of the link stays. Left and right move alike in every plan, so name
-        both, ``("left_thigh", "right_thigh")``: with one of them the robot leans, and the audit says by how much. The
-        URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for
-        links that the robot lacks or that have no mass, for numbers that are none, and if the robot cannot stand so.
+        The inertia scales with the mass, the CoM of the link stays. Name both of a pair, ``("left_thigh",
+        "right_thigh")``: with one of them the robot is no longer :attr:`planar`. The URDF gets the new numbers, the
+        TOML a remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for links that the robot lacks or
+        that have no mass, for numbers that are none, and if the robot cannot stand so.
         """
         return self._changed(*changes.masses(self, link, mass_kg, factor))
 

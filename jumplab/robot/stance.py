@@ -180,7 +180,7 @@ def standing(robot: Robot) -> np.ndarray:
     if np.abs(missing(found.x)).max() > STANDS_M:
         raise RobotError(
             f"robot {robot.name}: no standing posture with the knees at {wish:g} rad and the trunk at "
-            f"{robot.stance['trunk_pitch_rad']:g} rad has flat feet below the CoM, {1e3 * found.fun.max():.0f} mm or mrad "
-            f"are missing; change [stance] in its configuration"
+            f"{robot.stance['trunk_pitch_rad']:g} rad has flat feet below the CoM, "
+            f"{1e3 * np.abs(found.fun).max():.0f} mm or mrad are missing; change [stance] in its configuration"
         )
     return q

@@ -18,6 +18,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
+from jumplab.robot_import.roles import LEG
 from jumplab.robot_import.urdf import Tree, parse
 
 REPAIRS = ("inertia", "massless", "symmetry")
@@ -217,7 +218,7 @@ def _spine(boxes: Boxes, hip: np.ndarray) -> Boxes:
 def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
     by_name = {b.name: b for b in lumped.bodies}
-    hips, knees, ankles, arms = ([lumped.body(name) for name in pair] for pair in roles.values())
+    hips, knees, ankles = ([lumped.body(name) for name in roles[role]] for role in LEG)
     leg = float(np.linalg.norm((hips[0].place - ankles[0].place)[[0, 2]]))
     width = {}
     for part, share in THICKNESS.items():

@@ -33,6 +33,7 @@ class Tolerances:
     cad_share: float = 0.01  # of a body's mass or inertia, likewise
     most_m: float = 0.015  # more than this between left and right is another robot, not a rounding or a cable
     most_share: float = 0.10  # of a body's mass or inertia, likewise
+    pair_m: float = 0.10  # farther apart two joints are no counterparts
     same: float = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
 
@@ -294,7 +295,7 @@ def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
         like = [b for b in bodies[1:] if b.parent == image.get(body.parent) and abs(flipped @ b.axis) > TOLERANCES.same]
         near = [(float(np.abs(MIRROR @ b.place - body.place).max()), b.name, b) for b in like]
         gap, _, other = min(near, default=(np.inf, "", body))
-        if gap < TOLERANCES.most_m:
+        if gap < TOLERANCES.pair_m:
             image |= {body.name: other.name, other.name: body.name}
             out.append((body, other) if body.place[1] >= other.place[1] else (other, body))
     return out

@@ -152,8 +152,10 @@ def find_roles(tree: Tree) -> Roles:
     middle = knee.limits.get("lower", 0.0) + knee.limits.get("upper", 0.0)
     left = lateral * np.sign(finder.axis[knee.name] @ lateral) * (np.sign(middle) or 1.0)
     if abs(middle) < EVEN_RAD:
-        sides = [(_foot(finder, three, chain, lateral), three[2].name) for three, chain in zip(threes, limb, strict=True)]
-        left = left * (1.0 if max(_ahead(finder, *side, np.cross(left, up)) for side in sides) >= 0 else -1.0)
+        ahead = np.cross(left, up)
+        soles = [(_foot(finder, x, chain, lateral), x[2].name) for x, chain in zip(threes, limb, strict=True)]
+        reach = [_ahead(finder, *sole, ahead) for sole in soles]
+        left = left * (1.0 if max(reach) >= 0 else -1.0)
     forward = np.cross(left, up)
     order = (1, 0) if left @ lateral > 0 else (0, 1)
     joints = {role: tuple(threes[i][k].name for i in order) for k, role in enumerate(LEG)}

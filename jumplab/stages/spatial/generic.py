@@ -12,7 +12,7 @@ from jumplab.stages.spatial.tape import forces
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.task import JumpTask
 
-# Heights of the base against the stance, as shares of the leg's length from hip to ankle; angles [rad] of trunk and heel
+# heights of the base against the stance, as shares of the leg's length from hip to ankle; angles [rad]
 CROUCH, STRETCH, LANDED, TUCK = -0.20, 0.03, -0.12, 0.15
 BOW, PITCH, HEEL_UP = 0.35, 0.12, 0.4
 CROUCH_S, TOE_S = 0.35, 0.08
@@ -22,8 +22,7 @@ IK_STEPS, DAMPING = 8, 1e-4
 
 def generic(b: SpatialTerms, task: JumpTask) -> Tape:
     """A tape at 100 Hz of a jump straight ahead with the task's rise; ``b`` are terms of a phase on the ground."""
-    model, gravity = b.model.model, task.gravity
-    chart0, leg = b.stance, _leg(b)
+    gravity, chart0, leg = task.gravity, b.stance, _leg(b)
     z, speed = chart0[2] + leg * np.array([0.0, CROUCH, STRETCH, LANDED]), task.takeoff_speed
     push_s = 2 * (z[2] - z[1]) / speed
     drop = max(speed**2 - 2 * gravity * (z[3] + task.platform_m - z[2]), (0.3 * speed) ** 2)

@@ -13,9 +13,9 @@ from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
+from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
 from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms

@@ -17,6 +17,7 @@ from scipy.integrate import cumulative_trapezoid
 from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.spatial import CHART, SpatialModel
 from jumplab.ocp.solution import PhaseSolution
+from jumplab.robot import Robot
 from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.start import generators
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -269,7 +270,9 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
     return q, v, a
 
 
-def forces(robot, q, v, a, wrench, standing: int):
+def forces(
+    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, standing: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
     What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
