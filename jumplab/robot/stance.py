@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
+WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a robot keeps if it can
 STANDS_M = 1e-3  # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 
 
@@ -157,7 +158,7 @@ def standing(robot: Robot) -> np.ndarray:
     q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, robot.stance["trunk_pitch_rad"], 0.0)).coeffs()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     first = [data.oMf[f].act(robot.foot.center) for f in frames]
-    wide = abs(first[0][1] - first[1][1]) / 2
+    wide = abs(first[0][1] - first[1][1])
     for k, sign, angle in bends:
         q[7 + k] = sign * (wish - angle)
 
@@ -166,10 +167,11 @@ def standing(robot: Robot) -> np.ndarray:
         pin.centerOfMass(model, data, q)
         pin.framesForwardKinematics(model, data, q)
         rows = [data.com[0][0], np.mean([sign * q[7 + k] + angle for k, sign, angle in bends]) - wish]
-        for f, y in zip(frames, (wide, -wide), strict=True):
-            axes = data.oMf[f].rotation
-            rows += [*(data.oMf[f].act(robot.foot.center) - [0.0, y, 0.0]), axes[2, 0], axes[2, 1], axes[1, 0]]
-        return np.array(rows)
+        (x1, y1, z1), (x2, y2, z2) = (data.oMf[f].act(robot.foot.center) for f in frames)
+        rows += [x1, x2, z1, z2, y1 + y2]
+        for axes in (data.oMf[f].rotation for f in frames):
+            rows += [axes[2, 0], axes[2, 1], axes[1, 0]]
+        return np.array([*rows, WIDTH_WEIGHT * (y1 - y2 - wide)])
 
     low, high = (x[legs] for x in (model.lowerPositionLimit, model.upperPositionLimit))
     room = np.minimum(STANCE_ROOM_RAD, (high - low) / 3)
@@ -177,10 +179,10 @@ def standing(robot: Robot) -> np.ndarray:
     ends = np.concatenate([[-np.inf] * 2, low + room]), np.concatenate([[np.inf] * 2, high - room])
     begin = np.clip(begin, ends[0] + 1e-9, ends[1] - 1e-9)
     found = least_squares(missing, begin, bounds=ends, xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    if np.abs(missing(found.x)).max() > STANDS_M:
+    if np.abs(missing(found.x)[:-1]).max() > STANDS_M:
         raise RobotError(
             f"robot {robot.name}: no standing posture with the knees at {wish:g} rad and the trunk at "
             f"{robot.stance['trunk_pitch_rad']:g} rad has flat feet below the CoM, "
-            f"{1e3 * np.abs(found.fun).max():.0f} mm or mrad are missing; change [stance] in its configuration"
+            f"{1e3 * np.abs(found.fun[:-1]).max():.0f} mm or mrad are missing; change [stance] in its configuration"
         )
     return q

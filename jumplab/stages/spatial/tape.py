@@ -82,8 +82,8 @@ class Legs:
         self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
         self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
         bodies = sorted({j for k in b.feet for j in b.chain(k)})
-        self.columns = np.array([len(CHART) - 1 + j for j in bodies])
-        self.pitches = np.arange(rows.numel()).reshape(2, -1)[:, -1]  # rows that say how the feet pitch
+        self.columns = np.array([1, 3, 4] * b.short + [len(CHART) - 1 + j for j in bodies])
+        self.pitches = np.cumsum([len(held) + 3 for held in b.held]) - 1  # rows that say how the feet pitch
 
     def held(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, ...]:
         """Charts, rates and accelerations (n, .) with the legs moved so that the feet stay in their places.

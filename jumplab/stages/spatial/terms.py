@@ -78,6 +78,16 @@ class SpatialTerms:
             body = self.model.bodies[body].parent
         return found
 
+    @property
+    def short(self) -> bool:
+        """Whether a leg has fewer than six joints: feet that stand then hold yaw and roll of the base."""
+        return min(len(self.chain(k)) for k in self.feet) < 6
+
+    @property
+    def held(self) -> tuple[list[int], list[int]]:
+        """Which components of their feet's places are told to the legs: of short ones, the second's side follows."""
+        return [0, 1, 2], [0, 2] if self.short else [0, 1, 2]
+
     def _first_places(self, frames) -> np.ndarray:
         """Middles of both soles (2, 3) as the robot stands [m]."""
         model, data = self.model.model, self.model.model.createData()
@@ -197,15 +207,18 @@ class SpatialTerms:
 
     # launch -----------------------------------------------------------------------------------------------------
     def contact_rows(self, q: ca.SX) -> ca.SX:
-        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch."""
+        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch.
+
+        Short legs leave the base no roll and no yaw.
+        """
         s, rows, half = SpatialState(self.model, q, q, q), [], (self.robot.foot.toe - self.robot.foot.heel) / 2
-        for body, own, toe, first in zip(self.feet, self._foot_axes, self.toes, self.places, strict=True):
+        for side, (body, own) in enumerate(zip(self.feet, self._foot_axes, strict=True)):
             axes = s.rotation(body) @ ca.DM(own)
-            place = s.point(body, toe) - ca.DM(first + np.array([half, 0.0, 0.0]))
-            rows += [place, axes[2, 1], axes[0, 1]]
+            place = s.point(body, self.toes[side]) - ca.DM(self.places[side] + np.array([half, 0.0, 0.0]))
+            rows += [place[self.held[side]], axes[2, 1], axes[0, 1]]
             if self.contact is Contact.FLAT:
                 rows.append(axes[2, 0])
-        return ca.vertcat(*rows)
+        return ca.vertcat(*rows, *([q[3], q[4]] if self.short else []))
 
     def pitches(self, q: ca.SX) -> ca.SX:
         """Sines of the feet's pitch (2,); positive is heel up."""
@@ -316,9 +329,9 @@ class SpatialTerms:
         first = len(self.coordinates) - self.model.joints
         return ca.vertcat(*(sign * p.q[first + k] + angle for k, sign, angle in self.knees))
 
-    def turned(self, p: Point, x: ca.SX | np.ndarray) -> ca.SX:
-        """A vector (3,) turned by the asked yaw."""
-        c, s = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
+    def turned(self, p: Point, x: ca.SX | np.ndarray, way: int = 1) -> ca.SX:
+        """A vector (3,) turned by the asked yaw, or back."""
+        c, s = ca.cos(p.p.yaw), way * ca.sin(p.p.yaw)
         return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
 
     def feet_at_goal(self, p: Point) -> ca.SX:
@@ -327,8 +340,11 @@ class SpatialTerms:
         for side, body in enumerate(self.feet):
             goal = self.turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
             axes, ahead = self.foot_axes(p, side), self.turned(p, np.array([1.0, 0.0, 0.0]))
-            rows += [self.at(p, body, self.soles[side]) - goal, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
-        return ca.vertcat(*rows)
+            off = self.at(p, body, self.soles[side]) - goal
+            if self.short:
+                off = self.turned(p, off, -1)[self.held[side]]
+            rows += [off, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
+        return ca.vertcat(*rows, *([p.q[0] - p.p.yaw, p.q[1]] if self.short else []))
 
     def capture(self, p: Point) -> ca.SX:
         """How far the middle between the soles is off the place (2,) where it catches the robot [m]."""
