@@ -75,6 +75,11 @@ class JumpTask:
         return self.side_m == 0 and self.yaw_rad == 0
 
     @property
+    def along_rad(self) -> float:
+        """Direction of the travel seen from above [rad], along which a platform begins; zero straight ahead or back."""
+        return math.atan2(self.side_m, self.distance_m) if self.side_m else 0.0
+
+    @property
     def takeoff_speed(self) -> float:
         """Vertical CoM speed at take-off, sqrt(2 g h) [m/s] (v_z^exp, Sec. III)."""
         return math.sqrt(2 * self.gravity * self.height_m)

@@ -193,11 +193,11 @@ def test_what_is_measured_enters_the_next_plan(bhr):
     assert echo.asked[-1][0].distance_m == pytest.approx(0.6) and first.solve_s == pytest.approx(0.124)
     assert first.ready_s == pytest.approx(0.624) and not first.air
     # in the air, 0.57 m are foretold: 3 cm short, to be made good and to be expected again
-    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, (first, 0.12))
+    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, (first, np.array([0.12, 0.0, 0.0])))
     assert echo.asked[-1][0].distance_m == pytest.approx(1.2 - 0.57 + 0.03)
     # it stands at 0.56 m: the forecast was 1 cm too far, and the jump 4 cm short
-    see.learn_place(first, 0.12, [second], np.array([0.68, 0.0, 0.0]))
-    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, (second, 0.68))
+    see.learn_place(first, np.array([0.12, 0.0, 0.0]), [second], np.array([0.68, 0.0, 0.0]))
+    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, (second, np.array([0.68, 0.0, 0.0])))
     foretold, place = 1.33 - 0.12, 1.33 - 0.12 - 0.01
     assert (third.foretold_m, third.place_m) == pytest.approx((foretold, place))
     missed = [0.04, 0.66 - (place - 0.56)]

@@ -9,6 +9,7 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
+from jumplab.cli import common
 from jumplab.cli.common import (
     ENGINE,
     JUMP,
@@ -97,6 +98,8 @@ def trials(args: Namespace) -> None:
         values = report.values(unit)
         if len(values) and not args.basin:  # they would count from the apex
             print(f"{name} of those that landed: {values.min():.3f} ... {values.max():.3f} m")
+    if not (args.basin or report.in_plane) and report.landed:
+        print(f"errors of those that landed: {common.misses(report.target, report.values)}")
     kept = f"{'basin' if args.basin else 'trials'}.json in {args.dir}, {report.resumed} trials from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
 
@@ -125,6 +128,11 @@ def certify(args: Namespace) -> None:
         print(tables.table(rows, columns))
         landed = ", ".join(f"{sum(t.landed for t in jumps)} in {name}" for name, jumps in mode.robots.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
+        for engine in () if found.task.in_plane else mode.planned:
+            stood = [t.metrics for t in (mode.planned[engine], *mode.robots[engine]) if t.landed]
+            if stood:
+                errors = common.misses(asdict(found.task), lambda name, stood=stood: [getattr(m, name) for m in stood])
+                print(f"errors in {engine} of those that landed: {errors}")
     kept = f"certificate.json and certificate.html in {args.dir}, {found.resumed} simulations from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
     if found.failures:
@@ -138,6 +146,8 @@ def certify(args: Namespace) -> None:
     opt("--distances-m M+", "travel of the feet, per jump [m]", None, number, required=True),
     opt("--height-m M+", "rise of the CoM in flight [m], for all jumps or per jump (default 0.3)", [0.3], number),
     opt("--platforms-m M+", "height of each landing surface above the first ground [m] (default: level)", None, number),
+    opt("--sides-m M+", "travel of the feet to the left, per jump [m] (default 0)", None, number),
+    opt("--turns-deg DEG+", "turn about the vertical to the left, per jump (default 0)", None, number),
     opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(0, 2**31 - 1)),
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
     opt("--ranges", "how much they differ", "slight", ("slight", "wide")),
@@ -156,7 +166,9 @@ def chain(args: Namespace) -> None:
     how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method", "engine")}
     how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
-    course, robot = chains.Course.of(args.distances_m, args.height_m, args.platforms_m), robots.Robot.load(args.robot)
+    turns = None if args.turns_deg is None else [math.radians(x) for x in args.turns_deg]
+    course = chains.Course.of(args.distances_m, args.height_m, args.platforms_m, args.sides_m, turns)
+    robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     ranges = chains.RANGES[args.ranges]
     drawn = None if seed is None else sim.Perturbation.draw(robot, seed, ranges)
@@ -186,6 +198,8 @@ def _print_chain(result, report) -> None:
     for row in result.rows():
         cells = ("-" if row[n] is None else f"{row[n]:.3f} {n[-1]}" for n in names)
         print(f"{row['jump']:<5}" + "".join(f"{cell:>9}" for cell in cells))
+    if not result.course.in_plane:
+        print("heading off by " + ", ".join(f"{math.degrees(x):+.1f}" for x in result.heading_errors_rad) + " deg")
     ready = f"{result.in_time} of {len(result.replans)}"
     print(f"plans made on the way: {ready} were there when the robot was ready for them")
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
@@ -194,6 +208,9 @@ def _print_chain(result, report) -> None:
     (low, high), errors = report.interval, report.errors_m
     worst = f"{abs(errors).max():.3f} m" if len(errors) else "none"
     print(f"{report.stood} of {len(report.trials)} robots stand to the end, 95 % interval {low:.1%} ... {high:.1%}")
+    if not report.course.in_plane:
+        off = [abs(x) for t in report.trials if t.stood for x in t.heading_errors_rad]
+        print(f"largest heading error {math.degrees(max(off, default=math.nan)):.1f} deg")
     print(f"largest distance error {worst}; {report.in_time} of {report.replans} plans in time")
     print(f"{(report.waits_s <= 0).sum()} of {len(report.waits_s)} next jumps began without waiting for a plan")
     for trial in (t for t in report.trials if not t.stood):

@@ -169,9 +169,13 @@ def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
     return dict(t=tape.t[launch], F_x=force[:, 0], F_z=down, cop_x=cop, heel_z=heel[:, 1])
 
 
+AXIS_WORDS = {"distance_m": "distance [m]", "height_m": "rise of the CoM [m]"}  # of an envelope
+AXIS_WORDS |= {"side_m": "to the left [m]", "yaw_rad": "turn [rad]"}
+
+
 @style.styled
 def envelope_map(envelope: Envelope) -> Figure:
-    """Distance against height; a cell's colour is the limit that it uses most, its strength how much of it."""
+    """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much of it."""
     fig = style.new_figure(1.6 * style.COLUMN_IN, 3.2)
     ax = fig.subplots()
     names = sorted({c.limiting for c in envelope.cells if c.solved})
@@ -180,7 +184,7 @@ def envelope_map(envelope: Envelope) -> Figure:
     edges = envelope.distances, envelope.heights
     size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in edges])
     for c in envelope.cells:
-        place = np.array([c.distance_m, c.height_m])
+        place = np.array([getattr(c, name) for name in envelope.axes])
         if c.solved:
             face = style.tint(colors[c.limiting], 0.25 + 0.75 * float(np.clip(c.share, 0, 1)))
             ax.text(*place, f"{100 * c.share:.0f}", ha="center", va="center", fontsize=5.5)
@@ -189,7 +193,8 @@ def envelope_map(envelope: Envelope) -> Figure:
         ax.add_patch(Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6))
     x, y = ((min(values) - d / 2, max(values) + d / 2) for values, d in zip(edges, size, strict=True))
     title = f"{envelope.robot}: limit used most, in %"
-    ax.set(xlim=x, ylim=y, xlabel="distance [m]", ylabel="rise of the CoM [m]", title=title)
+    across, up = (AXIS_WORDS[name] for name in envelope.axes)
+    ax.set(xlim=x, ylim=y, xlabel=across, ylabel=up, title=title)
     if max(map(len, edges)) <= MOST_TICKS:
         ax.set(xticks=envelope.distances, yticks=envelope.heights)
     ax.grid(False)

@@ -36,10 +36,12 @@ class Pilot:
     """Decides the command of each step: playback until touchdown, landing controller afterwards.
 
     Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
-    :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead.
+    :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead. ``start_rad`` is the heading
+    in which the robot stands at the start, where the tape begins with zero.
 
     Attributes
     ----------
+    looks_rad : heading in which the robot shall land; all that looks ahead sees it along that one.
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
@@ -58,13 +60,15 @@ class Pilot:
         reaim: bool = True,
         stand_s: float = STAND_S,
         lead_s: float = 0.0,
+        start_rad: float = 0.0,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
-        self.goal, self._heading = tape.q[-1], Gauge(robot).heading(tape.q[-1])
+        self.goal, self._heading, self._start = tape.q[-1], Gauge(robot).heading(tape.q[-1]), start_rad
+        self.looks_rad = start_rad + self._heading
         self._robot, self.playback = robot, Playback(tape, robot, mode, lead_s)
         tape = replace(tape, q=headed(tape.q, self._heading))
-        scene = scene.seen_along(self._heading, robot, self.goal)
+        scene = scene.seen_along(self.looks_rad, robot, self.goal)
         self.forecast = Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         self._landing = LandingController(robot, reference=None if callable(reference) else reference)
@@ -114,9 +118,10 @@ class Pilot:
         The tape is played in the axes of the start; all that looks ahead sees the robot along the heading in which it
         shall land.
         """
+        played = headed(q, self._start)
         if self.touchdown is None and step < self._tape_until:
-            return self.playback.command(step, q, v, self._none)
-        played, q = q, headed(q, self._heading)
+            return self.playback.command(step, played, v, self._none)
+        q = self.seen(q)
         if self.touchdown is None:
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, played, q, v)
@@ -127,6 +132,14 @@ class Pilot:
         if since % PERIOD_STEPS == 0:
             self._tau = self._landing.torque(since * STEP_S, q, v, force)
         return Command(tau=self._tau)
+
+    def seen(self, q: np.ndarray) -> np.ndarray:
+        """A configuration (nq,) of the world, seen along the heading of the landing."""
+        return headed(q, self.looks_rad)
+
+    def heading_error(self, step: int, seen: np.ndarray) -> float:
+        """How far the trunk is turned about the vertical beyond the plan [rad]."""
+        return float(self.playback.attitude_error(step, headed(seen, -self._heading))[2])
 
     def _fly(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> Command:
         """In flight: ``played`` is the configuration in the tape's axes, ``q`` in those of the landing."""

@@ -59,7 +59,7 @@ class Command:
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
     change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
-    wrench: np.ndarray | None = None  # (2, 6) that the plan has on them, world axes, at their frames; None: shared alike
+    wrench: np.ndarray | None = None  # (2, 6) of the plan on them, as on a tape; None: both carry alike
     share: float = 1.0  # of the torque limit, for the servo
     state: tuple[np.ndarray, np.ndarray] | None = None  # (q, v) that it is expected to arrive in; as measured if None
 
@@ -118,7 +118,7 @@ class Playback:
 
     In ``mode`` "position" the servo law of :mod:`.servo` follows its angles, rates and accelerations and sees no
     planned torque; of a jump whose feet carry unlike loads it knows what each of them carries. In "pd" the planned
-    torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown or the tape belongs to another robot.
+    torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown or the tape is another robot's.
 
     Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot is expected to be
     as far off the tape then as it is measured to be now: the plan is sent ahead, errors are met late.

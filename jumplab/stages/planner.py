@@ -254,8 +254,10 @@ class Planner:
 
         It begins with the planar jump of the same distance and rise, where there is one.
         """
-        if start is not None:
-            raise InputError("a jump to the side or with a turn begins in the stance; leave its start away")
+        if start is not None and not self.robot.planar:
+            raise InputError(
+                f"robot {self.robot.name} begins in the stance: no plane describes it; leave its start away"
+            )
         last, asked = self.stage("spatial"), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
@@ -263,11 +265,11 @@ class Planner:
         rest = {
             f"{stage}/{name}": w for stage, x in asked.items() if stage != "spatial" for name, w in x.weights.items()
         }
-        first, begun = None, ()
+        first, begun, stance = None, (), None if start is None else self._standing(start)
         if self.robot.planar:
-            first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest)
+            first = self.plan(replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0), method, weights=rest, start=start)
             begun = first.tape, first.toe_phase_s
-        body = last.plan(task, *begun, weights=asked["spatial"].weights)
+        body = last.plan(task, *begun, weights=asked["spatial"].weights, stance=stance)
         name = "4 spatial" if first and method == "three-step" else "spatial"
         rows = (*(first.statistics if first else ()), _row(name, body.solution.statistics))
         return self._placed(method, body, rows, first)
@@ -316,12 +318,16 @@ class Planner:
     def _pass(
         self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
     ) -> tuple[SrmpPlan, JointPlan]:
-        q0 = None if start is None else configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
+        q0 = None if start is None else self._standing(start)
         srmp = self._pendulum(task, start, weights=asked["srmp"].weights)
         try:
             return srmp, self._joints(srmp, asked, step_s=STEPS_S, q0=q0)
         except SolverError:  # at its limits a jump needs more of them
             return srmp, self._joints(srmp, asked, q0=q0)
+
+    def _standing(self, start: np.ndarray) -> np.ndarray:
+        """Configuration (nq,) of a posture (5,) in which the robot waits, the middle of the soles at the origin."""
+        return configuration(self.robot, start, toe=-self.robot.sagittal.sole_center)
 
     def _joints(self, srmp: SrmpPlan, asked: Mapping[str, StageChanges], **how: Any) -> JointPlan:
         """Stage 2 with its own rows, weights and switches. All its roll-outs pass here."""
@@ -365,12 +371,13 @@ class Planner:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         if not (task.in_plane and self.robot.planar):
             near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
-            if near is None or start is not None:
+            if near is None:
                 return self.plan(task, previous.method, start=start)
             try:
-                body = self.stage("spatial").plan(task, near=near)
+                stance = None if start is None else self._standing(start)
+                body = self.stage("spatial").plan(task, near=near, stance=stance)
             except SolverError:
-                return self.plan(task, previous.method)
+                return self.plan(task, previous.method, start=start)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)

@@ -44,6 +44,7 @@ from jumplab.sim import (
 )
 from jumplab.sim.engine import engine_class
 from jumplab.sim.playback import MODES
+from jumplab.task import JumpTask
 
 SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
 CONFIDENCE = 0.95
@@ -242,12 +243,17 @@ class TrialReport:
         """One metric (M,) of the trials that landed."""
         return np.array([getattr(t.metrics, name) for t in self.trials if t.landed])
 
+    @property
+    def in_plane(self) -> bool:
+        """Whether the plan goes straight ahead or back."""
+        return JumpTask(**self.target).in_plane
+
     def to_json(self) -> dict[str, Any]:
         """The content of ``trials.json``; depends on the trials alone, not on how or when they were run."""
         kinds = {"least": np.min, "median": np.median, "largest": np.max}
         measured = {
             name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x := self.values(name)) else None
-            for name in ("foot_distance_m", "com_rise_m")
+            for name in ("foot_distance_m", "com_rise_m", *(() if self.in_plane else ("side_m", "yaw_rad")))
         }
         return {
             "schema": SCHEMA,

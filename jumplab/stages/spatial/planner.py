@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,9 @@ from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
 # beyond, the cost moves by less than one in a million; a solve that needs more time is lost
-IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_cpu_time": 60.0, "max_wall_time": 600.0}  # [s]
+IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 150, "max_cpu_time": 40.0, "max_wall_time": 600.0}  # [s]
+SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
+QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
@@ -77,6 +79,7 @@ class SpatialPlanner:
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
+        self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
 
     def plan(
         self,
@@ -86,6 +89,8 @@ class SpatialPlanner:
         *,
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
+        stance: np.ndarray | None = None,
+        patient: bool = True,
     ) -> SpatialPlan:
         """Solve for a target.
 
@@ -94,56 +99,97 @@ class SpatialPlanner:
         start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
+        patient : explain a refusal, and look for a smaller target; otherwise only solve, and not for long.
+        stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's places; it if None.
 
         Raises
         ------
         SolverError
-            If there is no plan; names the terms in conflict.
+            If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
         """
-        asked = self.parameters(task)
-        how = {"weights": self.changes.spread(self.nlp.problem, weights or {})}
-        edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
+        how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
         if near is not None:
             try:
-                found = self._warm.solve(
-                    asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how
-                )
-                return SpatialPlan(task, found, edge, self.limits)
+                return self._solved(self._warm, task, near, how)
             except SolverError:
                 if start is None:
                     raise
-        if start is None:
-            start = generic(self.terms["flat"], task)
-            toe_phase_s = float(start.extra["toe_phase_start"])
-        guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
-        return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, self.limits)
+        if not patient:
+            return self._solved(self._quick, task, (start, toe_phase_s), how)
+        try:
+            return self._solved(self.nlp, task, (start, toe_phase_s), how | {"explain": True})
+        except SolverError as e:
+            less = self._smaller(task, start, toe_phase_s, how)
+            if less is not None and not e.violations:  # there is a motion: perhaps from here
+                try:
+                    return self._solved(self._warm, task, less, how)
+                except SolverError:
+                    pass
+            words = "" if less is None else f"; at this height, {said(less.task)} is planned"
+            raise SolverError(f"{e}{words}", stage=e.stage, status=e.status, violations=e.violations) from e
+
+    def _solved(
+        self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | tuple[Tape | None, float], how: dict
+    ) -> SpatialPlan:
+        """A plan that begins with another one, or with a planar tape and when its heels rise."""
+        asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
+        del how["stance"]
+        if isinstance(begin, SpatialPlan):
+            guess, how = begin.solution.guess(), how | {"multipliers": begin.solution.multipliers}
+        else:
+            tape, toe_phase_s = begin
+            if tape is None:
+                tape = generic(self.terms["flat"], task)
+                toe_phase_s = float(tape.extra["toe_phase_start"])
+            guess = from_tape(self.terms, tape, toe_phase_s, self.mesh, task)
+        edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
+        return SpatialPlan(task, nlp.solve(asked, guess, **how), edge, self.limits)
+
+    def _smaller(self, task: JumpTask, start: Tape | None, toe_phase_s: float, how: dict) -> SpatialPlan | None:
+        """The plan of the largest of a few targets with less way and less turn."""
+        for share in SHORTER:
+            less = {name: round(share * getattr(task, name), 3) for name in ("distance_m", "side_m", "yaw_rad")}
+            try:
+                return self._solved(self._quick, replace(task, **less), (start, toe_phase_s), how)
+            except (InfeasibleError, SolverError):
+                continue
+        return None
 
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan."""
         return make_tape(self.terms, plan.solution.phases, plan.task.gravity)
 
-    def parameters(self, task: JumpTask) -> dict[str, Any]:
+    def parameters(self, task: JumpTask, stance: np.ndarray | None = None) -> dict[str, Any]:
         """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
         flat = self.terms["flat"]
-        values = dict(stance=flat.stance, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
+        start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
+        values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
         if not self.robot.planar:
             values["straight"] = float(task.in_plane)
-        return values | dict(edge=self._edge(task), gravity=task.gravity)
+        ways = np.cos(task.along_rad), np.sin(task.along_rad)
+        return values | dict(edge=self._edge(task, np.array(ways)), along=ways, gravity=task.gravity)
 
-    def _edge(self, task: JumpTask) -> float:
-        """Where the ground steps up or down [m], from the world's origin."""
+    def _edge(self, task: JumpTask, along: np.ndarray) -> float:
+        """Where the ground steps up or down [m], from the world's origin ``along`` (2,) the travel."""
         c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
         soles = self.robot.foot.corners - self.robot.foot.center
-        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)
-        landed = task.distance_m + corners[:, 0] * c - corners[:, 1] * s
-        room, first = self.limits.edge_before_heel_m, float(corners[:, 0].max())
+        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)[:, :2]
+        landed = ([task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])) @ along
+        room, first = self.limits.edge_before_heel_m, float((corners @ along).max())
         up, down = float(landed.min()) - room, first + room
         edge = down if task.platform_m < 0 else up
         apart = up - first if task.platform_m > 0 else float(landed.min()) - down
         if task.platform_m and apart < 0:
+            way = float(np.hypot(task.distance_m, task.side_m))
             raise InfeasibleError(
-                f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-                f"under a sole of {self.robot.name}; ask for a distance of {task.distance_m - apart:.2f} m or more"
+                f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
+                f"sole of {self.robot.name}; ask for a distance of {way - apart:.2f} m or more"
             )
         return edge
+
+
+def said(task: JumpTask) -> str:
+    """Way and turn of a target in words."""
+    turn = f"{np.degrees(task.yaw_rad):.3g} deg"
+    return f"{task.distance_m:g} m ahead and {task.side_m:g} m to the left with a turn of {turn}"

@@ -144,6 +144,6 @@ def build_problem(
     flat, toe, flight = (SpatialTerms(robot, limits, weights, contact) for contact in Contact)
     made = (flat, _flat_phase(flat, mesh)), (toe, _toe_phase(toe, mesh)), (flight, _flight_phase(flight, mesh))
     phases = tuple(replace(phase, view=partial(SpatialView, b)) for b, phase in made)
-    parameters = dict(stance=len(flat.coordinates), distance=1, side=1, yaw=1, platform=1, edge=1)
+    parameters = dict(stance=len(flat.coordinates), distance=1, side=1, yaw=1, platform=1, edge=1, along=2)
     parameters |= dict(takeoff_speed=1, rotation=1, gravity=1, **({} if robot.planar else {"straight": 1}))
     return Problem("spatial", phases, (_joined(), *_released(toe)), parameters)

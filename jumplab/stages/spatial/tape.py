@@ -176,7 +176,11 @@ def _flight(b: SpatialTerms, flight: PhaseSolution, chart0, stood, t: np.ndarray
     off = [x[len(CHART) :] - y[0] for x, y in zip(chart0, planned, strict=True)]
     joints = [x + y for x, y in zip(planned, _fading(off, halves), strict=True)]
     s = halves / t[-1]
-    bends = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / t[-1], 60 * s * (1 - s) * (1 - 2 * s) / t[-1] ** 2
+    bends = (
+        s**3 * (10 - 15 * s + 6 * s**2),
+        30 * s**2 * (1 - s) ** 2 / t[-1],
+        60 * s * (1 - s) * (1 - 2 * s) / t[-1] ** 2,
+    )
 
     def moved():
         chart, rates = _turning(model, joints, chart0[0][3:6], spin, t)
@@ -296,7 +300,9 @@ def forces(
                 slopes[k, i] = pin.getJointJacobian(model, data, joint, world)
     force, moment = (np.einsum("nij,nj->ni", turn, need[:standing, at : at + 3]) for at in (0, 3))
     missing = np.concatenate([force, moment + np.cross(base, force)], axis=1) - wrench[:standing].sum(1)
-    total = wrench[:standing] + _shared(wrench[:standing], soles, missing, LEAST_LOAD * robot.total_mass * robot.gravity)
+    total = wrench[:standing] + _shared(
+        wrench[:standing], soles, missing, LEAST_LOAD * robot.total_mass * robot.gravity
+    )
     f = np.zeros((n, 2, 6))
     f[:standing] = total
     f[:standing, :, 3:] -= np.cross(places, total[..., :3])

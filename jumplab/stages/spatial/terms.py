@@ -292,7 +292,7 @@ class SpatialTerms:
 
     def ground(self, p: Point, x: ca.SX) -> ca.SX:
         """Height of the surface below a point."""
-        return p.p.platform * (1 + ca.tanh((x[0] - p.p.edge) / 0.015)) / 2
+        return p.p.platform * (1 + ca.tanh((ca.dot(p.p.along, x[:2]) - p.p.edge) / 0.015)) / 2
 
     def body_clearance(self) -> Term:
         """Knees and hands stay away from the ground."""
