@@ -22,7 +22,7 @@ def test_course_of_numbers():
     assert course.count == 3 and course.heights_m == (0.3, 0.3, 0.3)
     assert course.goals_m == pytest.approx((0.6, 1.1, 1.5))
     assert [course.task(k).platform_m for k in range(3)] == pytest.approx([0.0, 0.2, -0.1])
-    assert course.task(1, 0.55) == JumpTask(0.55, 0.3, 0.2)
+    assert course.task(1, np.array([0.55, 0.0, 0.0])) == JumpTask(0.55, 0.3, 0.2)
     assert Course.of([0.6, 0.5], [0.3, 0.4]).heights_m == (0.3, 0.4)
 
 
@@ -166,6 +166,42 @@ def test_a_plan_begins_in_the_posture_it_is_given(bhr):
         assert plan.planned_distance_m == pytest.approx(0.6, abs=1e-4)
     with pytest.raises(InputError, match="a flip begins in the stance"):
         planner().plan(JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi), start=start)
+
+
+# ------------------------------------------------------------------------------------------ heading
+def test_a_square_leads_back():
+    course = Course.of([0.3] * 4, 0.35, None, None, [np.pi / 2] * 4)
+    assert not course.in_plane and course.task(1) == JumpTask(0.3, 0.35, yaw_rad=np.pi / 2)
+    assert course.goals[:2] == pytest.approx(np.array([[0.3, 0.0, np.pi / 2], [0.3, 0.3, np.pi]]))
+    assert course.goals[3] == pytest.approx([0.0, 0.0, 2 * np.pi], abs=1e-12)
+    aside = Course.of([0.3, 0.0], 0.3, sides_m=[0.0, 0.2])
+    assert aside.goals[1] == pytest.approx([0.3, 0.2, 0.0]) and Course.of([0.3], 0.3, sides_m=[0.0]).in_plane
+
+
+@pytest.mark.parametrize("given, sentence", [
+    (dict(sides_m=[0.1]), "1 sides for 2 distances: give one per jump"),
+    (dict(turns_rad=[1.0, 2.0, 3.0]), "3 turns for 2 distances: give one per jump"),
+    (dict(turns_rad=[1.0, 0.0], platforms_m=[0.1, 0.1]),
+     "platforms lie on a straight way: leave them away, or ask for neither sides nor turns"),
+])  # fmt: skip
+def test_courses_with_heading_that_cannot_be_meant(given, sentence):
+    with pytest.raises(InputError) as e:
+        Course.of([0.5, 0.5], 0.3, **given)
+    assert str(e.value) == sentence
+
+
+def test_what_is_missed_is_made_good_in_the_axes_of_each_jump(bhr):
+    """A turn of 90 degrees that ends 80 degrees round and 4 cm short: the next begins there and asks for the rest."""
+    echo = Echo()
+    see = Foresight(Course.of([0.3, 0.3], 0.3, turns_rad=[np.pi / 2] * 2), bhr, echo, None, solve_s=0.1)
+    first = see.look(0, 0.5, np.zeros(3))
+    stands = np.array([0.26, 0.0, np.radians(80)])
+    see.look(1, 1.5, stands, last=(first, np.zeros(3)))
+    task, (c, s) = echo.asked[-1][0], (np.cos(stands[2]), np.sin(stands[2]))
+    goal = np.array([0.3, 0.3]) - stands[:2]
+    assert task.distance_m == pytest.approx(c * goal[0] + s * goal[1] + 0.04)
+    assert task.side_m == pytest.approx(c * goal[1] - s * goal[0])
+    assert task.yaw_rad == pytest.approx(np.radians(100) + 0.1)  # as much as jumps may be mistaken by
 
 
 # ------------------------------------------------------------------------------------------ foresight

@@ -180,11 +180,12 @@ class SpatialPlanner:
         up, down = float(landed.min()) - room, first + room
         edge = down if task.platform_m < 0 else up
         apart = up - first if task.platform_m > 0 else float(landed.min()) - down
-        if task.platform_m and apart < 0:
+        if task.platform_m and apart < -1e-9:  # rounding
             way = float(np.hypot(task.distance_m, task.side_m))
+            least = np.ceil(100 * (way - apart) - 1e-6) / 100
             raise InfeasibleError(
                 f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
-                f"sole of {self.robot.name}; ask for a distance of {way - apart:.2f} m or more"
+                f"sole of {self.robot.name}; ask for a distance of {least:.2f} m or more"
             )
         return edge
 
