@@ -190,7 +190,7 @@ def test_where_there_is_a_motion_it_is_looked_for_from_a_smaller_target(monkeypa
 
 
 def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carries(bhr):
-    tape = jump(TURN).tape
+    tape = jump(SIDE).tape
     servo, player = Servo(bhr, substeps=10**6), Playback(tape, bhr)
     effort, worst = Actuators(bhr).effort, {True: 0.0, False: 0.0}
     for row in range(50, tape.takeoff_index - 5, 50):
@@ -201,7 +201,7 @@ def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carri
             told = command if knows else replace(command, wrench=None)
             off = servo.torque(told, tape.q[row], tape.v[row]) - player._tau[step]
             worst[knows] = max(worst[knows], float(np.abs(off / effort).max()))
-    assert worst[True] < 0.05 < worst[False] / 2
+    assert worst[True] < 0.03 < worst[False] / 2  # on the toes their line moves a little in the plan
 
 
 def test_targets_out_of_the_plane_are_checked():
