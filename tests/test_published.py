@@ -1,13 +1,13 @@
 """Published robots from the optional package example-robot-data: shipped configurations and true refusals."""
 
 import pytest
+from fixtures_robots import reduction_error
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.checkup import check
 from jumplab.robot.description import SHIPPED
-from jumplab.robot.reduction import reduction_error
 from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import Scene, simulate_jump
@@ -97,7 +97,7 @@ def test_no_jumper_and_why(name, repair, words):
         draft(urdf(name), repair)
 
 
-ALLOWED = ("symmetry", "inertia", "massless")
+ALLOWED = ("inertia", "massless")
 NO_ROBOT = [
     ("icub_description/robots/icub.urdf",
      r"joint 'l_hip_pitch': velocity = 100 rad/s is above 60: deg/s or a placeholder; .* \[limits\.hip_pitch\]"),

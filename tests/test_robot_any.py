@@ -16,6 +16,7 @@ from fixtures_robots import (
     mirrored,
     one_axis_ankle,
     plain,
+    reduction_error,
     root,
     text,
     waist,
@@ -26,7 +27,6 @@ from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.description import Robot as Described
-from jumplab.robot.reduction import reduction_error
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
@@ -71,7 +71,7 @@ def test_canted_hips_leave_the_plane(tmp_path, angle_rad, planar):
 def test_a_robot_whose_sides_differ_is_left_as_it_is():
     jumper = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
     robot = Robot.from_text(jumper.urdf, jumper.config_text)
-    said = "left and right differ, left as they are: places (most at 'left_hip_yaw_link')"
+    said = "left and right differ, left as they are, places"
     assert jumper.lumped.changed[said][0] == pytest.approx(50.0)
     assert not robot.planar
 
@@ -214,7 +214,7 @@ REFUSED = [
      "robot configuration: 'source.forward' = 'ahead' must be one of +x -x +y -y +z -z"),
     (text(root()), config("x", forward="+z"), "robot configuration: forward +z and up +z must be different axes"),
     (text(root()), config("x").replace("repair = []", 'repair = ["all"]'),
-     "robot configuration: 'source.repair' knows inertia, massless, symmetry, got 'all'"),
+     "robot configuration: 'source.repair' knows inertia, massless, got 'all'"),
     (text(root()), config("x") + "[locked]\nneck = 0.1\n",
      "my.urdf: [locked] names the joint 'neck', which the URDF lacks"),
     (text(root()), config("x") + '[locked]\nleft_knee = "bent"\n',

@@ -100,8 +100,8 @@ class Robot:
         ----------
         name_or_path : name of a shipped robot (:data:`SHIPPED`), or path of a TOML file or of a URDF. Of a bare URDF,
             roles, soles and standing posture are found.
-        repair : of a bare URDF, what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that
-            a solid can have), "massless" (a gram for bodies without any).
+        repair : of a bare URDF, what may be repaired: "inertia" (the nearest that a solid can have), "massless" (a gram
+            for bodies without any).
         """
         path, config = files_of(name_or_path)
         if config is not None and "source" not in read_toml(config, str(path)):

@@ -31,8 +31,6 @@ class Tolerances:
     alike: float = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
     cad_m: float = 0.005  # what a CAD export leaves between left and right is evened out without asking
     cad_share: float = 0.01  # of a body's mass or inertia, likewise
-    most_m: float = 0.015  # more than this between left and right is another robot, not a rounding or a cable
-    most_share: float = 0.10  # of a body's mass or inertia, likewise
     pair_m: float = 0.10  # farther apart two joints are no counterparts
     same: float = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
@@ -59,7 +57,7 @@ class Lumped:
 
     bodies: tuple[Body, ...]  # trunk first, each after the one that carries it
     foot_offset: np.ndarray  # (3,) from the foot body's origin to the origin of the told foot link [m]
-    changed: dict[str, tuple[float, str]]  # what symmetry and repairs changed: name -> (amount, unit)
+    changed: dict[str, tuple[float, str]]  # what evening out and repairs changed: name -> (amount, unit)
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
 
     def body(self, joint: str) -> Body:
@@ -87,7 +85,7 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
     changed = {}
     if "massless" in source["repair"]:
         bodies = _with_mass(bodies, changed)
-    bodies = _mirrored(bodies, "symmetry" in source["repair"], changed)
+    bodies = _mirrored(bodies, changed)
     offset = placed[feet[0]].translation - next(b for b in bodies if b.name == feet[0]).place
     return Lumped(tuple(bodies), offset, changed, held)
 
@@ -231,28 +229,30 @@ def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
 
 
 # left and right -------------------------------------------------------------------------------------------------
-def _mirrored(bodies: list[Body], allowed: bool, changed: dict) -> list[Body]:
-    """Left and right as exact mirror images: their means, where they are alike or that is ``allowed``."""
-    trunk, out = bodies[0], {}
-    place, mass = (0.0, trunk.name), (0.0, trunk.name)  # largest difference [m], and share, with the body's name
+def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
+    """Left and right as exact mirror images, their means, if they differ no more than a CAD export leaves."""
+    out, gap, share = {}, 0.0, 0.0  # largest differences [m], [1]
     for left, right in _pairs(bodies):
-        own, other = left.inertia.toPseudoInertia().toMatrix(), _image(right.inertia.toPseudoInertia().toMatrix())
-        gap = float(np.abs(left.place - MIRROR @ right.place).max())
-        mean, image = (own + other) / 2, MIRROR @ right.inertia.lever
-        weighs = left.inertia.mass > 0
-        if weighs:
-            if min(left.inertia.mass, right.inertia.mass) > 10 * DUMMY.mass:
-                gap = max(gap, float(np.abs(left.inertia.lever - image).max()))
-            heavier = float(abs(own[3, 3] - other[3, 3]) / mean[3, 3])
-            spread = float(np.abs(own - other)[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
-            mass = max(mass, (max(heavier, spread), left.name), key=lambda x: x[0])
-        place = max(place, (gap, left.name), key=lambda x: x[0])
-        middle = (left.place + MIRROR @ right.place) / 2
-        here, away = (_inertia(mean), _inertia(_image(mean))) if weighs else (left.inertia, right.inertia)
+        middle, gaps = (left.place + MIRROR @ right.place) / 2, [left.place - MIRROR @ right.place]
+        here, away = left.inertia, right.inertia
+        if here.mass > 0:
+            own, other = here.toPseudoInertia().toMatrix(), _image(away.toPseudoInertia().toMatrix())
+            mean = (own + other) / 2
+            if min(here.mass, away.mass) > 10 * DUMMY.mass:
+                gaps.append(here.lever - MIRROR @ away.lever)
+            spread = np.abs(own - other)[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12)
+            share = max(share, abs(own[3, 3] - other[3, 3]) / mean[3, 3], spread)
+            here, away = _inertia(mean), _inertia(_image(mean))
+        gap = max(gap, np.abs(gaps).max())
         out[left.joint] = replace(left, place=middle, inertia=here)
         if right is not left:
             out[right.joint] = replace(right, place=MIRROR @ middle, inertia=away, axis=_same_axis(left, right))
-    return [out.get(b.joint, b) for b in bodies] if _judge(place, mass, allowed, changed) else bodies
+    even = gap <= TOLERANCES.cad_m and share <= TOLERANCES.cad_share
+    done = "evened out" if even else "differ, left as they are"
+    if max(gap, share) > TOLERANCES.alike:
+        changed[f"left and right {done}, places"] = (1e3 * float(gap), "mm")
+        changed[f"left and right {done}, masses"] = (100 * float(share), "%")
+    return [out.get(b.joint, b) for b in bodies] if even else bodies
 
 
 def _image(moments: np.ndarray) -> np.ndarray:
@@ -270,19 +270,6 @@ def _same_axis(left: Body, right: Body) -> np.ndarray:
     image = -MIRROR @ left.axis
     image = image if image @ right.axis > 0 else -image
     return image if np.linalg.norm(image - right.axis) < 10 * TOLERANCES.axis_rad else right.axis
-
-
-def _judge(place: tuple[float, str], mass: tuple[float, str], allowed: bool, changed: dict) -> bool:
-    """Whether left and right shall be evened out: what a CAD export leaves always, more where that is ``allowed``."""
-    (gap, at), (share, heavy), most = place, mass, TOLERANCES
-    if gap > most.most_m or share > most.most_share or (not allowed and (gap > most.cad_m or share > most.cad_share)):
-        changed[f"left and right differ, left as they are: places (most at {at!r})"] = (1e3 * gap, "mm")
-        changed[f"left and right differ, left as they are: masses (most at {heavy!r})"] = (100 * share, "%")
-        return False
-    if max(gap, share) > most.alike:
-        changed["left and right evened out, places"] = (1e3 * gap, "mm")
-        changed["left and right evened out, masses"] = (100 * share, "%")
-    return True
 
 
 def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:

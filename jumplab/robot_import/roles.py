@@ -27,7 +27,6 @@ EVEN_RAD = 0.3  # a knee whose range is as even as this says nothing of where th
 SAME_M = 0.02  # how far from mirror images two limbs may stand
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
-ARM_SHARE = 0.5  # a joint that swings less than half of the arm's mass is no shoulder
 SOLE_M = 0.012  # points this near the lowest one belong to the sole
 SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
 # a sole where nothing is known: the default robot's, as shares of the leg's length from hip to ankle
@@ -196,15 +195,12 @@ def _shoulders(
     if not arms:
         notes.append("no arms were found: the shoulder is left out")
         return ()
-    limb = max(arms, key=lambda x: finder.mass(x[0][0].child))
-    first = limb[0][0]
-    for pair in zip(*limb, strict=True):
-        heavy = finder.mass(pair[0].child) >= ARM_SHARE * finder.mass(first.child)
-        if heavy and all(abs(finder.axis[j.name] @ lateral) > PARALLEL for j in pair):
-            return tuple(pair[i].name for i in order)
-    cant = np.degrees(np.arccos(min(1.0, abs(finder.axis[first.name] @ lateral))))
-    said = f"the arms are held: the first joint, {first.name!r}, turns {cant:.1f} deg off the pitch axis"
-    notes.append(f"{said}, and none behind it swings half of the arm about that axis")
+    pair = [limb[0] for limb in max(arms, key=lambda x: finder.mass(x[0][0].child))]
+    cosine = min(abs(finder.axis[joint.name] @ lateral) for joint in pair)
+    if cosine > PARALLEL:
+        return tuple(pair[i].name for i in order)
+    cant = np.degrees(np.arccos(cosine))
+    notes.append(f"the arms are held: the first joint, {pair[0].name!r}, turns {cant:.1f} deg off the pitch axis")
     return ()
 
 
