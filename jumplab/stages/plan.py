@@ -90,20 +90,24 @@ class JumpPlan(Shown, Named):
     @property
     def planned_distance_m(self) -> float:
         """Travel of the toe over the whole tape, of the middle between the soles in a jump out of the plane [m]."""
-        if "soles_travel" in self.tape.extra:
+        if self._spatial:
             return float(self.tape.extra["soles_travel"][0])
         toe = self.tape.extra["planar_toe"]
         return float(toe[-1, 0] - toe[0, 0])
 
     @property
+    def _spatial(self) -> bool:
+        return "soles_travel" in self.tape.extra
+
+    @property
     def toe_phase_s(self) -> float:
         """When the heels rise, on the tape [s]."""
-        return float(self.tape.extra["planar_toe_phase_start" if self.task.in_plane else "toe_phase_start"])
+        return float(self.tape.extra["toe_phase_start" if self._spatial else "planar_toe_phase_start"])
 
     @property
     def planned_side_m(self) -> float:
         """Travel of the middle between the soles to the left [m], on the tape."""
-        return float(self.tape.extra["soles_travel"][1]) if "soles_travel" in self.tape.extra else 0.0
+        return float(self.tape.extra["soles_travel"][1]) if self._spatial else 0.0
 
     @property
     def planned_yaw_rad(self) -> float:
@@ -179,7 +183,7 @@ class JumpPlan(Shown, Named):
         if self.stored is not None:
             return dict(self.stored)
         body, away = self.whole_body, {}
-        if not self.task.in_plane:
+        if self._spatial:
             away = dict(planned_side_m=self.planned_side_m, planned_yaw_rad=self.planned_yaw_rad)
         return {
             "target": asdict(self.task),

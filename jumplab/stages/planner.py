@@ -229,12 +229,14 @@ class Planner:
         """
         require_type(task, JumpTask, "the target")
         if isinstance(method, str) and method == USUAL:
-            method = METHODS[0 if task.in_plane and self.atlas is None else 1]
+            method = METHODS[0 if task.in_plane and self.robot.planar and self.atlas is None else 1]
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
         if self.atlas is not None and method != "direct":
             raise InputError(f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave it away")
-        if not task.in_plane:
+        if not self.robot.planar and method != "direct":
+            raise InputError(f"method {quoted(method)}: no plane describes robot {self.robot.name}; choose 'direct'")
+        if not (task.in_plane and self.robot.planar):
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
@@ -277,7 +279,13 @@ class Planner:
         )
 
     def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
-        """A jump out of the plane: three steps, or the planar jump of the same distance and rise, then the program."""
+        """A jump out of the plane, or of a robot that no plane describes: three steps, or the spatial program alone,
+        begun from the planar jump of the same distance and rise where there is one.
+        """
+        if start is not None and not self.robot.planar:
+            raise InputError(
+                f"robot {self.robot.name} begins in the stance: no plane describes it; leave its start away"
+            )
         last, asked = self.stage("spatial"), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
@@ -294,12 +302,13 @@ class Planner:
                 return self._three_spatial(task, asked)
             except SolverError as e:
                 skipped, rest = f"{e}; {AHEAD}", {}
-        planar = replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0)
-        first = self.plan(planar, "direct", weights=rest, start=start)
-        stance = None if start is None else self._standing(start)
-        body = last.plan(task, first.tape, first.toe_phase_s, weights=now, stance=stance)
-        rows = (*first.statistics, _row("spatial", body.solution.statistics))
-        return self._placed(method, body, rows, skipped=skipped)
+        begun, rows, stance = (), (), None if start is None else self._standing(start)
+        if self.robot.planar:
+            planar = replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0)
+            first = self.plan(planar, "direct", weights=rest, start=start)
+            begun, rows = (first.tape, first.toe_phase_s), first.statistics
+        body = last.plan(task, *begun, weights=now, stance=stance)
+        return self._placed(method, body, (*rows, _row("spatial", body.solution.statistics)), skipped=skipped)
 
     def _refuse_planar(self, asked: Mapping[str, StageChanges]) -> None:
         ignored = [f"{stage!r}" for stage in ("srmp", "whole body") if self.changes[stage] or asked[stage]]
@@ -394,7 +403,7 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
-        if not task.in_plane:
+        if not (task.in_plane and self.robot.planar):
             near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
             if near is None:
                 return self.plan(task, previous.method, start=start)

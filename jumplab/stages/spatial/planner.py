@@ -14,8 +14,9 @@ from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
+from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
-from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -33,7 +34,9 @@ IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3,
 # the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
 
-Begin = tuple[Tape, float, bool]  # a tape, when its heels rise [s], and whether side and yaw are added to it
+Begin = tuple[
+    Tape | None, float, bool
+]  # a tape (or a generic one), when its heels rise [s], and whether side and yaw are added to it
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,7 +68,7 @@ class SpatialPlanner:
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = SPATIAL_MESH,
+        mesh: Mesh | None = None,
         limits: SpatialLimits = SpatialLimits(),
         weights: SpatialWeights = SpatialWeights(),
         *,
@@ -73,10 +76,11 @@ class SpatialPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.mesh, self.limits, self.weights, self.changes = robot, mesh, limits, weights, changes
+        self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
+        self.limits, self.weights, self.changes = limits, weights, changes
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
         options = dict(options or {})
-        problem = changes.applied(build_problem(robot, mesh, limits, weights))
+        problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
@@ -98,7 +102,7 @@ class SpatialPlanner:
 
         Parameters
         ----------
-        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
         ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
@@ -131,9 +135,7 @@ class SpatialPlanner:
             words = "" if less is None else f"; at this height, {said(less.task)} is planned"
             raise SolverError(f"{e}{words}", stage=e.stage, status=e.status, violations=e.violations) from e
 
-    def _solved(
-        self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | tuple[Tape, float, bool], how: dict
-    ) -> SpatialPlan:
+    def _solved(self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | Begin, how: dict) -> SpatialPlan:
         """A plan that begins with another one, or with a tape, when its heels rise, and whether it needs ramps."""
         asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
         del how["stance"]
@@ -141,6 +143,9 @@ class SpatialPlanner:
             guess, how = begin.solution.guess(), how | {"multipliers": begin.solution.multipliers}
         else:
             tape, toe_phase_s, ramps = begin
+            if tape is None:
+                tape = generic(self.terms["flat"], task)
+                toe_phase_s = float(tape.extra["toe_phase_start"])
             guess = from_tape(self.terms, tape, toe_phase_s, self.mesh, task, ramps)
         edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
         return SpatialPlan(task, nlp.solve(asked, guess, **how), edge, self.limits)
@@ -165,6 +170,8 @@ class SpatialPlanner:
         start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
         values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
+        if not self.robot.planar:
+            values["straight"] = float(task.in_plane)
         ways = np.cos(task.along_rad), np.sin(task.along_rad)
         return values | dict(edge=self._edge(task, np.array(ways)), along=ways, gravity=task.gravity)
 
