@@ -34,9 +34,7 @@ IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3,
 # the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
 
-Begin = tuple[
-    Tape | None, float, bool
-]  # a tape (or a generic one), when its heels rise [s], and whether side and yaw are added to it
+Begin = tuple[Tape | None, float, bool]  # a tape or none, when its heels rise [s], whether side and yaw are added
 
 
 @dataclass(frozen=True, repr=False)
