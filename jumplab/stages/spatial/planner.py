@@ -136,6 +136,8 @@ class SpatialPlanner:
         if task.platform_m and apart < 0:
             raise InfeasibleError(
                 f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-                f"under a sole of {self.robot.name}; that takes a distance of at least {task.distance_m - apart:.2f} m"
+                f"under a sole of {self.robot.name}; that takes a distance of at least {task.distance_m - apart:.2f} m",
+                number="distance_m",
+                bound=task.distance_m - apart,
             )
         return edge

@@ -100,7 +100,9 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
         raise InfeasibleError(
             f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
             f"under a sole of {robot.name}; that takes a distance of at least {least:.2f} m (backward jumps only on "
-            f"the level)"
+            f"the level)",
+            number="distance_m",
+            bound=least,
         )
 
 
