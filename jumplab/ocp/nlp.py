@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextvars import ContextVar
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -24,6 +25,7 @@ from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
 from jumplab.ocp.sqp import GaussNewton
 
+EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)  # off where nobody reads why there is no plan
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # scaled row error above which a "solved" status is not believed
 IPOPT = {
@@ -157,7 +159,7 @@ class Nlp:
         status, iterations = stats["return_status"], int(stats["iter_count"])
         residual = float(np.max(posed.beyond(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            raise _failure(a, posed, x, status, iterations, explain)
+            raise _failure(a, posed, x, status, iterations, explain and EXPLAINED.get())
         functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
         return self._solution(posed, (x, lam_x, lam_g), iterations, status, solve_s, functions_s)
 

@@ -15,14 +15,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError, quoted
+from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, read_only, reduce
 from jumplab.robot.stance import check_stance, standing
 from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table, table
 from jumplab.robot_import.urdf import locate, read_urdf
-from jumplab.shown import Shown
 from jumplab.task import GRAVITY
 
 if TYPE_CHECKING:

@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
 from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of
 from jumplab.sim.playback import Actuators

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
 from jumplab.stages.spatial import SpatialPlan

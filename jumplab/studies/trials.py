@@ -26,14 +26,13 @@ import pinocchio as pin
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io import folder as store
 from jumplab.io.files import Log, open_log
 from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.shown import Shown
 from jumplab.sim import (
     DEFAULT_ENGINE,
     Metrics,

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody, FullMotion, FullTerms, TurningBody
 from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.shown import Shown
 from jumplab.stages.joint_qp.changes import changed
 from jumplab.stages.joint_qp.flight import FlightQp
 from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp

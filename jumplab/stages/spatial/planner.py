@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, Shown, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
@@ -188,7 +187,9 @@ class SpatialPlanner:
             least = np.ceil(100 * (way - apart) - 1e-6) / 100
             raise InfeasibleError(
                 f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
-                f"sole of {self.robot.name}; that takes a distance of at least {least:.2f} m"
+                f"sole of {self.robot.name}; that takes a distance of at least {least:.2f} m",
+                number="distance_m",
+                bound=float(least),
             )
         return edge
 

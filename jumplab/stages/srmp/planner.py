@@ -9,14 +9,13 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import SolverError
+from jumplab.errors import Shown, SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach, shipped_reach
-from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
 from jumplab.stages.srmp.reachable import check_reachable

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, Shown, SolverError
 from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
-from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.problem import build_problem
@@ -100,7 +99,9 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
         raise InfeasibleError(
             f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
             f"under a sole of {robot.name}; that takes a distance of at least {least:.2f} m (backward jumps only on "
-            f"the level)"
+            f"the level)",
+            number="distance_m",
+            bound=least,
         )
 
 
