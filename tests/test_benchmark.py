@@ -44,6 +44,9 @@ def test_the_report_is_plain_and_complete(found):
     assert again["warm_over_direct"] == pytest.approx(steps / cpu[again["peer"]][0])
     assert again["tape_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
     assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
+    assert again["atlas_over_direct"] == pytest.approx(cpu["atlas"][0] / cpu[again["peer"]][0])
+    assert again["plans_per_s"] == pytest.approx(1 / cpu["atlas, with tape and audit"][0])
+    assert again["three_over_direct_gn"] == again["warm_over_approached"] and again["process_s"] is None
     assert again["cold_over_direct"] is None and again["peak_memory_gib"] is None
     assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
     (other,) = again["growth"]["spread"]
@@ -53,7 +56,7 @@ def test_the_report_is_plain_and_complete(found):
 
 @pytest.mark.slow
 def test_every_timed_plan_was_audited(found):
-    assert {"plan", "re-plan", *benchmark.DIRECT, benchmark.APPROACHED} == set(found["audits"])
+    assert {"plan", "re-plan", *benchmark.DIRECT, benchmark.APPROACHED, benchmark.ATLAS} == set(found["audits"])
     assert all(a["of"] == 1 for a in found["audits"].values())
 
 
