@@ -16,11 +16,12 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
-NEAR, MILDER = 0.75, 0.6  # of a bound, and of a number that a solver could not meet
+NEAR = {"height_m": 0.75, "distance_m": 0.55, "platform_m": 0.6}  # of a bound, which plans do not reach
+MILDER = 0.6  # of a number that a solver could not meet
 BEYOND = 1.4  # times the least distance that a platform takes
 HIGHER = 3.0  # times the least height that a flip's rotation takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
-TRIES, LONGEST_S = 8, 15.0  # so many easier targets are tried, and none is begun after so long [s of CPU time]
+TRIES, LONGEST_S = 8, 30.0  # so many easier targets are tried, and none is begun after so long [s of CPU time]
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 NUMBERS = {"distance_m": "distance", "height_m": "height", "platform_m": "platform", "side_m": "side"}
 
@@ -95,7 +96,7 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int) -> JumpTask | Non
         higher = None if bound is None else _rounded(HIGHER * bound, up=True)
         changes = {"rotation_rad": 0.0} if higher is None or higher <= task.height_m else {"height_m": higher}
     elif bound is not None:
-        most, asked = NEAR * bound, getattr(task, name)
+        most, asked = NEAR[name] * bound, getattr(task, name)
         least = name == "distance_m" and bound > abs(asked)
         changes = {name: _rounded(BEYOND * bound, up=True) if least else math.copysign(_rounded(most), asked)}
     else:
