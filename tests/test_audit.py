@@ -106,6 +106,7 @@ BROKEN = {
     "energy balance": lambda t: edit(t, tau=lambda x, i: x.__imul__(1.02)),
     "mass": lambda t: (t, robot_with(urdf=HEAVIER), TASK),
     "toe slip": lambda t: shifted(t, 0, 0.003, 0.1, 0.8 * t.takeoff_time),
+    "foot turn": lambda t: edit(t, q=put(STANDING, 7 + joint("left_hip_yaw"), 0.04)),
     "toe on the ground": lambda t: shifted(t, 2, 0.002, 0.1, 0.8 * t.takeoff_time),
     "penetration": lambda t: shifted(t, 2, -0.002, 0.1, 0.8 * t.takeoff_time),
     "foot clearance": lambda t: shifted(t, 2, -0.3, t.takeoff_time + 0.01, t.t[-1] - 0.01),

@@ -220,6 +220,9 @@ class Truth:
         t, f = self.tape.t, self.tape.f
         slip = np.hypot(*np.moveaxis((self.toe - self.toe[0])[:LAUNCH, ..., :2], -1, 0)).max(axis=-1)
         self.worst("toe slip", 1e3 * slip, t, FEET)
+        left = np.array([[place.rotation[:2, 1] for place in row] for row in self.foot[:LAUNCH]])
+        heading = np.arctan2(-left[..., 0], left[..., 1])
+        self.worst("foot turn", 1e3 * np.abs(heading - heading[0]), t, FEET)
         self.worst("toe on the ground", 1e3 * np.abs(self.toe[:LAUNCH, ..., 2]).max(axis=-1), t, FEET)
         above = 1e3 * (self.sole[..., 2] - self.surface(self.sole[..., 0])).min(axis=-1)
         self.worst("penetration", -above, labels=FEET)
@@ -278,7 +281,7 @@ class Truth:
         height = self.com[LAUNCH:, 2]
         rise = abs(height.max() - height[0] - task.height_m)
         self.said["rise"] = (1e3 * rise, t[LAUNCH + np.argmax(height)], None)
-        pitch = [[math.atan2(-p.rotation[2, 0], p.rotation[0, 0]) for p in row] for row in self.foot]
+        pitch = [[math.atan2(-p.rotation[2, 0], p.rotation[2, 2]) for p in row] for row in self.foot]
         self.turned = turn = np.sum((np.diff(pitch, axis=0) + np.pi) % (2 * np.pi) - np.pi, axis=0)
         self.worst("rotation", 1e3 * np.abs(turn - task.rotation_rad)[None], end, FEET)
 

@@ -65,7 +65,7 @@ def physics(monkeypatch):
 def test_engines_that_measure_the_same_certify_a_plan(folder, physics, capsys):
     assert cli.main(["certify", str(folder), "--n", "3", "--jobs", "1"]) == 0
     said = capsys.readouterr().out
-    assert "certified: all 50 checks of the audit passed, and the engines agree that it lands" in said
+    assert "certified: all 51 checks of the audit passed, and the engines agree that it lands" in said
     assert held(folder) == LAID | WRITTEN
     found = store.read_json(folder / "certificate.json")
     assert found["passed"] and found["failures"] == [] and found["audit"]["passed"]

@@ -1,8 +1,10 @@
 """Chained jumps: what is refused before any solve, what enters a plan, and chains that stand, wait, and fail."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_chains import planner, rehearsal, waiting
+from fixtures_core import jump
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot import Robot
@@ -11,7 +13,7 @@ from jumplab.sim.kinematics import Gauge
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
 from jumplab.studies.chain.course import CROUCH
-from jumplab.studies.chain.pilot import Ahead, Foresight, posture
+from jumplab.studies.chain.pilot import Ahead, Foresight, _over_feet, posture
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses
@@ -22,7 +24,7 @@ def test_course_of_numbers():
     assert course.count == 3 and course.heights_m == (0.3, 0.3, 0.3)
     assert course.goals_m == pytest.approx((0.6, 1.1, 1.5))
     assert [course.task(k).platform_m for k in range(3)] == pytest.approx([0.0, 0.2, -0.1])
-    assert course.task(1, 0.55) == JumpTask(0.55, 0.3, 0.2)
+    assert course.task(1, np.array([0.55, 0.0, 0.0])) == JumpTask(0.55, 0.3, 0.2)
     assert Course.of([0.6, 0.5], [0.3, 0.4]).heights_m == (0.3, 0.4)
 
 
@@ -168,6 +170,42 @@ def test_a_plan_begins_in_the_posture_it_is_given(bhr):
         planner().plan(JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi), start=start)
 
 
+# ------------------------------------------------------------------------------------------ heading
+def test_a_square_leads_back():
+    course = Course.of([0.3] * 4, 0.35, None, None, [np.pi / 2] * 4)
+    assert not course.in_plane and course.task(1) == JumpTask(0.3, 0.35, yaw_rad=np.pi / 2)
+    assert course.goals[:2] == pytest.approx(np.array([[0.3, 0.0, np.pi / 2], [0.3, 0.3, np.pi]]))
+    assert course.goals[3] == pytest.approx([0.0, 0.0, 2 * np.pi], abs=1e-12)
+    aside = Course.of([0.3, 0.0], 0.3, sides_m=[0.0, 0.2])
+    assert aside.goals[1] == pytest.approx([0.3, 0.2, 0.0]) and Course.of([0.3], 0.3, sides_m=[0.0]).in_plane
+
+
+@pytest.mark.parametrize("given, sentence", [
+    (dict(sides_m=[0.1]), "1 sides for 2 distances: give one per jump"),
+    (dict(turns_rad=[1.0, 2.0, 3.0]), "3 turns for 2 distances: give one per jump"),
+    (dict(turns_rad=[1.0, 0.0], platforms_m=[0.1, 0.1]),
+     "platforms lie on a straight way: leave them away, or ask for neither sides nor turns"),
+])  # fmt: skip
+def test_courses_with_heading_that_cannot_be_meant(given, sentence):
+    with pytest.raises(InputError) as e:
+        Course.of([0.5, 0.5], 0.3, **given)
+    assert str(e.value) == sentence
+
+
+def test_what_is_missed_is_made_good_in_the_axes_of_each_jump(bhr):
+    """A turn of 90 degrees that ends 80 degrees round and 4 cm short: the next begins there and asks for the rest."""
+    echo = Echo()
+    see = Foresight(Course.of([0.3, 0.3], 0.3, turns_rad=[np.pi / 2] * 2), bhr, echo, None, solve_s=0.1)
+    first = see.look(0, 0.5, np.zeros(3))
+    stands = np.array([0.26, 0.0, np.radians(80)])
+    see.look(1, 1.5, stands, last=(first, np.zeros(3)))
+    task, (c, s) = echo.asked[-1][0], (np.cos(stands[2]), np.sin(stands[2]))
+    goal = np.array([0.3, 0.3]) - stands[:2]
+    assert task.distance_m == pytest.approx(c * goal[0] + s * goal[1] + 0.04)
+    assert task.side_m == pytest.approx(c * goal[1] - s * goal[0])
+    assert task.yaw_rad == pytest.approx(np.radians(100) + 0.1)  # as much as jumps may be mistaken by
+
+
 # ------------------------------------------------------------------------------------------ foresight
 
 
@@ -193,11 +231,11 @@ def test_what_is_measured_enters_the_next_plan(bhr):
     assert echo.asked[-1][0].distance_m == pytest.approx(0.6) and first.solve_s == pytest.approx(0.124)
     assert first.ready_s == pytest.approx(0.624) and not first.air
     # in the air, 0.57 m are foretold: 3 cm short, to be made good and to be expected again
-    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, (first, 0.12))
+    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, (first, np.array([0.12, 0.0, 0.0])))
     assert echo.asked[-1][0].distance_m == pytest.approx(1.2 - 0.57 + 0.03)
     # it stands at 0.56 m: the forecast was 1 cm too far, and the jump 4 cm short
-    see.learn_place(first, 0.12, [second], np.array([0.68, 0.0, 0.0]))
-    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, (second, 0.68))
+    see.learn_place(first, np.array([0.12, 0.0, 0.0]), [second], np.array([0.68, 0.0, 0.0]))
+    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, (second, np.array([0.68, 0.0, 0.0])))
     foretold, place = 1.33 - 0.12, 1.33 - 0.12 - 0.01
     assert (third.foretold_m, third.place_m) == pytest.approx((foretold, place))
     missed = [0.04, 0.66 - (place - 0.56)]
@@ -210,6 +248,38 @@ def test_posture_off_the_crouch_enters_within_reason(bhr):
     see.learn_posture(q)
     see.look(0, 0.5, np.zeros(3))
     assert echo.asked[0][1] == pytest.approx([0.0, 0.02, -0.03, 0.1, 0.04])
+
+
+def test_the_trunk_moves_as_planned_over_feet_that_stand_unevenly(bhr):
+    """One foot 2 cm ahead of the other and turned by 3 degrees: throughout the launch each foot keeps its place."""
+    tape = jump(0.6, 0.3, 0.0, "direct").tape
+    model, data = bhr.model, bhr.model.createData()
+    frames = [model.getFrameId(name) for name in bhr.foot.frames]
+
+    def between(q):
+        """From the left sole to the right one along the ground, in axes that look where both feet do, and the turn."""
+        pin.framesForwardKinematics(model, data, q)
+        soles = [data.oMf[f].act(bhr.foot.center) for f in frames]
+        yaw = [np.arctan2(*data.oMf[f].rotation[1::-1, 0]) for f in frames]
+        c, s = np.cos(np.mean(yaw)), np.sin(np.mean(yaw))
+        return np.append(np.array([[c, s], [-s, c]]) @ (soles[1] - soles[0])[:2], yaw[1] - yaw[0])
+
+    rng, q = np.random.default_rng(1), tape.q[0].copy()
+    hips = [i for i, name in enumerate(bhr.joint_names) if "hip_yaw" in name or name == "left_hip_pitch"]
+    q[7:][hips] += rng.uniform(-0.05, 0.05, len(hips))
+    asked = between(q)
+    assert abs(asked[0]) > 5e-3 and abs(asked[2]) > 0.01
+    spline = _over_feet(tape, bhr, q)
+    for time in (0.0, 0.2, 0.9 * tape.takeoff_time):
+        row = np.searchsorted(tape.t, time)
+        moved = tape.q[row].copy()
+        moved[7:] += spline(tape.t[row])
+        pin.framesForwardKinematics(model, data, tape.q[row])
+        level = [data.oMf[f].translation[2] for f in frames]
+        assert between(moved) == pytest.approx(asked, abs=1e-4 if time == 0 else 2e-3)  # heels rise about turned toes
+        assert [data.oMf[f].translation[2] for f in frames] == pytest.approx(level, abs=1e-4)
+    even = _over_feet(tape, bhr, tape.q[0])
+    assert np.abs(even(np.linspace(0, tape.takeoff_time, 50))).max() < 1e-9
 
 
 def test_a_failure_of_the_planner_is_kept_as_words(bhr):

@@ -41,6 +41,18 @@ def test_a_chain_stands_and_hits():
 
 
 @pytest.mark.slow
+def test_a_perturbed_robot_keeps_its_heading_over_five_jumps():
+    """Jump by jump it lands a little turned; that must not grow from one to the next."""
+    course, robot = Course.of([0.6] * 5, 0.3), Robot.load()
+    how = dict(planner=planner(), perturbation=Perturbation.draw(robot, 3, SLIGHT), solve_s=0.2)
+    result = run_chain(course, robot, **how)
+    assert result.stood, result.reason
+    assert np.abs(result.errors_m).max() < 0.01
+    ends = [j.simulation.q[-1] for j in result.jumps]
+    assert max(abs(Gauge(robot).heading(q)) for q in ends) < np.radians(4)
+
+
+@pytest.mark.slow
 def test_nothing_is_reset_between_jumps():
     """The log goes on from jump to jump as the engine's own step has it, and every part passes the honesty checks."""
     result = chain()

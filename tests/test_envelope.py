@@ -84,6 +84,24 @@ def test_far_cells_are_not_tried_for_ever(bhr, monkeypatch):
     assert [c.limiting for c in cells] == [OPEN, OPEN, BEYOND, BEYOND]
 
 
+def test_maps_over_other_numbers(bhr, monkeypatch):
+    asked, told = [], []
+
+    def solved(robot, task, guess, *, cold):
+        asked.append(task)
+        return Cell.of(task, True, "friction", 0.5), None
+
+    monkeypatch.setattr("jumplab.studies.envelope._solve", solved)
+    fixed = JumpTask(0.1, 0.4)
+    found = envelope(bhr, (0.0, 0.2), (0.3,), axes=("side_m", "distance_m"), fixed=fixed, tell=told.append)
+    assert asked == [JumpTask(0.3, 0.4), JumpTask(0.3, 0.4, side_m=0.2)] and told == [
+        "distance 0.30 m: 2 of 2 cells, up to 0.20 m"
+    ]
+    assert [c.side_m for c in found.cells] == [0.0, 0.2] and found.axes == ("side_m", "distance_m")
+    assert envelope_map(found).axes[0].get_xlabel() == "to the left [m]"
+    assert [c.yaw_rad for c in envelope(bhr, (0.0, 1.0), (0.3,), axes=("yaw_rad", "height_m")).cells] == [0.0, 1.0]
+
+
 def test_grids_that_cannot_be_meant(bhr):
     with pytest.raises(InputError, match=r"the map has 0 x 1 cells"):
         envelope(bhr, (), (0.3,))

@@ -1,7 +1,7 @@
 """Jumps in three dimensions: planned, on tape exact, audited, played back, re-planned, refused."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -13,11 +13,16 @@ import pytest
 import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
+from jumplab.cli.common import misses
 from jumplab.cli.main import main
-from jumplab.errors import InfeasibleError, InputError
+from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.ocp.problem import Point
+from jumplab.robot.stance import configuration, stance_angles
+from jumplab.sim import STEP_S, Disturbance
 from jumplab.sim.kinematics import Gauge, headed, pitch_of, planned_pitch, rotation
+from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.scene import Scene
+from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
 from jumplab.stages.spatial.start import spread
@@ -75,10 +80,11 @@ def test_audit_sees_another_goal():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("mode", ["position", "pd"])
 @pytest.mark.parametrize("engine", ["bullet", "mujoco"])
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
-def test_playback_lands_in_its_place_and_heading(task, engine):
-    result = run(task, "pd", engine)
+def test_playback_lands_in_its_place_and_heading(task, engine, mode):
+    result = run(task, mode, engine)
     m = result.metrics
     assert result.landed and result.checks_passed, result.reason
     assert np.hypot(m.foot_distance_m - task.distance_m, m.side_m - task.side_m) < 0.02
@@ -137,16 +143,63 @@ def test_names_that_do_not_exist_are_refused():
         planner().plan(SIDE, "direct", weights={"spatial/flight/torq": 0.01})
 
 
-def test_start_and_platform_that_cannot_be_are_refused():
-    with pytest.raises(InputError) as e:
-        planner().plan(SIDE, "direct", start=np.zeros(5))
-    assert str(e.value) == "a jump to the side or with a turn begins in the stance; leave its start away"
+def test_platforms_that_would_lie_under_a_sole_are_refused():
     with pytest.raises(InfeasibleError) as e:
         planner().plan(replace(SIDE, platform_m=0.2), "direct")
-    said = (
-        "platform = 0.2 m at a distance of 0 m: the two surfaces would meet under a sole of bhr; that takes a distance "
-    )
-    assert str(e.value) == said + "of at least 0.29 m"
+    said = "platform = 0.2 m at a distance of 0.3 m: the two surfaces would meet under a sole of bhr; that takes "
+    assert str(e.value) == said + "a distance of at least 0.35 m"
+    planner().stage("spatial").parameters(replace(SIDE, side_m=0.35, platform_m=0.2))
+
+
+def test_it_begins_in_the_posture_in_which_the_robot_waits(bhr):
+    start = stance_angles(bhr, 0.6)
+    plan = planner().plan(SIDE, "direct", start=start)
+    assert plan.tape.q[0, 7:] == pytest.approx(configuration(bhr, start)[7:], abs=1e-3)
+    assert plan.planned_side_m == pytest.approx(0.3, abs=2e-3) and np.abs(plan.tape.v[0]).max() < 1e-3
+
+
+def test_a_refusal_names_a_smaller_target_that_is_planned(monkeypatch):
+    last, tried, known = planner().stage("spatial"), [], jump(SIDE).whole_body
+
+    def solved(nlp, task, begin, how):
+        tried.append((task.side_m, nlp is last._quick))
+        if task.side_m > 0.5:
+            raise SolverError("spatial: no plan", stage="spatial", violations=("flight/capture window by 1 m",))
+        return replace(known, task=task)
+
+    monkeypatch.setattr(last, "_solved", solved)
+    with pytest.raises(SolverError) as e:
+        last.plan(replace(SIDE, side_m=0.9))
+    assert tried == [(0.9, False), (0.81, True), (0.63, True), (0.45, True)]
+    said = "spatial: no plan; at this height, 0 m ahead and 0.45 m to the left with a turn of 0 deg is planned"
+    assert str(e.value) == said and e.value.violations
+
+
+def test_where_there_is_a_motion_it_is_looked_for_from_a_smaller_target(monkeypatch):
+    last, known = planner().stage("spatial"), jump(SIDE).whole_body
+
+    def solved(nlp, task, begin, how):
+        if nlp is last.nlp:
+            raise SolverError("the search did not settle")
+        return replace(known, task=task)
+
+    monkeypatch.setattr(last, "_solved", solved)
+    assert last.plan(replace(SIDE, side_m=0.9)).task.side_m == 0.9
+
+
+def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carries(bhr):
+    tape = jump(SIDE).tape
+    servo, player = Servo(bhr, substeps=10**6), Playback(tape, bhr)
+    effort, worst = Actuators(bhr).effort, {True: 0.0, False: 0.0}
+    for row in range(50, tape.takeoff_index - 5, 50):
+        step = round(float(tape.t[row]) / STEP_S)
+        command = player.command(step, tape.q[row], tape.v[row], np.zeros(len(effort)))
+        assert command.wrench is not None and command.tau is None
+        for knows in worst:
+            told = command if knows else replace(command, wrench=None)
+            off = servo.torque(told, tape.q[row], tape.v[row]) - player._tau[step]
+            worst[knows] = max(worst[knows], float(np.abs(off / effort).max()))
+    assert worst[True] < 0.03 < worst[False] / 2  # on the toes their line moves a little in the plan
 
 
 def test_targets_out_of_the_plane_are_checked():
@@ -172,6 +225,35 @@ def test_command_line_plans_and_simulates_a_turn(tmp_path, capsys):
     assert told["side_m"] == pytest.approx(-0.1, abs=0.02) and told["yaw_rad"] == pytest.approx(np.pi / 3, abs=0.06)
     target = json.loads((tmp_path / "turn" / "summary.json").read_text())["target"]
     assert JumpTask(**target) == TURN
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", [JumpTask(0.0, 0.4, 0.1, side_m=0.6), JumpTask(0.5, 0.45, 0.15, side_m=0.4)])
+def test_platforms_lie_along_the_travel(task):
+    plan = jump(task)
+    assert jl.audit(plan).passed
+    result = jl.simulate(plan)
+    assert result.landed and abs(result.q[-1, 2] - plan.tape.q[0, 2] - task.platform_m) < 0.02
+    m = result.metrics
+    assert np.hypot(m.foot_distance_m - task.distance_m, m.side_m - task.side_m) < 0.02
+
+
+def test_errors_are_told_by_axis():
+    values = {"foot_distance_m": [0.19, 0.22], "side_m": [-0.1, -0.07], "yaw_rad": [1.0, 1.1]}
+    said = "forward -10.0 ... +20.0 mm, side +0.0 ... +30.0 mm, heading -2.7 ... +3.0 deg"
+    assert misses(asdict(TURN), values.__getitem__) == said
+
+
+def test_a_wrong_apex_has_a_direction(bhr):
+    """Tipped to the left, faster along the way: the velocity of the CoM and its place are otherwise the same."""
+    tape, gauge = jump(TURN).tape, Gauge(bhr)
+    _, q, v = Disturbance().apex(tape, bhr)
+    _, tipped, faster = Disturbance(1.2, 0.1, direction_rad=np.pi / 2).apex(tape, bhr)
+    assert gauge.com(tipped) == pytest.approx(gauge.com(q), abs=1e-9)
+    assert gauge.com_velocity(tipped, faster) == pytest.approx(gauge.com_velocity(q, v) * [1.2, 1.2, 1.0], abs=1e-9)
+    axis = TURN.yaw_rad + np.pi / 2  # of the heading; turned about the axis a quarter turn to its left, it tips left
+    turn = pin.log3(rotation(tipped[3:7]) @ rotation(q[3:7]).T)
+    assert turn == pytest.approx(0.1 * np.array([-np.sin(axis), np.cos(axis), 0.0]), abs=1e-3)
 
 
 # what it is made of -----------------------------------------------------------------------------------------------
@@ -220,6 +302,13 @@ def test_pitch_is_told_in_the_own_heading():
 
 def test_ground_is_seen_along_the_heading(bhr):
     scene, q = Scene.platform(0.5, 0.2), np.array(jump(SIDE).tape.q[-1])
+    aside = replace(scene, along_rad=np.pi / 2)
+    assert aside.seen_along(0.0, bhr, q).top_at(3.0) == 0.0  # its edge is 0.5 m to the left, the soles at 0.3 m
+    assert aside.seen_along(0.0, bhr, headed(q, -1.5)).top_at(3.0) == 0.0
+    half, centre, turn = aside.boxes()[1]
+    middle = (0.5 + 20.0) / 2
+    assert centre == pytest.approx([0.0, middle, 0.1], abs=1e-12) and half[0] == pytest.approx(20.0 - middle)
+    assert rotation(turn) @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
     assert scene.seen_along(0.0, bhr, q) is scene
     assert scene.seen_along(1.0, bhr, q).top_at(3.0) == 0.0
     q[0] += 1.0

@@ -60,13 +60,13 @@ def test_a_small_sweep_is_one_table(tmp_path):
 def test_it_goes_on_where_it_stopped(tmp_path, monkeypatch):
     cases, planned = sweep.grid([0.1, 0.2, 0.3], [0.3]), []
 
-    def some(case):
+    def some(case, atlas):
         if len(planned) == 2:
             raise KeyboardInterrupt
         planned.append(case.distance_m)
-        return quick(case)
+        return quick(case), None
 
-    monkeypatch.setattr(sweep, "run_case", some)
+    monkeypatch.setattr(sweep, "_planned", some)
     with pytest.raises(KeyboardInterrupt):
         sweep.run(cases, tmp_path, jobs=1, progress=False)
     assert sweep.TABLE not in names(tmp_path)
@@ -122,11 +122,12 @@ def test_no_such_cluster(tmp_path):
 
 
 def test_another_sweep_is_not_mixed_in(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweep, "run_case", quick)
+    monkeypatch.setattr(sweep, "_planned", lambda case, atlas: (quick(case), None))
     sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)
     with pytest.raises(InputError) as e:
         sweep.run(sweep.grid([0.2], [0.3]), tmp_path, jobs=1, progress=False)
-    assert str(e.value) == f"{str(tmp_path)!r} holds a sweep of other targets, robots or weights; choose another folder"
+    said = "a sweep of other targets, robots, weights or options; choose another folder"
+    assert str(e.value) == f"{str(tmp_path)!r} holds {said}"
     (tmp_path / sweep.CASES).write_text("good morning\n")
     with pytest.raises(InputError, match=r"is no log of a sweep; choose another folder$"):
         sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)

@@ -21,13 +21,17 @@ def _geometry(r: Replay) -> list[Check]:
     t, s, feet = r.tape.t, r.launch, r.tape.contact_frames
     toe, points = r.toe_corners[s], r.sole_points  # (n, K, 2, 3), (N, K, P, 3)
     slip = np.linalg.norm((toe - toe[0])[..., :2], axis=-1).max(axis=-1)
+    left = r.foot_rotation[s, :, :, 1]  # level, heel up or not (n, K, 3)
+    first = np.broadcast_to(left[0], left.shape)
+    turned = np.abs(np.arctan2(np.cross(first, left)[..., 2], (first * left)[..., :2].sum(-1)))
     hover = np.abs(toe[..., 2]).max(axis=-1)
-    above = 1e3 * (points[..., 2] - r.surface(points[..., 0])).min(axis=-1)  # (N, K)
+    above = 1e3 * (points[..., 2] - r.surface(r.along(points))).min(axis=-1)  # (N, K)
     flying = t[r.flight]
     share = (t - flying[0]) / (flying[-1] - flying[0])
     middle = (share >= METHOD.mid_flight[0]) & (share <= METHOD.mid_flight[1])
     return [
         LIMITS["toe slip"].worst(1e3 * slip, t[s], feet),
+        LIMITS["foot turn"].worst(1e3 * turned, t[s], feet),
         LIMITS["toe on the ground"].worst(1e3 * hover, t[s], feet),
         LIMITS["penetration"].worst(-above, t, feet),
         LIMITS["foot clearance"].worst(above[middle], t[middle], feet),
@@ -108,8 +112,9 @@ def _add_surroundings(r: Replay, geometry: pin.GeometryModel) -> None:
     blocks = [pin.GeometryObject("ground", 0, 0, pin.SE3.Identity(), below)]
     if high - low > 1e-6:
         towards, size = r.heading if r.platform > 0 else -r.heading, METHOD.block_m
-        centre = np.array([r.edge + towards * size / 2, 0.0, high - size / 2])
-        blocks.append(pin.GeometryObject("platform", 0, 0, pin.SE3(np.eye(3), centre), coal.Box(size, size, size)))
+        turn = pin.rpy.rpyToMatrix(0.0, 0.0, r.task.along_rad if r.task else 0.0)
+        centre = turn @ np.array([r.edge + towards * size / 2, 0.0, high - size / 2])
+        blocks.append(pin.GeometryObject("platform", 0, 0, pin.SE3(turn, centre), coal.Box(size, size, size)))
     for block in blocks:
         index = geometry.addGeometryObject(block)
         for i in bodies:

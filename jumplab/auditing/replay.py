@@ -86,27 +86,39 @@ class Replay:
         """Height of the landing surface [m]: the task's, or without one that of the soles in the last sample."""
         return self.task.platform_m if self.task else float(self.sole_points[-1, :, :, 2].min())
 
+    def along(self, points: np.ndarray) -> np.ndarray:
+        """How far points (..., 3) lie along the axis on which the surfaces change [m]: x, or the way to a side."""
+        if self.task is None or self.task.along_rad == 0:
+            return points[..., 0]
+        return np.cos(self.task.along_rad) * points[..., 0] + np.sin(self.task.along_rad) * points[..., 1]
+
     @cached_property
     def heading(self) -> float:
-        """+1 for a jump along +x, -1 along -x."""
+        """+1 for a jump along that axis, -1 against it."""
+        if self.task is not None and self.task.along_rad:
+            return 1.0
         return 1.0 if self.toe_corners[-1, ..., 0].mean() >= self.toe_corners[0, ..., 0].mean() else -1.0
 
     @cached_property
     def edge(self) -> float:
-        """x of the step between the two surfaces [m], as given; or else where the world is most natural.
+        """Place of the step between the two surfaces [m], as given; or else where the world is most natural.
 
         A higher surface begins a little behind the sole that lands on it, not under the launching one if that can be;
         the launching surface ends a little ahead of the launching sole if the landing one is lower.
         """
         if self.edge_m is not None:
-            return float(self.toe_corners[0, ..., 0].mean()) + self.edge_m
-        ahead = self.heading * self.sole_points[[0, -1], ..., 0]
+            first = float(self.toe_corners[0, ..., 0].mean())
+            if self.task is not None and self.task.along_rad:  # as far ahead of the soles' middle as the toes are
+                foot, middle = self.robot.foot, self.sole_points[0].mean(axis=(0, 1))
+                first = float(self.along(middle)) + foot.toe - float(foot.center[0])
+            return first + self.edge_m
+        ahead = self.heading * self.along(self.sole_points[[0, -1]])
         launched, landed = float(ahead[0].max()), float(ahead[1].min())
         up = min(max(landed - METHOD.edge_room_m, launched), landed)
         return self.heading * (up if self.platform > 0 else launched + METHOD.edge_room_m)
 
     def surface(self, x: np.ndarray) -> np.ndarray:
-        """Height of the surface under ``x`` [m]."""
+        """Height of the surface at ``x`` along the axis on which it changes [m]."""
         ahead = self.heading * (np.asarray(x) - self.edge)
         beyond = ahead > -1e-9 if self.platform > 0 else ahead > 1e-9
         return np.where(beyond, self.platform, 0.0)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.io.folder import to_json
-from jumplab.shown import Shown
 
 SCHEMA = "jumplab-passport-1"
 

@@ -161,6 +161,16 @@ def print_summary(summary: Mapping[str, Any]) -> None:
         print(f"inertia off stage 1's by {', '.join(off)} (rms)")
 
 
+def misses(target: Mapping[str, float], values: Callable[[str], Sequence[float]]) -> str:
+    """How far feet stand and point beyond a ``target``, least and most; ``values`` gives a metric of many jumps."""
+    rows = ("forward", "foot_distance_m", "distance_m", 1e3, "mm"), ("side", "side_m", "side_m", 1e3, "mm")
+    told = []
+    for word, name, asked, factor, unit in (*rows, ("heading", "yaw_rad", "yaw_rad", math.degrees(1), "deg")):
+        off = [factor * (x - target[asked]) for x in values(name)]
+        told.append(f"{word} {min(off):+.1f} ... {max(off):+.1f} {unit}")
+    return ", ".join(told)
+
+
 def print_simulation(metrics: Mapping[str, Any]) -> None:
     """What the simulation made of it."""
     lengths = (metrics["foot_distance_m"], metrics["com_rise_m"])

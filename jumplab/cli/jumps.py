@@ -17,7 +17,7 @@ from jumplab.task import JumpTask
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
-advice = Late("jumplab.studies.advice")
+advice, memory = Late("jumplab.studies.advice"), Late("jumplab.studies.atlas")
 movies = Late("jumplab.show.movies")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
@@ -73,7 +73,8 @@ def run(args: Namespace) -> None:
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
     opt("--side-m M", "travel of the feet to the left [m] (default 0)", "0", number),
     opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
-    opt("--method", "the paper's three steps, or the whole-body problem without them", METHODS[0], METHODS),
+    opt("--method", "three steps, usual in the plane, or the whole-body problem", "usual", ("usual", *METHODS)),
+    opt("--atlas DIR", "folder of an atlas to begin with ('jumplab atlas'); the method is then direct", None, folder),
 )
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
@@ -82,7 +83,8 @@ def plan(args: Namespace) -> None:
     task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    found = advice.plan_or_advise(planner.Planner(robot, keep=True), task, args.method)
+    known = args.atlas and memory.Atlas.load(args.atlas)
+    found = advice.plan_or_advise(planner.Planner(robot, keep=True, atlas=known), task, args.method)
     report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": found.summary, "audit": _audited(report)}
     common.print_summary(found.summary)

@@ -19,7 +19,7 @@ from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
 from jumplab.cli.status import Status
-from jumplab.cli.studies import bench, certify, chain, envelope, sweep, trials
+from jumplab.cli.studies import atlas, bench, certify, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL = 4
@@ -34,7 +34,8 @@ def completion(args: argparse.Namespace) -> None:
     print(args.found["script"])
 
 
-COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench, completion)
+COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export)
+COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -34,7 +34,7 @@ def list_(args: Namespace) -> None:
     opt("URDF", "the robot's URDF, or the name of a shipped robot"),
     opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
     opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
-    opt("--repair WHAT...", "allow a repair: symmetry, inertia or massless; may be repeated", []),
+    opt("--repair WHAT...", "allow a repair: inertia or massless; may be repeated", []),
 )
 def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""

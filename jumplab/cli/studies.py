@@ -1,12 +1,14 @@
 """The commands about many jumps: trials, certify, chain, envelope, sweep, bench."""
 
 import json
+import math
 import os
 import time
 from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
+from jumplab.cli import common
 from jumplab.cli.common import (
     ENGINE,
     JOBS,
@@ -33,6 +35,7 @@ from jumplab.task import JumpTask
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab.show.certificate")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
+memory = Late("jumplab.studies.atlas")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
@@ -90,6 +93,8 @@ def trials(args: Namespace) -> None:
         values = report.values(unit)
         if len(values) and not args.basin:  # they would count from the apex
             print(f"{name} of those that landed: {values.min():.3f} ... {values.max():.3f} m")
+    if not (args.basin or report.in_plane) and report.landed:
+        print(f"errors of those that landed: {common.misses(report.target, report.values)}")
     kept = f"{'basin' if args.basin else 'trials'}.json in {args.dir}, {report.resumed} trials from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
 
@@ -120,6 +125,11 @@ def certify(args: Namespace) -> None:
         print(tables.table(rows, columns))
         landed = ", ".join(f"{sum(t.landed for t in jumps)} in {name}" for name, jumps in mode.robots.items())
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
+        for engine in () if found.task.in_plane else mode.planned:
+            stood = [t.metrics for t in (mode.planned[engine], *mode.robots[engine]) if t.landed]
+            if stood:
+                errors = common.misses(asdict(found.task), lambda name, stood=stood: [getattr(m, name) for m in stood])
+                print(f"errors in {engine} of those that landed: {errors}")
     kept = f"certificate.json and certificate.html in {args.dir}, {found.resumed} simulations from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
     if found.failures:
@@ -133,6 +143,8 @@ def certify(args: Namespace) -> None:
     opt("--distance-m M", f"travel of the feet, per jump: {VALUES} [m]", None, values_of, required=True),
     opt("--height-m M", f"rise of the CoM in flight, for all jumps or per jump: {VALUES} [m]", "0.3", values_of),
     opt("--platform-m M", f"landing surfaces above the first ground: {VALUES} [m] (default: level)", None, values_of),
+    opt("--side-m M", f"travel of the feet to the left, per jump: {VALUES} [m] (default 0)", None, values_of),
+    opt("--yaw-deg DEG", f"turn about the vertical to the left, per jump: {VALUES} [deg] (default 0)", None, values_of),
     opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(0, 2**31 - 1)),
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
     opt("--ranges", "how much they differ (default slight)", None, ("slight", "wide")),
@@ -155,7 +167,9 @@ def chain(args: Namespace) -> None:
     how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method", "engine")}
     how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
-    course, robot = chains.Course.of(args.distance_m, args.height_m, args.platform_m), robots.Robot.load(args.robot)
+    turns = None if args.yaw_deg is None else [math.radians(x) for x in args.yaw_deg]
+    course = chains.Course.of(args.distance_m, args.height_m, args.platform_m, args.side_m, turns)
+    robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     ranges = chains.RANGES[args.ranges or "slight"]
     drawn = None if seed is None else sim.Perturbation.draw(robot, seed, ranges)
@@ -186,6 +200,8 @@ def _print_chain(result, report) -> None:
     for row in result.rows():
         cells = ("-" if row[n] is None else f"{row[n]:.3f} {n[-1]}" for n in names)
         print(f"{row['jump']:<5}" + "".join(f"{cell:>9}" for cell in cells))
+    if not result.course.in_plane:
+        print("heading off by " + ", ".join(f"{math.degrees(x):+.1f}" for x in result.heading_errors_rad) + " deg")
     ready = f"{result.in_time} of {len(result.replans)}"
     print(f"plans made on the way: {ready} were there when the robot was ready for them")
     print("chain: stands after every jump" if result.stood else f"chain: FAILED, {result.reason}")
@@ -194,6 +210,9 @@ def _print_chain(result, report) -> None:
     (low, high), errors = report.interval, report.errors_m
     worst = f"{abs(errors).max():.3f} m" if len(errors) else "none"
     print(f"{report.stood} of {len(report.trials)} robots stand to the end, 95 % interval {low:.1%} ... {high:.1%}")
+    if not report.course.in_plane:
+        off = [abs(x) for t in report.trials if t.stood for x in t.heading_errors_rad]
+        print(f"largest heading error {math.degrees(max(off, default=math.nan)):.1f} deg")
     print(f"largest distance error {worst}; {report.in_time} of {report.replans} plans in time")
     print(f"{(report.waits_s <= 0).sum()} of {len(report.waits_s)} next jumps began without waiting for a plan")
     for trial in (t for t in report.trials if not t.stood):
@@ -228,6 +247,26 @@ def envelope(args: Namespace) -> None:
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
+@command(
+    ROBOT,
+    opt("--out DIR", "folder for atlas.npz; an interrupted one goes on", None, folder, required=True),
+    opt("--distance-m M", f"of the nodes: {VALUES} [m] (default 0:1.2:7)", "0:1.2:7", values_of),
+    opt("--height-m M", f"of the nodes: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
+    JOBS,
+)
+def atlas(args: Namespace) -> None:
+    """Plan a grid once: any target between its nodes is then a few steps away."""
+    began, robot = time.perf_counter(), robots.Robot.load(args.robot)
+    store.ensure_writable(args.out)
+    axes, jobs = (args.distance_m, args.height_m), args.jobs or os.cpu_count() or 1
+    found = memory.Atlas.build(robot, *axes, folder=args.out, jobs=jobs, tell=print)
+    args.found |= {"out": args.out, "planned": len(found.nodes), "of": math.prod(map(len, axes))}
+    if not found.nodes:
+        raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
+    print(f"{found} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
+    print(f"whole atlas: {time.perf_counter() - began:.1f} s")
+
+
 def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     """All combinations of the weights that were given."""
     found: list[dict[str, float]] = [{}]
@@ -249,6 +288,8 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
     JOBS,
     opt("--cluster ADDRESS", "Dask scheduler that does the work, tcp://HOST:PORT"),
+    opt("--atlas", "build a small atlas of every robot first, and begin direct plans with it"),
+    opt("--tapes HZ", "also keep the motions, so many rows a second, in DIR/tapes", None, number),
 )
 def sweep(args: Namespace) -> None:
     """Plans for a grid of targets, robots and weights, in one table."""
@@ -257,7 +298,15 @@ def sweep(args: Namespace) -> None:
         without(args, "is for processes of this machine, and --cluster does the work elsewhere", jobs=None)
     axes = (args.distance_m, args.height_m, args.platform_m)
     cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
-    rows = sweeps.run(cases, args.out, jobs=args.jobs or -1, cluster=args.cluster, progress=bars(args))
+    rows = sweeps.run(
+        cases,
+        args.out,
+        jobs=args.jobs or -1,
+        cluster=args.cluster,
+        progress=bars(args),
+        atlas=args.atlas,
+        tapes_hz=args.tapes,
+    )
     args.found |= {"table": Path(args.out, sweeps.TABLE), "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
     outcome = f"{planned} planned, {clean} of them clean in the audit"

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jumplab.errors import InputError, as_path
-from jumplab.shown import Shown
+from jumplab.errors import InputError, Shown, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)

@@ -7,7 +7,7 @@ re-solve.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextvars import ContextVar
 from copy import copy
 from functools import cached_property
@@ -96,6 +96,12 @@ class Nlp:
         quiet = ("print_time", "error_on_fail", "show_eval_warnings", "calc_lam_p")
         return ca.nlpsol("solver", "ipopt", a.nlp, options | dict.fromkeys(quiet, False))
 
+    def _steps_of(self) -> GaussNewton:
+        try:
+            return self._gauss_newton
+        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
+            raise SolverError(str(e), stage=self.problem.name, status="approach") from e
+
     @cached_property
     def _gauss_newton(self) -> GaussNewton:
         return GaussNewton(self.assembled)
@@ -107,10 +113,7 @@ class Nlp:
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
         check_start(a, posed)
-        try:
-            method, began = self._gauss_newton, time.perf_counter()
-        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
-            raise SolverError(str(e), stage=a.problem.name, status="approach") from e
+        method, began = self._steps_of(), time.perf_counter()
         x, count = method.steps(posed)
         f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
         spent, residual = time.perf_counter() - began, float(np.max(posed.beyond(g), initial=0.0))
@@ -157,9 +160,44 @@ class Nlp:
         residual = float(np.max(posed.beyond(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
             raise _failure(a, posed, x, status, iterations, explain and EXPLAINED.get())
-        sizes, cost = (len(x), len(g)), float(answer["f"])
         functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
-        statistics = Statistics(iterations, status, self.build_s, solve_s, *sizes, cost, residual, functions_s)
+        return self._solution(posed, (x, lam_x, lam_g), iterations, status, solve_s, functions_s)
+
+    def settled(self, parameters: Mapping, near: Mapping[str, PhaseGuess], **how: Any) -> Solution:
+        """From the solution for a target close by to a plan for this one, in a few steps without ipopt.
+
+        Every row is met as closely as ipopt meets it; the cost is not quite the least, see
+        :meth:`jumplab.ocp.sqp.GaussNewton.settled`. ``near`` is that solution's :meth:`Solution.guess`, with the same
+        weights; ``how`` are references, weights, off as of :meth:`solve`. Raises :class:`SolverError` if the target is
+        not that close.
+        """
+        posed = pose(self.assembled, parameters, near, **how)
+        check_start(self.assembled, posed)
+        method, began = self._steps_of(), time.perf_counter()
+        *found, count = method.settled(posed)
+        return self._solution(posed, found, count, "Settled", time.perf_counter() - began)
+
+    def weighs_as(self, near: Solution, weights: Mapping[str, float]) -> bool:
+        """Whether a solution was found with just the weights that :meth:`solve` would take from ``weights``."""
+        now = {**{f"{o}/{t.name}": t.weight for o, t in self.assembled.cost_terms}, **weights}
+        now |= {f"{o}/{t.name}": weights[t.name] for o, t in self.assembled.cost_terms if t.name in weights}
+        return all(now[f"{row['phase']}/{row['name']}"] == row["weight"] for row in near.cost_shares)
+
+    def _solution(
+        self,
+        posed: Posed,
+        found: Sequence[np.ndarray],
+        count: int,
+        status: str,
+        solve_s: float,
+        functions_s: float = 0.0,
+    ) -> Solution:
+        """The solution of ``found``: scaled variables, multipliers of their bounds, multipliers of the rows."""
+        a, (x, lam_x, lam_g) = self.assembled, found
+        f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
+        residual = float(np.max(posed.beyond(g), initial=0.0))
+        sizes = len(x), len(g)
+        statistics = Statistics(count, status, self.build_s, solve_s, *sizes, float(f[0]), residual, functions_s)
         tables = self._cost_shares(x, posed.p), self._constraint_report(g, posed)
         return Solution(unpack(a, x), statistics, self.problem, *tables, unpack_multipliers(a, lam_x, lam_g))
 

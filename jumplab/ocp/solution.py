@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Problem
-from jumplab.shown import Shown
 
 
 def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, Shown
 from jumplab.show import jumps, style
 from jumplab.show.bodies import robot_sheet
 from jumplab.show.tables import Table, table
@@ -19,7 +19,6 @@ from jumplab.stages.plan import JumpPlan
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.auditing import AuditReport
     from jumplab.robot import Robot
-    from jumplab.shown import Shown
     from jumplab.sim import SimulationResult
     from jumplab.studies.trials import TrialReport
 

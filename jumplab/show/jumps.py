@@ -13,8 +13,9 @@ from matplotlib.patches import Patch, Rectangle
 from jumplab.io.columns import com_height
 from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot
-from jumplab.show import style
+from jumplab.show import style, turning
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip, five_link_points
+from jumplab.stages.spatial import SpatialLimits
 from jumplab.stages.whole_body import Limits
 from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Envelope
 from jumplab.task import GRAVITY
@@ -36,7 +37,7 @@ LEAST_FORCE_SHARE = 0.02  # below this share of the weight, CoP and friction are
 
 def heel_up_time(tape: Tape) -> float:
     """When the heel leaves the ground [s]."""
-    return float(tape.extra["planar_toe_phase_start"])
+    return float(tape.extra["toe_phase_start" if turning.leaves_plane(tape) else "planar_toe_phase_start"])
 
 
 # Fig. 8 ---------------------------------------------------------------------------------------------------------
@@ -46,8 +47,11 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 
     Parameters
     ----------
-    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's.
+    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's; out of the
+        plane in the order of the robot's joints, one column per pair, the right side paler.
     """
+    if turning.leaves_plane(tape):
+        return turning.joint_trajectories(tape, robot, heel_up_time(tape), guess)
     fig = style.new_figure(style.PAGE_IN, 3.1)
     axes = fig.subplots(2, 4, sharex=True)
     m, e = robot.sagittal, tape.extra
@@ -76,6 +80,8 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 @style.styled
 def inertia_and_momentum(tape: Tape) -> Figure:
     """F-9: inertia, CoM velocity and angular momentum of the plan, and dashed what stage 1 asked for."""
+    if turning.leaves_plane(tape):
+        return turning.inertia_and_momentum(tape, heel_up_time(tape))
     fig = style.new_figure(style.PAGE_IN, 3.3)
     axes = fig.subplots(2, 2, sharex=True)
     e, takeoff, known = tape.extra, tape.takeoff_time, "srmp_launch_t" in tape.extra
@@ -103,11 +109,13 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 
 # limits ---------------------------------------------------------------------------------------------------------
 @style.styled
-def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
+def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through the launch.
 
     ``limits`` are the planner's (its defaults if None), drawn dashed inside what the motors could do.
     """
+    if turning.leaves_plane(tape):
+        return turning.margins(tape, robot, limits or SpatialLimits(), heel_up_time(tape))
     limits = limits or Limits()
     fig = style.new_figure(style.PAGE_IN, 3.9)
     names = [["hip", "knee", "ankle", "shoulder"], ["cop", "cop", "friction", "friction"]]
@@ -138,20 +146,9 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
 
 def _torque_speed(ax: Axes, tape: Tape, robot: Robot, i: int, limits: Limits) -> None:
     m = robot.sagittal
-    speed, corner, effort = m.speed[i], m.corner_speed[i], m.effort[i]
-    # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
-    x = np.array([-speed, -corner, 0.0, corner, speed])
-    upper = np.array([effort, effort, effort, effort, 0.0])
-    ax.fill_between(x, -upper[::-1], upper, color=style.BAND, linewidth=0)
-    for bound in (upper, -upper[::-1]):
-        ax.plot(x, bound, **style.LIMIT_STYLE)
-    cut, top = limits.speed_share * speed, limits.torque_share * effort
-    allowed = np.array([[-cut, corner, cut, cut], [top, top, top * (speed - cut) / (speed - corner), -top]])
-    for sign in (1, -1):
-        ax.plot(*(sign * allowed), **style.REFERENCE_STYLE)
+    turning.motor(ax, m.speed[i], m.corner_speed[i], m.effort[i], limits)
     rates, torques = (tape.extra[f"planar_{name}"][:, i] for name in ("joint_rates", "torques"))
     style.by_phase(ax, rates, torques, tape.phase, linewidth=1.3)
-    ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * speed, 1.08 * speed), ylim=(-1.12 * effort, 1.12 * effort))
 
 
 def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
@@ -170,9 +167,13 @@ def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
     return dict(t=tape.t[launch], F_x=force[:, 0], F_z=down, cop_x=cop, heel_z=heel[:, 1])
 
 
+AXIS_WORDS = {"distance_m": "distance [m]", "height_m": "rise of the CoM [m]"}  # of an envelope
+AXIS_WORDS |= {"side_m": "to the left [m]", "yaw_rad": "turn [rad]"}
+
+
 @style.styled
 def envelope_map(envelope: Envelope) -> Figure:
-    """Distance against height; a cell's colour is the limit that it uses most, its strength how much of it."""
+    """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much of it."""
     fig = style.new_figure(1.6 * style.COLUMN_IN, 3.2)
     ax = fig.subplots()
     names = sorted({c.limiting for c in envelope.cells if c.solved})
@@ -181,7 +182,7 @@ def envelope_map(envelope: Envelope) -> Figure:
     edges = envelope.distances, envelope.heights
     size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in edges])
     for c in envelope.cells:
-        place = np.array([c.distance_m, c.height_m])
+        place = np.array([getattr(c, name) for name in envelope.axes])
         if c.solved:
             face = style.tint(colors[c.limiting], 0.25 + 0.75 * float(np.clip(c.share, 0, 1)))
             ax.text(*place, f"{100 * c.share:.0f}", ha="center", va="center", fontsize=5.5)
@@ -190,7 +191,8 @@ def envelope_map(envelope: Envelope) -> Figure:
         ax.add_patch(Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6))
     x, y = ((min(values) - d / 2, max(values) + d / 2) for values, d in zip(edges, size, strict=True))
     title = f"{envelope.robot}: limit used most, in %"
-    ax.set(xlim=x, ylim=y, xlabel="distance [m]", ylabel="rise of the CoM [m]", title=title)
+    across, up = (AXIS_WORDS[name] for name in envelope.axes)
+    ax.set(xlim=x, ylim=y, xlabel=across, ylabel=up, title=title)
     if max(map(len, edges)) <= MOST_TICKS:
         ax.set(xticks=envelope.distances, yticks=envelope.heights)
     ax.grid(False)
@@ -206,15 +208,17 @@ def envelope_map(envelope: Envelope) -> Figure:
 def jump_strobe(result: SimulationResult | Tape, robot: Robot) -> Figure:
     """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's path.
 
-    Heights are true; sideways the frames are evenly spaced, so that none hides another.
+    Heights are true; sideways the frames are evenly spaced, so that none hides another. A jump that goes more to the
+    side than ahead is seen from the front.
     """
-    height = com_height(result)
+    height, travel = com_height(result), np.abs(np.ptp(result.com, axis=0))
     rows = _strip_rows(result, height)
     fig = style.new_figure(style.PAGE_IN, 2.6)
     ax = fig.subplots()
     places = STRIP_M * np.arange(len(rows))
     colors = [style.PHASE_COLORS[str(phase)] for phase in result.phase[rows]]
-    film_strip(ax, Silhouette(robot), result.q[rows], result.t[rows], colors, places, below=0.07)
+    view = "front" if travel[1] > travel[0] else "side"
+    film_strip(ax, Silhouette(robot, view), result.q[rows], result.t[rows], colors, places, below=0.07)
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(style.shade(color, 0.8))
     air = (result.phase == "flight") & (result.t >= result.t[rows[0]])
@@ -242,7 +246,12 @@ def _strip_rows(result: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
 
 @style.styled
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
-    """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation."""
+    """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation.
+
+    Out of the plane CoM position and velocity alone, in all three directions.
+    """
+    if turning.leaves_plane(tape):
+        return turning.momentum(result, tape, AFTER_TOUCHDOWN_S)
     fig = style.new_figure(style.PAGE_IN, 3.4)
     axes = fig.subplot_mosaic([["x", "z", "L"], ["vx", "vz", "rho"]])
     e = tape.extra

@@ -18,7 +18,7 @@ from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine
 from jumplab.sim.kinematics import inertial, rotation
-from jumplab.sim.scene import REACH_M, Block, Contacts
+from jumplab.sim.scene import REACH_M, Contacts
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class BulletEngine(Engine):
         self._client = bullet.connect(bullet.DIRECT)
         self._bullet = _Client(self._client)
         self._set_engine()
-        self._ground = [self._add_block(b) for b in self.scene.blocks]
+        self._ground = [self._add_block(*box) for box in self.scene.boxes()]
         self._body = load_urdf(self.robot.urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
         self._index_links()
         self._set_dynamics(friction)
@@ -131,11 +131,9 @@ class BulletEngine(Engine):
         self._bullet.setGravity(0, 0, -self.robot.gravity)
         self._bullet.setPhysicsEngineParameter(**steps, **contact)
 
-    def _add_block(self, block: Block) -> int:
-        half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
-        centre = [(block.x_from + block.x_to) / 2, 0, block.top - block.thickness / 2]
+    def _add_block(self, half: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> int:
         box = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
-        body = self._bullet.createMultiBody(0, box, basePosition=centre)
+        body = self._bullet.createMultiBody(0, box, basePosition=centre, baseOrientation=turn)
         self._bullet.changeDynamics(body, -1, lateralFriction=SETTINGS.ground_friction)
         self._bullet.changeDynamics(body, -1, restitution=0.0)
         return body

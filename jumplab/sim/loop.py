@@ -16,7 +16,7 @@ from jumplab.sim import DEFAULT_ENGINE, STEP_S
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.sim.estimator import Perception
-from jumplab.sim.kinematics import rotation
+from jumplab.sim.kinematics import Gauge, rotation
 from jumplab.sim.perturbation import Perturbation
 from jumplab.sim.pilot import Pilot
 from jumplab.sim.playback import Command, Delay, Motors
@@ -94,8 +94,9 @@ class Disturbance:
     """A wrong state at the apex of the flight."""
 
     speed_factor: float = 1.0  # on the horizontal velocity of the whole robot [1]
-    pitch_rad: float = 0.0  # turn of the whole robot about its CoM
+    pitch_rad: float = 0.0  # turn of the whole robot about its CoM, forward along ``direction_rad``
     height_m: float = 0.0  # shift of the whole robot upward
+    direction_rad: float = 0.0  # from the heading in which the jump shall land; a quarter turn tips it to its left
 
     def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
         """Step of the tape's apex, and the disturbed configuration (nq,) and velocity (nv,) there."""
@@ -105,12 +106,16 @@ class Disturbance:
             if data.vcom[0][2] <= 0:
                 break
         q, v, com, speed = tape.q[row].copy(), tape.v[row].copy(), data.com[0].copy(), data.vcom[0].copy()
+        along = Gauge(robot).heading(tape.q[-1]) + self.direction_rad
         turn = pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0)
+        if along:
+            seen = pin.rpy.rpyToMatrix(0.0, 0.0, along)
+            turn = seen @ turn @ seen.T
         attitude = turn @ rotation(q[3:7])
         q[:3] = com + turn @ (q[:3] - com) + np.array([0.0, 0.0, self.height_m])
         q[3:7] = pin.Quaternion(attitude).coeffs()
         # the base twist is written in base axes and so has turned with the robot; the flight of its CoM must not
-        v[:3] += attitude.T @ (speed * [self.speed_factor, 1.0, 1.0] - turn @ speed)
+        v[:3] += attitude.T @ (speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed)
         return round(float(tape.t[row]) / STEP_S), q, v
 
 

@@ -49,11 +49,9 @@ class MujocoEngine(Engine):
         option.impratio, option.iterations, option.tolerance = CONE_RATIO, ITERATIONS, TOLERANCE
         for geom in spec.geoms:
             geom.friction, geom.priority = [friction, 0.0, 0.0], FIRST
-        for block in self.scene.blocks:
-            half = [(block.x_to - block.x_from) / 2, REACH_M, block.thickness / 2]
-            centre = [(block.x_from + block.x_to) / 2, 0.0, block.top - block.thickness / 2]
-            box = mujoco.mjtGeom.mjGEOM_BOX
-            spec.worldbody.add_geom(type=box, size=half, pos=centre, friction=[1.0, 0.0, 0.0])
+        for half, centre, turn in self.scene.boxes():
+            how = dict(size=half, pos=centre, quat=np.roll(turn, 1), friction=[1.0, 0.0, 0.0])
+            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **how)
         for geom in spec.geoms:
             geom.condim, geom.margin = 3, 0.0
             geom.solref = [self.softness.time_s, self.softness.damping_ratio]

@@ -36,10 +36,12 @@ class Pilot:
     """Decides the command of each step: playback until touchdown, landing controller afterwards.
 
     Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
-    :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead.
+    :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead. ``start_rad`` is the heading
+    in which the robot stands at the start, where the tape begins with zero.
 
     Attributes
     ----------
+    looks_rad : heading in which the robot shall land; all that looks ahead sees it along that one.
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
@@ -58,12 +60,15 @@ class Pilot:
         reaim: bool = True,
         stand_s: float = STAND_S,
         lead_s: float = 0.0,
+        start_rad: float = 0.0,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
-        self.goal, self._heading = tape.q[-1], Gauge(robot).heading(tape.q[-1])
-        tape, scene = replace(tape, q=headed(tape.q, self._heading)), scene.seen_along(self._heading, robot, self.goal)
+        self.goal, self._heading, self._start = tape.q[-1], Gauge(robot).heading(tape.q[-1]), start_rad
+        self.looks_rad = start_rad + self._heading
         self._robot, self.playback = robot, Playback(tape, robot, mode, lead_s)
+        tape = replace(tape, q=headed(tape.q, self._heading))
+        scene = scene.seen_along(self.looks_rad, robot, self.goal)
         self.forecast = Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         self._landing = LandingController(robot, reference=None if callable(reference) else reference)
@@ -110,15 +115,17 @@ class Pilot:
     def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
         """Command at ``step`` from measured state and vertical foot forces.
 
-        All that feeds back sees the robot along the heading in which it shall land.
+        The tape is played in the axes of the start; all that looks ahead sees the robot along the heading in which it
+        shall land.
         """
-        q = headed(q, self._heading)
+        played = headed(q, self._start)
+        if self.touchdown is None and step < self._tape_until:
+            return self.playback.command(step, played, v, self._none)
+        q = self.seen(q)
         if self.touchdown is None:
-            if step < self._tape_until:
-                return self.playback.command(step, q, v, self._none)
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
-                return self._fly(step, q, v)
-            self._touch(step, q, v)
+                return self._fly(step, played, q, v)
+            self._touch(step, played, q, v)
         since = step - self.touchdown
         if self._replan is not None and self.ahead.followed == "planned":
             self._landing.reference = self._replan.follow(since * STEP_S, q, v, self._landing.reference)
@@ -126,38 +133,51 @@ class Pilot:
             self._tau = self._landing.torque(since * STEP_S, q, v, force)
         return Command(tau=self._tau)
 
-    def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
+    def seen(self, q: np.ndarray) -> np.ndarray:
+        """A configuration (nq,) of the world, seen along the heading of the landing."""
+        return headed(q, self.looks_rad)
+
+    def heading_error(self, step: int, seen: np.ndarray) -> float:
+        """How far the trunk is turned about the vertical beyond the plan [rad]."""
+        return float(self.playback.attitude_error(step, headed(seen, -self._heading))[2])
+
+    def _fly(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> Command:
+        """In flight: ``played`` is the configuration in the tape's axes, ``q`` in those of the landing."""
         left, aimed = self.forecast.time_left(q, v), self._none
         shift = None if self._tuck is None else self._tuck.shift(step, q, v, left)
         if left <= LEAD_S:
-            self._look_ahead(step, q, v, left)
+            self._look_ahead(step, played, q, v, left)
         if self._reaim is not None:
-            aimed = self._reaim.correction(q, v, self._error(step, q), None if self._tuck is None else left)
+            aimed = self._reaim.correction(q, v, self._error(step, played), None if self._tuck is None else left)
         if shift is None:
-            command = self.playback.command(step, q, v, aimed)
+            command = self.playback.command(step, played, v, aimed)
         else:
-            command = self.playback.shifted(step, *shift, q, v, aimed)
+            command = self.playback.shifted(step, *shift, played, v, aimed)
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
 
-    def _look_ahead(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> None:
+    def _look_ahead(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray, left: float) -> None:
         """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
         if self.ahead.source != "planned" or self.ahead.followed is not None:
             return
         there = q, v
         if left > 0:
-            error = self._error(step, q)
+            error = self._error(step, played)
             correction = None if self._reaim is None else self._reaim.wish(q, v, error)
             there = self.forecast.state(q, v, error, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 
-    def _error(self, step: int, q: np.ndarray) -> float:
+    def _error(self, step: int, played: np.ndarray) -> float:
         """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
-        error = self.playback.attitude_error(step, q)[1] if self._tuck is None else self._tuck.miss
+        if self._tuck is None:
+            x, y, _ = self.playback.attitude_error(step, played)
+            error = y if self._heading == 0 else np.cos(self._heading) * y - np.sin(self._heading) * x
+        else:
+            error = self._tuck.miss
         return float(np.arctan2(np.sin(error), np.cos(error)))
 
-    def _touch(self, step: int, q: np.ndarray, v: np.ndarray) -> None:
+    def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
         self.touchdown = step
         if self._plan_landing is not None:
             self._landing.reference = self._plan_landing(q, v)
             self.ahead.followed = "spring" if self._landing.reference is None else "given"
-        self._look_ahead(step, q, v, 0.0)  # the ground came early
+        self._look_ahead(step, played, q, v, 0.0)  # the ground came early

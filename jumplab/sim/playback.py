@@ -21,6 +21,7 @@ from jumplab.sim.kinematics import rotation, solved
 MODES = ("position", "pd")
 FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
 HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
+ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
 
 
 class Actuators:
@@ -58,6 +59,7 @@ class Command:
     tau: np.ndarray | None = None  # (nv - 6,) [N m]
     change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
+    wrench: np.ndarray | None = None  # (2, 6) of the plan on them, as on a tape; None: both carry alike
     share: float = 1.0  # of the torque limit, for the servo
     state: tuple[np.ndarray, np.ndarray] | None = None  # (q, v) that it is expected to arrive in; as measured if None
 
@@ -115,8 +117,8 @@ class Playback:
     """The tape on the 1 ms grid of the simulation, as commands. After its end the last posture is held.
 
     In ``mode`` "position" the servo law of :mod:`.servo` follows its angles, rates and accelerations and sees no
-    planned torque; in "pd" the planned torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown
-    or the tape belongs to another robot.
+    planned torque; of a jump whose feet carry unlike loads it knows what each of them carries. In "pd" the planned
+    torque is commanded, plus PD. Raises :class:`InputError` if the mode is unknown or the tape is another robot's.
 
     Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot is expected to be
     as far off the tape then as it is measured to be now: the plan is sent ahead, errors are met late.
@@ -141,6 +143,9 @@ class Playback:
         self._change = np.vstack([np.diff(self._tau, axis=0), self._rest])
         self._change[self._takeoff - 1] = 0.0  # what the ground held ends there at once
         self._heel_off = self._first_tilt(robot, tape)
+        loads = tape.f[: tape.takeoff_index]
+        unlike = loads.shape[1] == 2 and np.abs(loads[:, 0, 2] - loads[:, 1, 2]).max() > ALIKE_N
+        self._wrench = _resample(grid, tape.t, tape.f.reshape(len(tape.t), -1)) if unlike else None
 
     def _first_tilt(self, robot: Robot, tape: Tape) -> int:
         """Step at which the heels leave the ground."""
@@ -180,7 +185,8 @@ class Playback:
             rate = self._rest if holding else self._rate[now]
             due = (self._rate[min(now + 1, self.steps)] - self._rate[now]) / STEP_S
             moves = dict(q=self._q[now] + correction, rate=rate, acceleration=due)
-            return Command(**moves, feet=self.stands(step), state=(q, v))
+            wrench = None if self._wrench is None or step >= self._takeoff else self._wrench[now].reshape(2, 6)
+            return Command(**moves, feet=self.stands(step), wrench=wrench, state=(q, v))
         rate = self._rest if holding else self._rate[now]
         error, rate_error = self._q[now] + correction - q[7:], rate + self._correction_rate(correction) - v[6:]
         if step < self._takeoff:

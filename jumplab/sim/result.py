@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
 from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of
 from jumplab.sim.playback import Actuators
@@ -62,7 +61,8 @@ class Finding:
 class Metrics:
     """Numbers of one jump, all measured in the simulation; None where the jump did not get so far.
 
-    Loads are ratios |value| / limit, largest over the run; vectors are (x, z).
+    Loads are ratios |value| / limit, largest over the run; vectors are (x, z), those of the landing along the heading
+    in which the robot was meant to land, those of the launch along the one in which it began.
     """
 
     foot_distance_m: float | None = None  # travel of the toes from the start to where they stand at the end
@@ -270,6 +270,7 @@ class Recorder:
             turn = self._gauge.heading(self._planned_end)
             place = self._gauge.soles if turn else self._gauge.toe  # a turn moves the toes, and shall be no distance
             start, touch, end = (place(q[row]) for row in (0, touchdown, -1))
+            ahead, window = self._gauge.soles(q[touchdown]) - com[touchdown], round(IMPACT_S / STEP_S)
             yaw = self._gauge.heading(q[-1]) - self._gauge.heading(q[0])
             found |= dict(
                 touchdown_s=float(t[touchdown]),
@@ -279,9 +280,9 @@ class Recorder:
                 yaw_rad=yaw + 2 * np.pi * round((_turned(q) - yaw) / (2 * np.pi)),
                 touchdown_trunk_pitch_rad=_counted(pitch_of(q[: touchdown + 1])),
                 touchdown_trunk_rate=float(log["v"][touchdown, 4]),
-                touchdown_com_velocity=_xz(velocity[touchdown]),
-                sole_ahead_m=float(self._gauge.soles(q[touchdown])[0] - com[touchdown, 0]),
-                landing_impulse=_xz((impact := force[touchdown:][: round(IMPACT_S / STEP_S)]).sum(axis=0) * STEP_S),
+                touchdown_com_velocity=_xz(_seen(velocity[touchdown], turn)),
+                sole_ahead_m=float(_seen(ahead, turn)[0]),
+                landing_impulse=_xz(_seen((impact := force[touchdown:][:window]).sum(axis=0), turn) * STEP_S),
                 landing_force_n=_largest_mean(impact[:, 2]),
             )
         collisions = STEP_S * float(log["colliding"].sum())
@@ -349,6 +350,13 @@ def _largest_mean(force: np.ndarray) -> float:
 
 def _xz(vector: np.ndarray) -> tuple[float, float]:
     return float(vector[0]), float(vector[2])
+
+
+def _seen(vector: np.ndarray, heading_rad: float) -> np.ndarray:
+    """A vector (3,) as somebody sees it who looks along a heading; itself if that is zero."""
+    if heading_rad == 0:
+        return vector
+    return pin.rpy.rpyToMatrix(0.0, 0.0, -heading_rad) @ vector
 
 
 def _turned(q: np.ndarray) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.sim.kinematics import Gauge
+from jumplab.task import JumpTask
 
 REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
@@ -37,10 +38,14 @@ class Block:
 
 @dataclass(frozen=True)
 class Scene:
-    """A named list of blocks. The robot starts with the middle of its soles at x = 0 on a top at z = 0."""
+    """A named list of blocks. The robot starts with the middle of its soles at x = 0 on a top at z = 0.
+
+    Blocks lie one behind the other along the direction ``along_rad``, seen from above; x is counted along it.
+    """
 
     name: str
     blocks: tuple[Block, ...]
+    along_rad: float = 0.0
 
     @classmethod
     def flat(cls) -> Scene:
@@ -71,14 +76,26 @@ class Scene:
         if top == 0:
             return cls.flat()
         edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
-        return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)))
+        along = JumpTask(**summary["target"]).along_rad
+        return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)), along)
 
     def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
-        """The ground as seen along a heading: itself straight ahead, else the surface under the soles of ``q``."""
-        if heading_rad == 0:
+        """The ground seen along a heading: itself if all is straight ahead, else what is under the soles of ``q``."""
+        if heading_rad == self.along_rad == 0:
             return self
-        x = float(Gauge(robot).soles(q)[0])
+        soles = Gauge(robot).soles(q)
+        x = float(np.cos(self.along_rad) * soles[0] + np.sin(self.along_rad) * soles[1])
         return Scene(self.name, (Block(-REACH_M, REACH_M, self.top_at(x)),))
+
+    def boxes(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """(half sizes (3,), centre (3,), quaternion (4,) x y z w) of the blocks [m]."""
+        c, s, out = np.cos(self.along_rad), np.sin(self.along_rad), []
+        for b in self.blocks:
+            middle = (b.x_from + b.x_to) / 2
+            half = np.array([(b.x_to - b.x_from) / 2, REACH_M, b.thickness / 2])
+            turn = np.array([0.0, 0.0, np.sin(self.along_rad / 2), np.cos(self.along_rad / 2)])
+            out.append((half, np.array([c * middle, s * middle, b.top - b.thickness / 2]), turn))
+        return out
 
     def top_at(self, x: float) -> float:
         """Height of the highest surface at ``x`` [m]."""

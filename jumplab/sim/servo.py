@@ -4,7 +4,9 @@ It sums what the motion takes and what its errors ask for, both from the planned
 the feet standing as they do in the plan. What the joints' accelerations a_j take is inverse dynamics; those of the base
 a_b and the wrenches f on the feet go with it,
 
-    min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f|^2   so that   M a + h = J^T f   in the rows of the base.
+    min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f - f_p|^2   so that   M a + h = J^T f   in the rows of the base,
+
+where f_p is the plan's, none where both feet carry alike: what they push against each other no joint's motion tells.
 
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may be far stiffer than
 what is computed from the velocity before the step,
@@ -40,7 +42,7 @@ class ServoGains:
 
 GAINS = ServoGains()
 AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-PITCH = 4  # row of a foot's twist that is free while it stands on its toe
+PITCH = 4  # row of a foot's twist, in axes that are turned with it, that is free while it stands on its toe
 
 
 class Servo:
@@ -66,15 +68,21 @@ class Servo:
         pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
         feet, drift, units = self._feet(command.feet)
         push = feet.T * units
-        tau = self._feed_forward(command.acceleration, feet, drift, push)
+        shared = self._shared(command) / units if command.wrench is not None else 0.0
+        tau = self._feed_forward(command.acceleration, feet, drift, push, shared)
         error = command.q + self._ahead_s * command.rate - q[7:]
         wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
         tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
 
-    def _feed_forward(self, joints: np.ndarray, feet: np.ndarray, drift: np.ndarray, push: np.ndarray) -> np.ndarray:
-        """Torques (nv - 6,) that accelerate the ``joints`` as told, while the feet stay where they are."""
+    def _feed_forward(
+        self, joints: np.ndarray, feet: np.ndarray, drift: np.ndarray, push: np.ndarray, shared: np.ndarray | float
+    ) -> np.ndarray:
+        """Torques (nv - 6,) that accelerate the ``joints`` as told, while the feet stay where they are.
+
+        The wrenches on them are as near to those ``shared`` (k,) out by the plan as that allows.
+        """
         data, held = self._gauge.data, 6 + len(drift)
         offset = data.nle + data.M[:, 6:] @ joints
         kkt, right = np.zeros((held + 6, held + 6)), np.zeros(held + 6)
@@ -82,6 +90,7 @@ class Servo:
         kkt[range(6, held), range(6, held)] = self._gains.epsilon
         kkt[held:, :6], kkt[held:, 6:held] = data.M[:6, :6], -push[:6]
         kkt[:held, held:] = kkt[held:, :held].T
+        right[6:held] = self._gains.epsilon * shared
         right[:6], right[held:] = -feet[:, :6].T @ (drift + feet[:, 6:] @ joints), -offset[:6]
         x = solved(kkt, right)
         return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held]
@@ -99,19 +108,40 @@ class Servo:
         right[6:nv] += step_s * (tau + self._damping * wish)
         return solved(kkt, right)[6:nv]
 
+    def _shared(self, command: Command) -> np.ndarray:
+        """The plan's wrenches (k,) on the feet, about the points on which they stand, less what a toe cannot hold."""
+        found, held = [], _held(command.feet)
+        for frame, wrench in zip(self._gauge.frames, command.wrench, strict=True):
+            foot = self._gauge.data.oMf[frame].rotation
+            arm, along = foot @ self._pivot[command.feet], headings(foot)
+            found.append(np.concatenate([along @ wrench[:3], along @ (wrench[3:] - np.cross(arm, wrench[:3]))])[held])
+        return np.concatenate(found)
+
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench against each."""
         model, data = self._gauge.model, self._gauge.data
         rows, drifts, units = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
-        held = np.delete(np.arange(6), [] if stand == FLAT else PITCH)
+        held = _held(stand)
         for frame in self._gauge.frames if stand != AIR else ():
-            arm = pin.updateFramePlacement(model, data, frame).rotation @ self._pivot[stand]
+            foot = pin.updateFramePlacement(model, data, frame).rotation
+            arm, along = foot @ self._pivot[stand], headings(foot)
             jacobian = pin.getFrameJacobian(model, data, frame, AXES)
             jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
             drift = pin.getFrameClassicalAcceleration(model, data, frame, AXES)
             spin = pin.skew(pin.getFrameVelocity(model, data, frame, AXES).angular)
             linear = drift.linear + pin.skew(drift.angular) @ arm + spin @ (spin @ arm)
-            rows.append(jacobian[held])
-            drifts.append(np.concatenate([linear, drift.angular])[held])
+            rows.append(np.vstack([along @ jacobian[:3], along @ jacobian[3:]])[held])
+            drifts.append(np.concatenate([along @ linear, along @ drift.angular])[held])
             units.append(np.repeat([1.0, self._gains.lever_m], 3)[held])
         return np.vstack(rows), np.concatenate(drifts), np.concatenate(units)
+
+
+def headings(foot: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) from world axes to axes that are turned about the vertical as a ``foot`` (3, 3) is."""
+    c, s = foot[:2, 0] / np.hypot(*foot[:2, 0])
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _held(stand: str) -> np.ndarray:
+    """Rows of a foot's twist that the ground holds."""
+    return np.delete(np.arange(6), [] if stand == FLAT else PITCH)

@@ -9,20 +9,24 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
 from jumplab.stages.spatial import SpatialPlan
 from jumplab.stages.srmp import SrmpPlan
+from jumplab.stages.srmp.spatial import SpatialSrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
-TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}  # names on the tape
+# what is compared -> stage 1's column, and which part of it
+TRACKED = {"rho": ("rho", ...), "rho_rate": ("rho_rate", ...), "velocity": ("com_velocity", ...), "L": ("L", ...)}
+TRACKED_IN_SPACE = TRACKED | {"rho": ("rho", 0), "rho_rate": ("rho_rate", 0)}
+TRACKED_IN_SPACE |= {"yaw_rho": ("rho", 1), "yaw_rho_rate": ("rho_rate", 1)}
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -56,7 +60,7 @@ class JumpPlan(Shown, Named):
     robot: Robot
     method: str
     tape: Tape
-    srmp: SrmpPlan | None
+    srmp: SrmpPlan | SpatialSrmpPlan | None
     joints: JointPlan | None
     whole_body: WholeBodyPlan | SpatialPlan | None
     statistics: tuple[StageRow, ...]
@@ -86,20 +90,24 @@ class JumpPlan(Shown, Named):
     @property
     def planned_distance_m(self) -> float:
         """Travel of the toe over the whole tape, of the middle between the soles in a jump out of the plane [m]."""
-        if "soles_travel" in self.tape.extra:
+        if self._spatial:
             return float(self.tape.extra["soles_travel"][0])
         toe = self.tape.extra["planar_toe"]
         return float(toe[-1, 0] - toe[0, 0])
 
     @property
+    def _spatial(self) -> bool:
+        return "soles_travel" in self.tape.extra
+
+    @property
     def toe_phase_s(self) -> float:
         """When the heels rise, on the tape [s]."""
-        return float(self.tape.extra["planar_toe_phase_start" if self.task.in_plane else "toe_phase_start"])
+        return float(self.tape.extra["toe_phase_start" if self._spatial else "planar_toe_phase_start"])
 
     @property
     def planned_side_m(self) -> float:
         """Travel of the middle between the soles to the left [m], on the tape."""
-        return float(self.tape.extra["soles_travel"][1]) if "soles_travel" in self.tape.extra else 0.0
+        return float(self.tape.extra["soles_travel"][1]) if self._spatial else 0.0
 
     @property
     def planned_yaw_rad(self) -> float:
@@ -162,7 +170,8 @@ class JumpPlan(Shown, Named):
         -------
         phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
         -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
-        zero). None for a plan without stage 1, or out of the plane.
+        zero). Out of the plane also "yaw_rho" and "yaw_rho_rate", and L has three components. None for a plan without
+        stage 1.
         """
         if self.stored is not None:
             return self.stored.get("tracking")
@@ -174,7 +183,7 @@ class JumpPlan(Shown, Named):
         if self.stored is not None:
             return dict(self.stored)
         body, away = self.whole_body, {}
-        if not self.task.in_plane:
+        if self._spatial:
             away = dict(planned_side_m=self.planned_side_m, planned_yaw_rad=self.planned_yaw_rad)
         return {
             "target": asdict(self.task),
@@ -195,20 +204,31 @@ class JumpPlan(Shown, Named):
         }
 
 
-def _tracking(tape: Tape, srmp: SrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
-    k, toe = tape.takeoff_index, float(tape.extra["planar_toe_phase_start"])
-    launch = np.interp(tape.t[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
-    air = tape.t[k:] - tape.takeoff_time
-    found = {}
-    for name, rows, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
+def _tracking(tape: Tape, srmp: SrmpPlan | SpatialSrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
+    rows, toe, done = _moved(tape)
+    time, k = tape.t[rows], int(np.argmax(tape.phase[rows] == "flight"))
+    launch = np.interp(time[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
+    air, found = time[k:] - tape.takeoff_time, {}
+    for name, at, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
         part, found[name] = getattr(srmp, name), {}
-        for key, column in TRACKED.items():
-            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
-            done = np.atleast_2d(tape.extra[f"planar_{column}"][rows].T)
-            rms = float(np.sqrt(np.mean(np.sum((done - asked) ** 2, axis=0))))
+        for key, (column, i) in (TRACKED if "planar_rho" in tape.extra else TRACKED_IN_SPACE).items():
+            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column)[:, i].T)])
+            missed = np.atleast_2d(done[column][at, i].T) - asked
+            rms = float(np.sqrt(np.mean(np.sum(missed**2, axis=0))))
             size = float(np.mean(np.linalg.norm(asked, axis=0)))
             found[name][key] = {"rms": rms, "relative_rms": rms / size if size else None}
     return found
+
+
+def _moved(tape: Tape) -> tuple[np.ndarray | slice, float, dict[str, np.ndarray]]:
+    """Rows of the tape, when its heels rise [s], and what the robot does there by stage 1's names."""
+    e = tape.extra
+    if "planar_rho" in e:
+        columns = {column: e[f"planar_{column}"] for column, _ in TRACKED.values()}
+        return slice(None), float(e["planar_toe_phase_start"]), columns
+    rows, columns = e["inertia_rows"], {column: e[column] for column in ("rho", "rho_rate")}
+    columns |= {"com_velocity": e["com_velocity"][rows], "L": e["angular_momentum"][rows]}
+    return rows, float(e["toe_phase_start"]), columns
 
 
 def _solver(s: Statistics) -> dict:

@@ -35,6 +35,7 @@ class Limits:
     place_m: float = 0.01  # [m] of the toes at touchdown and in the end; a twentieth of a foot
     rise_m: float = 0.01  # [m] of the CoM in flight
     pitch_rad: float = float(np.radians(1.0))  # [rad] of the trunk at touchdown: a foot 1.5 cm off
+    yaw_rad: float = float(np.radians(3.0))  # [rad] of the feet in the end: what a playback may miss
     pitch_rate: float = 0.2  # [rad/s] of the trunk at touchdown; a degree more in 0.1 s
     impulse_share: float = 0.1  # [1] of the ground's vertical impulse in the 0.1 s after touchdown, relative
     force_share: float = 0.15  # [1] of its largest 20 ms mean, relative; shorter peaks are made by the engine's step
@@ -65,6 +66,12 @@ QUANTITIES = (
         relative=True,
     ),
     Quantity("largest force of landing", "N", "force_share", lambda m: m.landing_force_n, relative=True),
+)
+
+
+AWAY = (
+    Quantity("side in the end", "m", "place_m", lambda m: m.side_m),
+    Quantity("heading in the end", "rad", "yaw_rad", lambda m: m.yaw_rad),
 )
 
 
@@ -106,11 +113,12 @@ class ModeReport:
     robots: dict[str, tuple[Trial, ...]]  # by engine: perturbed robots, the same in each
     settings: TrialSettings  # of those, but for the engine
     limits: Limits
+    quantities: tuple[Quantity, ...] = QUANTITIES  # that are compared; out of the plane also :data:`AWAY`
 
     @property
     def differences(self) -> tuple[Difference, ...]:
         """Of the robot as planned."""
-        return tuple(Difference.between(q, self.planned, self.limits) for q in QUANTITIES)
+        return tuple(Difference.between(q, self.planned, self.limits) for q in self.quantities)
 
     @property
     def pairs(self) -> list[dict[str, Trial]]:
@@ -139,7 +147,7 @@ class ModeReport:
             elif not d.within:
                 apart = f"the engines are {d.apart:.3g}{unit} apart in {d.quantity.name}"
                 told.append(f"{self.mode} mode: {apart}, at most {d.limit:.3g}{unit}")
-        for q in QUANTITIES:
+        for q in self.quantities:
             apart, limit = self.apart(q), getattr(self.limits, q.limit)
             if len(apart) and np.median(apart) > limit:
                 middle = f"{np.median(apart):.3g}{'' if q.relative else f' {q.unit}'}"
@@ -153,11 +161,11 @@ class ModeReport:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data, in SI units."""
-        spread = {q.name: self.apart(q) for q in QUANTITIES}
+        spread = {q.name: self.apart(q) for q in self.quantities}
         robots = [
             {"number": k, "same": len({t.landed for t in pair.values()}) == 1}
             | {name: {"landed": t.landed, "reason": t.reason} for name, t in pair.items()}
-            | {"apart": {q.name: Difference.between(q, pair, self.limits).apart for q in QUANTITIES}}
+            | {"apart": {q.name: Difference.between(q, pair, self.limits).apart for q in self.quantities}}
             for k, pair in enumerate(self.pairs)
         ]
         return {
@@ -267,6 +275,7 @@ def certify(
             {engine: tuple(done[key] for key in others[mode, engine]) for engine in ENGINES},
             TrialSettings(mode),
             limits,
+            QUANTITIES if task.in_plane else (*QUANTITIES, *AWAY),
         )
         for mode in MODES
     )

@@ -26,14 +26,13 @@ import pinocchio as pin
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io import folder as store
 from jumplab.io.files import Log, open_log
 from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.shown import Shown
 from jumplab.sim import (
     DEFAULT_ENGINE,
     Metrics,
@@ -46,6 +45,7 @@ from jumplab.sim import (
 )
 from jumplab.sim.engine import engine_class
 from jumplab.sim.playback import MODES
+from jumplab.task import JumpTask
 
 SCHEMA, NAME = "jumplab-trials-1", "trials.jsonl"
 CONFIDENCE = 0.95
@@ -249,12 +249,17 @@ class TrialReport(Shown):
         """One metric (M,) of the trials that landed."""
         return np.array([getattr(t.metrics, name) for t in self.trials if t.landed])
 
+    @property
+    def in_plane(self) -> bool:
+        """Whether the plan goes straight ahead or back."""
+        return JumpTask(**self.target).in_plane
+
     def to_json(self) -> dict[str, Any]:
         """The content of ``trials.json``; depends on the trials alone, not on how or when they were run."""
         kinds = {"least": np.min, "median": np.median, "largest": np.max}
         measured = {
             name: {kind: float(of(x)) for kind, of in kinds.items()} if len(x := self.values(name)) else None
-            for name in ("foot_distance_m", "com_rise_m")
+            for name in ("foot_distance_m", "com_rise_m", *(() if self.in_plane else ("side_m", "yaw_rad")))
         }
         return {
             "schema": SCHEMA,

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, Shown, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
-from jumplab.shown import Shown
 from jumplab.stages.changes import StageChanges
+from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
-from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -23,11 +23,17 @@ from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
 # beyond, the cost moves by less than one in a million; a solve that needs more time is lost
-IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_cpu_time": 60.0, "max_wall_time": 600.0}  # [s]
+IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 150, "max_cpu_time": 40.0, "max_wall_time": 600.0}  # [s]
+SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
+QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
 IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3, "acceptable_iter": 2}
+# the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
+IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
+
+Begin = tuple[Tape | None, float, bool]  # a tape or none, when its heels rise [s], whether side and yaw are added
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,7 +65,7 @@ class SpatialPlanner:
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = SPATIAL_MESH,
+        mesh: Mesh | None = None,
         limits: SpatialLimits = SpatialLimits(),
         weights: SpatialWeights = SpatialWeights(),
         *,
@@ -67,13 +73,15 @@ class SpatialPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.mesh, self.limits, self.weights, self.changes = robot, mesh, limits, weights, changes
+        self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
+        self.limits, self.weights, self.changes = limits, weights, changes
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
         options = dict(options or {})
-        problem = changes.applied(build_problem(robot, mesh, limits, weights))
+        problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
+        self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
 
     def plan(
         self,
@@ -81,63 +89,112 @@ class SpatialPlanner:
         start: Tape | None = None,
         toe_phase_s: float = 0.0,
         *,
+        ramps: bool = True,
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
+        stance: np.ndarray | None = None,
+        patient: bool = True,
     ) -> SpatialPlan:
         """Solve for a target.
 
         Parameters
         ----------
-        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
+        ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
+        patient : explain a refusal, and look for a smaller target; otherwise only solve, and not for long.
+        stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's places; it if None.
 
         Raises
         ------
         SolverError
-            If there is no plan; names the terms in conflict.
+            If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
         """
-        asked = self.parameters(task)
-        how = {"weights": self.changes.spread(self.nlp.problem, weights or {})}
-        edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
+        how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
         if near is not None:
             try:
-                found = self._warm.solve(
-                    asked, near.solution.guess(), multipliers=near.solution.multipliers, explain=False, **how
-                )
-                return SpatialPlan(task, found, edge, self.limits)
+                return self._solved(self._warm, task, near, how)
             except SolverError:
                 if start is None:
                     raise
-        guess = from_tape(self.terms, start, toe_phase_s, self.mesh, task)
-        return SpatialPlan(task, self.nlp.solve(asked, guess, **how), edge, self.limits)
+        if not patient:
+            return self._solved(self._quick, task, (start, toe_phase_s, ramps), how)
+        try:
+            return self._solved(self.nlp, task, (start, toe_phase_s, ramps), how | {"explain": True})
+        except SolverError as e:
+            less = self._smaller(task, (start, toe_phase_s, ramps), how)
+            if less is not None and not e.violations:  # there is a motion: perhaps from here
+                try:
+                    return self._solved(self._warm, task, less, how)
+                except SolverError:
+                    pass
+            words = "" if less is None else f"; at this height, {said(less.task)} is planned"
+            raise SolverError(f"{e}{words}", stage=e.stage, status=e.status, violations=e.violations) from e
+
+    def _solved(self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | Begin, how: dict) -> SpatialPlan:
+        """A plan that begins with another one, or with a tape, when its heels rise, and whether it needs ramps."""
+        asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
+        del how["stance"]
+        if isinstance(begin, SpatialPlan):
+            guess, how = begin.solution.guess(), how | {"multipliers": begin.solution.multipliers}
+        else:
+            tape, toe_phase_s, ramps = begin
+            if tape is None:
+                tape = generic(self.terms["flat"], task)
+                toe_phase_s = float(tape.extra["toe_phase_start"])
+            guess = from_tape(self.terms, tape, toe_phase_s, self.mesh, task, ramps)
+        edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
+        return SpatialPlan(task, nlp.solve(asked, guess, **how), edge, self.limits)
+
+    def _smaller(self, task: JumpTask, begin: Begin, how: dict) -> SpatialPlan | None:
+        """The plan of the largest of a few targets with less way and less turn."""
+        for share in SHORTER:
+            less = {name: round(share * getattr(task, name), 3) for name in ("distance_m", "side_m", "yaw_rad")}
+            try:
+                return self._solved(self._quick, replace(task, **less), begin, how)
+            except (InfeasibleError, SolverError):
+                continue
+        return None
 
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan."""
         return make_tape(self.terms, plan.solution.phases, plan.task.gravity)
 
-    def parameters(self, task: JumpTask) -> dict[str, Any]:
+    def parameters(self, task: JumpTask, stance: np.ndarray | None = None) -> dict[str, Any]:
         """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
         flat = self.terms["flat"]
-        values = dict(stance=flat.stance, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
+        start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
+        values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
-        return values | dict(edge=self._edge(task), gravity=task.gravity)
+        if not self.robot.planar:
+            values["straight"] = float(task.in_plane)
+        ways = np.cos(task.along_rad), np.sin(task.along_rad)
+        return values | dict(edge=self._edge(task, np.array(ways)), along=ways, gravity=task.gravity)
 
-    def _edge(self, task: JumpTask) -> float:
-        """Where the ground steps up or down [m], from the world's origin."""
+    def _edge(self, task: JumpTask, along: np.ndarray) -> float:
+        """Where the ground steps up or down [m], from the world's origin ``along`` (2,) the travel."""
         c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
         soles = self.robot.foot.corners - self.robot.foot.center
-        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)
-        landed = task.distance_m + corners[:, 0] * c - corners[:, 1] * s
-        room, first = self.limits.edge_before_heel_m, float(corners[:, 0].max())
+        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)[:, :2]
+        landed = ([task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])) @ along
+        room, first = self.limits.edge_before_heel_m, float((corners @ along).max())
         up, down = float(landed.min()) - room, first + room
         edge = down if task.platform_m < 0 else up
         apart = up - first if task.platform_m > 0 else float(landed.min()) - down
-        if task.platform_m and apart < 0:
+        if task.platform_m and apart < -1e-9:  # rounding
+            way = float(np.hypot(task.distance_m, task.side_m))
+            least = np.ceil(100 * (way - apart) - 1e-6) / 100
             raise InfeasibleError(
-                f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-                f"under a sole of {self.robot.name}; that takes a distance of at least {task.distance_m - apart:.2f} m",
+                f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
+                f"sole of {self.robot.name}; that takes a distance of at least {least:.2f} m",
                 number="distance_m",
-                bound=task.distance_m - apart,
+                bound=float(least),
             )
         return edge
+
+
+def said(task: JumpTask) -> str:
+    """Way and turn of a target in words."""
+    turn = f"{np.degrees(task.yaw_rad):.3g} deg"
+    return f"{task.distance_m:g} m ahead and {task.side_m:g} m to the left with a turn of {turn}"

@@ -15,8 +15,9 @@ import pinocchio as pin
 from scipy.integrate import cumulative_trapezoid
 
 from jumplab.io.tape import RATE_HZ, Tape
-from jumplab.models.spatial import CHART, SpatialModel, spin_slope
+from jumplab.models.spatial import CHART, SpatialModel
 from jumplab.ocp.solution import PhaseSolution
+from jumplab.robot import Robot
 from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.start import generators
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -38,10 +39,10 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     q, v, a, w = _launch(terms, phases, legs, np.maximum(t, 0.0), gravity)
     late = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
     stood = b.model.to_pinocchio(q, v, a)
-    start = [stood, _flight(b.model, flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
+    start = [stood, _flight(terms["flight"], flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
     q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
     wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
-    f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
+    f, tau, com, spin = forces(robot, q, v, a, wrench, len(t))
     phase = np.repeat(["launch", "flight"], [len(t), len(late)])
     extra = {
         "com": com[:, :3],
@@ -81,8 +82,8 @@ class Legs:
         self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
         self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
         bodies = sorted({j for k in b.feet for j in b.chain(k)})
-        self.columns = np.array([len(CHART) - 1 + j for j in bodies])
-        self.pitches = np.arange(rows.numel()).reshape(2, -1)[:, -1]  # rows that say how the feet pitch
+        self.columns = np.array([1, 3, 4] * b.short + [len(CHART) - 1 + j for j in bodies])
+        self.pitches = np.cumsum([len(held) + 3 for held in b.held]) - 1  # rows that say how the feet pitch
 
     def held(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, ...]:
         """Charts, rates and accelerations (n, .) with the legs moved so that the feet stay in their places.
@@ -160,39 +161,81 @@ def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gr
         yield np.concatenate([force, base @ need[3:] + np.cross(motion[0][:3], force)])
 
 
-def _flight(model: SpatialModel, flight: PhaseSolution, chart0, stood, t: np.ndarray, gravity: float):
+def _flight(b: SpatialTerms, flight: PhaseSolution, chart0, stood, t: np.ndarray, gravity: float):
     """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands.
 
-    It begins where the launch ends, as charts and as Pinocchio has it; the joints are as planned a little later.
+    It begins where the launch ends, as charts and as Pinocchio has it; the joints are as planned a little later, and
+    legs end where the feet meet their places, whatever the base has drifted by.
     """
-    data = model.model.createData()
+    model, data = b.model, b.model.model.createData()
     pin.computeCentroidalMomentum(model.model, data, *stood[:2])
     pin.centerOfMass(model.model, data, *stood[:2])
     spin, com = data.hg.angular.copy(), (data.com[0].copy(), data.vcom[0].copy())
     halves = np.concatenate([t, (t[1:] + t[:-1]) / 2])
     planned = [x[:, 3:] for x in flight.sample(halves)]
     off = [x[len(CHART) :] - y[0] for x, y in zip(chart0, planned, strict=True)]
-    q, v, a = (x + y for x, y in zip(planned, _fading(off, halves), strict=True))
-    zero, neutral = np.zeros(6), pin.neutral(model.model)[:7]
-    own, carried = np.empty((len(halves), 3, 3)), np.empty((len(halves), 3))
-    for k, (qj, vj) in enumerate(zip(q, v, strict=True)):
+    joints = [x + y for x, y in zip(planned, _fading(off, halves), strict=True)]
+    s = halves / t[-1]
+    bends = (
+        s**3 * (10 - 15 * s + 6 * s**2),
+        30 * s**2 * (1 - s) ** 2 / t[-1],
+        60 * s * (1 - s) * (1 - 2 * s) / t[-1] ** 2,
+    )
+
+    def moved():
+        chart, rates = _turning(model, joints, chart0[0][3:6], spin, t)
+        return _falling(model, [x[: len(t)] for x in joints], chart, rates, com, t, gravity)
+
+    missed = _missed(b, flight, moved()[0][-1], gravity)
+    joints = [x + missed * y[:, None] for x, y in zip(joints, bends, strict=True)]
+    return moved()
+
+
+def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, t: np.ndarray):
+    """Angles of the base (n, 3) and their rates at times ``t``, from L; ``joints`` are given there and half-way."""
+    data, zero, neutral = model.model.createData(), np.zeros(6), pin.neutral(model.model)[:7]
+    own, carried = np.empty((len(joints[0]), 3, 3)), np.empty((len(joints[0]), 3))
+    for k, (qj, vj) in enumerate(zip(*joints[:2], strict=True)):
         pin.ccrba(model.model, data, np.concatenate([neutral, qj]), np.concatenate([zero, vj]))
         own[k], carried[k] = data.Ag[3:, 3:6], data.hg.angular
+    own, (x, y, z) = np.linalg.inv(own), spin.tolist()
 
-    def rate(x, k):
-        turn = model.rotations(np.concatenate([np.zeros(3), x])[None])[0]
-        return np.linalg.solve(spin_slope(x[1:2], x[2:3])[0], np.linalg.solve(own[k], turn.T @ spin - carried[k]))
+    def rate(angles, k):
+        (cy, cr, cp), (sy, sr, sp) = np.cos(angles).tolist(), np.sin(angles).tolist()
+        ahead, left = cy * x + sy * y, cy * y - sy * x
+        up = cr * z - sr * left
+        seen = np.array([cp * ahead - sp * up, cr * left + sr * z, sp * ahead + cp * up])  # L in base axes
+        wx, wy, wz = (own[k] @ (seen - carried[k])).tolist()
+        yaw = (cp * wz - sp * wx) / cr
+        return np.array([yaw, cp * wx + sp * wz, wy - sr * yaw])
 
     n, chart = len(t), np.empty((len(t), 3))
-    chart[0] = chart0[0][3:6]
+    chart[0] = chart0
     for k in range(n - 1):  # Runge and Kutta, fourth order
-        h, x, mid = t[k + 1] - t[k], chart[k], n + k
-        k1 = rate(x, k)
-        k2 = rate(x + h / 2 * k1, mid)
-        k3 = rate(x + h / 2 * k2, mid)
-        chart[k + 1] = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, k + 1))
-    rates = np.array([rate(x, k) for k, x in enumerate(chart)])
-    return _falling(model, (q[:n], v[:n], a[:n]), chart, rates, com, t, gravity)
+        h, here, mid = t[k + 1] - t[k], chart[k], n + k
+        k1 = rate(here, k)
+        k2 = rate(here + h / 2 * k1, mid)
+        k3 = rate(here + h / 2 * k2, mid)
+        chart[k + 1] = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(here + h * k3, k + 1))
+    return chart, np.array([rate(angles, k) for k, angles in enumerate(chart)])
+
+
+def _missed(b: SpatialTerms, flight: PhaseSolution, q: np.ndarray, gravity: float) -> np.ndarray:
+    """By what joints (nj,) of the last configuration ``q`` (nq,) have to change for the feet to stand as planned."""
+    tree, c, t, still = b.model.model, flight.constants, flight.duration, np.zeros((1, b.model.model.nv))
+    data, q = tree.createData(), q.copy()
+    planned = b.model.to_pinocchio(np.concatenate([np.zeros(3), flight.q[-1]])[None], still, still)[0][0]
+    com = np.array([c[f"com_{x}"] + c[f"vel_{x}"] * t for x in "xyz"]) - [0.0, 0.0, gravity * t**2 / 2]
+    planned[:3] = com - pin.centerOfMass(tree, data, planned)
+    pin.forwardKinematics(tree, data, planned)
+    goals, first = [data.oMi[body + 1].copy() for body in b.feet], q[7:].copy()
+    for _ in range(LEG_STEPS):
+        pin.computeJointJacobians(tree, data, q)
+        for body, goal in zip(b.feet, goals, strict=True):
+            legs = 5 + np.array(b.chain(body))
+            slope = pin.getJointJacobian(tree, data, body + 1, pin.ReferenceFrame.LOCAL)[:, legs]
+            q[1 + legs] += np.linalg.pinv(slope) @ pin.log6(data.oMi[body + 1].inverse() * goal).vector
+    return q[7:] - first
 
 
 def _fading(off, t: np.ndarray) -> list[np.ndarray]:
@@ -231,49 +274,53 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
     return q, v, a
 
 
-def _forces(robot, q, v, a, wrench, standing: int):
+def forces(
+    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, standing: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
     What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
     """
-    model, data, n = robot.model, robot.model.createData(), len(q)
+    model, data, n, world = robot.model, robot.model.createData(), len(q), pin.ReferenceFrame.WORLD
     frames = [model.getFrameId(name) for name in robot.foot.frames]
-    f, tau = np.zeros((n, 2, 6)), np.empty((n, model.nv - 6))
-    com, spin = np.empty((n, 6)), np.empty((n, 3))
-    least = LEAST_LOAD * robot.total_mass * robot.gravity
+    joints = [model.frames[frame].parentJoint for frame in frames]
+    need, com, spin = np.empty((n, model.nv)), np.empty((n, 6)), np.empty((n, 3))
+    places, soles, slopes = np.zeros((standing, 2, 3)), np.zeros((standing, 2, 3)), np.zeros((standing, 2, 6, model.nv))
+    base, turn = np.zeros((standing, 3)), np.zeros((standing, 3, 3))
     for k in range(n):
-        need = pin.rnea(model, data, q[k], v[k], a[k])
+        need[k] = pin.rnea(model, data, q[k], v[k], a[k])
+        pin.computeCentroidalMomentum(model, data, q[k], v[k])
+        com[k, :3], com[k, 3:], spin[k] = data.com[0], data.hg.linear / robot.total_mass, data.hg.angular
         if k < standing:
             pin.computeJointJacobians(model, data, q[k])
             pin.updateFramePlacements(model, data)
-            base = data.oMi[1]
-            force = base.rotation @ need[:3]
-            missing = np.concatenate([force, base.rotation @ need[3:6] + np.cross(base.translation, force)]) - wrench[
-                k
-            ].sum(0)
-            columns, shares = [], []
-            for i, frame in enumerate(frames):
-                place = _pressure(wrench[k, i], data.oMf[frame].act(robot.foot.center))
-                columns.append(np.block([[np.eye(3), np.zeros((3, 3))], [pin.skew(place), np.eye(3)]]))
-                shares.append(max(wrench[k, i, 2], least) * np.repeat([1.0, WRENCH_ARM_M**2], 3))
-            spread = np.hstack(columns)
-            weighted = np.concatenate(shares)[:, None] * spread.T
-            extra = (weighted @ np.linalg.solve(spread @ weighted, missing)).reshape(2, 6)
-            for i, (frame, column) in enumerate(zip(frames, columns, strict=True)):
-                total = wrench[k, i] + column @ extra[i]
-                f[k, i] = total
-                f[k, i, 3:] -= np.cross(data.oMf[frame].translation, total[:3])
-                joint = model.frames[frame].parentJoint
-                need -= pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.WORLD).T @ total
-        tau[k] = need[6:]
-        pin.computeCentroidalMomentum(model, data, q[k], v[k])
-        pin.centerOfMass(model, data, q[k], v[k])
-        com[k, :3], com[k, 3:], spin[k] = data.com[0], data.vcom[0], data.hg.angular
-    return f, tau, com, spin
+            base[k], turn[k] = data.oMi[1].translation, data.oMi[1].rotation
+            for i, (frame, joint) in enumerate(zip(frames, joints, strict=True)):
+                places[k, i], soles[k, i] = data.oMf[frame].translation, data.oMf[frame].act(robot.foot.center)
+                slopes[k, i] = pin.getJointJacobian(model, data, joint, world)
+    force, moment = (np.einsum("nij,nj->ni", turn, need[:standing, at : at + 3]) for at in (0, 3))
+    missing = np.concatenate([force, moment + np.cross(base, force)], axis=1) - wrench[:standing].sum(1)
+    total = wrench[:standing] + _shared(
+        wrench[:standing], soles, missing, LEAST_LOAD * robot.total_mass * robot.gravity
+    )
+    f = np.zeros((n, 2, 6))
+    f[:standing] = total
+    f[:standing, :, 3:] -= np.cross(places, total[..., :3])
+    need[:standing] -= np.einsum("nkij,nki->nj", slopes, total)
+    return f, need[:, 6:], com, spin
 
 
-def _pressure(wrench: np.ndarray, sole: np.ndarray) -> np.ndarray:
-    """Centre of pressure (3,) of a wrench about the world's origin; the middle of the sole if there is no load."""
-    if wrench[2] <= 0:
-        return sole
-    return np.array([-wrench[4] / wrench[2], wrench[3] / wrench[2], 0.0])
+def _shared(wrench: np.ndarray, soles: np.ndarray, missing: np.ndarray, least: float) -> np.ndarray:
+    """What each foot (n, 2, 6) adds of ``missing`` (n, 6) about the origin: by its load, at its centre of pressure."""
+    loaded = wrench[..., 2] > 0  # else in the middle of the sole (n, 2, 3)
+    up = np.where(loaded, wrench[..., 2], 1.0)
+    pressed = np.stack([-wrench[..., 4] / up, wrench[..., 3] / up, 0 * up], -1)
+    x, y, z = np.moveaxis(np.where(loaded[..., None], pressed, soles), -1, 0)
+    column, zero = np.tile(np.eye(6), (*wrench.shape[:2], 1, 1)), np.zeros_like(x)
+    arm = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    column[..., 3:, :3] = arm.reshape(*x.shape, 3, 3)
+    share = np.maximum(wrench[..., 2], least)[..., None] * np.repeat([1.0, WRENCH_ARM_M**2], 3)
+    weighted = share[..., None] * np.swapaxes(column, -1, -2)  # (n, 2, 6, 6)
+    whole = np.einsum("nkij,nkjl->nil", column, weighted)
+    given = weighted @ np.linalg.solve(whole, missing[..., None])[:, None]
+    return np.einsum("nkij,nkj->nki", column, given[..., 0])

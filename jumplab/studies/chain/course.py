@@ -37,6 +37,18 @@ def crouched(robot: Robot) -> Robot:
     return other
 
 
+def placed(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Where a ``step`` (3,) leads from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as seen from there."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
+
+
+def seen_from(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The step (3,) that leads from a ``pose`` to an ``other``."""
+    c, s, (x, y, turn) = np.cos(pose[2]), np.sin(pose[2]), other - pose
+    return np.array([c * x + s * y, c * y - s * x, turn])
+
+
 @dataclass(frozen=True)
 class Course:
     """Targets of a chain; make one with :meth:`of`, which reads and checks numbers."""
@@ -44,10 +56,20 @@ class Course:
     distances_m: tuple[float, ...]  # travel of the feet in each jump, toe to toe
     heights_m: tuple[float, ...]  # rise of the CoM in each flight
     platforms_m: tuple[float, ...]  # height of each landing surface above the ground that the chain begins on
+    sides_m: tuple[float, ...] = ()  # travel of the feet to the left, in the heading in which each jump begins
+    turns_rad: tuple[float, ...] = ()  # about the vertical, to the left
 
     @classmethod
-    def of(cls, distances_m: Iterable[Any], height_m: Any, platforms_m: Iterable[Any] | None = None) -> Course:
-        """A course from what somebody typed: one height for all jumps or one per jump; level ground without platforms.
+    def of(
+        cls,
+        distances_m: Iterable[Any],
+        height_m: Any,
+        platforms_m: Iterable[Any] | None = None,
+        sides_m: Iterable[Any] | None = None,
+        turns_rad: Iterable[Any] | None = None,
+    ) -> Course:
+        """A course from what somebody typed: one height for all jumps or one per jump; level ground without platforms,
+        straight ahead without sides and turns.
 
         Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number cannot be meant.
         """
@@ -58,10 +80,14 @@ class Course:
         heights = _numbers("heights", [height_m] if np.ndim(height_m) == 0 else height_m)
         heights = heights * count if len(heights) == 1 else heights
         platforms = (0.0,) * count if platforms_m is None else _numbers("platforms", platforms_m)
-        for name, values in (("heights", heights), ("platforms", platforms)):
-            if len(values) != count:
+        away = [() if x is None else _numbers(n, x) for n, x in (("sides", sides_m), ("turns", turns_rad))]
+        rows = ("heights", heights), ("platforms", platforms), *zip(("sides", "turns"), away, strict=True)
+        for name, values in rows:
+            if len(values) not in ((count,) if name in ("heights", "platforms") else (0, count)):
                 raise InputError(f"{len(values)} {name} for {count} distances: give one per jump")
-        course = cls(distances, heights, platforms)
+        if any(map(any, away)) and any(platforms):
+            raise InputError("platforms lie on a straight way: leave them away, or ask for neither sides nor turns")
+        course = cls(distances, heights, platforms, *away)
         for k in range(count):
             try:
                 course.task(k)
@@ -74,16 +100,33 @@ class Course:
         """Number of jumps."""
         return len(self.distances_m)
 
+    @property
+    def in_plane(self) -> bool:
+        """Whether it goes straight ahead or back; then places are those of the toes, else of the soles' middle."""
+        return not (any(self.sides_m) or any(self.turns_rad))
+
+    def step(self, k: int) -> np.ndarray:
+        """(3,) way ahead and to the left [m], and turn [rad], of jump ``k``."""
+        return np.array([self.distances_m[k], *(x[k] if x else 0.0 for x in (self.sides_m, self.turns_rad))])
+
+    @cached_property
+    def goals(self) -> np.ndarray:
+        """(K, 3) x, y [m] and heading [rad] of the feet after each jump as wanted, from where they stand at first."""
+        poses = [np.zeros(3)]
+        for k in range(self.count):
+            poses.append(placed(poses[-1], self.step(k)))
+        return np.array(poses[1:])
+
     @cached_property
     def goals_m(self) -> tuple[float, ...]:
-        """Where the toes should be after each jump, from where they stand at first [m]."""
-        return tuple(np.cumsum(self.distances_m).tolist())
+        """How far ahead the feet should be after each jump, from where they stand at first [m]."""
+        return tuple(self.goals[:, 0].tolist())
 
-    def task(self, k: int, distance_m: float | None = None) -> JumpTask:
-        """Target of jump ``k`` (counted from 0), with another distance if given."""
-        distance = self.distances_m[k] if distance_m is None else distance_m
+    def task(self, k: int, step: np.ndarray | None = None) -> JumpTask:
+        """Target of jump ``k`` (counted from 0), with another step (3,) if given."""
+        ahead, side, turn = self.step(k) if step is None else step
         rise = self.platforms_m[k] - (0.0, *self.platforms_m)[k]  # above the surface that it starts from
-        return JumpTask(distance, self.heights_m[k], round(rise, 9))
+        return JumpTask(ahead, self.heights_m[k], round(rise, 9), side_m=side, yaw_rad=turn)
 
     def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
         """(x, height) where the ground changes its height, x from the toes' first place [m]."""

@@ -8,27 +8,36 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pinocchio as pin
+from scipy.interpolate import CubicSpline
 
 from jumplab.errors import InfeasibleError, JumplabError, SolverError
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitch_of
+from jumplab.sim.kinematics import Gauge, headed, pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
 from jumplab.sim.pilot import AFTER_FALL_S, EXTRA_S, Pilot
 from jumplab.sim.playback import Command
 from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
 from jumplab.stages.planner import JumpPlan, Planner, to_link_angles
-from jumplab.studies.chain.course import Course
+from jumplab.studies.chain.course import Course, placed, seen_from
 
 FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
 STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25  # still enough to begin: what is left fades within BLEND_S
 STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
 BLEND_S = 0.25  # a third of the launch, over before the push begins
+ROWS, NEWTON = 10, 3  # of the tape per inverse kinematics, and its steps: exact to 1e-6 rad
 PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
-LARGEST_BIAS_M = 0.10  # a robot that misses by more than this has another problem than a wrong model
+LARGEST_BIAS = 0.10  # [m, rad] a robot that misses by more than this has another problem than a wrong model
 LARGEST_OFFSET_RAD = 0.10  # a posture that is farther off the crouch is not the robot standing still
+
+
+def _turned(step: np.ndarray) -> np.ndarray:
+    """A step (3,) whose turn is within half a turn."""
+    return np.array([*step[:2], np.arctan2(np.sin(step[2]), np.cos(step[2]))])
 
 
 def posture(robot: Robot, q: np.ndarray) -> np.ndarray:
@@ -65,17 +74,32 @@ class Ahead:
     number: int  # of the jump, from 0
     looked_s: float  # when the state was measured
     air: bool  # whether the robot was in the air then
-    foretold_m: float  # where the toes stood, or were going to stand, by that measurement
-    place_m: float  # the same, less what such forecasts were wrong by in this chain
+    foretold: np.ndarray  # (3,) x, y and heading that the feet had, or were going to have, by that measurement
+    place: np.ndarray  # (3,) the same, less what such forecasts were wrong by in this chain
     start: np.ndarray  # (5,) link angles in which the plan begins [rad]
     joints: np.ndarray  # (nv - 6,) the same as joint angles [rad]
-    bias_m: float  # what was added to the distance because earlier jumps of this chain missed by it
+    bias: np.ndarray  # (3,) what was added to way and turn because earlier jumps of this chain missed by it
     solve_s: float  # what planning was charged: its wall clock, in whole steps, unless another number was given
     cpu_s: float  # processor time of the same, which an idle core would need
     plan: JumpPlan | None
     failure: str = ""  # why there is no plan
     needed_s: float | None = None  # when the robot was first still enough to begin
     began_s: float | None = None  # when it began the jump
+
+    @property
+    def foretold_m(self) -> float:
+        """How far ahead the feet were foretold [m]."""
+        return float(self.foretold[0])
+
+    @property
+    def place_m(self) -> float:
+        """The same, corrected [m]."""
+        return float(self.place[0])
+
+    @property
+    def bias_m(self) -> float:
+        """What was added to the distance [m]."""
+        return float(self.bias[0])
 
     @property
     def ready_s(self) -> float:
@@ -110,42 +134,54 @@ class Foresight:
     ):
         self.course, self.robot, self.planner, self.rehearsal = course, robot, planner, rehearsal
         self._solve_s, self._method, self._offset = solve_s, method, np.zeros(5)
-        self._missed: dict[int, float] = {}  # jump: by how much it fell short [m]
-        self._misjudged: list[float] = []  # by how much places foretold in the air were too far ahead [m]
-        self._zero: float | None = None  # where the chain began, by its own measurement [m]
+        self._missed: dict[int, np.ndarray] = {}  # jump: by how much way and turn (3,) fell short
+        self._misjudged: list[np.ndarray] = []  # by how much poses (3,) foretold in the air were too far
+        self._zero: np.ndarray | None = None  # where the chain began, by its own measurement
         self._crouch = planner.stage("whole body" if method == "three-step" else "direct").stance
 
     def learn_posture(self, q: np.ndarray) -> None:
         """Plans begin as far off the crouch as the robot, heavier perhaps, stands still in ``q``."""
         self._offset = np.clip(posture(self.robot, q) - self._crouch, -LARGEST_OFFSET_RAD, LARGEST_OFFSET_RAD)
 
-    def learn_place(self, last: Ahead, began_x: float, plans: list[Ahead], toe: np.ndarray) -> None:
-        """Jump ``last`` brought the toes from ``began_x`` of the world to ``toe``, as the next ``plans`` foretold."""
-        self._missed[last.number] = last.plan.task.distance_m - (float(toe[0]) - began_x)
-        self._misjudged += [p.foretold_m - (float(toe[0]) - self._zero) for p in plans if p.air]
+    def learn_place(self, last: Ahead, began: np.ndarray, plans: list[Ahead], pose: np.ndarray) -> None:
+        """Jump ``last`` brought the feet from ``began`` in the world to ``pose``, as the next ``plans`` foretold."""
+        self._missed[last.number] = self._short(last, began, pose)
+        self._misjudged += [_turned(p.foretold - seen_from(self._zero, pose)) for p in plans if p.air]
+
+    def _short(self, last: Ahead, began: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """By how much way and turn (3,) of a jump between two poses fell short of its plan."""
+        task = last.plan.task
+        return _turned(np.array([task.distance_m, task.side_m, task.yaw_rad]) - seen_from(began, pose))
 
     @property
-    def bias_m(self) -> float:
-        """Mean of what the jumps so far fell short by [m]."""
-        return float(np.clip(np.mean([*self._missed.values()] or [0.0]), -LARGEST_BIAS_M, LARGEST_BIAS_M))
+    def bias(self) -> np.ndarray:
+        """Mean (3,) of what the jumps so far fell short by [m, rad]."""
+        return np.clip(np.mean([*self._missed.values()] or [np.zeros(3)], axis=0), -LARGEST_BIAS, LARGEST_BIAS)
 
     def look(
-        self, number: int, time_s: float, toe: np.ndarray, air: bool = False, last: tuple[Ahead, float] | None = None
+        self,
+        number: int,
+        time_s: float,
+        pose: np.ndarray,
+        air: bool = False,
+        last: tuple[Ahead, np.ndarray] | None = None,
     ) -> Ahead:
-        """Plan jump ``number`` for toes that stand, or in the ``air`` will stand, at ``toe`` (3,) of the world.
+        """Plan jump ``number`` for feet that have, or in the ``air`` will have, the ``pose`` (3,) in the world.
 
-        ``last`` is the plan of the jump before, and the place from where it began.
+        It is x and y of the toes, or on a course with sides and turns of the soles' middle [m], and the heading [rad].
+        ``last`` is the plan of the jump before, and the pose from where it began.
         """
         began, cpu, plan, failure = time.perf_counter(), time.process_time(), None, ""
         if self._zero is None:
-            self._zero = float(toe[0])
-        foretold = float(toe[0]) - self._zero
-        place = foretold - (float(np.mean(self._misjudged)) if air and self._misjudged else 0.0)
+            self._zero = np.array(pose, float)
+        foretold = seen_from(self._zero, pose)
+        place = foretold - (np.mean(self._misjudged, axis=0) if air and self._misjudged else 0.0)
         if last is not None:
-            self._missed[last[0].number] = last[0].plan.task.distance_m - (place + self._zero - last[1])
-        start, bias = self._crouch + self._offset, self.bias_m
+            self._missed[last[0].number] = self._short(last[0], last[1], placed(self._zero, place))
+        start, bias = self._crouch + self._offset, self.bias
         try:
-            task = self.course.task(number, self.course.goals_m[number] - place + bias)
+            step, asked = seen_from(place, self.course.goals[number]), np.array([0.0, 0.0, self.course.step(number)[2]])
+            task = self.course.task(number, _turned(step - asked) + asked + bias)
             if self.rehearsal is None:
                 plan = self.planner.plan(task, self._method, start=start)
             else:
@@ -260,34 +296,43 @@ class ChainPilot:
             self._begin(there[-1], step, q, v)
         return still and bool(there)
 
+    def _pose(self, q: np.ndarray) -> np.ndarray:
+        """Pose (3,) of the feet as the course counts it: straight ahead the toes' x alone."""
+        if self._foresight.course.in_plane:
+            return np.array([self._gauge.toe(q)[0], 0.0, 0.0])
+        return np.array([*self._gauge.soles(q)[:2], self._gauge.heading(q)])
+
     def _sight(self, step: int, q: np.ndarray, v: np.ndarray, plans: list[Ahead]) -> tuple[np.ndarray, bool] | None:
-        """Where the toes (3,) stand, or will stand, and whether the robot flies; None unless it is time to plan."""
+        """Pose (3,) of the feet, now or to come, and whether the robot flies; None unless it is time to plan."""
         if not self.pilots:
             if plans or step * STEP_S < FIRST_STAND_S:
                 return None
             self._foresight.learn_posture(q)
-            return self._gauge.toe(q), False
+            return self._pose(q), False
         since = self.since_touchdown(step)
         if plans:  # one core plans: a correction waits until the draft is done
             due = plans[-1].air and self._revise_s is not None and since >= self._revise_s
-            return (self._gauge.toe(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
+            return (self._pose(q), False) if due and step * STEP_S >= plans[-1].ready_s else None
         if since >= max(self._look_s, 0.0):
-            return self._gauge.toe(q), False
+            return self._pose(q), False
         airborne = (step - self.began[-1]) * STEP_S > self.used[-1].plan.tape.takeoff_time
         if self.landed or self._look_s >= 0 or not airborne:
             return None
-        left = self.pilots[-1].forecast.time_left(q, v)
-        return None if left > -self._look_s else (self._gauge.toe(self._at_touchdown(step, q, v, left)), True)
+        left = self.pilots[-1].forecast.time_left(self.pilots[-1].seen(q), v)
+        return None if left > -self._look_s else (self._at_touchdown(step, q, v, left), True)
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
-        """Configuration (nq,) of the touchdown to come: the posture of the tape, turned as far as the trunk is off its
-        pitch now, on the ballistic CoM."""
-        tape = self.used[-1].plan.tape
+        """Pose (3,) at the touchdown to come: the posture of the tape, turned as far as the trunk is off its pitch and
+        its heading now, on the ballistic CoM."""
+        tape, pilot = self.used[-1].plan.tape, self.pilots[-1]
         row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
-        turned = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)])
-        end, _ = self.pilots[-1].forecast.state(q, v, turned)
+        turned, q = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)]), pilot.seen(q)
+        end, _ = pilot.forecast.state(q, v, turned)
         end[:3] += self._gauge.com_ahead(q, v, left) - self._gauge.com(end)
-        return end
+        if self._foresight.course.in_plane:
+            return self._pose(end)
+        off = pilot.heading_error(step - self.began[-1], q)
+        return self._pose(headed(end, -pilot.looks_rad)) + np.array([0.0, 0.0, off])
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:
         """Whether the robot stands in the posture in which the plan begins, within the tolerances."""
@@ -297,21 +342,81 @@ class ChainPilot:
         return bool(near and slow)
 
     def _begin(self, ahead: Ahead, step: int, q: np.ndarray, v: np.ndarray) -> None:
-        ahead.began_s, toe, tape = step * STEP_S, self._gauge.toe(q), ahead.plan.tape
+        ahead.began_s, pose, tape = step * STEP_S, self._pose(q), ahead.plan.tape
         if self.used:
-            self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], toe)
-        self._from, self._offset = float(toe[0]), (q[7:] - tape.q[0, 7:], v[6:].copy())
+            self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], pose)
+        self._from, self._uneven = pose, _over_feet(tape, self._robot, q)
+        self._offset = q[7:] - tape.q[0, 7:] - self._uneven(0.0), v[6:].copy()
         self.used.append(ahead)
-        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, lead_s=self._lead_s))
+        how = dict(lead_s=self._lead_s, start_rad=float(pose[2]))
+        self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, **how))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:
-        """The tape's command plus what was left of posture and rates when it began, fading smoothly."""
-        if time >= BLEND_S:
-            return command
-        s, (error, rate) = time / BLEND_S, self._offset
-        angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
-        speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
-        push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
-        moved = dict(q=command.q + angle, rate=command.rate + speed, acceleration=command.acceleration + push)
-        return replace(command, **moved)
+        """The tape's command over the feet as they stand, plus what else was left of posture and rates when it began,
+        fading smoothly; once they are off the ground, the feet are drawn to their places beside each other."""
+        ends, moved = self._uneven.x[-1], np.array([command.q, command.rate, command.acceleration])
+        moved += _fading(*self._offset, time)
+        if time < ends:
+            moved += [self._uneven(time, order) for order in range(3)]
+        else:
+            moved += _fading(self._uneven(ends), self._uneven(ends, 1), time - ends)
+        return replace(command, q=moved[0], rate=moved[1], acceleration=moved[2])
+
+
+def _fading(error: np.ndarray, rate: np.ndarray, time: float) -> np.ndarray:
+    """A cubic from ``error`` and ``rate`` at time 0 to rest at zero: its value, rate and acceleration (3, ...)."""
+    if time >= BLEND_S:
+        return np.zeros((3, *error.shape))
+    s = time / BLEND_S
+    angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
+    speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
+    push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
+    return np.array([angle, speed, push])
+
+
+def _over_feet(tape: Tape, robot: Robot, q: np.ndarray) -> CubicSpline:
+    """Joint angles (nv - 6,) over the time of the launch [s] to add to the tape's, so that its trunk moves as planned
+    between feet that stand as in ``q`` (nq,) instead of side by side.
+
+    Legs that are made even on feet that are not would twist the robot, and turn it further in every jump.
+    """
+    model, data = robot.model, robot.model.createData()
+    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    legs = [[i for i in model.supports[model.frames[f].parentJoint] if i > 1] for f in frames]
+    columns = [[model.idx_vs[i] for i in leg] for leg in legs]
+    pin.framesForwardKinematics(model, data, tape.q[0])
+    planned = [data.oMf[f].act(robot.foot.center) for f in frames]
+    moves = _unevenness(model, data, frames, robot.foot.center, q, planned)
+    launch = np.flatnonzero(tape.phase == "launch")
+    rows = np.unique(np.append(launch[::ROWS], launch[-1]))
+    out = np.zeros((len(rows), model.nv - 6))
+    for k, row in enumerate(rows):
+        pin.framesForwardKinematics(model, data, tape.q[row])
+        goals, now = [move * data.oMf[f] for move, f in zip(moves, frames, strict=True)], tape.q[row].copy()
+        for _ in range(NEWTON):
+            pin.computeJointJacobians(model, data, now)
+            for goal, f, leg in zip(goals, frames, columns, strict=True):
+                off = pin.log6(pin.updateFramePlacement(model, data, f).actInv(goal)).vector
+                slope = pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL)[:, leg]
+                now[np.array(leg) + 1] += np.linalg.lstsq(slope, off, rcond=None)[0]
+        out[k] = now[7:] - tape.q[row, 7:]
+    return CubicSpline(tape.t[rows], out)
+
+
+def _unevenness(model, data, frames: list[int], center: np.ndarray, q: np.ndarray, planned: list) -> list[pin.SE3]:
+    """What moves each foot from its ``planned`` place (sole's middles) to where it stands in ``q``, seen from between
+    both: along the ground, and turned about the vertical."""
+    pin.framesForwardKinematics(model, data, q)
+    soles = [data.oMf[f].act(center) for f in frames]
+    ahead = [data.oMf[f].rotation[:2, 0] for f in frames]
+    x, y = np.sum(ahead, axis=0)
+    own, middle = pin.rpy.rpyToMatrix(0.0, 0.0, -math.atan2(y, x)), np.mean(soles, axis=0)
+    out = []
+    for sole, (c, s), place in zip(soles, ahead, planned, strict=True):
+        off = own @ (sole - middle) - (place - np.mean(planned, axis=0))
+        yaw = math.remainder(math.atan2(s, c) - math.atan2(y, x), math.tau)
+        turn = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
+        there = pin.SE3(np.eye(3), place + off * [1.0, 1.0, 0.0])
+        out.append(there * turn * pin.SE3(np.eye(3), -place))
+    return out

@@ -47,15 +47,22 @@ class ChainedJump:
         feet = np.isin(self.simulation.link_names, robot.foot.frames)
         return self.air_s is not None and not self.simulation.touching[:, ~feet].any()
 
-    def row(self, course: Course, robot: Robot, travel_m: float, error_m: float) -> dict[str, Any]:
+    def row(
+        self, course: Course, robot: Robot, travel_m: float, error_m: float, heading_error_rad: float
+    ) -> dict[str, Any]:
         """Distances, errors, and when the plan was made, ready, needed and begun, as plain data."""
         a, first, run = self.ahead, self.plans[0] if self.plans else None, self.simulation
-        row = dict(jump=self.number + 1, asked_m=course.distances_m[self.number], travel_m=travel_m, error_m=error_m)
+        row = dict(
+            jump=self.number + 1,
+            asked_m=float(np.hypot(*course.step(self.number)[:2])),
+            travel_m=travel_m,
+            error_m=error_m,
+        )
         row |= dict(rise_m=run.metrics.com_rise_m, air_s=self.air_s, planned_m=a and a.plan.task.distance_m)
         row |= {name: a and getattr(a, name) for name in PLAN_NAMES}
         row |= dict(first_solve_s=first and first.solve_s, first_ready_s=first and first.ready_s)
         row["in_time"] = a.in_time if self.number and a else None
-        row |= dict(on_feet=self.on_feet(robot), honest=run.checks_passed)
+        row |= dict(on_feet=self.on_feet(robot), honest=run.checks_passed, heading_error_rad=heading_error_rad)
         row["plans"] = [{n: getattr(p, n) for n in ("failure", *PLAN_NAMES)} for p in self.plans]
         return row
 
@@ -82,20 +89,38 @@ class ChainResult:
 
     @cached_property
     def places_m(self) -> np.ndarray:
-        """(K + 1, 3) middle between the toes at first, and at the end of each jump's log, from the first [m]."""
+        """(K + 1, 3) middle between the toes at first, and at the end of each jump's log, from the first [m].
+
+        On a course with sides and turns the middle between the soles.
+        """
         gauge = Gauge(self.robot)
-        first = gauge.toe(self.jumps[0].simulation.q[0])
-        return np.array([np.zeros(3), *(gauge.toe(j.simulation.q[-1]) - first for j in self.jumps)])
+        where = gauge.toe if self.course.in_plane else gauge.soles
+        first = where(self.jumps[0].simulation.q[0])
+        return np.array([np.zeros(3), *(where(j.simulation.q[-1]) - first for j in self.jumps)])
 
     @property
     def travels_m(self) -> np.ndarray:
-        """(K,) travel of the feet in each jump [m]."""
+        """(K,) travel of the feet in each jump [m]; with sides and turns the length of the way."""
+        if not self.course.in_plane:
+            return np.linalg.norm(np.diff(self.places_m[:, :2], axis=0), axis=1)
         return np.diff(self.places_m[:, 0])
 
     @property
     def errors_m(self) -> np.ndarray:
-        """(K,) where the toes stand after each jump less where the course wants them [m]."""
-        return self.places_m[1:, 0] - np.array(self.course.goals_m[: len(self.jumps)])
+        """(K,) where the feet stand after each jump less where the course wants them [m]; with sides and turns how far
+        off they are."""
+        goals = self.course.goals[: len(self.jumps)]
+        if not self.course.in_plane:
+            return np.linalg.norm(self.places_m[1:, :2] - goals[:, :2], axis=1)
+        return self.places_m[1:, 0] - goals[:, 0]
+
+    @property
+    def heading_errors_rad(self) -> np.ndarray:
+        """(K,) where the feet point after each jump less where the course wants them to [rad]."""
+        gauge = Gauge(self.robot)
+        found = [gauge.heading(j.simulation.q[-1]) for j in self.jumps]
+        off = np.array(found) - gauge.heading(self.jumps[0].simulation.q[0]) - self.course.goals[: len(found), 2]
+        return np.arctan2(np.sin(off), np.cos(off))
 
     @property
     def stood(self) -> bool:
@@ -155,8 +180,10 @@ class ChainResult:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per jump, see :meth:`ChainedJump.row`."""
-        told = zip(self.jumps, self.travels_m.tolist(), self.errors_m.tolist(), strict=True)
-        return [jump.row(self.course, self.robot, travel, error) for jump, travel, error in told]
+        told = zip(
+            self.jumps, *(x.tolist() for x in (self.travels_m, self.errors_m, self.heading_errors_rad)), strict=True
+        )
+        return [jump.row(self.course, self.robot, *row) for jump, *row in told]
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``chain.json``."""

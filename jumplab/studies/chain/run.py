@@ -119,6 +119,7 @@ class ChainTrial:
     stood: bool
     reason: str  # why not
     errors_m: tuple[float, ...] = ()
+    heading_errors_rad: tuple[float, ...] = ()
     travels_m: tuple[float, ...] = ()
     air_s: tuple[float | None, ...] = ()  # None where it never touched down
     waits_s: tuple[float, ...] = ()  # for its plan, before each jump but the first
@@ -130,7 +131,8 @@ class ChainTrial:
         """What is kept of a chain."""
         names = ("air", "solve_s", "cpu_s", "spare_s")
         plans = tuple({"jump": p.number} | {n: getattr(p, n) for n in names} for p in result.replans)
-        numbers = (tuple(map(float, x)) for x in (result.errors_m, result.travels_m))
+        measured = result.errors_m, result.heading_errors_rad, result.travels_m
+        numbers = (tuple(map(float, x)) for x in measured)
         air = tuple(j.air_s for j in result.jumps)
         return cls(seed, result.stood, result.reason, *numbers, air, result.waits_s, plans)
 
