@@ -49,7 +49,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, atlas, sweep, bench or completion"
+NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, atlas, sweep, bench or "
+NAMES += "completion"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
