@@ -238,6 +238,14 @@ def test_stage2_keeps_all_three_momenta(bhr):
     assert np.abs(L - L[0]).max() < 0.05
 
 
+def test_mirrored_target_has_the_mirrored_motion(bhr):
+    one, other = stage2(SIDE), stage2(mirrored(SIDE))
+    t = np.linspace(0.0, 0.9, 30)
+    for name, sign in (("com", [1, -1, 1]), ("L", [-1, 1, -1]), ("rho", [1, 1])):
+        x, y = (np.stack([np.interp(t, p.t / p.t[-1], c) for c in p.actual[name].T], -1) for p in (one, other))
+        np.testing.assert_allclose(y, sign * x, atol=0.03)
+
+
 def test_feet_turn_to_the_asked_heading(bhr):
     body, plan = TurningBody(bhr), stage2(TURN)
     for turn in body.motion(plan.q[-1], plan.v[-1]).foot_rotation:

@@ -415,6 +415,8 @@ class Planner:
             except SolverError:
                 return self.plan(task, previous.method)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
+        if isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
+            return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
         srmp, last = None, "direct"
