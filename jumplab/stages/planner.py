@@ -413,7 +413,7 @@ class Planner:
             except SolverError:
                 return self.plan(task, previous.method, start=start)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
-        if task.rotation_rad:
+        if task.rotation_rad or isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
             return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
@@ -514,7 +514,7 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
     return expand(motion, robot, gravity, extra | _of_stage1(srmp), values["ground_wrench"])
 
 
-def _of_stage1(srmp: SrmpPlan | SpatialSrmpPlan | None) -> dict[str, np.ndarray]:
+def _of_stage1(srmp: SrmpPlan | None) -> dict[str, np.ndarray]:
     """Stage 1's columns under the names that they have on a tape."""
     parts = [] if srmp is None else [("launch", srmp.launch), ("flight", srmp.flight)]
     return {f"srmp_{name}_{k}": np.array(v) for name, part in parts for k, v in vars(part).items()}
