@@ -25,7 +25,8 @@ from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
-from jumplab.stages.spatial import SpatialPlan, SpatialPlanner
+from jumplab.stages.spatial import SpatialLimits, SpatialPlan, SpatialPlanner
+from jumplab.stages.spatial.settings import FLIP_MESH
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
@@ -107,13 +108,17 @@ class Planner:
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
-            build["spatial"] = lambda flip: SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"])
+            build["spatial"] = self._away
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 
     def _srmp(self, flip: bool) -> SrmpPlanner:
         settings = settled(SrmpSettings, self._given[1], flip)
         return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
+
+    def _away(self, flip: bool) -> SpatialPlanner:
+        how = dict(mesh=FLIP_MESH, limits=SpatialLimits().of_flip()) if flip else {}
+        return SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"], **how)
 
     def _body(self, flip: bool, tracking: bool) -> WholeBodyPlanner:
         limits, how = settled(Limits, self._given[0], flip), dict(tracking=tracking, changes=self.changes["whole body"])
@@ -251,7 +256,7 @@ class Planner:
 
     def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
         """A jump out of the plane: the planar jump of the same distance and rise, then the spatial program."""
-        last, asked = self.stage("spatial"), sorted_out(weights=weights)
+        last, asked = self.stage(_away(task)), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
             asked["spatial"].applied(last.nlp.problem)
@@ -270,7 +275,7 @@ class Planner:
         self, method: str, body: SpatialPlan, rows: tuple[StageRow, ...], first: JumpPlan | None = None
     ) -> JumpPlan:
         """The plan of a spatial solution; ``first`` is the planar one that it began with."""
-        tape, robot = self.stage("spatial").tape(body), self.robot.under_gravity(body.task.gravity)
+        tape, robot = self.stage(_away(body.task)).tape(body), self.robot.under_gravity(body.task.gravity)
         srmp, joints = (None, None) if first is None else (first.srmp, first.joints)
         return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, first and first.skipped)
 
@@ -367,7 +372,7 @@ class Planner:
                 return self.plan(task, previous.method, start=start)
             try:
                 stance = None if start is None else self._standing(start)
-                body = self.stage("spatial").plan(task, near=near, stance=stance)
+                body = self.stage(_away(task)).plan(task, near=near, stance=stance)
             except SolverError:
                 return self.plan(task, previous.method, start=start)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
@@ -380,6 +385,11 @@ class Planner:
             srmp, last = self._pendulum(task, start, near=previous.srmp), "whole body"
         body = self.stage(last).plan(task, srmp, near=previous.whole_body, start=start)
         return self._finished(previous.method, body, srmp)
+
+
+def _away(task: JumpTask) -> str:
+    """The stage for a jump out of the plane."""
+    return "spatial" + " flip" * bool(task.rotation_rad)
 
 
 def _row(stage: str, s: Statistics) -> StageRow:

@@ -76,7 +76,7 @@ class SpatialPlanner:
         problem = changes.applied(build_problem(robot, mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
-        self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
+        self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
         self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
 
     def plan(
