@@ -77,7 +77,7 @@ def test_what_is_not_reached_is_said():
 def test_the_command_prints_a_short_table_and_writes_the_numbers(monkeypatch, capsys, tmp_path):
     times = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
     monkeypatch.setattr(benchmark, "bench", lambda *asked, say: times)
-    assert main(["bench", "--json", str(tmp_path / "b.json")]) == 0
+    assert main(["bench", "--out", str(tmp_path / "b.json")]) == 0
     head, _, *lines = capsys.readouterr().out.splitlines()
     assert head.split() == ["what", "CPU", "[s]", "ratio"]
     rows = {row["what"]: (row["CPU [s]"], row["ratio"]) for row in benchmark.rows(times)}

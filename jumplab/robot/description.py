@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError, quoted
+from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, read_only, reduce
@@ -74,8 +74,8 @@ class Foot:
         return read_only([(self.heel + self.toe) / 2, 0.0, self.sole_z])
 
 
-@dataclass(frozen=True)
-class Robot:
+@dataclass(frozen=True, repr=False)
+class Robot(Shown):
     """A humanoid: the texts of its URDF and of its TOML file, and all that follows from them; made by :meth:`load`.
 
     Everything is read-only, so that :attr:`hash` names what is planned with; :meth:`with_limits`, :meth:`with_mass` and
@@ -91,6 +91,11 @@ class Robot:
     stance: Mapping[str, float] = field(init=False)  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
     rest: Mapping[str, float] = field(init=False)  # joint -> angle [rad] of the standing posture, beside those
     corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
+
+    def line(self) -> str:
+        """Name, mass, joints, hash."""
+        arms = "" if self.joints["shoulder_pitch"] else ", arms held"
+        return f"{self.name}, {self.total_mass:.1f} kg, {len(self.joint_names)} joints{arms}, hash {self.hash}"
 
     @classmethod
     def load(cls, name_or_path: str | Path = "bhr", *, repair: tuple[str, ...] = ()) -> Robot:

@@ -205,7 +205,7 @@ def run_chains(
     check_numbers(n, seed, jobs)
     drawn = [Perturbation.draw(robot, seed + k, ranges, noise or SensorNoise()) for k in range(n)]
     work = [joblib.delayed(_trial)(course, robot, seed + k, one, how) for k, one in enumerate(drawn)]
-    return ChainReport(course, tuple(in_parallel(work, jobs, "list")))
+    return ChainReport(course, tuple(in_parallel(work, jobs, "generator")))
 
 
 def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: dict) -> ChainTrial:
