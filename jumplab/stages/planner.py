@@ -200,6 +200,8 @@ class Planner:
         -------
         rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
         """
+        if not self.robot.planar:
+            return self.stage("spatial").nlp.problem.table()
         if method == "direct":
             return self.stage("direct" + " flip" * flip).nlp.problem.table()
         first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
@@ -287,9 +289,7 @@ class Planner:
         begun from the planar jump of the same distance and rise where there is one.
         """
         if start is not None and not self.robot.planar:
-            raise InputError(
-                f"robot {self.robot.name} begins in the stance: no plane describes it; leave its start away"
-            )
+            raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
         last, asked = self.stage(_away(task)), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
