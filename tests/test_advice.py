@@ -82,7 +82,7 @@ def test_where_nothing_helps_it_says_so(monkeypatch):
 
 def follow(task, text):
     """The target and the method that an advice names."""
-    changes, method = {}, "three-step"
+    changes, method = {}, "usual"
     for name, key in (
         ("distance", "distance_m"),
         ("height", "height_m"),

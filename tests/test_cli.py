@@ -49,7 +49,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench or completion"
+NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, atlas, sweep, bench or "
+NAMES += "completion"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
@@ -76,7 +77,7 @@ REFUSALS = [
     ),
     (
         "plan --out x --method magic",
-        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); " + HELP_PLAN,
+        "argument --method: invalid choice: 'magic' (choose from 'usual', 'three-step', 'direct'); " + HELP_PLAN,
     ),
     (
         "plan --out x --robot asimo",

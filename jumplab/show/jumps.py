@@ -211,7 +211,7 @@ def jump_strobe(result: SimulationResult | Tape, robot: Robot) -> Figure:
     Heights are true; sideways the frames are evenly spaced, so that none hides another. A jump that goes more to the
     side than ahead is seen from the front.
     """
-    height, travel = com_height(result), np.abs(np.ptp(result.com, axis=0))
+    height, travel = com_height(result), np.ptp(result.q[:, :2], axis=0)
     rows = _strip_rows(result, height)
     fig = style.new_figure(style.PAGE_IN, 2.6)
     ax = fig.subplots()

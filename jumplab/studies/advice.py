@@ -16,16 +16,18 @@ from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
-NEAR, MILDER = 0.75, 0.6  # of a bound, and of a number that a solver could not meet
+NEAR = {"height_m": 0.75, "distance_m": 0.55, "platform_m": 0.6}  # of a bound, which plans do not reach
+MILDER = 0.6  # of a number that a solver could not meet
 BEYOND = 1.4  # times the least distance that a platform takes
 HIGHER = 3.0  # times the least height that a flip's rotation takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
-TRIES, LONGEST_S = 8, 15.0  # so many easier targets are tried, and none is begun after so long [s of CPU time]
+TRIES, LONGEST_S = 8, 30.0  # so many easier targets are tried, and none is begun after so long [s of CPU time]
+THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 NUMBERS = {"distance_m": "distance", "height_m": "height", "platform_m": "platform", "side_m": "side"}
 
 
-def plan_or_advise(planner: Planner, task: JumpTask, method: str = "three-step") -> JumpPlan:
+def plan_or_advise(planner: Planner, task: JumpTask, method: str = "usual") -> JumpPlan:
     """The plan of a target, as :meth:`jumplab.Planner.plan`; a refusal ends with an easier target that has a plan.
 
     Looking for that takes some seconds, so studies of many targets leave it out.
@@ -36,7 +38,7 @@ def plan_or_advise(planner: Planner, task: JumpTask, method: str = "three-step")
         raise advised(e, planner, task, method) from e
 
 
-def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str = "three-step") -> JumplabError:
+def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str = "usual") -> JumplabError:
     """The ``refusal`` again, ending with an easier target that has a clean plan, or saying that none was found.
 
     Each target that is tried is changed in the number that the one before was refused for.
@@ -51,7 +53,7 @@ def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str
 
 def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str, began: float) -> str:
     easier, said = task, refusal
-    if method == "three-step" and isinstance(refusal, SolverError) and _refused(planner, task, "direct") is None:
+    if getattr(refusal, "stage", "") in THREE_STEPS and _refused(planner, task, "direct") is None:
         return "ask for the method 'direct', which has a plan"
     for number in range(TRIES):
         easier = _easier(easier, said, number)
@@ -95,7 +97,7 @@ def _easier(task: JumpTask, refusal: JumplabError, tried: int) -> JumpTask | Non
         higher = None if bound is None else _rounded(HIGHER * bound, up=True)
         changes = {"rotation_rad": 0.0} if higher is None or higher <= task.height_m else {"height_m": higher}
     elif bound is not None:
-        most, asked = NEAR * bound, getattr(task, name)
+        most, asked = NEAR[name] * bound, getattr(task, name)
         least = name == "distance_m" and bound > abs(asked)
         changes = {name: _rounded(BEYOND * bound, up=True) if least else math.copysign(_rounded(most), asked)}
     else:
