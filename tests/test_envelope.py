@@ -138,3 +138,9 @@ def test_the_picture_has_every_reason():
     fig = envelope_map(Envelope("x", (0.0, 0.1), (0.1, 0.2), cells))
     labels = [t.get_text() for t in fig.axes[0].get_legend().get_texts()]
     assert labels == ["friction", "no plan found", "refused before solving", "not tried"]
+
+
+def test_two_maps_at_once_are_refused(capsys, tmp_path):
+    argv = ["envelope", "--out", str(tmp_path / "x"), "--sides-m", "0:0.4:0.2", "--turns-deg", "0:90:45"]
+    assert main(argv) == 2
+    assert capsys.readouterr().err == "jumplab: --sides-m and --turns-deg are two maps; leave one of them away\n"

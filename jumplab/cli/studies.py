@@ -230,13 +230,25 @@ def _steps(option: str, text: str) -> list[float]:
     opt("--out DIR", "folder for the map; an interrupted one goes on", None, folder, required=True),
     opt("--distances-m A:B:STEP", "of the cells [m]", "0:1.2:0.1", _steps),
     opt("--heights-m A:B:STEP", "of the cells [m]", "0.1:0.6:0.1", _steps),
+    opt("--sides-m A:B:STEP", "map sides against distances instead, at one height [m]", None, _steps),
+    opt("--turns-deg A:B:STEP", "map turns on the spot against heights instead", None, _steps),
+    opt("--height-m M", "rise of the CoM in a map of sides [m] (default 0.4)", "0.4", number),
     opt("--workers N", "processes side by side", str(os.cpu_count() or 1), whole(1, 256)),
 )
 def envelope(args: Namespace) -> None:
     """Map of the jumps that a robot can do."""
+    if args.sides_m is not None and args.turns_deg is not None:
+        raise InputError("--sides-m and --turns-deg are two maps; leave one of them away")
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    found = maps.envelope(robot, args.distances_m, args.heights_m, folder=args.out, workers=args.workers, tell=print)
+    values, more = (args.distances_m, args.heights_m), {}
+    if args.sides_m is not None:
+        fixed = JumpTask(0.0, args.height_m)
+        values, more = (args.sides_m, args.distances_m), dict(axes=("side_m", "distance_m"), fixed=fixed)
+    elif args.turns_deg is not None:
+        turns = [math.radians(x) for x in args.turns_deg]
+        values, more = (turns, args.heights_m), dict(axes=("yaw_rad", "height_m"))
+    found = maps.envelope(robot, *values, **more, folder=args.out, workers=args.workers, tell=print)
     text = json.dumps(asdict(found) | {"hash": robot.hash}, indent=1).replace("NaN", "null")
     store.write_file(Path(args.out, "envelope.json"), f"{text}\n".encode())
     caption = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
@@ -247,6 +259,8 @@ def envelope(args: Namespace) -> None:
         raise InfeasibleError(f"{robot.name} can do none of these jumps: {reason}")
     for word, cell in (("highest", found.highest), ("farthest", found.farthest)):
         jump = f"{cell.distance_m:.2f} m far with a rise of {cell.height_m:.2f} m"
+        if more:
+            jump += f", {cell.side_m:.2f} m to the left, turned by {math.degrees(cell.yaw_rad):.0f} deg"
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
