@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.sim.scene import Scene as Scene
     from jumplab.stages.plan import JumpPlan as JumpPlan
     from jumplab.stages.planner import Planner as Planner
+    from jumplab.studies.atlas import Atlas as Atlas
     from jumplab.studies.chain import run_chain as run_chain
     from jumplab.studies.envelope import envelope as envelope
     from jumplab.studies.trials import run_trials as run_trials
@@ -47,6 +48,7 @@ _PLACES = {
     "view": "api",
     "Scene": "sim",
     "Perturbation": "sim",
+    "Atlas": "studies.atlas",
     "run_trials": "studies.trials",
     "run_chain": "studies.chain",
     "envelope": "studies.envelope",

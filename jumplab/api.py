@@ -29,7 +29,7 @@ def plan(
     task: JumpTask,
     robot: Robot | str | Path = "bhr",
     *,
-    method: str = "three-step",
+    method: str = "usual",
     **changes: Any,
 ) -> JumpPlan:
     """Plan one jump: three optimisations, then the 1 kHz tape (Sec. III to V of the paper).
@@ -38,17 +38,22 @@ def plan(
     ----------
     task : what to reach.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
-    method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, from a crouch).
+    method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, from a crouch). The
+        default is "three-step" in the plane, and "direct" for a jump to the side or with a turn, see
+        :meth:`jumplab.Planner.plan`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
         :class:`jumplab.Planner`, which plans many targets with them.
 
     Raises
     ------
     InputError, InfeasibleError, SolverError
-        If a stage refuses the target or finds no motion; the sentence says which, and what to ask for instead.
+        If a stage refuses the target or finds no motion; the sentence says which, and ends with an easier target
+        that has a plan, if one was found.
     """
+    from jumplab.studies.advice import plan_or_advise
+
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
-    return Planner(robot, keep=True, **changes).plan(task, method)
+    return plan_or_advise(Planner(robot, keep=True, **changes), task, method)
 
 
 def audit(plan: JumpPlan) -> AuditReport:

@@ -1,4 +1,4 @@
-"""One root for every error that jumplab raises on purpose.
+"""One root for every error that jumplab raises on purpose, and for all objects that say in a line what they are.
 
 A message says what is wrong, where, the value, the limit and what to do. The command line prints the message alone and
 exits with ``exit_code``.
@@ -6,6 +6,8 @@ exits with ``exit_code``.
 
 import os
 import reprlib
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +32,16 @@ class RobotError(InputError):
 
 
 class InfeasibleError(JumplabError):
-    """The question is well posed, but this robot cannot do it (or no plan was found within the limits)."""
+    """The question is well posed, but this robot cannot do it (or no plan was found within the limits).
+
+    ``number`` names what of the target is beyond its limit ("height_m"), ``bound`` is one that no plan passes [m].
+    """
 
     exit_code = 3
+
+    def __init__(self, message: str, *, number: str = "", bound: float | None = None):
+        super().__init__(message)
+        self.number, self.bound = number, bound
 
 
 class SolverError(JumplabError):
@@ -65,3 +74,23 @@ def as_path(value: Any, what: str) -> Path:
     if isinstance(value, str | os.PathLike) and value != "" and isinstance(os.fspath(value), str):
         return Path(value)
     raise InputError(f"{what} must be a path, got {quoted(value)}")
+
+
+# objects ------------------------------------------------------------------------------------------
+class Shown:
+    """A dataclass with arrays in it, whose own text would flood a screen; declare it with ``repr=False``."""
+
+    __slots__ = ()
+
+    def line(self) -> str:
+        """What there is to say of it, without line breaks; by default its plain values, and the names of the rest."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        plain = [f"{k}={x!r}" for k, x in values.items() if isinstance(x, str | int | float) and len(repr(x)) < 40]
+        rest = [k for k in values if not any(text.startswith(f"{k}=") for text in plain)]
+        return ", ".join([*plain, *rest])
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.line()}>"
+
+    def _repr_html_(self) -> str | None:
+        return import_module("jumplab.show.cards").card(self)  # by name: pictures stand above whatever shows itself

@@ -1,13 +1,16 @@
 """Robots made from the default one by hand: other proportions, axes, ankles, arms and base links."""
 
 import pickle
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pinocchio as pin
 from paper import bhr_table as table
 
 from jumplab.robot import Robot
+from jumplab.robot.sagittal import SagittalModel
+from jumplab.robot.stance import com_from_toe, configuration
 
 GOOD = table.URDF_PATH.read_text()
 CONFIG = """
@@ -219,3 +222,57 @@ def values(sagittal) -> list:
 def through_processes(robot: Robot) -> Robot:
     robot.sagittal, robot.actuators, robot.hash  # noqa: B018  (filled in, then sent)
     return pickle.loads(pickle.dumps(robot))
+
+
+# how well the five links stand for the full robot -------------------------------------------------------------------
+SAMPLES = 24  # fixed random postures over the whole joint range
+RATE_RAD_S = 3.0  # of every link, for the momentum
+
+
+@dataclass(frozen=True)
+class ReductionError:
+    """Largest difference between the sagittal and the full model; the shares are of the largest value seen."""
+
+    mass_kg: float
+    com_m: float
+    inertia_kgm2: float
+    momentum_kgm2_s: float
+    inertia_share: float
+    momentum_share: float
+
+
+def reduction_error(robot: Robot) -> ReductionError:
+    """Compare mass, CoM, pitch inertia and angular momentum of both models on random symmetric motions."""
+    s, model, rng = robot.sagittal, robot.model, np.random.default_rng(8)
+    data = model.createData()
+    com, full, flat = [], [], []
+    for _ in range(SAMPLES):
+        joints = s.lower + rng.uniform(0.05, 0.95, 4) * (s.upper - s.lower)
+        angles = s.link_angles(joints, rng.uniform(-0.3, 0.8))
+        rates = rng.uniform(-RATE_RAD_S, RATE_RAD_S, 5)
+        pin.ccrba(model, data, configuration(robot, angles), _velocity(robot, angles, rates))
+        com.append(data.com[0][[0, 2]] - com_from_toe(robot, angles))
+        full.append((data.Ig.inertia[1, 1], data.hg.angular[1]))
+        flat.append(_planar(s, angles, rates))
+    off, top = np.abs(np.subtract(full, flat)).max(axis=0), np.abs(full).max(axis=0)
+    mass = abs(robot.total_mass - s.total_mass)
+    return ReductionError(mass, float(np.abs(com).max()), *off.tolist(), *(off / top).tolist())
+
+
+def _planar(s: SagittalModel, angles: np.ndarray, rates: np.ndarray) -> tuple[float, float]:
+    """Pitch inertia and angular momentum about the CoM of the five links; vectors as x + iz, turned by exp(-ia)."""
+    arms, turn = s.com_arms() @ [1, 1j], np.exp(-1j * angles)
+    r, v = (x - s.mass @ x / s.total_mass for x in (arms @ turn, arms @ (-1j * rates * turn)))
+    return s.inertia.sum() + s.mass @ np.abs(r) ** 2, s.inertia @ rates - s.mass @ (r.conj() * v).imag
+
+
+def _velocity(robot: Robot, angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Rates (nv,) of the full robot: toe at rest, links turning at ``rates``."""
+    s, model, turn = robot.sagittal, robot.model, np.exp(-1j * angles[:4])
+    v = np.zeros(model.nv)
+    base = np.array([*s.span[:3], s.base]) @ [1, 1j] @ (-1j * rates[:4] * turn) / turn[3]
+    v[0], v[2], v[4] = base.real, base.imag, rates[3]
+    joints = s.joint_angles(rates)
+    for name, row, sign in robot.role_signs():
+        v[model.idx_vs[model.getJointId(name)]] = sign * joints[row]
+    return v

@@ -1,8 +1,10 @@
 """Chained jumps: what is refused before any solve, what enters a plan, and chains that stand, wait, and fail."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_chains import planner, rehearsal, waiting
+from fixtures_core import jump
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot import Robot
@@ -11,7 +13,7 @@ from jumplab.sim.kinematics import Gauge
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
 from jumplab.studies.chain.course import CROUCH
-from jumplab.studies.chain.pilot import Ahead, Foresight, posture
+from jumplab.studies.chain.pilot import Ahead, Foresight, _over_feet, posture
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses
@@ -246,6 +248,38 @@ def test_posture_off_the_crouch_enters_within_reason(bhr):
     see.learn_posture(q)
     see.look(0, 0.5, np.zeros(3))
     assert echo.asked[0][1] == pytest.approx([0.0, 0.02, -0.03, 0.1, 0.04])
+
+
+def test_the_trunk_moves_as_planned_over_feet_that_stand_unevenly(bhr):
+    """One foot 2 cm ahead of the other and turned by 3 degrees: throughout the launch each foot keeps its place."""
+    tape = jump(0.6, 0.3, 0.0, "direct").tape
+    model, data = bhr.model, bhr.model.createData()
+    frames = [model.getFrameId(name) for name in bhr.foot.frames]
+
+    def between(q):
+        """From the left sole to the right one along the ground, in axes that look where both feet do, and the turn."""
+        pin.framesForwardKinematics(model, data, q)
+        soles = [data.oMf[f].act(bhr.foot.center) for f in frames]
+        yaw = [np.arctan2(*data.oMf[f].rotation[1::-1, 0]) for f in frames]
+        c, s = np.cos(np.mean(yaw)), np.sin(np.mean(yaw))
+        return np.append(np.array([[c, s], [-s, c]]) @ (soles[1] - soles[0])[:2], yaw[1] - yaw[0])
+
+    rng, q = np.random.default_rng(1), tape.q[0].copy()
+    hips = [i for i, name in enumerate(bhr.joint_names) if "hip_yaw" in name or name == "left_hip_pitch"]
+    q[7:][hips] += rng.uniform(-0.05, 0.05, len(hips))
+    asked = between(q)
+    assert abs(asked[0]) > 5e-3 and abs(asked[2]) > 0.01
+    spline = _over_feet(tape, bhr, q)
+    for time in (0.0, 0.2, 0.9 * tape.takeoff_time):
+        row = np.searchsorted(tape.t, time)
+        moved = tape.q[row].copy()
+        moved[7:] += spline(tape.t[row])
+        pin.framesForwardKinematics(model, data, tape.q[row])
+        level = [data.oMf[f].translation[2] for f in frames]
+        assert between(moved) == pytest.approx(asked, abs=1e-4 if time == 0 else 2e-3)  # heels rise about turned toes
+        assert [data.oMf[f].translation[2] for f in frames] == pytest.approx(level, abs=1e-4)
+    even = _over_feet(tape, bhr, tape.q[0])
+    assert np.abs(even(np.linspace(0, tape.takeoff_time, 50))).max() < 1e-9
 
 
 def test_a_failure_of_the_planner_is_kept_as_words(bhr):

@@ -41,6 +41,18 @@ def test_a_chain_stands_and_hits():
 
 
 @pytest.mark.slow
+def test_a_perturbed_robot_keeps_its_heading_over_five_jumps():
+    """Jump by jump it lands a little turned; that must not grow from one to the next."""
+    course, robot = Course.of([0.6] * 5, 0.3), Robot.load()
+    how = dict(planner=planner(), perturbation=Perturbation.draw(robot, 3, SLIGHT), solve_s=0.2)
+    result = run_chain(course, robot, **how)
+    assert result.stood, result.reason
+    assert np.abs(result.errors_m).max() < 0.01
+    ends = [j.simulation.q[-1] for j in result.jumps]
+    assert max(abs(Gauge(robot).heading(q)) for q in ends) < np.radians(4)
+
+
+@pytest.mark.slow
 def test_nothing_is_reset_between_jumps():
     """The log goes on from jump to jump as the engine's own step has it, and every part passes the honesty checks."""
     result = chain()
@@ -139,18 +151,18 @@ HELP = "'jumplab chain --help' shows what is possible"
 @pytest.mark.parametrize(
     ("arguments", "code", "sentence"),
     [
-        ("--out x", 2, f"the following arguments are required: --distances-m; {HELP}"),
-        ("--distances-m --out x", 2, f"argument --distances-m: expected at least one argument; {HELP}"),
-        ("--distances-m 0.6 far --out x", 2, "--distances-m must be a number, got 'far'"),
-        ("--distances-m 0.6 --height-m tall --out x", 2, "--height-m must be a number, got 'tall'"),
-        ("--distances-m 0.6 0.6 --platforms-m 0.1 --out x", 2, "1 platforms for 2 distances: give one per jump"),
-        ("--distances-m 0.6 --seed -1 --out x", 2, "--seed must be a whole number from 0 to 2147483647, got '-1'"),
-        ("--distances-m 0.6 --runs 1.5 --out x", 2, "--runs must be a whole number from 1 to 10000, got '1.5'"),
-        ("--distances-m 0.6 --solve-s -1 --out x", 2, "solve_s = -1.0 s is outside 0 ... 60 s"),
-        ("--distances-m 0.6 0.2 --platforms-m 0 0.1 --out x", 2,
+        ("--out x", 2, f"the following arguments are required: --distance-m; {HELP}"),
+        ("--distance-m --out x", 2, f"argument --distance-m: expected one argument; {HELP}"),
+        ("--distance-m 0.6,far --out x", 2, "--distance-m must be a number, got 'far'"),
+        ("--distance-m 0.6 --height-m tall --out x", 2, "--height-m must be a number, got 'tall'"),
+        ("--distance-m 0.6,0.6 --platform-m 0.1 --out x", 2, "1 platforms for 2 distances: give one per jump"),
+        ("--distance-m 0.6 --seed -1 --out x", 2, "--seed must be a whole number from 0 to 2147483647, got '-1'"),
+        ("--distance-m 0.6 --runs 1.5 --out x", 2, "--runs must be a whole number from 1 to 10000, got '1.5'"),
+        ("--distance-m 0.6 --solve-s -1 --out x", 2, "solve_s = -1.0 s is outside 0 ... 60 s"),
+        ("--distance-m 0.6,0.2 --platform-m 0,0.1 --out x", 2,
          "jump 2 of 2: the surface 0.1 m high would begin under the sole that stands 0.2 m before it; place them "
          "0.34 m apart or more, toe to toe"),
-        ("--distances-m 0.6 2.9 --out x", 3, "jump 2 of 2: distance = 2.9 m"),
+        ("--distance-m 0.6,2.9 --out x", 3, "jump 2 of 2: distance = 2.9 m"),
     ],
 )  # fmt: skip
 def test_refusals_of_the_command(capsys, tmp_path, monkeypatch, arguments, code, sentence):
@@ -164,7 +176,7 @@ def test_refusals_of_the_command(capsys, tmp_path, monkeypatch, arguments, code,
 @pytest.mark.slow
 def test_the_command_tells_jump_by_jump(capsys, tmp_path):
     out = tmp_path / "chain"
-    code = cli.main(["chain", "--distances-m", "0.5", "--solve-s", "0.2", "--seed", "4", "--out", str(out)])
+    code = cli.main(["chain", "--distance-m", "0.5", "--solve-s", "0.2", "--seed", "4", "--out", str(out)])
     told, err = capsys.readouterr()
     assert code == 0, err
     assert re.search(r"^1 +0\.500 m +0\.500 m +0\.\d{3} m +-?0\.0\d\d m +0\.4\d\d s +0\.200 s", told, re.M), told

@@ -49,7 +49,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep or bench"
+NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, atlas, sweep, bench or "
+NAMES += "completion"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
@@ -76,7 +77,7 @@ REFUSALS = [
     ),
     (
         "plan --out x --method magic",
-        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); " + HELP_PLAN,
+        "argument --method: invalid choice: 'magic' (choose from 'usual', 'three-step', 'direct'); " + HELP_PLAN,
     ),
     (
         "plan --out x --robot asimo",
@@ -89,13 +90,13 @@ REFUSALS = [
     ("trials", "the following arguments are required: DIR; 'jumplab trials --help' shows what is possible"),
     ("trials nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
     ("trials .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
-    ("trials . --n 0", "--n must be at least 1, got 0"),
-    ("trials . --n -3", "--n must be at least 1, got -3"),
-    ("trials . --n 2.5", "--n must be a whole number, got '2.5'"),
-    ("trials . --n many", "--n must be a whole number, got 'many'"),
-    ("trials . --n 1000000", "--n must be at most 100000, got 1000000"),
-    ("trials . --seed -1", "--seed must be at least 0, got -1"),
-    ("trials . --jobs 0", "--jobs must be at least 1, got 0"),
+    ("trials . --n 0", "--n must be a whole number from 1 to 100000, got '0'"),
+    ("trials . --n -3", "--n must be a whole number from 1 to 100000, got '-3'"),
+    ("trials . --n 2.5", "--n must be a whole number from 1 to 100000, got '2.5'"),
+    ("trials . --n many", "--n must be a number, got 'many'"),
+    ("trials . --n 1000000", "--n must be a whole number from 1 to 100000, got '1000000'"),
+    ("trials . --seed -1", "--seed must be a whole number from 0 to 2147483647, got '-1'"),
+    ("trials . --jobs 0", "--jobs must be a whole number from 1 to 4096, got '0'"),
     (
         "trials . --mode fast",
         "argument --mode: invalid choice: 'fast' (choose from 'position', 'pd'); "
@@ -161,7 +162,8 @@ def planner(bhr, monkeypatch):
     """A planner and an audit that answer at once; tests may change what they say."""
     said = types.SimpleNamespace(error=None, checks=[types.SimpleNamespace(name="slip", passed=True)], task=None)
 
-    def plan_jump(task, robot, method):
+    def plan_jump(planner, task, method):
+        robot = planner.robot
         said.task, said.method = task, method
         if said.error:
             raise said.error
@@ -171,9 +173,9 @@ def planner(bhr, monkeypatch):
 
     def write_audit(folder, into=None):
         ((into or folder) / "passport.json").write_text("{}")
-        return types.SimpleNamespace(checks=said.checks, table=lambda: "the table")
+        return types.SimpleNamespace(checks=said.checks, table=lambda: "the table", to_json=lambda: "{}")
 
-    monkeypatch.setattr("jumplab.stages.planner.plan_jump", plan_jump)
+    monkeypatch.setattr("jumplab.studies.advice.plan_or_advise", plan_jump)
     monkeypatch.setattr("jumplab.auditing.write_audit", write_audit)
     return said
 

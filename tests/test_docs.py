@@ -1,6 +1,7 @@
 """Every public name has a docstring, nothing is longer than what one reads in one go, the README leaves nothing out."""
 
 import ast
+import importlib
 import json
 import re
 from pathlib import Path
@@ -132,3 +133,14 @@ def test_these_checks_can_fail():
     assert undocumented(tree) == ["A.f", "g"] and list(long_functions(tree)) == ["g"]
     assert undocumented(ast.parse("x = 1")) == [""]
     assert unhinted(tree) == ["A.f", "g"] and not unhinted(ast.parse("def f(x: int, *, y: str = '') -> None: ..."))
+
+
+def test_the_book_has_all_that_it_names():
+    """Every module of the reference can be imported; every picture and notebook that a page names is there."""
+    book = ROOT / "notebooks" / "book"
+    modules = re.findall(r"automodule:: ([\w.]+)", (book / "api.md").read_text(encoding="utf-8"))
+    assert len(modules) > 30 and all(importlib.import_module(name).__doc__ for name in modules)
+    for page in ("index.md", "gallery.md"):
+        links = re.findall(r"\]\(([^):]+)\)", (book / page).read_text(encoding="utf-8"))
+        assert links and all((book / link).exists() for link in links), links
+    assert (ROOT / "figures" / "jump.gif").stat().st_size <= 1.5e6

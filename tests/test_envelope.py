@@ -21,7 +21,7 @@ def test_cells_are_plans_within_the_limits(bhr, tmp_path):
     found = envelope(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
     near, far, *refused = found.cells
     assert near.solved and far.solved and all(0.3 < c.share < 1.05 for c in (near, far))
-    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "ask for" in refused[0].reason
+    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "no plan is higher than" in refused[0].reason
     assert far.iterations <= near.iterations  # warm
     assert (found.highest, found.farthest) == (far, far)
     assert told[0] == "height 0.30 m: 2 of 2 cells, up to 0.60 m"
@@ -110,10 +110,11 @@ def test_grids_that_cannot_be_meant(bhr):
 
 
 @pytest.mark.parametrize("argv, sentence", [
-    (["--distances-m", "0:1"], "jumplab: --distances-m must be A:B:STEP with A <= B and a positive STEP, got '0:1'"),
-    (["--heights-m", "1:0:0.1"],
-     "jumplab: --heights-m must be A:B:STEP with A <= B and a positive STEP, got '1:0:0.1'"),
-    (["--workers", "0"], "jumplab: --workers must be a whole number from 1 to 256, got '0'"),
+    (["--distance-m", "0:1"],
+     "jumplab: --distance-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '0:1'"),
+    (["--height-m", "1:0:0.1"],
+     "jumplab: --height-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '1:0:0.1'"),
+    (["--jobs", "0"], "jumplab: --jobs must be a whole number from 1 to 4096, got '0'"),
 ])  # fmt: skip
 def test_bad_input_in_one_sentence(capsys, tmp_path, argv, sentence):
     assert main(["envelope", "--out", str(tmp_path / "x"), *argv]) == 2
@@ -124,7 +125,7 @@ def test_bad_input_in_one_sentence(capsys, tmp_path, argv, sentence):
 @pytest.mark.slow
 def test_the_command_draws_and_names_the_largest_jump(capsys, tmp_path):
     robot = write(tmp_path, child)
-    argv = ["--distances-m", "0.2:0.4:0.2", "--heights-m", "0.2:0.2:0.1", "--workers", "1", "--robot", robot]
+    argv = ["--distance-m", "0.2:0.4:2", "--height-m", "0.2", "--jobs", "1", "--robot", robot]
     assert main(["envelope", "--out", str(tmp_path / "map"), *argv]) == 0
     assert "limited by" in capsys.readouterr().out
     assert (tmp_path / "map" / "envelope.png").stat().st_size > 5000
@@ -141,6 +142,9 @@ def test_the_picture_has_every_reason():
 
 
 def test_two_maps_at_once_are_refused(capsys, tmp_path):
-    argv = ["envelope", "--out", str(tmp_path / "x"), "--sides-m", "0:0.4:0.2", "--turns-deg", "0:90:45"]
-    assert main(argv) == 2
-    assert capsys.readouterr().err == "jumplab: --sides-m and --turns-deg are two maps; leave one of them away\n"
+    argv = ["envelope", "--out", str(tmp_path / "x"), "--side-m", "0:0.4:3"]
+    assert main([*argv, "--yaw-deg", "0:90:3"]) == 2
+    assert capsys.readouterr().err == "jumplab: --side-m and --yaw-deg are two maps; leave one of them away\n"
+    assert main([*argv, "--height-m", "0.3,0.4"]) == 2
+    said = "jumplab: a map of sides has one height, got 2; give --height-m one number\n"
+    assert capsys.readouterr().err == said

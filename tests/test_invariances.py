@@ -23,7 +23,7 @@ from test_export_amounts import short
 
 from jumplab.auditing import AuditReport, audit
 from jumplab.cli import main as command_line
-from jumplab.cli.studies import values_of
+from jumplab.cli.common import values_of
 from jumplab.errors import InputError
 from jumplab.io.files import open_log
 from jumplab.io.folder import read_json, to_json

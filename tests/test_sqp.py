@@ -9,7 +9,8 @@ from test_transcription import random_point, toy
 from jumplab.errors import SolverError
 from jumplab.ocp.assembly import Assembled, Posed
 from jumplab.ocp.nlp import Nlp
-from jumplab.ocp.sqp import GaussNewton, TimeOrder
+from jumplab.ocp.problem import Term
+from jumplab.ocp.sqp import MET, GaussNewton, TimeOrder
 from jumplab.robot import Robot
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
@@ -104,3 +105,39 @@ def test_a_start_without_numbers_is_refused():
     rows = np.zeros(a.n_rows), np.zeros(a.n_rows)
     with pytest.raises(SolverError, match="step 1 of the approach is no number"):
         method.steps(Posed(np.full(a.size, np.nan), np.ones(a.p_size), wide, rows))
+
+
+# beside a solution ------------------------------------------------------------------------------------------------
+def test_steps_beside_a_solution_meet_every_row():
+    """A goal moved by a tenth: met to the last digits, at hardly more than the least cost."""
+    nlp = Nlp(move())
+    first, best = nlp.solve({"goal": 2.0}, flat_guess()), nlp.solve({"goal": 2.2}, flat_guess())
+    found = nlp.settled({"goal": 2.2}, first.guess())
+    assert found.statistics.status == "Settled" and found.statistics.iterations <= 3
+    assert found.statistics.residual <= MET
+    assert found.phases["go"].q[-1, 0] == pytest.approx(2.2, abs=1e-5)
+    assert best.statistics.objective * (1 - 1e-6) <= found.statistics.objective <= 1.02 * best.statistics.objective
+
+
+def test_at_the_solution_nothing_moves():
+    nlp = Nlp(move())
+    best = nlp.solve({"goal": 2.0}, flat_guess())
+    again = nlp.settled({"goal": 2.0}, best.guess())
+    np.testing.assert_allclose(again.phases["go"].q, best.phases["go"].q, atol=1e-4)
+    assert again.statistics.objective == pytest.approx(best.statistics.objective, rel=1e-4)
+
+
+def test_rows_that_cannot_be_met_are_told():
+    nlp = Nlp(move(Term("wall", "-", "m", "node", lambda p: p.q, lower=-np.inf, upper=1.5)))
+    first = nlp.solve({"goal": 1.0}, flat_guess())
+    with pytest.raises(
+        SolverError, match=r"^move: rows are still off by \d\.\de[-+]\d\d \(scaled\) after 4 steps from a"
+    ):
+        nlp.settled({"goal": 2.0}, first.guess())
+
+
+def test_other_weights_are_noticed():
+    nlp = Nlp(move())
+    first = nlp.solve({"goal": 2.0}, flat_guess())
+    name = nlp.assembled.cost_terms[0][1].name
+    assert nlp.weighs_as(first, {}) and not nlp.weighs_as(first, {name: 7.0})

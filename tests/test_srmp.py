@@ -327,7 +327,6 @@ def test_platform_above_the_apex_is_refused_before_solving():
 
 
 @pytest.mark.slow
-def test_just_beyond_the_robot_is_refused_with_a_target_that_has_a_plan():
-    words = r"take-off speed by .*; the same target with a height of 0\.63 m can be planned$"
-    with pytest.raises(SolverError, match=words):
+def test_just_beyond_the_robot_is_refused():
+    with pytest.raises(SolverError, match=r"take-off speed by "):
         srmp_planner().plan(JumpTask(0.53, 0.67, -0.17))

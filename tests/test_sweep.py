@@ -13,7 +13,8 @@ import pytest
 from test_cli import one_sentence, run
 from test_store import names
 
-from jumplab.cli.studies import values_of, weights_of
+from jumplab.cli.common import values_of
+from jumplab.cli.studies import weights_of
 from jumplab.errors import InputError
 from jumplab.robot.description import SHIPPED
 from jumplab.studies import sweep
@@ -59,13 +60,13 @@ def test_a_small_sweep_is_one_table(tmp_path):
 def test_it_goes_on_where_it_stopped(tmp_path, monkeypatch):
     cases, planned = sweep.grid([0.1, 0.2, 0.3], [0.3]), []
 
-    def some(case):
+    def some(case, atlas):
         if len(planned) == 2:
             raise KeyboardInterrupt
         planned.append(case.distance_m)
-        return quick(case)
+        return quick(case), None
 
-    monkeypatch.setattr(sweep, "run_case", some)
+    monkeypatch.setattr(sweep, "_planned", some)
     with pytest.raises(KeyboardInterrupt):
         sweep.run(cases, tmp_path, jobs=1, progress=False)
     assert sweep.TABLE not in names(tmp_path)
@@ -121,11 +122,12 @@ def test_no_such_cluster(tmp_path):
 
 
 def test_another_sweep_is_not_mixed_in(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweep, "run_case", quick)
+    monkeypatch.setattr(sweep, "_planned", lambda case, atlas: (quick(case), None))
     sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)
     with pytest.raises(InputError) as e:
         sweep.run(sweep.grid([0.2], [0.3]), tmp_path, jobs=1, progress=False)
-    assert str(e.value) == f"{str(tmp_path)!r} holds a sweep of other targets, robots or weights; choose another folder"
+    said = "a sweep of other targets, robots, weights or options; choose another folder"
+    assert str(e.value) == f"{str(tmp_path)!r} holds {said}"
     (tmp_path / sweep.CASES).write_text("good morning\n")
     with pytest.raises(InputError, match=r"is no log of a sweep; choose another folder$"):
         sweep.run(sweep.grid([0.1], [0.3]), tmp_path, jobs=1, progress=False)
@@ -133,20 +135,30 @@ def test_another_sweep_is_not_mixed_in(tmp_path, monkeypatch):
 
 REFUSALS = [
     ("sweep", "the following arguments are required: --out; 'jumplab sweep --help' shows what is possible"),
-    ("sweep --out s --distance-m 0:1", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1'"),
-    ("sweep --out s --distance-m 0:1:x", "--distance-m must be FROM:TO:COUNT or A,B,..., got '0:1:x'"),
+    (
+        "sweep --out s --distance-m 0:1",
+        "--distance-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '0:1'",
+    ),
+    (
+        "sweep --out s --distance-m 0:1:x",
+        "--distance-m must be FROM:TO:COUNT or A,B,... with COUNT from 1 to 10000, got '0:1:x'",
+    ),
     ("sweep --out s --height-m low", "--height-m must be a number, got 'low'"),
     ("sweep --out s --height-m 9", "height = 9 m is outside 0.02 ... 1.5 m"),
     ("sweep --out s --weight torque", "--weight must be TERM=A,B,..., got 'torque'"),
-    ("sweep --out s --jobs many", "--jobs must be a number of processes, or -1 for all processors, got 'many'"),
-    ("sweep --out s --method magic", "method 'magic': choose one of three-step, direct"),
+    ("sweep --out s --jobs many", "--jobs must be a number, got 'many'"),
+    (
+        "sweep --out s --method magic",
+        "argument --method: invalid choice: 'magic' (choose from 'three-step', 'direct'); "
+        "'jumplab sweep --help' shows what is possible",
+    ),
     ("sweep --out s --distance-m 0.1,0.1", "the sweep has the same case twice; give every value once"),
     (
         "sweep --out s --robot asimo",
         f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
     ),
-    ("bench --repeats 0", "--repeats must be a number from 1 to 1000, got '0'"),
-    ("bench --repeats 1 --json no/such/file", "--json must name a file in a folder that exists, got 'no/such/file'"),
+    ("bench --repeats 0", "--repeats must be a whole number from 1 to 1000, got '0'"),
+    ("bench --repeats 1 --out no/such/file", "--out must name a file in a folder that exists, got 'no/such/file'"),
     ("bench --distance-m far", "--distance-m must be a number, got 'far'"),
 ]
 

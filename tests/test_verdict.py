@@ -63,10 +63,10 @@ def test_platforms_drops_flips_and_backward_jumps_pass(task):
 
 @pytest.mark.parametrize("task, words", [
     (JumpTask(1.0, 1.2), r"height = 1\.2 m: take-off at 4\.85 m/s, on average \d+ N over 0\.\d\d m of leg stroke"),
-    (JumpTask(2.8, 0.5), r"distance = 2\.8 m: .* at most \d\.\d\d m forward .* ask for \d\.\d\d m"),
-    (JumpTask(-2.9, 0.2), r"distance = -2\.9 m: .* backward .* ask for -\d\.\d\d m"),
-    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* ask for a platform of 0\.\d\d m or less, or for a height of 0"),
-    (JumpTask(0.0, 0.2, rotation_rad=-4 * math.pi), r"rotation = -720 deg: .* ask for a height of 0\.\d\d m"),
+    (JumpTask(2.8, 0.5), r"distance = 2\.8 m: .* at most \d\.\d\d m forward .* cover more than \d\.\d\d m"),
+    (JumpTask(-2.9, 0.2), r"distance = -2\.9 m: .* at most \d\.\d\d m backward"),
+    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* no such plan lands above 0\.\d\d m, and none lands on this one"),
+    (JumpTask(0.0, 0.2, rotation_rad=-4 * math.pi), r"rotation = -720 deg: .* heights of less than 0\.\d\d m"),
 ])  # fmt: skip
 def test_the_absurd_is_refused_in_words(task, words):
     assert re.search(words, message(task)), message(task)
@@ -81,17 +81,17 @@ def number_after(words: str, text: str) -> float:
     return float(re.search(words + r" (-?\d+\.\d+)", text).group(1))
 
 
-def test_nearest_numbers_pass():
-    check(JumpTask(0.0, number_after("ask for", message(JumpTask(0.0, 1.2)))))
-    check(JumpTask(number_after("ask for", message(JumpTask(2.8, 0.5))), 0.5))
-    check(JumpTask(number_after("ask for", message(JumpTask(-2.9, 0.2))), 0.2))
+def test_bounds_are_where_the_verdict_turns():
+    check(JumpTask(0.0, number_after("no plan is higher than", message(JumpTask(0.0, 1.2)))))
+    check(JumpTask(number_after("at most", message(JumpTask(2.8, 0.5))), 0.5))
+    check(JumpTask(-number_after("at most", message(JumpTask(-2.9, 0.2))), 0.2))
     text = message(JumpTask(2.6, 0.6))
-    check(JumpTask(number_after("farthest is", text), number_after(", at a height of", text)))
+    check(JumpTask(number_after("cover more than", text), number_after("m, at", text)))
     text = message(JumpTask(0.5, 0.2, 0.9))
-    check(JumpTask(0.5, 0.2, number_after("platform of", text)))
-    check(JumpTask(0.5, number_after("for a height of", text), 0.9))
+    check(JumpTask(0.5, 0.2, number_after("lands above", text)))
+    check(JumpTask(0.5, number_after("a height of less than", text), 0.9))
     text = message(JumpTask(0.0, 0.2, rotation_rad=4 * math.pi))
-    check(JumpTask(0.0, number_after("ask for a height of", text), rotation_rad=4 * math.pi))
+    check(JumpTask(0.0, number_after("heights of less than", text), rotation_rad=4 * math.pi))
 
 
 @pytest.mark.parametrize("task", [JumpTask(0.0, 0.75), JumpTask(2.0, 0.1), JumpTask(2.4, 0.5), JumpTask(0.3, 0.3, 0.5)])

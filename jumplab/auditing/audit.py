@@ -12,6 +12,7 @@ from jumplab.auditing.report import AuditReport
 from jumplab.errors import InputError, as_path, quoted, require_type
 from jumplab.io.files import write_file
 from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
+from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
@@ -73,6 +74,7 @@ def write_audit(folder: str | Path, task: JumpTask | None = None, *, into: str |
     target in ``summary.json``. Raises :class:`InputError` if a file is missing or damaged, or the folder cannot be
     written to.
     """
+    tell("audit")
     folder = as_path(folder, "a result folder")
     tape = Tape.load(folder / PLAN)
     humanoid = Robot.from_text(_text(folder / URDF), _text(folder / CONFIG))

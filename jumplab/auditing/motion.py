@@ -36,7 +36,7 @@ def checks(r: Replay) -> list[Check]:
         *_steps(r),
         *_reintegration(r),
         *_switch(r),
-        *(_symmetry(r) if r.task is None or r.task.in_plane else ()),
+        *(_symmetry(r) if r.robot.planar and (r.task is None or r.task.in_plane) else ()),
     ]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.io.folder import to_json
 
 SCHEMA = "jumplab-passport-1"
@@ -87,8 +88,8 @@ _TABLE = tomllib.loads(Path(__file__).with_name("limits.toml").read_text(encodin
 LIMITS = {name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()}
 
 
-@dataclass(frozen=True)
-class AuditReport:
+@dataclass(frozen=True, repr=False)
+class AuditReport(Shown):
     """Outcome of an audit: the checks in the order they were made, and what was audited.
 
     The manifest tells robot and its hash, target, number of samples, package versions;
@@ -97,6 +98,12 @@ class AuditReport:
 
     checks: tuple[Check, ...]
     manifest: dict = field(default_factory=dict)
+
+    def line(self) -> str:
+        """How many checks passed, and which did not."""
+        if self.passed:
+            return f"all {len(self.checks)} checks passed"
+        return f"{len(self.failed)} of {len(self.checks)} checks failed: {', '.join(c.name for c in self.failed)}"
 
     @property
     def passed(self) -> bool:

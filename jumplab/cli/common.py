@@ -29,7 +29,7 @@ def command(*options: Option, actions: Sequence[Work] = ()) -> Callable[[Work], 
     """Make a command of a function: its name and docstring are the command's; ``actions`` are commands below it."""
 
     def mark(work: Work) -> Work:
-        work.options, work.actions = (DEBUG, *options), actions
+        work.options, work.actions = (*options, JSON, QUIET, DEBUG), actions
         return work
 
     return mark
@@ -101,8 +101,25 @@ def whole(least: int, most: int) -> Kind:
     return lambda option, text: int(check(option, text))
 
 
+def values_of(option: str, text: str) -> list[float]:
+    """Kind of an option that takes numbers, as FROM:TO:COUNT or with commas."""
+    parts = text.split(":")
+    if len(parts) == 1:
+        return [number(option, part) for part in text.split(",")]
+    if len(parts) != 3 or not parts[2].isdecimal() or not 1 <= int(parts[2]) <= MOST_VALUES:
+        raise InputError(f"{option} must be {VALUES} with COUNT from 1 to {MOST_VALUES}, got {text!r}")
+    first, last, count = number(option, parts[0]), number(option, parts[1]), int(parts[2])
+    return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
+
+
+VALUES, MOST_VALUES = "FROM:TO:COUNT or A,B,...", 10_000
 folder = needing("name a folder", str.strip)
-DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)  # a default would undo it if it stands before COMMAND
+# without defaults, which would undo them where they stand before COMMAND
+DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)
+JSON = opt("--json", "one JSON object on stdout, refusals included, instead of text", argparse.SUPPRESS)
+QUIET = opt("--quiet", "say nothing but what goes wrong (and --json)", argparse.SUPPRESS)
+JOBS = opt("--jobs N", "processes side by side (default: one per core)", None, whole(1, 4096))
+SEED = opt("--seed S", "seed of the first robot (default 0)", None, whole(0, 2**31 - 1))
 PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
 ENGINE = opt("--engine", "physics engine of the simulation", DEFAULT_ENGINE, tuple(ENGINES))
@@ -113,6 +130,13 @@ JUMP = (
     opt("--height-m M", "rise of the CoM in flight [m] (default 0.5)", "0.5", number),
     ROBOT,
 )
+
+
+def without(args: argparse.Namespace, why: str, **options: Any) -> None:
+    """Refuse options that would be ignored: by name, and the value that each has if it was not given."""
+    for name, default in options.items():
+        if getattr(args, name) != default:
+            raise InputError(f"--{name.replace('_', '-')} {why}; leave it away")
 
 
 def judge(audit: Any, folder: str) -> None:

@@ -1,10 +1,12 @@
 """The commands about one jump and its folder: run, plan, audit, simulate, view, export."""
 
 import ast
+import json
 import math
 import time
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
 from jumplab.cli import common
 from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
@@ -15,16 +17,19 @@ from jumplab.task import JumpTask
 store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), Late("jumplab.io.export")
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
+advice, memory = Late("jumplab.studies.advice"), Late("jumplab.studies.atlas")
+movies = Late("jumplab.show.movies")
 
 FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
+MOVIE = needing("name a file that ends in .gif or .mp4", lambda text: text.lower().endswith((".gif", ".mp4")))
 ORDERS = ("depth-first", "breadth-first")
 
 
 @command(
     *JUMP,
     opt("NOTEBOOK*", "which ones, as 00 or 02_srmp (default: all)"),
-    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout)", None, folder),
+    opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout, else here)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
     opt("--engine", "physics engine of the simulations (default: the first that is installed)", None, tuple(ENGINES)),
     opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
@@ -46,11 +51,15 @@ def run(args: Namespace) -> None:
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             values[name] = text
     chosen = notebooks.find_notebooks(args.notebook)
-    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen)
+    shown = "quiet" not in args
+    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen, progress=shown)
+    args.found |= {name: getattr(report, name) for name in ("out", "figures", "notebooks", "wall_s")}
     if (report.out / "plan.npz").is_file():
-        common.print_summary(store.read_plan(report.out)[2])
+        common.print_summary(summary := store.read_plan(report.out)[2])
+        args.found["plan"] = summary
     if (report.out / "simulation.json").is_file():
-        common.print_simulation(store.read_json(report.out / "simulation.json"))
+        common.print_simulation(simulated := store.read_json(report.out / "simulation.json"))
+        args.found["simulation"] = simulated
     print(f"figures in {report.figures}, results and executed notebooks in {report.out}")
     if (report.out / "jump.html").is_file():
         print(f"the jump in 3-D, for any browser: {report.out / 'jump.html'}")
@@ -64,7 +73,8 @@ def run(args: Namespace) -> None:
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
     opt("--side-m M", "travel of the feet to the left [m] (default 0)", "0", number),
     opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
-    opt("--method", "the paper's three steps, or the whole-body problem without them", METHODS[0], METHODS),
+    opt("--method", "three steps, usual in the plane, or the whole-body problem", "usual", ("usual", *METHODS)),
+    opt("--atlas DIR", "folder of an atlas to begin with ('jumplab atlas'); the method is then direct", None, folder),
 )
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
@@ -73,8 +83,10 @@ def plan(args: Namespace) -> None:
     task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    found = planner.plan_jump(task, robot, method=args.method)
+    known = args.atlas and memory.Atlas.load(args.atlas)
+    found = advice.plan_or_advise(planner.Planner(robot, keep=True, atlas=known), task, args.method)
     report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
+    args.found |= {"out": args.out, "plan": found.summary, "audit": _audited(report)}
     common.print_summary(found.summary)
     print(f"plan in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     common.judge(report, args.out)
@@ -87,8 +99,13 @@ def audit(args: Namespace) -> None:
     folder = store.ensure_writable(args.dir)
     with store.transaction(folder) as staging:
         report = auditing.write_audit(folder, into=staging)
+    args.found |= _audited(report)
     print(report.table())
     common.judge(report, args.dir)
+
+
+def _audited(report: Any) -> dict[str, Any]:
+    return json.loads(report.to_json())
 
 
 @command(PLAN, MODE, ENGINE)
@@ -99,23 +116,34 @@ def simulate(args: Namespace) -> None:
     scene = sim.Scene.of_plan(summary, robot)
     result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine)
     store.write_simulation(args.dir, result, summary)
+    args.found |= result.to_json()
     common.print_simulation(result.to_json())
 
 
 @command(
     opt("DIR", "folder of a plan, simulated or not"),
     opt("--out FILE.html", "file to write (default: DIR/jump.html)", None, HTML),
+    opt("--movie FILE", "a moving picture instead of the page: a file that ends in .gif or .mp4", None, MOVIE),
 )
 def view(args: Namespace) -> None:
-    """A jump in 3-D, as one HTML file."""
+    """A jump in 3-D, as one HTML file, or as a moving picture."""
+    if args.movie:
+        common.without(args, "names the page, and --movie is given instead of it", out=None)
     tape, robot, summary = store.read_plan(args.dir)
-    path = Path(args.out or Path(args.dir, "jump.html"))
+    path = Path(args.movie or args.out or Path(args.dir, "jump.html"))
     store.ensure_writable(path.parent)
     simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
     simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None
     task, scene = JumpTask(**summary["target"]), sim.Scene.of_plan(summary, robot)
+    if args.movie:
+        made = movies.write_movie(path, robot, simulation or tape, scene)
+        size = path.stat().st_size
+        args.found |= {"file": path, "bytes": size, "frames": made.frames, "drawn_by": made.drawn_by}
+        print(f"{made.frames} frames, {made.seconds:.1f} s at half speed: {path}, {size / 1e6:.1f} MB")
+        return
     page = pages.page(robot, plan=tape, simulation=simulation, task=task, scene=scene)
     page.save(path)
+    args.found |= {"file": path, "bytes": path.stat().st_size, "title": page.title}
     print(f"{page.title}: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
@@ -130,13 +158,19 @@ def view(args: Namespace) -> None:
     ),
     opt("--out PATH", "file, or folder of a urdf-replay (default: in DIR)", None, folder),
     opt("--simulated", "the simulated jump instead of the planned one"),
-    opt("--fps N", "frames per second of a motion-clip (default 50)", "50", number),
-    opt("--order", "of joints and bodies in a clip: MuJoCo's, or Isaac Lab's (breadth-first)", ORDERS[0], ORDERS),
+    opt("--fps N", "frames per second of a motion-clip (default 50)", None, number),
+    opt(
+        "--order", "of a motion-clip's joints and bodies: MuJoCo's depth-first (default), or Isaac Lab's", None, ORDERS
+    ),
 )
 def export(args: Namespace) -> None:
     """A jump for other programs."""
+    if args.format != "motion-clip":
+        common.without(args, f"is of a motion-clip, not of {args.format}", fps=None, order=None)
+    clip = {"fps": 50.0 if args.fps is None else args.fps, "order": args.order or ORDERS[0]}
     tape, robot, _ = store.read_plan(args.dir)
     motion = motions.Motion.of_simulation_file(args.dir, robot) if args.simulated else motions.Motion.of(tape)
     path = Path(args.out or Path(args.dir, exports.default_name(args.format, motion.source)))
-    exports.write(args.format, motion, robot, path, fps=args.fps, order=args.order)
+    exports.write(args.format, motion, robot, path, **clip)
+    args.found |= {"file": path, "format": args.format, "source": motion.source, "duration_s": motion.duration}
     print(f"{motion.source}, {motion.duration:.3f} s, as {args.format}: {path}")

@@ -5,23 +5,37 @@ limits, 4 internal failure, 130 and 143 interrupted.
 """
 
 import argparse
+import contextlib
 import os
 import re
 import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NoReturn
 
-from jumplab.cli.common import DEBUG, declare
+from jumplab.cli.common import DEBUG, JSON, QUIET, command, declare, opt
+from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
-from jumplab.cli.studies import bench, certify, chain, envelope, sweep, trials
+from jumplab.cli.status import Status
+from jumplab.cli.studies import atlas, bench, certify, chain, envelope, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
-INTERNAL, INTERRUPTED, TERMINATED = 4, 130, 143
-COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, sweep, bench)
+INTERNAL = 4
+
+
+@command(opt("SHELL", "bash, zsh or fish", None, ("bash", "zsh", "fish")))
+def completion(args: argparse.Namespace) -> None:
+    """Completion of commands and options: eval "$(jumplab completion bash)"."""
+    import shtab
+
+    args.found["script"] = shtab.complete(_parser(), args.shell)
+    print(args.found["script"])
+
+
+COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export)
+COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -37,13 +51,15 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
-    parser.add_argument("--debug", **DEBUG[1])
+    for names, how in (JSON, QUIET, DEBUG):
+        parser.add_argument(*names, **how)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     declare(parser, COMMANDS)
     return parser
 
 
-def _work(argv: Sequence[str]) -> None:
+def _work(argv: Sequence[str], found: dict[str, Any]) -> None:
+    """Do what was typed; ``found`` is filled with what --json prints."""
     parser = _parser()
     for text in argv:  # argparse would make an empty list of it
         if re.fullmatch(r"-[^=]*=--", text):
@@ -58,23 +74,28 @@ def _work(argv: Sequence[str]) -> None:
         *first, last = (work.__name__ for work in COMMANDS)
         parser.error(f"choose a command: {', '.join(first)} or {last}")
     else:
-        args.work(args)
+        args.found, quiet = found, "quiet" in args
+        with contextlib.ExitStack() as stack:
+            if not quiet:
+                stack.enter_context(Status(args.command))
+            if quiet or "json" in args:
+                stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+            args.work(args)
     sys.stdout.flush()
 
 
-def _stop(seen: list[int], signum: int, frame: Any) -> NoReturn:
-    """Note the signal before raising: CasADi can lose what is raised within its calls, and only a failure is left."""
-    seen.append(signum)
-    raise KeyboardInterrupt if signum == signal.SIGINT else SystemExit(TERMINATED)
+def _print_json(data: dict[str, Any]) -> None:
+    from jumplab.io.folder import to_json
+
+    print(to_json(data), end="", flush=True)
 
 
-def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
-    """Say in one sentence what has ended a command; returns the exit code."""
-    if isinstance(e, KeyboardInterrupt) or seen[-1:] == [signal.SIGINT]:
-        said = isinstance(e, KeyboardInterrupt) and str(e)
-        code, said = INTERRUPTED, said or "interrupted; what was there before is unchanged"
-    elif seen:
-        return TERMINATED
+def _tell(e: BaseException, heard: Interrupts, debug: bool) -> tuple[int, str]:
+    """Say in one sentence what has ended a command; returns the exit code and the sentence."""
+    if heard.number == signal.SIGTERM:
+        return heard.code, "terminated"
+    if isinstance(e, KeyboardInterrupt) or heard.number is not None:
+        code, said = CODES[signal.SIGINT], (isinstance(e, KeyboardInterrupt) and str(e)) or UNCHANGED
     elif isinstance(e, JumplabError):
         code, said = e.exit_code, str(e)
     else:
@@ -82,26 +103,32 @@ def _tell(e: BaseException, seen: list[int], debug: bool) -> int:
         hint = "" if debug else "; run it again with --debug for the traceback"
         code, said = INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
     if debug:
-        traceback.print_exc()
-    print(f"jumplab: {' '.join(said.split())}", file=sys.stderr)
-    return code
+        traceback.print_exception(e)
+    said = " ".join(said.split())
+    print(f"jumplab: {said}", file=sys.stderr)
+    return code, said
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else list(argv)
+    """Run one command; returns the exit code. Without ``argv`` the process is its own, and ends if interrupted."""
+    alone, argv = argv is None, sys.argv[1:] if argv is None else list(argv)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # an ignored Ctrl-C stays ignored
-    numbers, seen = (signal.SIGTERM, signal.SIGINT) if heard else (signal.SIGTERM,), []
-    before = {number: signal.signal(number, partial(_stop, seen)) for number in numbers}
+    heard, found = Interrupts(alone), {}
     try:
-        _work(argv)
+        with heard.heeded():
+            _work(argv, found)
+            if heard.number is not None:  # and lost
+                raise KeyboardInterrupt
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
     except (KeyboardInterrupt, Exception) as e:
-        return _tell(e, seen, "--debug" in argv)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        code, said = _tell(e, heard, "--debug" in argv)
+        if "--json" in argv:
+            _print_json({**found, "exit_code": code, "error": said})
+        if alone and heard.number is not None:
+            end_soon(code)
+        return code
+    if "--json" in argv:
+        _print_json({**found, "exit_code": 0, "error": None})
     return 0

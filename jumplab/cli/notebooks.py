@@ -12,14 +12,17 @@ import math
 import os
 import re
 import shutil
+import signal
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any
+from typing import Any, ClassVar
 
 from jumplab import errors
 from jumplab.cli.common import Late
@@ -30,7 +33,8 @@ store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jum
 
 STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
 PATTERN = "[0-9][0-9]_*.ipynb"
-_PACKAGE_PARENT = Path(__file__).resolve().parent.parent.parent
+_PACKAGE = Path(__file__).resolve().parent.parent
+_PACKAGE_PARENT = _PACKAGE.parent
 
 
 def check_parameters(namespace: Mapping[str, Any], **extra: type | range) -> None:
@@ -112,16 +116,16 @@ class RunReport:
 
 
 def find_notebooks(names: Sequence[str] = ()) -> list[Path]:
-    """The package's notebooks in their order: beside the package (a checkout), else in ./notebooks.
+    """The package's notebooks in their order: beside the package (a checkout), else those that it was installed with.
 
     ``names`` says which ones, by number or whole name ("02", "02_srmp"); all if empty. Raises InputError if there are
-    none, since an installed package carries no notebooks, or none of a name.
+    none, or none of a name.
     """
-    places = list(dict.fromkeys(root / "notebooks" for root in (_PACKAGE_PARENT, Path.cwd())))
+    places = [root / "notebooks" for root in (_PACKAGE_PARENT, _PACKAGE)]
     found = next(filter(None, (sorted(place.glob(PATTERN)) for place in places)), None)
     if found is None:
         there = " nor in ".join(repr(str(p)) for p in places)
-        raise InputError(f"no notebooks in {there}; run this in a clone of the repository")
+        raise InputError(f"no notebooks in {there}; install jumplab anew")
     for name in names:
         if not any(name in (p.stem, p.stem[:2]) for p in found):
             raise InputError(f"no notebook {name!r}; there are {', '.join(p.stem for p in found)}")
@@ -145,9 +149,9 @@ def run_notebooks(
     Parameters
     ----------
     parameters : name -> value, for instance ``{"distance_m": 0.8}``.
-    out : result folder; ``executed`` in the checkout if None.
-    figures : their folder; if None, ``figures`` in ``out`` if that is given, else in the checkout (or in its result
-        folder where the checkout is read-only).
+    out : result folder; if None, ``executed`` in the checkout, or where one is if there is no checkout.
+    figures : their folder; if None, ``figures`` in ``out`` if that is given or there is no checkout, else in the
+        checkout (or in its result folder where the checkout is read-only).
     progress : show a bar per notebook on stderr.
     """
     start = time.perf_counter()
@@ -156,12 +160,12 @@ def run_notebooks(
     notebooks = [as_path(n, "a notebook").resolve() for n in notebooks or find_notebooks()]
     declared = {n: declared_parameters(n) for n in notebooks}
     values = _checked(dict(parameters or {}), declared.values())
-    root = notebooks[0].parent.parent
+    root, installed = notebooks[0].parent.parent, notebooks[0].is_relative_to(_PACKAGE)
     asked = out is not None
-    out = store.ensure_writable(out if asked else root / "executed").resolve()
+    out = store.ensure_writable(out if asked else (Path.cwd() if installed else root) / "executed").resolve()
     if figures is None:
         figures = out / "figures"
-        if not asked:
+        if not (asked or installed):
             with contextlib.suppress(InputError):
                 figures = store.ensure_writable(root / "figures")
     figures = store.ensure_writable(figures).resolve()
@@ -211,16 +215,42 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool
 
     executed = work.parent / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
-        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": _kernel(scratch, notebook)}
+        manager = _kernel(scratch, notebook)
+        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": manager}
         files = literal(notebook), literal(executed)
+        execute = partial(papermill.execute_notebook, *files, given, cwd=str(work), progress_bar=bar, **kernel)
         try:
-            papermill.execute_notebook(*files, given, cwd=str(work), progress_bar=bar, **kernel)
+            _aside(execute, manager.started)
         except papermill.PapermillExecutionError as e:
             failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, failed)
             raise _explained(notebook.name, e, place) from e
         except DeadKernelError as e:
             raise JumplabError(f"notebook {notebook.name}: its Python process died; is there enough memory?") from e
+
+
+def _aside(execute: Callable[[], Any], started: list[int]) -> None:
+    """Do it in a thread, where the notebooks' client takes no signals; interrupted, its kernels are killed."""
+    raised: list[Exception] = []
+
+    def work() -> None:
+        try:
+            execute()
+        except Exception as e:
+            raised.append(e)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        thread.join()
+    except BaseException:
+        for group in started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(group, signal.SIGKILL)
+        thread.join(1.0)
+        raise
+    if raised:
+        raise raised[0]
 
 
 def _explained(name: str, e: Any, place: str) -> JumplabError:
@@ -255,14 +285,17 @@ def _kernel(scratch: str, notebook: Path) -> type:
     class ThisInterpreter(AsyncKernelManager):
         kernel_spec = KernelSpec(**spec, display_name="Python of jumplab")
         connection_file = Unicode(f"{scratch}/kernel.json")
+        started: ClassVar[list[int]] = []  # process groups
 
         async def start_kernel(self, **kwargs: Any) -> None:
             await super().start_kernel(stdout=DEVNULL, stderr=DEVNULL, **kwargs)  # cells print another way
+            self.started.append(self.provisioner.pid)
 
     return ThisInterpreter
 
 
 def _publish(work: Path, out: Path, figures: Path) -> None:
+    store.settle()
     with store.transaction(out) as staging:
         for p in (work / "result").iterdir():
             if p.is_file():

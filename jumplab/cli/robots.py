@@ -26,6 +26,7 @@ def list_(args: Namespace) -> None:
         except JumplabError as e:
             kg, joints, arms, note = None, None, "", str(e).rpartition(": ")[2]
         rows.append({"name": name, "kg": kg, "joints": joints, "arms": arms, "note": note})
+    args.found["robots"] = rows
     print(tables.table(rows, digits=3))
 
 
@@ -33,13 +34,15 @@ def list_(args: Namespace) -> None:
     opt("URDF", "the robot's URDF, or the name of a shipped robot"),
     opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
     opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
-    opt("--repair WHAT...", "allow a repair: symmetry, inertia or massless; may be repeated", []),
+    opt("--repair WHAT...", "allow a repair: inertia or massless; may be repeated", []),
 )
 def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
     for word in args.repair:
         if word not in jumper.REPAIRS:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
+    if args.repair and (args.config is not None or args.urdf in describe.SHIPPED):
+        raise InputError("--repair is for a bare URDF; a configuration says itself what is repaired, so leave it away")
     if args.config is not None:
         try:
             text = Path(args.config).read_text()
@@ -53,6 +56,7 @@ def check(args: Namespace) -> None:
     else:
         said = "is the default robot, described as jumplab wants it; there is nothing to check"
         raise InputError(f"{args.urdf!r} {said}")
+    args.found |= {"robot": result.robot.name, "notes": result.lines(), "roles": result.rows()}
     print(*result.lines(), sep="\n")
     print(tables.table(result.rows()))
     if args.out is not None:

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import sys
 import time
 from argparse import Namespace
 from dataclasses import asdict
@@ -12,65 +11,59 @@ from pathlib import Path
 from jumplab.cli import common
 from jumplab.cli.common import (
     ENGINE,
+    JOBS,
     JUMP,
     METHODS,
     MODE,
     ROBOT,
-    Kind,
+    SEED,
+    VALUES,
     Late,
     command,
     folder,
     needing,
     number,
     opt,
+    values_of,
     whole,
+    without,
 )
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.io.progress import tell
 from jumplab.task import JumpTask
 
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab.show.certificate")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
+memory = Late("jumplab.studies.atlas")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
 
-MOST, RUNS = 100_000, whole(1, 10_000)  # trials: two days of one core; chains: a day of two; more must be a typo
-JOBS = needing("be a number of processes, or -1 for all processors", {"-1", *map(str, range(1, 4097))}.__contains__)
-REPEATS = needing("be a number from 1 to 1000", lambda text: text.isdecimal() and 1 <= int(text) <= 1000)
+MOST = 100_000  # trials: two days of one core; more must be a typo
+RUNS = whole(1, 10_000)  # of chains: a day of two cores
 FILE = needing(
     "name a file in a folder that exists",
     lambda text: text.strip() and not Path(text).is_dir() and Path(text).resolve().parent.is_dir(),
 )
 KEPT = "interrupted; finished trials are kept, and the same command goes on from there"
-VALUES = "FROM:TO:COUNT or A,B,..."
 
 
-def _count(least: int, most: float = math.inf) -> Kind:
-    def kind(option: str, text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise InputError(f"{option} must be a whole number, got {text!r}") from None
-        if value < least:
-            raise InputError(f"{option} must be at least {least}, got {value}")
-        if value > most:
-            raise InputError(f"{option} must be at most {most}, got {value}")
-        return value
-
-    return kind
+def bars(args: Namespace) -> bool | None:
+    """Whether bars are shown: on a terminal, and not with --quiet."""
+    return False if "quiet" in args else None
 
 
 @command(
     opt("DIR", "folder of a plan; trials.jsonl and trials.json are written there"),
-    opt("--n N", "number of robots (default 200), or of the basin's states (default: all)", None, _count(1, MOST)),
-    opt("--seed S", "seed of the robots (default 0)", None, _count(0)),
+    opt("--n N", "number of robots (default 200), or of the basin's states (default: all)", None, whole(1, MOST)),
+    SEED,
     opt("--basin", "the robot as planned, from 225 wrong states at the apex; writes basin.json"),
     MODE,
     ENGINE,
     opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
     opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
-    opt("--jobs J", "processes (default: one per core)", None, _count(1)),
+    JOBS,
 )
 def trials(args: Namespace) -> None:
     """Let many perturbed robots jump a plan."""
@@ -82,12 +75,14 @@ def trials(args: Namespace) -> None:
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
     settings = many.TrialSettings(args.mode, args.reaim, noise, engine=args.engine)
     try:
+        how = {"jobs": args.jobs, "progress": bars(args)}
         if args.basin:
-            report = basins.landing_basin(args.dir, args.n, settings, jobs=args.jobs)
+            report = basins.landing_basin(args.dir, args.n, settings, **how)
         else:  # 200: a success rate near 95 % is then known to 3 % on either side
-            report = many.run_trials(args.dir, args.n or 200, args.seed or 0, settings, jobs=args.jobs)
+            report = many.run_trials(args.dir, args.n or 200, args.seed or 0, settings, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(KEPT) from None
+    args.found |= report.to_json() | {"resumed": report.resumed}
     for what, said in report.conditions.items():
         print(f"{what}: {said}")
     low, high = report.interval
@@ -106,9 +101,9 @@ def trials(args: Namespace) -> None:
 
 @command(
     opt("DIR", "folder of a plan; trials.jsonl, certificate.json and certificate.html are written there"),
-    opt("--n N", "number of perturbed robots, in each engine and mode (default 10)", "10", _count(1, MOST)),
-    opt("--seed S", "seed of the robots (default 0)", "0", _count(0)),
-    opt("--jobs J", "processes (default: one per core)", None, _count(1)),
+    opt("--n N", "number of perturbed robots, in each engine and mode (default 10)", "10", whole(1, MOST)),
+    SEED,
+    JOBS,
 )
 def certify(args: Namespace) -> None:
     """Do two physics agree on a plan? Audit, both engines, both modes."""
@@ -117,9 +112,11 @@ def certify(args: Namespace) -> None:
     store.ensure_writable(args.dir)
     page = certificate_pages.certificate_page
     try:
-        found = certificates.certify(args.dir, args.n, args.seed, page=lambda c: page(c).html, jobs=args.jobs)
+        how = {"jobs": args.jobs, "progress": bars(args)}
+        found = certificates.certify(args.dir, args.n, args.seed or 0, page=lambda c: page(c).html, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(KEPT) from None
+    args.found |= found.to_json()
     columns = {"name": "as planned", **{name: name for name in sim.ENGINES}, "apart": "apart", "limit": "at most"}
     for mode in found.modes:
         rows = [d.to_json() for d in mode.differences]
@@ -143,34 +140,38 @@ def certify(args: Namespace) -> None:
 
 @command(
     ROBOT,
-    opt("--distances-m M+", "travel of the feet, per jump [m]", None, number, required=True),
-    opt("--height-m M+", "rise of the CoM in flight [m], for all jumps or per jump (default 0.3)", [0.3], number),
-    opt("--platforms-m M+", "height of each landing surface above the first ground [m] (default: level)", None, number),
-    opt("--sides-m M+", "travel of the feet to the left, per jump [m] (default 0)", None, number),
-    opt("--turns-deg DEG+", "turn about the vertical to the left, per jump (default 0)", None, number),
+    opt("--distance-m M", f"travel of the feet, per jump: {VALUES} [m]", None, values_of, required=True),
+    opt("--height-m M", f"rise of the CoM in flight, for all jumps or per jump: {VALUES} [m]", "0.3", values_of),
+    opt("--platform-m M", f"landing surfaces above the first ground: {VALUES} [m] (default: level)", None, values_of),
+    opt("--side-m M", f"travel of the feet to the left, per jump: {VALUES} [m] (default 0)", None, values_of),
+    opt("--yaw-deg DEG", f"turn about the vertical to the left, per jump: {VALUES} [deg] (default 0)", None, values_of),
     opt("--seed S", "seed of a perturbed robot (default: the robot as planned)", None, whole(0, 2**31 - 1)),
     opt("--runs N", "so many perturbed robots, from the seed on; the first is kept in full", "1", RUNS),
-    opt("--ranges", "how much they differ", "slight", ("slight", "wide")),
+    opt("--ranges", "how much they differ (default slight)", None, ("slight", "wide")),
     opt("--look-s S", "when the next jump is planned, from touchdown on [s]; negative: in the air", "-0.3", number),
     opt("--revise-s S", "when it is planned again, from touchdown on [s], or 'never'", "0.1"),
     opt("--solve-s S", "charge each plan this [s] instead of its wall clock", None, number),
     opt("--landing", "how it lands", "spring", ("planned", "spring")),
     opt("--method", "of planning", METHODS[0], METHODS),
     ENGINE,
-    opt("--jobs J", "processes for several runs (default: one per core)", None, whole(1, 4096)),
+    JOBS,
     opt("--out DIR", "folder for plans, log, report and 3-D page", None, folder, required=True),
 )
 def chain(args: Namespace) -> None:
     """Several jumps in a row, each planned while the one before lands."""
     start = time.perf_counter()
+    if args.runs == 1:
+        without(args, "is for several --runs", jobs=None)
+        if args.seed is None:
+            without(args, "says how perturbed robots differ, and neither --seed nor --runs asks for one", ranges=None)
     how = {name: getattr(args, name) for name in ("look_s", "landing", "solve_s", "method", "engine")}
     how["revise_s"] = None if args.revise_s == "never" else number("--revise-s", args.revise_s)
     seed = None if args.seed is None and args.runs == 1 else args.seed or 0
-    turns = None if args.turns_deg is None else [math.radians(x) for x in args.turns_deg]
-    course = chains.Course.of(args.distances_m, args.height_m, args.platforms_m, args.sides_m, turns)
+    turns = None if args.yaw_deg is None else [math.radians(x) for x in args.yaw_deg]
+    course = chains.Course.of(args.distance_m, args.height_m, args.platform_m, args.side_m, turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    ranges = chains.RANGES[args.ranges]
+    ranges = chains.RANGES[args.ranges or "slight"]
     drawn = None if seed is None else sim.Perturbation.draw(robot, seed, ranges)
     result = chains.run_chain(course, robot, perturbation=drawn, **how)
     report = None
@@ -179,6 +180,7 @@ def chain(args: Namespace) -> None:
     where = {"scene": result.scene, "marks_m": course.goals_m}
     page = pages.page(result.robot, simulation=result, title="A chain of jumps", **where)
     audits = chains.write_chain(args.out, result, {"chain.html": page.html}, series=report and report.to_json())
+    args.found |= {"out": args.out} | result.to_json() | {"series": report and report.to_json()}
     _print_chain(result, report)
     print(f"chain in {args.out}, whole run: {time.perf_counter() - start:.1f} s")
     failed = [f"jump {k}: {c.name}" for k, a in enumerate(audits, 1) for c in a.checks if not c.passed]
@@ -217,42 +219,36 @@ def _print_chain(result, report) -> None:
         print(f"  seed {trial.seed}: {trial.reason}")
 
 
-def _steps(option: str, text: str) -> list[float]:
-    parts = [number(option, part) for part in text.split(":")]
-    if len(parts) != 3 or not all(map(math.isfinite, parts)) or parts[2] <= 0 or parts[1] < parts[0]:
-        raise InputError(f"{option} must be A:B:STEP with A <= B and a positive STEP, got {text!r}")
-    count = min(math.floor((parts[1] - parts[0]) / parts[2] + 1e-9), 10_000)
-    return [round(parts[0] + i * parts[2], 9) for i in range(count + 1)]
-
-
 @command(
     ROBOT,
     opt("--out DIR", "folder for the map; an interrupted one goes on", None, folder, required=True),
-    opt("--distances-m A:B:STEP", "of the cells [m]", "0:1.2:0.1", _steps),
-    opt("--heights-m A:B:STEP", "of the cells [m]", "0.1:0.6:0.1", _steps),
-    opt("--sides-m A:B:STEP", "map sides against distances instead, at one height [m]", None, _steps),
-    opt("--turns-deg A:B:STEP", "map turns on the spot against heights instead", None, _steps),
-    opt("--height-m M", "rise of the CoM in a map of sides [m] (default 0.4)", "0.4", number),
-    opt("--workers N", "processes side by side", str(os.cpu_count() or 1), whole(1, 256)),
+    opt("--distance-m M", f"of the cells: {VALUES} [m] (default 0:1.2:13)", "0:1.2:13", values_of),
+    opt("--height-m M", f"of the cells: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
+    opt("--side-m M", f"sides against distances instead, at one height: {VALUES} [m]", None, values_of),
+    opt("--yaw-deg DEG", f"turns on the spot against heights instead: {VALUES}", None, values_of),
+    JOBS,
 )
 def envelope(args: Namespace) -> None:
     """Map of the jumps that a robot can do."""
-    if args.sides_m is not None and args.turns_deg is not None:
-        raise InputError("--sides-m and --turns-deg are two maps; leave one of them away")
+    if args.side_m is not None and args.yaw_deg is not None:
+        raise InputError("--side-m and --yaw-deg are two maps; leave one of them away")
+    if args.side_m is not None and len(args.height_m) != 1:
+        raise InputError(f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number")
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    values, more = (args.distances_m, args.heights_m), {}
-    if args.sides_m is not None:
-        fixed = JumpTask(0.0, args.height_m)
-        values, more = (args.sides_m, args.distances_m), dict(axes=("side_m", "distance_m"), fixed=fixed)
-    elif args.turns_deg is not None:
-        turns = [math.radians(x) for x in args.turns_deg]
-        values, more = (turns, args.heights_m), dict(axes=("yaw_rad", "height_m"))
-    found = maps.envelope(robot, *values, **more, folder=args.out, workers=args.workers, tell=print)
-    text = json.dumps(asdict(found) | {"hash": robot.hash}, indent=1).replace("NaN", "null")
+    values, more, jobs = (args.distance_m, args.height_m), {}, args.jobs or os.cpu_count() or 1
+    if args.side_m is not None:
+        fixed = JumpTask(0.0, args.height_m[0])
+        values, more = (args.side_m, args.distance_m), dict(axes=("side_m", "distance_m"), fixed=fixed)
+    elif args.yaw_deg is not None:
+        values, more = ([math.radians(x) for x in args.yaw_deg], args.height_m), dict(axes=("yaw_rad", "height_m"))
+    found = maps.envelope(robot, *values, **more, folder=args.out, workers=jobs, tell=print)
+    figure, args.found["map"] = pictures.envelope_map(found), asdict(found) | {"hash": robot.hash}
+    store.settle()
+    text = json.dumps(args.found["map"], indent=1).replace("NaN", "null")
     store.write_file(Path(args.out, "envelope.json"), f"{text}\n".encode())
     caption = "Cells with a plan of the direct planner, coloured by the limit of which they use most."
-    style.save_figure(pictures.envelope_map(found), "envelope", args.out, caption, robot=robot)
+    style.save_figure(figure, "envelope", args.out, caption, robot=robot)
     print(f"map in {args.out}: {sum(c.solved for c in found.cells)} of {len(found.cells)} cells have a plan")
     if found.highest is None:
         reason = next((c.reason for c in found.cells if c.reason), "no cell has a plan")
@@ -264,15 +260,24 @@ def envelope(args: Namespace) -> None:
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 
-def values_of(option: str, text: str) -> list[float]:
-    """Numbers written as FROM:TO:COUNT, or with commas."""
-    parts = text.split(":")
-    if len(parts) == 1:
-        return [number(option, part) for part in text.split(",")]
-    if len(parts) != 3 or not parts[2].isdecimal() or not 1 <= int(parts[2]) <= 10_000:
-        raise InputError(f"{option} must be {VALUES}, got {text!r}")
-    first, last, count = number(option, parts[0]), number(option, parts[1]), int(parts[2])
-    return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
+@command(
+    ROBOT,
+    opt("--out DIR", "folder for atlas.npz; an interrupted one goes on", None, folder, required=True),
+    opt("--distance-m M", f"of the nodes: {VALUES} [m] (default 0:1.2:7)", "0:1.2:7", values_of),
+    opt("--height-m M", f"of the nodes: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
+    JOBS,
+)
+def atlas(args: Namespace) -> None:
+    """Plan a grid once: any target between its nodes is then a few steps away."""
+    began, robot = time.perf_counter(), robots.Robot.load(args.robot)
+    store.ensure_writable(args.out)
+    axes, jobs = (args.distance_m, args.height_m), args.jobs or os.cpu_count() or 1
+    found = memory.Atlas.build(robot, *axes, folder=args.out, jobs=jobs, tell=print)
+    args.found |= {"out": args.out, "planned": len(found.nodes), "of": math.prod(map(len, axes))}
+    if not found.nodes:
+        raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
+    print(f"{found} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
+    print(f"whole atlas: {time.perf_counter() - began:.1f} s")
 
 
 def weights_of(pairs: list[str]) -> list[dict[str, float]]:
@@ -287,22 +292,35 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
 
 
 @command(
-    opt("--distance-m M", f"{VALUES} [m] (default 0:1.2:13)", "0:1.2:13", values_of),
+    opt("--distance-m M", f"travel of the feet: {VALUES} [m] (default 0:1.2:13)", "0:1.2:13", values_of),
     opt("--height-m M", f"{VALUES} [m] (default 0.1:0.6:11)", "0.1:0.6:11", values_of),
     opt("--platform-m M", f"{VALUES} [m] (default 0)", "0", values_of),
     opt("--robot NAME...", "robot; may be repeated (default bhr)"),
     opt("--weight TERM=VALUES...", "weights of a term, as TERM=A,B,... or STAGE/TERM=A,B,...; may be repeated", []),
-    opt("--method METHOD", "three-step (default) or direct", "three-step"),
+    opt("--method", "of planning", METHODS[0], METHODS),
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
-    opt("--jobs N", "processes (default: one per processor)", "-1", JOBS),
+    JOBS,
     opt("--cluster ADDRESS", "Dask scheduler that does the work, tcp://HOST:PORT"),
+    opt("--atlas", "build a small atlas of every robot first, and begin direct plans with it"),
+    opt("--tapes HZ", "also keep the motions, so many rows a second, in DIR/tapes", None, number),
 )
 def sweep(args: Namespace) -> None:
     """Plans for a grid of targets, robots and weights, in one table."""
     began, weights = time.perf_counter(), weights_of(args.weight)
+    if args.cluster:
+        without(args, "is for processes of this machine, and --cluster does the work elsewhere", jobs=None)
     axes = (args.distance_m, args.height_m, args.platform_m)
     cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
-    rows = sweeps.run(cases, args.out, jobs=int(args.jobs), cluster=args.cluster)
+    rows = sweeps.run(
+        cases,
+        args.out,
+        jobs=args.jobs or -1,
+        cluster=args.cluster,
+        progress=bars(args),
+        atlas=args.atlas,
+        tapes_hz=args.tapes,
+    )
+    args.found |= {"table": Path(args.out, sweeps.TABLE), "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))
     outcome = f"{planned} planned, {clean} of them clean in the audit"
     print(f"{len(rows)} cases, {outcome}; table in {args.out}/{sweeps.TABLE}")
@@ -311,15 +329,17 @@ def sweep(args: Namespace) -> None:
 
 @command(
     *JUMP,
-    opt("--repeats N", "how often everything is timed (default 7)", "7", REPEATS),
-    opt("--json FILE", "file for ratios and all raw times", None, FILE),
+    opt("--repeats N", "how often everything is timed (default 7)", "7", whole(1, 1000)),
+    opt("--out FILE", "file for ratios and all raw times, as JSON", None, FILE),
 )
 def bench(args: Namespace) -> None:
     """How long planning takes, against one direct NLP."""
     task = JumpTask(args.distance_m, args.height_m)
-    found = benchmark.bench(args.robot, task, int(args.repeats), say=lambda word: print(word, file=sys.stderr))
+    found = benchmark.bench(args.robot, task, args.repeats, say=tell)
+    args.found |= found
     print(tables.table(benchmark.rows(found), digits=3))
     print("audited clean: " + ", ".join(f"{name} {x['clean']} of {x['of']}" for name, x in found["audits"].items()))
-    if args.json is not None:
-        store.write_file(args.json, json.dumps(found, indent=1).encode())
-        print(f"raw times in {args.json}")
+    if args.out is not None:
+        store.settle()
+        store.write_file(args.out, json.dumps(found, indent=1).encode())
+        print(f"raw times in {args.out}")

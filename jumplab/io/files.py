@@ -21,6 +21,13 @@ from jumplab.errors import InputError, as_path
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 LOCK_WAIT_S = 20.0  # a write lasts well under a second: after a longer wait something hangs
+AT_SETTLE: list[Callable[[], None]] = []  # who wants to know, see settle
+
+
+def settle() -> None:
+    """To be called just before results are put in their places: whoever would stop the work raises here, or never."""
+    for call in list(AT_SETTLE):
+        call()
 
 
 @contextlib.contextmanager

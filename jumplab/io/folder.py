@@ -26,7 +26,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from jumplab.errors import InputError, as_path, require_type
-from jumplab.io.files import ensure_writable, locked, made, write_file  # noqa: F401 - two of them for users of a result
+from jumplab.io.files import ensure_writable, locked, made, settle, write_file  # noqa: F401 - two of them for users of a result
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import GRAVITY
@@ -63,6 +63,8 @@ def transaction(folder: str | Path) -> Iterator[Path]:
         staging.mkdir()
         try:
             yield staging
+            if not {_STAGING, _COMMIT} & set(folder.resolve().parts):  # else it is part of a larger one
+                settle()
             staging.rename(folder / _COMMIT)
             _finish(folder)
         finally:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jumplab.errors import InputError, as_path
+from jumplab.errors import InputError, Shown, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
@@ -19,8 +19,8 @@ _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, jo
 DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
-@dataclass(frozen=True)
-class Tape:
+@dataclass(frozen=True, repr=False)
+class Tape(Shown):
     """Launch and flight of the full robot at 1 kHz.
 
     Configurations are in Pinocchio's free-flyer order. The instant of take-off appears twice, once per phase. ``extra``

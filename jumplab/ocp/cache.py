@@ -73,6 +73,12 @@ def _words(problem: Problem) -> list:
     return [problem.name, problem.parameters, phases, terms, bounds, own]
 
 
+def fingerprint(problem: Problem, key: str) -> str:
+    """Hash of what a problem and its solutions depend on; ``key`` says what it was made of besides its words."""
+    made_of = [_sources(), ca.CasadiMeta.version(), _words(problem), key]
+    return hashlib.sha256(json.dumps(made_of, default=lambda array: array.tolist()).encode()).hexdigest()
+
+
 def assembled(problem: Problem, key: str | None = None) -> Assembled:
     """The problem assembled, from the file of ``key`` if there is a sound one, else anew and then kept.
 
@@ -82,9 +88,7 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
     place, modules = folder(), {str(t.expression.__module__) for t in shipped}
     if key is None or place is None or not all(module.startswith(HOME) for module in modules):
         return Assembled(problem)
-    made_of = [_sources(), ca.CasadiMeta.version(), _words(problem), key]
-    name = hashlib.sha256(json.dumps(made_of, default=lambda array: array.tolist()).encode()).hexdigest()
-    path = place / f"{name[:32]}.casadi"
+    path = place / f"{fingerprint(problem, key)[:32]}.casadi"
     known = _read(path, problem)
     if known is not None:
         return Assembled(problem, known)

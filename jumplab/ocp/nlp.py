@@ -7,7 +7,8 @@ re-solve.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextvars import ContextVar
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -16,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from jumplab.errors import InputError, SolverError
+from jumplab.io.progress import tell
 from jumplab.ocp.assembly import Assembled, Posed, pack_multipliers, pose, unpack, unpack_multipliers
 from jumplab.ocp.cache import assembled
 from jumplab.ocp.derivatives import JERK_CHAIN, scatter
@@ -23,6 +25,7 @@ from jumplab.ocp.problem import Problem
 from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
 from jumplab.ocp.sqp import GaussNewton
 
+EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)  # off where nobody reads why there is no plan
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # scaled row error above which a "solved" status is not believed
 IPOPT = {
@@ -69,6 +72,7 @@ class Nlp:
         self, problem: Problem, options: Mapping | None = None, key: str | None = None, like: Nlp | None = None
     ):
         began = time.perf_counter()
+        tell(f"building {problem.name}")
         self.problem, self._options = problem, {**IPOPT, **(options or {})}
         self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
         self.build_s = time.perf_counter() - began
@@ -92,6 +96,12 @@ class Nlp:
         quiet = ("print_time", "error_on_fail", "show_eval_warnings", "calc_lam_p")
         return ca.nlpsol("solver", "ipopt", a.nlp, options | dict.fromkeys(quiet, False))
 
+    def _steps_of(self) -> GaussNewton:
+        try:
+            return self._gauss_newton
+        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
+            raise SolverError(str(e), stage=self.problem.name, status="approach") from e
+
     @cached_property
     def _gauss_newton(self) -> GaussNewton:
         return GaussNewton(self.assembled)
@@ -103,10 +113,7 @@ class Nlp:
         """
         a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
         check_start(a, posed)
-        try:
-            method, began = self._gauss_newton, time.perf_counter()
-        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
-            raise SolverError(str(e), stage=a.problem.name, status="approach") from e
+        method, began = self._steps_of(), time.perf_counter()
         x, count = method.steps(posed)
         f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
         spent, residual = time.perf_counter() - began, float(np.max(posed.beyond(g), initial=0.0))
@@ -144,6 +151,7 @@ class Nlp:
         (lbx, ubx), (lbg, ubg), start = posed.box, posed.rows, {}
         if multipliers is not None:
             start = dict(zip(("lam_x0", "lam_g0"), pack_multipliers(a, multipliers), strict=True))
+        tell(f"solving {a.problem.name}")
         began = time.perf_counter()
         answer = self._solver(x0=posed.x0, p=posed.p, lbx=lbx, ubx=ubx, lbg=lbg, ubg=ubg, **start)
         solve_s, stats = time.perf_counter() - began, self._solver.stats()
@@ -151,10 +159,45 @@ class Nlp:
         status, iterations = stats["return_status"], int(stats["iter_count"])
         residual = float(np.max(posed.beyond(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            raise _failure(a, posed, x, status, iterations, explain)
-        sizes, cost = (len(x), len(g)), float(answer["f"])
+            raise _failure(a, posed, x, status, iterations, explain and EXPLAINED.get())
         functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
-        statistics = Statistics(iterations, status, self.build_s, solve_s, *sizes, cost, residual, functions_s)
+        return self._solution(posed, (x, lam_x, lam_g), iterations, status, solve_s, functions_s)
+
+    def settled(self, parameters: Mapping, near: Mapping[str, PhaseGuess], **how: Any) -> Solution:
+        """From the solution for a target close by to a plan for this one, in a few steps without ipopt.
+
+        Every row is met as closely as ipopt meets it; the cost is not quite the least, see
+        :meth:`jumplab.ocp.sqp.GaussNewton.settled`. ``near`` is that solution's :meth:`Solution.guess`, with the same
+        weights; ``how`` are references, weights, off as of :meth:`solve`. Raises :class:`SolverError` if the target is
+        not that close.
+        """
+        posed = pose(self.assembled, parameters, near, **how)
+        check_start(self.assembled, posed)
+        method, began = self._steps_of(), time.perf_counter()
+        *found, count = method.settled(posed)
+        return self._solution(posed, found, count, "Settled", time.perf_counter() - began)
+
+    def weighs_as(self, near: Solution, weights: Mapping[str, float]) -> bool:
+        """Whether a solution was found with just the weights that :meth:`solve` would take from ``weights``."""
+        now = {**{f"{o}/{t.name}": t.weight for o, t in self.assembled.cost_terms}, **weights}
+        now |= {f"{o}/{t.name}": weights[t.name] for o, t in self.assembled.cost_terms if t.name in weights}
+        return all(now[f"{row['phase']}/{row['name']}"] == row["weight"] for row in near.cost_shares)
+
+    def _solution(
+        self,
+        posed: Posed,
+        found: Sequence[np.ndarray],
+        count: int,
+        status: str,
+        solve_s: float,
+        functions_s: float = 0.0,
+    ) -> Solution:
+        """The solution of ``found``: scaled variables, multipliers of their bounds, multipliers of the rows."""
+        a, (x, lam_x, lam_g) = self.assembled, found
+        f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
+        residual = float(np.max(posed.beyond(g), initial=0.0))
+        sizes = len(x), len(g)
+        statistics = Statistics(count, status, self.build_s, solve_s, *sizes, float(f[0]), residual, functions_s)
         tables = self._cost_shares(x, posed.p), self._constraint_report(g, posed)
         return Solution(unpack(a, x), statistics, self.problem, *tables, unpack_multipliers(a, lam_x, lam_g))
 
@@ -198,7 +241,7 @@ def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteratio
         violations = _conflicts(a, posed)
         if violations:
             said += f": the best compromise still violates {'; '.join(violations)}"
-            said += "; ask for less, or give these terms more room"
+            said += "; they leave each other no room"
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
     return SolverError(said, stage=name, status=status, violations=violations)

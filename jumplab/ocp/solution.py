@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from jumplab.errors import Shown
 from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Problem
 
@@ -18,8 +19,8 @@ def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarra
     return np.array([np.interp(new, old, column) for column in values.T]).reshape(-1, len(new)).T
 
 
-@dataclass(frozen=True)
-class PhaseGuess:
+@dataclass(frozen=True, repr=False)
+class PhaseGuess(Shown):
     """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
 
     duration: float
@@ -46,8 +47,8 @@ class PhaseGuess:
         return replace(self, q=mean(self.q, width), v=mean(self.v, rate_width), a=mean(self.a, rate_width))
 
 
-@dataclass(frozen=True)
-class PhaseSolution:
+@dataclass(frozen=True, repr=False)
+class PhaseSolution(Shown):
     """One phase at its nodes, and between them."""
 
     t: np.ndarray  # (N + 1,) from the start of the phase [s]
@@ -73,8 +74,8 @@ class PhaseSolution:
         return PhaseGuess(self.duration, *self.sample(t), resampled(self.t, self.z, t), dict(self.constants))
 
 
-@dataclass(frozen=True)
-class Multipliers:
+@dataclass(frozen=True, repr=False)
+class Multipliers(Shown):
     """Lagrange multipliers of a solution, free of its mesh: what each limit is worth.
 
     Of limits along a phase they are per unit of its share. Box bounds have the names (phase, "bounds of nodes") and
@@ -99,8 +100,8 @@ class Statistics:
     functions_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Near:
+@dataclass(frozen=True, repr=False)
+class Near(Shown):
     """A start, not a solution: phases that a few steps led to, rows still violated."""
 
     phases: dict[str, PhaseSolution]
@@ -111,7 +112,7 @@ class Near:
         return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution(Near):
     """Result of one solve, every row met; what each cost and the tightest row of each constraint is, for people."""
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.robot.description import Robot, files_of
-from jumplab.robot.reduction import ReductionError, check_reduction
-from jumplab.robot.stance import check_stance, com_from_toe
+from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import Jumper
@@ -23,8 +23,7 @@ class Checkup:
 
     robot: Robot
     jumper: Jumper  # its lumped bodies and the URDF as it was
-    error: ReductionError  # sagittal model against full robot
-    stance: np.ndarray  # (5,) absolute link angles of the standing posture [rad]
+    stance: np.ndarray  # (nq,) Pinocchio configuration of the standing posture, soles at the origin
 
     def rows(self) -> list[dict]:
         """One row per role: joints, direction of their axes, range, torque and speed."""
@@ -42,18 +41,19 @@ class Checkup:
 
     def lines(self) -> list[str]:
         """What else is worth knowing, a line each."""
-        r, tree, e = self.robot, self.jumper.tree, self.error
-        moving, foot, com = len(r.joint_names), r.foot, com_from_toe(r, self.stance)
+        r, tree = self.robot, self.jumper.tree
+        moving, foot, com = len(r.joint_names), r.foot, pin.centerOfMass(r.model, r.model.createData(), self.stance)
         movable = sum(joint.kind in MOVING for joint in tree.joints.values())
         out = [
             f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
             f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
             f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
             f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
-            f"standing: CoM {com[1]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
+            f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
             f"trunk {r.stance['trunk_pitch_rad']:.2f} rad",
-            f"sagittal against full model: mass {e.mass_kg:.1e} kg, CoM {e.com_m:.1e} m, inertia {e.inertia_kgm2:.1e} "
-            f"kg m^2, L {e.momentum_kgm2_s:.1e} kg m^2/s",
+            "five links describe it"
+            if r.planar
+            else "no five links describe it: the spatial program plans all its jumps",
         ]
         return out + [f"changed: {what}: {x:.3g} {unit}" for what, (x, unit) in self.jumper.lumped.changed.items()]
 
@@ -67,7 +67,8 @@ def all_faults(path: str | Path, repair: tuple[str, ...] = ()) -> list[str]:
 def check(path: str | Path, config_text: str) -> Checkup:
     """Build the robot that a URDF and a configuration describe, and measure it; raises :class:`RobotError`."""
     jumper, robot = Robot.imported(Path(path), config_text)
-    return Checkup(robot, jumper, check_reduction(robot), check_stance(robot))
+    check_stance(robot)
+    return Checkup(robot, jumper, stance_configuration(robot))
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:

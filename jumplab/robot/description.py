@@ -15,12 +15,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import RobotError, quoted
+from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes
-from jumplab.robot.reduction import check_reduction
+from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, read_only, reduce
-from jumplab.robot.stance import check_stance
-from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table
+from jumplab.robot.stance import check_stance, standing
+from jumplab.robot_import.config import ROLES, entry, read_toml, roles_table, table
 from jumplab.robot_import.urdf import locate, read_urdf
 from jumplab.task import GRAVITY
 
@@ -74,8 +74,8 @@ class Foot:
         return read_only([(self.heel + self.toe) / 2, 0.0, self.sole_z])
 
 
-@dataclass(frozen=True)
-class Robot:
+@dataclass(frozen=True, repr=False)
+class Robot(Shown):
     """A humanoid: the texts of its URDF and of its TOML file, and all that follows from them; made by :meth:`load`.
 
     Everything is read-only, so that :attr:`hash` names what is planned with; :meth:`with_limits`, :meth:`with_mass` and
@@ -89,7 +89,13 @@ class Robot:
     joints: Mapping[str, tuple[str, ...]] = field(init=False)  # role -> (left, right) names; shoulder () if arms held
     foot: Foot = field(init=False)
     stance: Mapping[str, float] = field(init=False)  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
+    rest: Mapping[str, float] = field(init=False)  # joint -> angle [rad] of the standing posture, beside those
     corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
+
+    def line(self) -> str:
+        """Name, mass, joints, hash."""
+        arms = "" if self.joints["shoulder_pitch"] else ", arms held"
+        return f"{self.name}, {self.total_mass:.1f} kg, {len(self.joint_names)} joints{arms}, hash {self.hash}"
 
     @classmethod
     def load(cls, name_or_path: str | Path = "bhr", *, repair: tuple[str, ...] = ()) -> Robot:
@@ -99,8 +105,8 @@ class Robot:
         ----------
         name_or_path : name of a shipped robot (:data:`SHIPPED`), or path of a TOML file or of a URDF. Of a bare URDF,
             roles, soles and standing posture are found.
-        repair : of a bare URDF, what may be repaired: "symmetry" (mean of left and right), "inertia" (the nearest that
-            a solid can have), "massless" (a gram for bodies without any).
+        repair : of a bare URDF, what may be repaired: "inertia" (the nearest that a solid can have), "massless" (a gram
+            for bodies without any).
         """
         path, config = files_of(name_or_path)
         if config is not None and "source" not in read_toml(config, str(path)):
@@ -108,7 +114,6 @@ class Robot:
         from jumplab.robot_import.roles import draft  # the importer takes time that most robots need not wait for
 
         robot = cls.imported(path, draft(path, repair).text if config is None else config)[1]
-        check_reduction(robot)
         check_stance(robot)
         return robot
 
@@ -146,8 +151,10 @@ class Robot:
         corner = get("actuators", "corner_speed_ratio")
         if not 0 < corner < 1:
             raise RobotError(f"robot configuration: corner_speed_ratio = {corner:g} must lie between 0 and 1")
-        joints, stance = MappingProxyType(joints), MappingProxyType(stance)
-        told = dict(name=get("name", kind=str), joints=joints, foot=foot, stance=stance, corner_speed_ratio=corner)
+        rest = {key: get("rest", key) for key in table(config, "rest")}
+        joints, stance, rest = (MappingProxyType(x) for x in (joints, stance, rest))
+        told = dict(name=get("name", kind=str), joints=joints, foot=foot, stance=stance, rest=rest)
+        told["corner_speed_ratio"] = corner
         for key, value in told.items():
             object.__setattr__(self, key, value)  # once: from here on the dataclass is frozen
         self._check_names()
@@ -243,10 +250,10 @@ class Robot:
     ) -> Robot:
         """Another robot, some links of which weigh otherwise: each ``mass_kg`` [kg], or ``factor`` times as much.
 
-        The inertia scales with the mass, the CoM of the link stays. Left and right move alike in every plan, so name
-        both, ``("left_thigh", "right_thigh")``: with one of them the robot leans, and the audit says by how much. The
-        URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for
-        links that the robot lacks or that have no mass, for numbers that are none, and if the robot cannot stand so.
+        The inertia scales with the mass, the CoM of the link stays. Name both of a pair, ``("left_thigh",
+        "right_thigh")``: with one of them the robot is no longer :attr:`planar`. The URDF gets the new numbers, the
+        TOML a remark on each, so the :attr:`hash` is new. Raises :class:`RobotError` for links that the robot lacks or
+        that have no mass, for numbers that are none, and if the robot cannot stand so.
         """
         return self._changed(*changes.masses(self, link, mass_kg, factor))
 
@@ -296,6 +303,16 @@ class Robot:
     def sagittal(self) -> SagittalModel:
         """The symmetric five-link model of this robot."""
         return reduce(self._model, self.joints, self.foot, self.actuators, self.urdf)
+
+    @cached_property
+    def planar(self) -> bool:
+        """Whether five links in the plane stand for it exactly; if not, the spatial program plans its jumps."""
+        return in_plane(self)
+
+    @cached_property
+    def standing(self) -> np.ndarray:
+        """Pinocchio configuration (nq,) of the standing posture of a robot that is not :attr:`planar`."""
+        return read_only(standing(self))
 
     def role_signs(self) -> tuple[tuple[str, int, float], ...]:
         """(joint, row of its role, sign) for every joint with a role: joint angle = sign * sagittal angle."""

@@ -17,7 +17,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot_import.config import ROLES
 
-PITCH_AXIS = 0.999  # [1] axes canted by less than 2.6 deg count as pitch
+PITCH_AXIS = 0.5  # [1] a joint canted by 60 deg and more swings its limb sideways
 SAGITTAL_LINKS = ("foot", "shank", "thigh", "trunk", "arm")
 SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 # hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)

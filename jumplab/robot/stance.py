@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
+from scipy.optimize import least_squares
 
 from jumplab.errors import RobotError
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, rotated
@@ -15,6 +16,8 @@ if TYPE_CHECKING:  # a robot is checked by this before anybody gets it
 
 STANCE_ROOM_RAD = 0.04  # plans keep 0.03 off every stop
 SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
+WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a robot keeps if it can
+STANDS_M = 1e-3  # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
@@ -73,6 +76,8 @@ def _level(robot: Robot, knee: float, trunk: float, arm: float) -> float:
 
 def check_stance(robot: Robot) -> np.ndarray:
     """The standing posture (5,), refused if a joint has less than :data:`STANCE_ROOM_RAD` left to its stops."""
+    if not robot.planar:
+        return robot.standing
     angles, m = stance_angles(robot), robot.sagittal
     for name, angle, low, high in zip(SAGITTAL_JOINTS, m.joint_angles(angles), m.lower, m.upper, strict=True):
         if min(angle - low, high - angle) < STANCE_ROOM_RAD:
@@ -104,4 +109,80 @@ def configuration(robot: Robot, angles: np.ndarray, toe: tuple[float, float] | n
 
 def stance_configuration(robot: Robot) -> np.ndarray:
     """Pinocchio configuration (nq,) of the standing robot, middle of the soles at the origin."""
+    if not robot.planar:
+        return robot.standing.copy()
     return configuration(robot, stance_angles(robot), toe=-robot.sagittal.sole_center)
+
+
+# robots that need space ---------------------------------------------------------------------------------------------
+def knees(robot: Robot) -> list[tuple[int, float, float]]:
+    """(index into q[7:], sign, angle) of both knees: flexion = sign * q + angle, zero where the leg is straight.
+
+    A planar robot's angles are what they are.
+    """
+    if robot.planar:
+        return [(robot.joint_names.index(n), s, 0.0) for n, row, s in robot.role_signs() if row == 1]
+    model, data = robot.model, robot.model.createData()
+    jacobian, out = pin.computeJointJacobians(model, data, pin.neutral(model)), []
+    for side in (0, 1):
+        hip, knee, ankle = (model.getJointId(robot.joints[role][side]) for role in ("hip_pitch", "knee", "ankle_pitch"))
+        axis = jacobian[3:, model.idx_vs[knee]]
+        sign = 1.0 if axis[1] > 0 else -1.0
+        across = np.eye(3) - np.outer(axis, axis)
+        thigh, shank = (
+            across @ (data.oMi[b].translation - data.oMi[a].translation) for a, b in ((hip, knee), (knee, ankle))
+        )
+        bent = np.arctan2(sign * axis @ np.cross(thigh, shank), thigh @ shank)
+        out.append((model.idx_vs[knee] - 6, sign, float(bent)))
+    return out
+
+
+def rest_angles(robot: Robot) -> np.ndarray:
+    """Angles (nv - 6,) of the joints as told for the standing posture, else zero or well inside the range [rad]."""
+    rows = [robot.actuators[name] for name in robot.joint_names]
+    low, high = (np.array([r[key] for r in rows]) for key in ("lower", "upper"))
+    room = np.minimum(2 * STANCE_ROOM_RAD, (high - low) / 3)
+    return np.clip([robot.rest.get(name, 0.0) for name in robot.joint_names], low + room, high - room)
+
+
+def standing(robot: Robot) -> np.ndarray:
+    """Pinocchio configuration (nq,) with flat feet that point ahead, the CoM above them, knees and trunk as told.
+
+    Raises :class:`RobotError` if the legs reach no such posture within their ranges.
+    """
+    model, data, q = robot.model, robot.model.createData(), pin.neutral(robot.model)
+    frames, bends, wish = [model.getFrameId(n) for n in robot.foot.frames], knees(robot), robot.stance["knee_rad"]
+    supports = {j for f in frames for j in model.supports[model.frames[f].parentJoint]}
+    legs = np.array([model.idx_qs[j] for j in sorted(supports) if j > 1])
+    q[7:] = rest_angles(robot)
+    q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, robot.stance["trunk_pitch_rad"], 0.0)).coeffs()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    first = [data.oMf[f].act(robot.foot.center) for f in frames]
+    wide = abs(first[0][1] - first[1][1])
+    for k, sign, angle in bends:
+        q[7 + k] = sign * (wish - angle)
+
+    def missing(x):
+        q[[0, 2]], q[legs] = x[:2], x[2:]
+        pin.centerOfMass(model, data, q)
+        pin.framesForwardKinematics(model, data, q)
+        rows = [data.com[0][0], np.mean([sign * q[7 + k] + angle for k, sign, angle in bends]) - wish]
+        (x1, y1, z1), (x2, y2, z2) = (data.oMf[f].act(robot.foot.center) for f in frames)
+        rows += [x1, x2, z1, z2, y1 + y2]
+        for axes in (data.oMf[f].rotation for f in frames):
+            rows += [axes[2, 0], axes[2, 1], axes[1, 0]]
+        return np.array([*rows, WIDTH_WEIGHT * (y1 - y2 - wide)])
+
+    low, high = (x[legs] for x in (model.lowerPositionLimit, model.upperPositionLimit))
+    room = np.minimum(STANCE_ROOM_RAD, (high - low) / 3)
+    begin = np.concatenate([[0.0, -np.mean(first, axis=0)[2]], np.clip(q[legs], low + room, high - room)])
+    ends = np.concatenate([[-np.inf] * 2, low + room]), np.concatenate([[np.inf] * 2, high - room])
+    begin = np.clip(begin, ends[0] + 1e-9, ends[1] - 1e-9)
+    found = least_squares(missing, begin, bounds=ends, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    if np.abs(missing(found.x)[:-1]).max() > STANDS_M:
+        raise RobotError(
+            f"robot {robot.name}: no standing posture with the knees at {wish:g} rad and the trunk at "
+            f"{robot.stance['trunk_pitch_rad']:g} rad has flat feet below the CoM, "
+            f"{1e3 * np.abs(found.fun[:-1]).max():.0f} mm or mrad are missing; change [stance] in its configuration"
+        )
+    return q

@@ -18,9 +18,10 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
+from jumplab.robot_import.roles import LEG
 from jumplab.robot_import.urdf import Tree, parse
 
-REPAIRS = ("inertia", "massless", "symmetry")
+REPAIRS = ("inertia", "massless")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as shares of the leg's
 # length from hip to ankle: the trunk's rear, front, half width, bottom and top, from the middle between the hips.
@@ -94,49 +95,28 @@ def _sole(config: dict, lumped: Lumped, where: str) -> dict[str, float]:
 
 # the range of the hips ------------------------------------------------------------------------------------------
 def _cut_hips(lumped: Lumped, roles: RoleJoints, urdf: str) -> Lumped:
-    """Hip ranges cut to where the boxes of thigh and trunk meet."""
-    left, right = (lumped.body(name) for name in roles["hip_pitch"])
-    low, high = _free_range(lumped, roles, urdf)
-    cut = max(abs(low - left.limits["lower"]), abs(high - left.limits["upper"]))
-    if cut == 0.0:
-        return lumped
-    mirrored = (low, high) if left.axis @ right.axis > 0 else (-high, -low)
-    new = {}
-    for body, (least, most) in ((left, (low, high)), (right, mirrored)):
-        limits = {"lower": max(body.limits["lower"], least), "upper": min(body.limits["upper"], most)}
-        new[body.name] = replace(body, limits=body.limits | limits)
-    changed = lumped.changed | {"hip range cut, thigh meets trunk": (cut, "rad")}
-    return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
-
-
-def _free_range(lumped: Lumped, roles: RoleJoints, urdf: str) -> tuple[float, float]:
-    """(lower, upper) of the left hip's own angle [rad] around 0 within which neither thigh touches the trunk.
-
-    Both hips are turned together, by mirrored angles, every other joint at 0.
-    """
-    hips = [lumped.body(name) for name in roles["hip_pitch"]]
+    """Hip ranges around 0 cut to where the boxes of thigh and trunk meet; canted hips keep theirs."""
     model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
-    shapes = pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
-    carried = [lumped.body(name).parent for name in roles["knee"]]
-    thighs = [model.getJointId(b.joint) for b in lumped.bodies if b.name in carried]
+    shapes, new, cut = pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION), {}, 0.0
     joint = [shape.parentJoint for shape in shapes.geometryObjects]
-    for i, k in ((i, k) for i, a in enumerate(joint) for k, b in enumerate(joint) if a == 1 and b in thighs):
-        shapes.addCollisionPair(pin.CollisionPair(i, k))
-    data, places = model.createData(), shapes.createData()
-
-    def free(angle: float) -> bool:
-        q = pin.neutral(model)
-        for hip in hips:
-            q[model.idx_qs[model.getJointId(hip.joint)]] = np.sign(hip.axis[1] * hips[0].axis[1]) * angle
-        pin.computeDistances(model, data, shapes, places, q)
-        return min(d.min_distance for d in places.distanceResults) > FREE_M
-
-    ends = []
-    for end in (hips[0].limits["lower"], hips[0].limits["upper"]):
-        grid = np.linspace(0.0, end, max(int(abs(end) / STEP_RAD), 1) + 1)
-        met = next((i for i, angle in enumerate(grid) if not free(angle)), None)
-        ends.append(end if met is None else float(grid[max(met - 1, 0)]))
-    return ends[0], ends[1]
+    for hip, knee in zip(*(map(lumped.body, roles[role]) for role in ("hip_pitch", "knee")), strict=True):
+        thigh = next(model.getJointId(b.joint) for b in lumped.bodies if b.name == knee.parent)
+        shapes.removeAllCollisionPairs()
+        for i, k in ((i, k) for i, a in enumerate(joint) for k, b in enumerate(joint) if a == 1 and b == thigh):
+            shapes.addCollisionPair(pin.CollisionPair(i, k))
+        data, places, limits = model.createData(), shapes.createData(), dict(hip.limits)
+        for end in ("lower", "upper") if abs(hip.axis[1]) == 1 else ():
+            grid, q = np.linspace(0.0, limits[end], max(int(abs(limits[end]) / STEP_RAD), 1) + 1), pin.neutral(model)
+            for i, angle in enumerate(grid):
+                q[model.idx_qs[model.getJointId(hip.joint)]] = angle
+                pin.computeDistances(model, data, shapes, places, q)
+                if min(d.min_distance for d in places.distanceResults) <= FREE_M:
+                    limits[end] = float(grid[max(i - 1, 0)])
+                    break
+        cut = max(cut, *(abs(limits[end] - hip.limits[end]) for end in limits))
+        new[hip.name] = replace(hip, limits=limits)
+    changed = lumped.changed | ({"hip range cut, thigh meets trunk": (cut, "rad")} if cut else {})
+    return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
 
 
 # the URDF -------------------------------------------------------------------------------------------------------
@@ -217,7 +197,7 @@ def _spine(boxes: Boxes, hip: np.ndarray) -> Boxes:
 def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
     by_name = {b.name: b for b in lumped.bodies}
-    hips, knees, ankles, arms = ([lumped.body(name) for name in pair] for pair in roles.values())
+    hips, knees, ankles = ([lumped.body(name) for name in roles[role]] for role in LEG)
     leg = float(np.linalg.norm((hips[0].place - ankles[0].place)[[0, 2]]))
     width = {}
     for part, share in THICKNESS.items():
@@ -232,10 +212,24 @@ def _boxes(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, floa
         out[knee.name] = _limb(knee, knee.place, ankle.place, width["shank"])
         centre = [(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2]
         out[foot.name] = [(np.array(centre), np.array([sole["toe"] - sole["heel"], 2 * sole["half"], width["foot"]]))]
-    for arm in arms:
-        lever = arm.inertia.lever
-        out[arm.name] = [(lever, np.maximum(ARM_REACH * np.abs(lever), width["arm"]))]
+    legs = {b.name for ankle in ankles for b in [ankle, *beyond(lumped.bodies, ankle)]}
+    for body in lumped.bodies[:0:-1]:
+        legs |= {body.parent} if body.name in legs else set()
+    for body in lumped.bodies[1:]:
+        if body.name not in legs and (boxes := _arm(lumped, body, width["arm"])):
+            out[body.name] = boxes
     return out
+
+
+def _arm(lumped: Lumped, body: Body, width: float) -> Boxes:
+    """A box around a body of an arm, none where it is short, or carries the rest of the arm beside the trunk."""
+    further, lever = beyond(lumped.bodies, body), body.inertia.lever
+    if not further:
+        return [(lever, np.maximum(ARM_REACH * np.abs(lever), width))]
+    way = further[0].place - body.place
+    if body.parent == lumped.bodies[0].name or np.linalg.norm(way) < 2 * width:
+        return []
+    return [(way / 2, np.maximum((1 - 2 * GAP) * np.abs(way), width))]
 
 
 def _limb(body: Body, start: np.ndarray, end: np.ndarray, width: float) -> Boxes:
@@ -271,6 +265,16 @@ def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], 
         joints="\n".join(f"{role} = {texts(pair)}" for role, pair in roles.items()),
         links=texts(feet),
         sole=sole,
-        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE),
+        stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE) + _rest(config, lumped),
         corner=entry(config, "actuators", "corner_speed_ratio"),
     )
+
+
+def _rest(config: dict, lumped: Lumped) -> str:
+    """The table [rest] of joints that move besides those with a role, if it says anything."""
+    told = {name: entry(config, "rest", name) for name in table(config, "rest")}
+    unknown = sorted(told.keys() - {b.joint for b in lumped.bodies})
+    if unknown:
+        raise RobotError(f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move")
+    rows = "".join(f"{texts([name])[1:-1]} = {angle:.12g}\n" for name, angle in told.items())
+    return f"\n\n[rest]\n{rows.rstrip()}" if rows else ""

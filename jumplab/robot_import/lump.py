@@ -29,8 +29,10 @@ class Tolerances:
 
     axis_rad: float = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y or z are meant to be
     alike: float = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
-    most_m: float = 0.015  # more than this between left and right is another robot, not a rounding or a cable
-    most_share: float = 0.10  # of a body's mass or inertia, likewise
+    cad_m: float = 0.005  # what a CAD export leaves between left and right is evened out without asking
+    cad_share: float = 0.01  # of a body's mass or inertia, likewise
+    pair_m: float = 0.10  # farther apart two joints are no counterparts
+    same: float = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
 
 TOLERANCES = Tolerances()
@@ -55,7 +57,7 @@ class Lumped:
 
     bodies: tuple[Body, ...]  # trunk first, each after the one that carries it
     foot_offset: np.ndarray  # (3,) from the foot body's origin to the origin of the told foot link [m]
-    changed: dict[str, tuple[float, str]]  # what symmetry and repairs changed: name -> (amount, unit)
+    changed: dict[str, tuple[float, str]]  # what evening out and repairs changed: name -> (amount, unit)
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
 
     def body(self, joint: str) -> Body:
@@ -72,7 +74,7 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
     for link in (source["trunk"], *feet):
         if link not in tree.links:
             raise RobotError(f"{tree.where}: the configuration names the link {link!r}, which the URDF lacks")
-    moving = _moving_joints(tree, roles, source["trunk"], feet)
+    moving = _moving_joints(tree, roles, source["trunk"], feet, _free(config))
     held = {name: angle for name, angle in _held_angles(tree, config).items() if angle and name not in moving}
     pose = tree.poses(held)
     turn = robot_axes(pose[source["trunk"]].rotation, source["forward"], source["up"])
@@ -83,15 +85,23 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
     changed = {}
     if "massless" in source["repair"]:
         bodies = _with_mass(bodies, changed)
-    bodies = _mirrored(tree.where, bodies, roles, "symmetry" in source["repair"], changed)
+    bodies = _mirrored(bodies, changed)
     offset = placed[feet[0]].translation - next(b for b in bodies if b.name == feet[0]).place
     return Lumped(tuple(bodies), offset, changed, held)
 
 
 # what moves, and how far ----------------------------------------------------------------------------------------
-def _moving_joints(tree: Tree, roles: RoleJoints, trunk: str, feet: Sequence[str]) -> list[str]:
-    """Names of the joints that jump: those of the roles, and every revolute joint between trunk and feet."""
-    moving = [name for pair in roles.values() for name in pair]
+def _free(config: dict) -> list[str]:
+    """Names of further joints that move: of arms and waist."""
+    names = table(config, "joints").get("free", [])
+    return entry(config, "joints", "free", kind=str, count=len(names)) if isinstance(names, list) and names else []
+
+
+def _moving_joints(
+    tree: Tree, roles: RoleJoints, trunk: str, feet: Sequence[str], free: Sequence[str] = ()
+) -> list[str]:
+    """Names of the joints that jump: those of the roles, ``free`` ones, every revolute joint between trunk and feet."""
+    moving = list(dict.fromkeys([*(name for pair in roles.values() for name in pair), *free]))
     for name in moving:
         if name not in tree.joints:
             raise RobotError(f"{tree.where}: a role names the joint {name!r}, which the URDF lacks")
@@ -219,29 +229,30 @@ def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
 
 
 # left and right -------------------------------------------------------------------------------------------------
-def _mirrored(where: str, bodies: list[Body], roles: RoleJoints, allowed: bool, changed: dict) -> list[Body]:
-    """Left and right as exact mirror images: their means, where they are alike or that is ``allowed``."""
-    trunk, out = bodies[0], {}
-    place, mass = (0.0, trunk.name), (0.0, trunk.name)  # largest difference [m], and share, with the body's name
-    for left, right in [(trunk, trunk), *_pairs(where, bodies, roles)]:
-        own, other = left.inertia.toPseudoInertia().toMatrix(), _image(right.inertia.toPseudoInertia().toMatrix())
-        gap = float(np.abs(left.place - MIRROR @ right.place).max())
-        mean, image = (own + other) / 2, MIRROR @ right.inertia.lever
-        weighs = left.inertia.mass > 0
-        if weighs:
-            if min(left.inertia.mass, right.inertia.mass) > 10 * DUMMY.mass:
-                gap = max(gap, float(np.abs(left.inertia.lever - image).max()))
-            heavier = float(abs(own[3, 3] - other[3, 3]) / mean[3, 3])
-            spread = float(np.abs(own - other)[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
-            mass = max(mass, (max(heavier, spread), left.name), key=lambda x: x[0])
-        place = max(place, (gap, left.name), key=lambda x: x[0])
-        middle = (left.place + MIRROR @ right.place) / 2
-        here, away = (_inertia(mean), _inertia(_image(mean))) if weighs else (left.inertia, right.inertia)
+def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
+    """Left and right as exact mirror images, their means, if they differ no more than a CAD export leaves."""
+    out, gap, share = {}, 0.0, 0.0  # largest differences [m], [1]
+    for left, right in _pairs(bodies):
+        middle, gaps = (left.place + MIRROR @ right.place) / 2, [left.place - MIRROR @ right.place]
+        here, away = left.inertia, right.inertia
+        if here.mass > 0:
+            own, other = here.toPseudoInertia().toMatrix(), _image(away.toPseudoInertia().toMatrix())
+            mean = (own + other) / 2
+            if min(here.mass, away.mass) > 10 * DUMMY.mass:
+                gaps.append(here.lever - MIRROR @ away.lever)
+            spread = np.abs(own - other)[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12)
+            share = max(share, abs(own[3, 3] - other[3, 3]) / mean[3, 3], spread)
+            here, away = _inertia(mean), _inertia(_image(mean))
+        gap = max(gap, np.abs(gaps).max())
         out[left.joint] = replace(left, place=middle, inertia=here)
         if right is not left:
             out[right.joint] = replace(right, place=MIRROR @ middle, inertia=away, axis=_same_axis(left, right))
-    _judge(where, place, mass, allowed, changed)
-    return [out.get(b.joint, b) for b in bodies]
+    even = gap <= TOLERANCES.cad_m and share <= TOLERANCES.cad_share
+    done = "evened out" if even else "differ, left as they are"
+    if max(gap, share) > TOLERANCES.alike:
+        changed[f"left and right {done}, places"] = (1e3 * float(gap), "mm")
+        changed[f"left and right {done}, masses"] = (100 * float(share), "%")
+    return [out.get(b.joint, b) for b in bodies] if even else bodies
 
 
 def _image(moments: np.ndarray) -> np.ndarray:
@@ -261,37 +272,19 @@ def _same_axis(left: Body, right: Body) -> np.ndarray:
     return image if np.linalg.norm(image - right.axis) < 10 * TOLERANCES.axis_rad else right.axis
 
 
-def _judge(where: str, place: tuple[float, str], mass: tuple[float, str], allowed: bool, changed: dict) -> None:
-    (gap, at), (share, heavy), most, said = place, mass, TOLERANCES, f"{where}: left and right differ by"
-    if gap > most.most_m or share > most.most_share:
-        far = gap > most.most_m
-        what = f"{1e3 * gap:.1f} mm at {at!r}" if far else f"{100 * share:.1f} % in mass or inertia at {heavy!r}"
-        raise RobotError(
-            f"{said} {what}, at most {1e3 * most.most_m:g} mm and {100 * most.most_share:g} % can be evened out; a "
-            f"symmetric jump is not defined for this robot, or [locked] holds the arms unevenly"
-        )
-    if max(gap, share) <= most.alike:
-        return
-    if not allowed:
-        said += f" {1e3 * gap:.3g} mm at {at!r} and {100 * share:.3g} % of mass or inertia at {heavy!r}"
-        raise RobotError(f'{said}; allow their mean with [source] repair = ["symmetry"]')
-    changed["left and right evened out, places"] = (1e3 * gap, "mm")
-    changed["left and right evened out, masses"] = (100 * share, "%")
-
-
-def _pairs(where: str, bodies: list[Body], roles: RoleJoints) -> list[tuple[Body, Body]]:
-    """(left, right) bodies that correspond, counted along legs and arms from the trunk."""
-    above, out = {b.name: b for b in bodies}, []
-    for role in ("ankle_pitch", "shoulder_pitch"):
-        limbs = []
-        for body in (b for name in roles[role] for b in bodies if b.joint == name):
-            limb = [body, *beyond(bodies, body)]
-            while limb[0].parent != bodies[0].name:
-                limb.insert(0, above[limb[0].parent])
-            limbs.append(limb)
-        if limbs and len(limbs[0]) != len(limbs[1]):
-            raise RobotError(f"{where}: left and right limbs have {len(limbs[0])} and {len(limbs[1])} moving joints")
-        out += zip(*limbs, strict=True)
+def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
+    """(left, right) bodies that mirror each other, from the trunk outwards; one in the middle is its own image."""
+    image, out = {bodies[0].name: bodies[0].name}, [(bodies[0], bodies[0])]
+    for body in bodies[1:]:
+        if body.name in image:
+            continue
+        flipped = -MIRROR @ body.axis
+        like = [b for b in bodies[1:] if b.parent == image.get(body.parent) and abs(flipped @ b.axis) > TOLERANCES.same]
+        near = [(float(np.abs(MIRROR @ b.place - body.place).max()), b.name, b) for b in like]
+        gap, _, other = min(near, default=(np.inf, "", body))
+        if gap < TOLERANCES.pair_m:
+            image |= {body.name: other.name, other.name: body.name}
+            out.append((body, other) if body.place[1] >= other.place[1] else (other, body))
     return out
 
 

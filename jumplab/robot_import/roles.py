@@ -20,11 +20,13 @@ from jumplab.robot_import.config import ROLES, filled, texts
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, parse, read_urdf
 
 # None of these numbers is printed by the paper.
-PARALLEL = 0.999  # cosine: axes canted by less than 2.6 deg count as pitch
+SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
+PARALLEL = 0.999  # cosine: shoulders canted by less than 2.6 deg swing arms in the plane; others are held
+LOWEST = 0.15  # share of the robot's height within which the ankles are above the lowest joint: arms end higher
+EVEN_RAD = 0.3  # a knee whose range is as even as this says nothing of where the robot faces: its feet do
 SAME_M = 0.02  # how far from mirror images two limbs may stand
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
-ARM_SHARE = 0.5  # a joint that swings less than half of the arm's mass is no shoulder
 SOLE_M = 0.012  # points this near the lowest one belong to the sole
 SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
 # a sole where nothing is known: the default robot's, as shares of the leg's length from hip to ankle
@@ -100,23 +102,25 @@ class _Finder:
         return out
 
     def pitch(self, chain: Chain, lateral: np.ndarray) -> Chain:
-        """Joints of a chain that turn about the lateral axis."""
-        return [j for j in chain if abs(self.axis[j.name] @ lateral) > PARALLEL]
+        """Joints of a chain that turn about the lateral axis, more or less."""
+        return [j for j in chain if abs(self.axis[j.name] @ lateral) > SWINGS]
 
     def triple(self, chain: Chain, lateral: np.ndarray) -> tuple[Joint, Joint, Joint] | None:
-        """Hip, knee, ankle: the three pitch joints with the longest shorter segment between them."""
+        """Hip, knee, ankle: the three pitch joints with the longest shorter segment between them, canted ones last."""
 
         def shorter(three: tuple[Joint, Joint, Joint]) -> float:
             flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(lateral))
-            return min(np.linalg.norm(np.diff(flat, axis=0), axis=1))
+            turning = np.prod([abs(self.axis[j.name] @ lateral) for j in three])
+            return turning * min(np.linalg.norm(np.diff(flat, axis=0), axis=1))
 
         best = max(combinations(self.pitch(chain, lateral), 3), key=shorter, default=None)
         return best if best and shorter(best) > 1e-3 else None
 
     def along(self, three: tuple[Joint, Joint, Joint], up: np.ndarray) -> bool:
-        """True if the leg hangs from hip to ankle."""
-        leg = self.at[three[2].name] - self.at[three[0].name]
-        return leg @ -up > STEEP * np.linalg.norm(leg)
+        """True if the leg hangs from hip to ankle, and ends where the robot does."""
+        leg, heights = self.at[three[2].name] - self.at[three[0].name], np.array([x @ up for x in self.at.values()])
+        low = self.at[three[2].name] @ up < heights.min() + LOWEST * np.ptp(heights)
+        return low and leg @ -up > STEEP * np.linalg.norm(leg)
 
     def legs(self, every_kind: bool = False) -> tuple | None:
         """(lateral, up, limb, triples) of the legs: the lowest mirrored pair with hip, knee and ankle; or None."""
@@ -146,6 +150,11 @@ def find_roles(tree: Tree) -> Roles:
     knee = threes[0][1]
     middle = knee.limits.get("lower", 0.0) + knee.limits.get("upper", 0.0)
     left = lateral * np.sign(finder.axis[knee.name] @ lateral) * (np.sign(middle) or 1.0)
+    if abs(middle) < EVEN_RAD:
+        ahead = np.cross(left, up)
+        soles = [(_foot(finder, x, chain, lateral), x[2].name) for x, chain in zip(threes, limb, strict=True)]
+        reach = [_ahead(finder, *sole, ahead) for sole in soles]
+        left = left * (1.0 if max(reach) >= 0 else -1.0)
     forward = np.cross(left, up)
     order = (1, 0) if left @ lateral > 0 else (0, 1)
     joints = {role: tuple(threes[i][k].name for i in order) for k, role in enumerate(LEG)}
@@ -163,7 +172,7 @@ def find_roles(tree: Tree) -> Roles:
 def _foot(finder: _Finder, three: tuple, chain: Chain, lateral: np.ndarray) -> str:
     """The link that stands: behind the ankle, before any toe joint (a pitch joint beyond the ankle)."""
     at = chain.index(three[2])
-    while at + 1 < len(chain) and abs(finder.axis[chain[at + 1].name] @ lateral) < PARALLEL:
+    while at + 1 < len(chain) and abs(finder.axis[chain[at + 1].name] @ lateral) < SWINGS:
         at += 1
     return chain[at].child
 
@@ -186,15 +195,12 @@ def _shoulders(
     if not arms:
         notes.append("no arms were found: the shoulder is left out")
         return ()
-    limb = max(arms, key=lambda x: finder.mass(x[0][0].child))
-    first = limb[0][0]
-    for pair in zip(*limb, strict=True):
-        heavy = finder.mass(pair[0].child) >= ARM_SHARE * finder.mass(first.child)
-        if heavy and len(finder.pitch(pair, lateral)) == 2:
-            return tuple(pair[i].name for i in order)
-    cant = np.degrees(np.arccos(min(1.0, abs(finder.axis[first.name] @ lateral))))
-    said = f"the arms are held: the first joint, {first.name!r}, turns {cant:.1f} deg off the pitch axis"
-    notes.append(f"{said}, and none behind it swings half of the arm about that axis")
+    pair = [limb[0] for limb in max(arms, key=lambda x: finder.mass(x[0][0].child))]
+    cosine = min(abs(finder.axis[joint.name] @ lateral) for joint in pair)
+    if cosine > PARALLEL:
+        return tuple(pair[i].name for i in order)
+    cant = np.degrees(np.arccos(cosine))
+    notes.append(f"the arms are held: the first joint, {pair[0].name!r}, turns {cant:.1f} deg off the pitch axis")
     return ()
 
 

@@ -25,6 +25,8 @@ _NAMES = {  # module: its public names, loaded when they are first used
     # helpers: bodies, with the sheet of a robot; curves, colours and saving
     "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "
     "draw_path draw_com equal_scales",
+    "movies": "Movie movie",
+    "cards": "card Plots",
     "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
     "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
     "VERMILION INK LIMIT_STYLE REFERENCE_STYLE MIN_FONT_PT",

@@ -237,7 +237,7 @@ def _sheet_joints(ax: Axes, robot: Robot, q: np.ndarray, top: float) -> None:
 
 def _sheet_links(ax: Axes, robot: Robot, top: float) -> None:
     m = robot.sagittal
-    p = draw_five_link(ax, m, stance_angles(robot), -m.sole_center)
+    p = draw_five_link(ax, m, stance_angles(robot, within_limits=robot.planar), -m.sole_center)
     links = ("ankle", "knee", "hip", "shoulder")
     middles = [(p[a] + p[b]) / 2 for a, b in itertools.pairwise(links)]
     places = (p["toe"] + [0.0, 0.03 * top], *middles, p["hand"])

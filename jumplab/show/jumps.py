@@ -10,10 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from jumplab.io.columns import com_height
 from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot
-from jumplab.show import style
+from jumplab.show import style, turning
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip, five_link_points
+from jumplab.stages.spatial import SpatialLimits
 from jumplab.stages.whole_body import Limits
 from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Envelope
 from jumplab.task import GRAVITY
@@ -35,7 +37,7 @@ LEAST_FORCE_SHARE = 0.02  # below this share of the weight, CoP and friction are
 
 def heel_up_time(tape: Tape) -> float:
     """When the heel leaves the ground [s]."""
-    return float(tape.extra["planar_toe_phase_start"])
+    return float(tape.extra["toe_phase_start" if turning.leaves_plane(tape) else "planar_toe_phase_start"])
 
 
 # Fig. 8 ---------------------------------------------------------------------------------------------------------
@@ -45,8 +47,11 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 
     Parameters
     ----------
-    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's.
+    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's; out of the
+        plane in the order of the robot's joints, one column per pair, the right side paler.
     """
+    if turning.leaves_plane(tape):
+        return turning.joint_trajectories(tape, robot, heel_up_time(tape), guess)
     fig = style.new_figure(style.PAGE_IN, 3.1)
     axes = fig.subplots(2, 4, sharex=True)
     m, e = robot.sagittal, tape.extra
@@ -75,6 +80,8 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 @style.styled
 def inertia_and_momentum(tape: Tape) -> Figure:
     """F-9: inertia, CoM velocity and angular momentum of the plan, and dashed what stage 1 asked for."""
+    if turning.leaves_plane(tape):
+        return turning.inertia_and_momentum(tape, heel_up_time(tape))
     fig = style.new_figure(style.PAGE_IN, 3.3)
     axes = fig.subplots(2, 2, sharex=True)
     e, takeoff, known = tape.extra, tape.takeoff_time, "srmp_launch_t" in tape.extra
@@ -102,11 +109,13 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 
 # limits ---------------------------------------------------------------------------------------------------------
 @style.styled
-def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
+def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through the launch.
 
     ``limits`` are the planner's (its defaults if None), drawn dashed inside what the motors could do.
     """
+    if turning.leaves_plane(tape):
+        return turning.margins(tape, robot, limits or SpatialLimits(), heel_up_time(tape))
     limits = limits or Limits()
     fig = style.new_figure(style.PAGE_IN, 3.9)
     names = [["hip", "knee", "ankle", "shoulder"], ["cop", "cop", "friction", "friction"]]
@@ -137,20 +146,9 @@ def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
 
 def _torque_speed(ax: Axes, tape: Tape, robot: Robot, i: int, limits: Limits) -> None:
     m = robot.sagittal
-    speed, corner, effort = m.speed[i], m.corner_speed[i], m.effort[i]
-    # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
-    x = np.array([-speed, -corner, 0.0, corner, speed])
-    upper = np.array([effort, effort, effort, effort, 0.0])
-    ax.fill_between(x, -upper[::-1], upper, color=style.BAND, linewidth=0)
-    for bound in (upper, -upper[::-1]):
-        ax.plot(x, bound, **style.LIMIT_STYLE)
-    cut, top = limits.speed_share * speed, limits.torque_share * effort
-    allowed = np.array([[-cut, corner, cut, cut], [top, top, top * (speed - cut) / (speed - corner), -top]])
-    for sign in (1, -1):
-        ax.plot(*(sign * allowed), **style.REFERENCE_STYLE)
+    turning.motor(ax, m.speed[i], m.corner_speed[i], m.effort[i], limits)
     rates, torques = (tape.extra[f"planar_{name}"][:, i] for name in ("joint_rates", "torques"))
     style.by_phase(ax, rates, torques, tape.phase, linewidth=1.3)
-    ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * speed, 1.08 * speed), ylim=(-1.12 * effort, 1.12 * effort))
 
 
 def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
@@ -207,45 +205,53 @@ def envelope_map(envelope: Envelope) -> Figure:
 
 # simulations ----------------------------------------------------------------------------------------------------
 @style.styled
-def jump_strobe(result: SimulationResult, robot: Robot) -> Figure:
-    """F-1: the simulated jump in one picture, launch, flight and landing in their colours, with the CoM's path.
+def jump_strobe(result: SimulationResult | Tape, robot: Robot) -> Figure:
+    """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's path.
 
-    Heights are true; sideways the frames are evenly spaced, so that none hides another.
+    Heights are true; sideways the frames are evenly spaced, so that none hides another. A jump that goes more to the
+    side than ahead is seen from the front.
     """
-    rows = _strip_rows(result)
+    height, travel = com_height(result), np.ptp(result.q[:, :2], axis=0)
+    rows = _strip_rows(result, height)
     fig = style.new_figure(style.PAGE_IN, 2.6)
     ax = fig.subplots()
     places = STRIP_M * np.arange(len(rows))
     colors = [style.PHASE_COLORS[str(phase)] for phase in result.phase[rows]]
-    film_strip(ax, Silhouette(robot), result.q[rows], result.t[rows], colors, places, below=0.07)
+    view = "front" if travel[1] > travel[0] else "side"
+    film_strip(ax, Silhouette(robot, view), result.q[rows], result.t[rows], colors, places, below=0.07)
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(style.shade(color, 0.8))
     air = (result.phase == "flight") & (result.t >= result.t[rows[0]])
-    draw_path(ax, np.interp(result.t[air], result.t[rows], places), result.com[air, 2])  # linear in time between frames
+    draw_path(ax, np.interp(result.t[air], result.t[rows], places), height[air])  # linear in time between frames
     left, right = ax.get_xlim()
     draw_ground(ax, left, right)
     ax.set_xlim(left, right)
-    style.legend_above(fig, style.phase_handles(*style.PHASE_COLORS))
+    style.legend_above(fig, style.phase_handles(*dict.fromkeys(map(str, result.phase))))
     style.bare(ax)
     return fig
 
 
-def _strip_rows(result: SimulationResult) -> np.ndarray:
+def _strip_rows(result: SimulationResult | Tape, height: np.ndarray) -> np.ndarray:
     """Rows of the frames: start, crouch, lift-off, some of the flight, touchdown, deepest, end."""
     flight = np.flatnonzero(result.phase == "flight")
     if not len(flight):  # it never left the ground
         return np.linspace(0, len(result.t) - 1, 5).astype(int)
     off, on = int(flight[0]), int(flight[-1])
-    rows = [0, int(np.argmin(result.com[:off, 2])), off - 1] if off else []
+    rows = [0, int(np.argmin(height[:off])), off - 1] if off else []
     rows += [off + int(share * (on - off)) for share in FLIGHT_SHARES]
     if on + 1 < len(result.t):
-        rows += [on + 1, on + 1 + int(np.argmin(result.com[on + 1 :, 2])), len(result.t) - 1]
+        rows += [on + 1, on + 1 + int(np.argmin(height[on + 1 :])), len(result.t) - 1]
     return np.array(rows)
 
 
 @style.styled
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
-    """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation."""
+    """F-12: CoM position and velocity, and L during the launch; dashed the plan, coloured the simulation.
+
+    Out of the plane CoM position and velocity alone, in all three directions.
+    """
+    if turning.leaves_plane(tape):
+        return turning.momentum(result, tape, AFTER_TOUCHDOWN_S)
     fig = style.new_figure(style.PAGE_IN, 3.4)
     axes = fig.subplot_mosaic([["x", "z", "L"], ["vx", "vz", "rho"]])
     e = tape.extra

@@ -21,6 +21,7 @@ from matplotlib.lines import Line2D
 from jumplab.errors import InputError
 from jumplab.io.folder import versions
 from jumplab.robot import Robot
+from jumplab.show.waiting import show_waiting
 from jumplab.task import JumpTask
 
 Tasks = JumpTask | Sequence[JumpTask] | None
@@ -44,8 +45,9 @@ STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
 def use_style() -> None:
-    """Make the package's style matplotlib's default for this process (a notebook's second cell)."""
+    """A notebook's second cell: the package's style is matplotlib's, and cells that take long show a bar."""
     plt.style.use(STYLE_FILE)
+    show_waiting()
 
 
 # decorator or ``with`` block: the style, whatever the caller's settings are

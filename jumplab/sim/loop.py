@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, quoted, require_type
+from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import DEFAULT_ENGINE, STEP_S
@@ -23,6 +24,8 @@ from jumplab.sim.reference import LandingSource
 from jumplab.sim.result import STAND_S, Recorder, SimulationResult
 from jumplab.sim.scene import Scene
 from jumplab.sim.servo import Servo
+
+TOLD = 100  # after so many steps it is told how far the run is
 
 
 class Commander(Protocol):
@@ -62,6 +65,8 @@ class Run:
             servo = Servo(self.robot, late_s=how.known_delay_s, substeps=engine.substeps)
             contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
+                if step % TOLD == 0:
+                    tell(f"simulated {step * STEP_S:.1f} s")
                 q, v = engine.state()
                 seen = perceive(q, v, contacts.wrench)
                 command = pilot.command(step, *seen)

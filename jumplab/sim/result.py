@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
+from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
 from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
@@ -97,8 +98,8 @@ class Metrics:
     qp_failures: int
 
 
-@dataclass(frozen=True)
-class SimulationResult:
+@dataclass(frozen=True, repr=False)
+class SimulationResult(Shown, Named):
     """Logs of one simulated jump at 1 kHz, its metrics and its settings.
 
     Row k holds the state at t[k] and what acted in the step that follows.
@@ -121,6 +122,14 @@ class SimulationResult:
     metrics: Metrics
     settings: dict
     checks: tuple[Finding, ...] = ()  # of jumplab.sim.checks.check
+    robot: Robot | None = None  # as it really was; as planned, if read from a folder
+
+    def line(self) -> str:
+        """Travel, rise and verdict."""
+        m = self.metrics
+        far, high = ("none" if x is None else f"{x:.3f} m" for x in (m.foot_distance_m, m.com_rise_m))
+        verdict = f"stands {m.standing_s:.2f} s" if m.landed else f"FAILED, {m.reason}"
+        return f"travel {far}, rise {high}, {verdict}"
 
     @property
     def checks_passed(self) -> bool:
@@ -182,10 +191,10 @@ class SimulationResult:
             raise InputError(f"{folder}: not a readable simulation ({why}); simulate the plan again") from e
         for array in logs.values():
             array.setflags(write=False)
-        return cls(**logs, **names, metrics=metrics, settings=settings, checks=findings)
+        return cls(**logs, **names, metrics=metrics, settings=settings, checks=findings, robot=robot)
 
 
-LOGS = tuple(f.name for f in fields(SimulationResult) if f.name not in ("metrics", "settings", "checks"))
+LOGS = tuple(f.name for f in fields(SimulationResult) if f.name not in ("metrics", "settings", "checks", "robot"))
 
 
 class Recorder:
@@ -230,7 +239,7 @@ class Recorder:
             array.setflags(write=False)
         names = dict(link_names=self._links, joint_names=self._robot.joint_names)
         metrics = self._metrics(log, liftoff, touchdown, solves)
-        return SimulationResult(**log, **names, metrics=metrics, settings=settings)
+        return SimulationResult(**log, **names, metrics=metrics, settings=settings, robot=self._robot)
 
     def _centroidal(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         model, data, rows = self._robot.model, self._gauge.data, []

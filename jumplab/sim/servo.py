@@ -42,7 +42,7 @@ class ServoGains:
 
 GAINS = ServoGains()
 AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-PITCH = 4  # row of a foot's twist that is free while it stands on its toe
+PITCH = 4  # row of a foot's twist, in axes that are turned with it, that is free while it stands on its toe
 
 
 class Servo:
@@ -112,8 +112,9 @@ class Servo:
         """The plan's wrenches (k,) on the feet, about the points on which they stand, less what a toe cannot hold."""
         found, held = [], _held(command.feet)
         for frame, wrench in zip(self._gauge.frames, command.wrench, strict=True):
-            arm = self._gauge.data.oMf[frame].rotation @ self._pivot[command.feet]
-            found.append(np.concatenate([wrench[:3], wrench[3:] - np.cross(arm, wrench[:3])])[held])
+            foot = self._gauge.data.oMf[frame].rotation
+            arm, along = foot @ self._pivot[command.feet], headings(foot)
+            found.append(np.concatenate([along @ wrench[:3], along @ (wrench[3:] - np.cross(arm, wrench[:3]))])[held])
         return np.concatenate(found)
 
     def _feet(self, stand: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -122,16 +123,23 @@ class Servo:
         rows, drifts, units = [np.zeros((0, model.nv))], [np.zeros(0)], [np.zeros(0)]
         held = _held(stand)
         for frame in self._gauge.frames if stand != AIR else ():
-            arm = pin.updateFramePlacement(model, data, frame).rotation @ self._pivot[stand]
+            foot = pin.updateFramePlacement(model, data, frame).rotation
+            arm, along = foot @ self._pivot[stand], headings(foot)
             jacobian = pin.getFrameJacobian(model, data, frame, AXES)
             jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
             drift = pin.getFrameClassicalAcceleration(model, data, frame, AXES)
             spin = pin.skew(pin.getFrameVelocity(model, data, frame, AXES).angular)
             linear = drift.linear + pin.skew(drift.angular) @ arm + spin @ (spin @ arm)
-            rows.append(jacobian[held])
-            drifts.append(np.concatenate([linear, drift.angular])[held])
+            rows.append(np.vstack([along @ jacobian[:3], along @ jacobian[3:]])[held])
+            drifts.append(np.concatenate([along @ linear, along @ drift.angular])[held])
             units.append(np.repeat([1.0, self._gains.lever_m], 3)[held])
         return np.vstack(rows), np.concatenate(drifts), np.concatenate(units)
+
+
+def headings(foot: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) from world axes to axes that are turned about the vertical as a ``foot`` (3, 3) is."""
+    c, s = foot[:2, 0] / np.hypot(*foot[:2, 0])
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _held(stand: str) -> np.ndarray:

@@ -10,11 +10,12 @@ from jumplab.errors import InputError, quoted, require_type
 from jumplab.ocp import Problem, Term, changed
 
 LAUNCH = ("flat", "toe")  # phases of "launch" in stages 1 and 3
-PHASES = {  # stage -> names of its phases; with stages 1 and 3 "launch" means both of LAUNCH
+PHASES = {  # stage -> names of its phases; but for stage 2 "launch" means both of LAUNCH
     "srmp": (*LAUNCH, "launch", "flight"),
     "joint qp": ("launch", "flight"),
     "whole body": (*LAUNCH, "launch", "flight"),
     "spatial": (*LAUNCH, "launch", "flight"),
+    "spatial srmp": (*LAUNCH, "launch", "flight"),
 }
 LAST = "whole body"  # the stage of names without one; the direct planner takes its terms too
 Settings = TypeVar("Settings")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from jumplab.errors import Shown
+from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
@@ -19,7 +22,10 @@ from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
-TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}  # names on the tape
+# what is compared -> stage 1's column, and which part of it
+TRACKED = {"rho": ("rho", ...), "rho_rate": ("rho_rate", ...), "velocity": ("com_velocity", ...), "L": ("L", ...)}
+TRACKED_IN_SPACE = TRACKED | {"rho": ("rho", 0), "rho_rate": ("rho_rate", 0)}
+TRACKED_IN_SPACE |= {"yaw_rho": ("rho", 1), "yaw_rho_rate": ("rho_rate", 1)}
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -33,8 +39,8 @@ class StageRow:
     solve_s: float
 
 
-@dataclass(frozen=True)
-class JumpPlan:
+@dataclass(frozen=True, repr=False)
+class JumpPlan(Shown, Named):
     """A finished plan.
 
     Attributes
@@ -68,23 +74,39 @@ class JumpPlan:
         rows = tuple(StageRow(**row) for row in summary["stages"])
         return cls(task, robot, summary["method"], tape, None, None, None, rows, summary.get("skipped"), summary)
 
+    def line(self) -> str:
+        """Robot, target and duration."""
+        turned = "" if self.task.in_plane else f", {self.planned_side_m:.2f} m to the left"
+        turned += f", turned by {round(math.degrees(self.task.rotation_rad))} deg" if self.task.rotation_rad else ""
+        jump = f"{self.planned_distance_m:.2f} m far{turned}, rise {self.planned_rise_m:.2f} m"
+        return f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time (N,) of the tape [s]; take-off appears twice."""
+        return self.tape.t
+
     @property
     def planned_distance_m(self) -> float:
         """Travel of the toe over the whole tape, of the middle between the soles in a jump out of the plane [m]."""
-        if "soles_travel" in self.tape.extra:
+        if self._spatial:
             return float(self.tape.extra["soles_travel"][0])
         toe = self.tape.extra["planar_toe"]
         return float(toe[-1, 0] - toe[0, 0])
 
     @property
+    def _spatial(self) -> bool:
+        return "soles_travel" in self.tape.extra
+
+    @property
     def toe_phase_s(self) -> float:
         """When the heels rise, on the tape [s]."""
-        return float(self.tape.extra["planar_toe_phase_start" if self.task.in_plane else "toe_phase_start"])
+        return float(self.tape.extra["toe_phase_start" if self._spatial else "planar_toe_phase_start"])
 
     @property
     def planned_side_m(self) -> float:
         """Travel of the middle between the soles to the left [m], on the tape."""
-        return float(self.tape.extra["soles_travel"][1]) if "soles_travel" in self.tape.extra else 0.0
+        return float(self.tape.extra["soles_travel"][1]) if self._spatial else 0.0
 
     @property
     def planned_yaw_rad(self) -> float:
@@ -147,11 +169,12 @@ class JumpPlan:
         -------
         phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
         -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
-        zero). None for a plan without stage 1.
+        zero). Out of the plane also "yaw_rho" and "yaw_rho_rate", and L has three components. None for a plan without
+        stage 1.
         """
         if self.stored is not None:
             return self.stored.get("tracking")
-        return None if self.srmp is None else _tracking(self.tape, self.srmp)
+        return None if self.srmp is None or not self.task.in_plane else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:
@@ -159,7 +182,7 @@ class JumpPlan:
         if self.stored is not None:
             return dict(self.stored)
         body, away = self.whole_body, {}
-        if not self.task.in_plane:
+        if self._spatial:
             away = dict(planned_side_m=self.planned_side_m, planned_yaw_rad=self.planned_yaw_rad)
         return {
             "target": asdict(self.task),
@@ -181,19 +204,30 @@ class JumpPlan:
 
 
 def _tracking(tape: Tape, srmp: SrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
-    k, toe = tape.takeoff_index, float(tape.extra["planar_toe_phase_start"])
-    launch = np.interp(tape.t[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
-    air = tape.t[k:] - tape.takeoff_time
-    found = {}
-    for name, rows, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
+    rows, toe, done = _moved(tape)
+    time, k = tape.t[rows], int(np.argmax(tape.phase[rows] == "flight"))
+    launch = np.interp(time[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
+    air, found = time[k:] - tape.takeoff_time, {}
+    for name, at, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
         part, found[name] = getattr(srmp, name), {}
-        for key, column in TRACKED.items():
-            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
-            done = np.atleast_2d(tape.extra[f"planar_{column}"][rows].T)
-            rms = float(np.sqrt(np.mean(np.sum((done - asked) ** 2, axis=0))))
+        for key, (column, i) in (TRACKED if "planar_rho" in tape.extra else TRACKED_IN_SPACE).items():
+            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column)[:, i].T)])
+            missed = np.atleast_2d(done[column][at, i].T) - asked
+            rms = float(np.sqrt(np.mean(np.sum(missed**2, axis=0))))
             size = float(np.mean(np.linalg.norm(asked, axis=0)))
             found[name][key] = {"rms": rms, "relative_rms": rms / size if size else None}
     return found
+
+
+def _moved(tape: Tape) -> tuple[np.ndarray | slice, float, dict[str, np.ndarray]]:
+    """Rows of the tape, when its heels rise [s], and what the robot does there by stage 1's names."""
+    e = tape.extra
+    if "planar_rho" in e:
+        columns = {column: e[f"planar_{column}"] for column, _ in TRACKED.values()}
+        return slice(None), float(e["planar_toe_phase_start"]), columns
+    rows, columns = e["inertia_rows"], {column: e[column] for column in ("rho", "rho_rate")}
+    columns |= {"com_velocity": e["com_velocity"][rows], "L": e["angular_momentum"][rows]}
+    return rows, float(e["toe_phase_start"]), columns
 
 
 def _solver(s: Statistics) -> dict:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
+from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
 from jumplab.ocp import PhaseGuess, Statistics, Term
@@ -24,23 +24,24 @@ from jumplab.stages.changes import StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
-from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
+from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities, turning_inertias
 from jumplab.stages.spatial import SpatialLimits, SpatialPlan, SpatialPlanner
 from jumplab.stages.spatial.settings import FLIP_MESH
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
-from jumplab.stages.srmp.settings import SrmpSettings
+from jumplab.stages.srmp.settings import SpatialSrmpSettings, SrmpSettings
+from jumplab.stages.srmp.spatial import SpatialSrmpPlan, SpatialSrmpPlanner
 from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
-METHODS = ("three-step", "direct")
+METHODS, USUAL = ("three-step", "direct"), "usual"
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
-SHORTER = (0.9, 0.7, 0.5)  # of the distance; tried after a refusal, half a second each
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
+AHEAD = "stage 3 began from a jump ahead with ramps of side and yaw instead"  # the same out of the plane
 
 
 class Planner:
@@ -52,12 +53,14 @@ class Planner:
     Parameters
     ----------
     robot : who jumps.
-    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body"
-        have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight; "srmp" or "whole body" alone
-        takes those at "problem". An expression sees a point with joints, joint_rates, torques, com, com_velocity, L,
-        inertia, wrench, posture, point("hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and in
-        stage 1 com, com_velocity, L, inertia, wrench, lean, posture, time, see
-        :class:`jumplab.stages.srmp.view.RodView`. The direct planner takes those of "whole body".
+    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body",
+        out of the plane "spatial srmp" and "spatial", have phases flat, toe, launch (both) and flight, "joint qp" has
+        launch and flight; "srmp" or "whole body" alone takes those at "problem". An expression sees a point with
+        joints, joint_rates, torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
+        :class:`jumplab.stages.whole_body.view.BodyView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
+        posture, time, see :class:`jumplab.stages.srmp.view.RodView`; out of the plane
+        :class:`jumplab.stages.spatial.view.SpatialView` and :class:`jumplab.stages.srmp.spatial.Pendulum`. The direct
+        planner takes those of "whole body", out of the plane of "spatial".
     weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's. For
         "joint qp" it is a factor on the block's own weights.
     off : names of the same sort: terms and bounds to leave out.
@@ -65,6 +68,8 @@ class Planner:
     settings : of stage 1: :class:`jumplab.stages.srmp.SrmpSettings`, or a mapping of some of its fields.
     mesh : of stage 3: :class:`jumplab.stages.whole_body.Mesh`, or a mapping of some of its fields.
     keep : keep the built problems for later processes, see :mod:`jumplab.ocp.cache`.
+    atlas : of plans with the same robot, terms and limits: a :class:`jumplab.Atlas`. Direct plans begin with it where
+        it has something close by; other methods refuse it.
 
     Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
     terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
@@ -87,9 +92,10 @@ class Planner:
         settings: SrmpSettings | Mapping[str, Any] | None = None,
         mesh: Mesh | Mapping[str, int] | None = None,
         keep: bool = False,
+        atlas: Any | None = None,
     ):
         require_type(robot, Robot, "the robot to plan for")
-        self.robot, self.keep, self.changes = robot, keep, sorted_out(terms, weights, off)
+        self.robot, self.keep, self.changes, self.atlas = robot, keep, sorted_out(terms, weights, off), atlas
         self._given = limits, settings, mesh
         self.limits, self.mesh = settled(Limits, limits), self._mesh()
         settled(SrmpSettings, settings)  # refuses what does not fit
@@ -104,17 +110,28 @@ class Planner:
         return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
     def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "spatial", "srmp", "whole body", "direct"; the last three as "... flip" too."""
+        """A stage's planner: "reach", "spatial", "spatial srmp", "srmp", "whole body", "direct".
+
+        The last three as "... flip" too.
+        """
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
-            build["spatial"] = self._away
+            build |= {"spatial srmp": self._spatial_srmp, "spatial": self._away}
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 
     def _srmp(self, flip: bool) -> SrmpPlanner:
         settings = settled(SrmpSettings, self._given[1], flip)
         return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
+
+    def _spatial_srmp(self, flip: bool) -> SpatialSrmpPlanner:
+        given = self._given[1]
+        if isinstance(given, SrmpSettings):
+            usual = vars(SrmpSettings())
+            given = {name: x for name, x in vars(given).items() if name in usual and x != usual[name]}
+        settings = replace(SpatialSrmpSettings(), **(given or {}))
+        return SpatialSrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["spatial srmp"])
 
     def _away(self, flip: bool) -> SpatialPlanner:
         how = dict(mesh=FLIP_MESH, limits=SpatialLimits().of_flip()) if flip else {}
@@ -183,6 +200,8 @@ class Planner:
         -------
         rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
         """
+        if not self.robot.planar:
+            return self.stage("spatial").nlp.problem.table()
         if method == "direct":
             return self.stage("direct" + " flip" * flip).nlp.problem.table()
         first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
@@ -191,7 +210,7 @@ class Planner:
     def plan(
         self,
         task: JumpTask,
-        method: str = "three-step",
+        method: str = USUAL,
         *,
         weights: Mapping[str, float] | None = None,
         start: np.ndarray | None = None,
@@ -201,7 +220,9 @@ class Planner:
         Parameters
         ----------
         task : the target.
-        method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold).
+        method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold; with side or
+            yaw the spatial program, begun from a jump ahead with ramps). "usual" is "three-step" in the plane and
+            "direct" out of it, which there takes less time (``notebooks/13_three_dimensions`` measures it).
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
@@ -213,9 +234,15 @@ class Planner:
             If a stage refuses or fails; no later stage is run.
         """
         require_type(task, JumpTask, "the target")
+        if isinstance(method, str) and method == USUAL:
+            method = METHODS[0 if task.in_plane and self.robot.planar and self.atlas is None else 1]
         if not isinstance(method, str) or method not in METHODS:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
-        if not task.in_plane:
+        if self.atlas is not None and method != "direct":
+            raise InputError(f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave it away")
+        if not self.robot.planar and method != "direct":
+            raise InputError(f"method {quoted(method)}: no plane describes robot {self.robot.name}; choose 'direct'")
+        if not (task.in_plane and self.robot.planar):
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
@@ -227,6 +254,9 @@ class Planner:
         if method == "direct":
             check_reachable(task, self.stage("reach"), self.robot)
             planner = self.stage("direct flip" if task.rotation_rad else "direct")
+            if self.atlas is not None and not asked["whole body"]:
+                if (body := self.atlas.solve(self.stage("direct"), task, start)) is not None:
+                    return self._finished(method, body)
             return self._finished(method, planner.plan(task, weights=asked["whole body"].weights, **where))
         if task.rotation_rad:
             return self._flip(task, asked)
@@ -255,7 +285,11 @@ class Planner:
         )
 
     def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
-        """A jump out of the plane: the planar jump of the same distance and rise, then the spatial program."""
+        """A jump out of the plane, or of a robot that no plane describes: three steps, or the spatial program alone,
+        begun from the planar jump of the same distance and rise where there is one.
+        """
+        if start is not None and not self.robot.planar:
+            raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
         last, asked = self.stage(_away(task)), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
@@ -263,21 +297,53 @@ class Planner:
         rest = {
             f"{stage}/{name}": w for stage, x in asked.items() if stage != "spatial" for name, w in x.weights.items()
         }
-        planar = replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0)
-        first = self.plan(planar, method, weights=rest, start=start)
-        stance = None if start is None else self._standing(start)
-        body = last.plan(task, first.tape, first.toe_phase_s, weights=asked["spatial"].weights, stance=stance)
-        name = "4 spatial" if method == "three-step" else "spatial"
-        rows = (*first.statistics, _row(name, body.solution.statistics))
-        return self._placed(method, body, rows, first)
+        now, skipped = asked["spatial"].weights, None
+        if method == "three-step":
+            self._refuse_planar(asked)
+            try:
+                if start is not None:
+                    raise SolverError("stages 1 and 2 out of the plane begin in the stance")
+                return self._three_spatial(task, asked)
+            except SolverError as e:
+                skipped, rest = f"{e}; {AHEAD}", {}
+        begun, rows, stance = (), (), None if start is None else self._standing(start)
+        if self.robot.planar:
+            planar = replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0)
+            first = self.plan(planar, "direct", weights=rest, start=start)
+            begun, rows = (first.tape, first.toe_phase_s), first.statistics
+        body = last.plan(task, *begun, weights=now, stance=stance)
+        return self._placed(method, body, (*rows, _row("spatial", body.solution.statistics)), skipped=skipped)
+
+    def _refuse_planar(self, asked: Mapping[str, StageChanges]) -> None:
+        ignored = [f"{stage!r}" for stage in ("srmp", "whole body") if self.changes[stage] or asked[stage]]
+        if ignored:
+            raise InputError(
+                f"three steps to the side or with a turn have no place for {' and '.join(ignored)}: their stages are "
+                f"'spatial srmp', 'joint qp' and 'spatial'; leave that out, or choose the method 'direct'"
+            )
+
+    def _three_spatial(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
+        """Stages 1 and 2 without a plane, then the spatial program from their motion."""
+        srmp = self.stage("spatial srmp").plan(task, weights=asked["spatial srmp"].weights)
+        joints, heels = self._joints(srmp, asked, step_s=STEPS_S), srmp.launch_s - srmp.toe_s
+        weights = asked["spatial"].weights
+        body = self.stage(_away(task)).plan(task, joints.tape(self.robot), heels, ramps=False, weights=weights)
+        rows = _row("1 SRMP", srmp.solution.statistics), _joint_row(joints), _row("3 spatial", body.solution.statistics)
+        return self._placed("three-step", body, rows, srmp, joints)
 
     def _placed(
-        self, method: str, body: SpatialPlan, rows: tuple[StageRow, ...], first: JumpPlan | None = None
+        self,
+        method: str,
+        body: SpatialPlan,
+        rows: tuple[StageRow, ...],
+        srmp: SpatialSrmpPlan | None = None,
+        joints: JointPlan | None = None,
+        skipped: str | None = None,
     ) -> JumpPlan:
-        """The plan of a spatial solution; ``first`` is the planar one that it began with."""
+        """The plan of a spatial solution; ``rows`` are its stages', the first two those of three steps."""
         tape, robot = self.stage(_away(body.task)).tape(body), self.robot.under_gravity(body.task.gravity)
-        srmp, joints = (None, None) if first is None else (first.srmp, first.joints)
-        return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, first and first.skipped)
+        tape = replace(tape, extra=tape.extra | turning_inertias(robot, tape) | _of_stage1(srmp))
+        return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, skipped)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
@@ -303,18 +369,7 @@ class Planner:
     def _first_two(
         self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
     ) -> tuple[SrmpPlan, JointPlan]:
-        """Stages 1 and 2; where stage 2 refuses, the nearest of a few shorter jumps that passes both is named."""
-        try:
-            return self._pass(task, start, asked)
-        except SolverError as e:
-            nearest = self._nearest(task, asked) if e.stage == "joint_map" else ""  # stage 1 looks for one itself
-            if not nearest:
-                raise
-            raise SolverError(f"{e}{nearest}", stage=e.stage, status=e.status, violations=e.violations) from e
-
-    def _pass(
-        self, task: JumpTask, start: np.ndarray | None, asked: Mapping[str, StageChanges]
-    ) -> tuple[SrmpPlan, JointPlan]:
+        """Stages 1 and 2."""
         q0 = None if start is None else self._standing(start)
         srmp = self._pendulum(task, start, weights=asked["srmp"].weights)
         try:
@@ -337,27 +392,13 @@ class Planner:
         """Stage 1, from the rod of a posture in which the robot waits."""
         return self.stage("srmp").plan(task, start=None if start is None else rod_of(self.robot, start), **how)
 
-    def _nearest(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> str:
-        """Words about a shorter jump that passes stages 1 and 2; none if stage 1 fails again, which takes its time."""
-        for share in SHORTER if task.distance_m else ():
-            less = replace(task, distance_m=round(share * task.distance_m, 2))
-            try:
-                self._pass(less, None, asked)
-            except InfeasibleError:
-                continue
-            except SolverError as e:
-                if e.stage != "joint_map":
-                    break
-            else:
-                return f"; at this height, stages 1 and 2 manage {less.distance_m:g} m"
-        return ""
-
     def replan(self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None) -> JumpPlan:
         """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
 
-        Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
+        Stages 1 and 3 begin with their previous solutions; a target within :data:`jumplab.task.NEAR` takes a few steps
+        from there, see :meth:`jumplab.ocp.nlp.Nlp.settled`. Stage 2, whose result is only a start for stage 3, is left
         out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
-        ``start`` as in :meth:`plan`.
+        A flip is planned anew. ``start`` as in :meth:`plan`.
 
         Raises
         ------
@@ -366,7 +407,7 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
-        if not task.in_plane:
+        if not (task.in_plane and self.robot.planar):
             near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
             if near is None:
                 return self.plan(task, previous.method, start=start)
@@ -376,6 +417,8 @@ class Planner:
             except SolverError:
                 return self.plan(task, previous.method, start=start)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
+        if task.rotation_rad or isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
+            return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
         srmp, last = None, "direct"
@@ -408,7 +451,7 @@ def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
     return (*coarse, *uneven, _row(stage, body.solution.statistics))
 
 
-def plan_jump(task: JumpTask, robot: Robot, *, method: str = "three-step") -> JumpPlan:
+def plan_jump(task: JumpTask, robot: Robot, *, method: str = USUAL) -> JumpPlan:
     """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
     return Planner(robot, keep=True).plan(task, method)
 
@@ -477,8 +520,10 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
         "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"],
     }
     extra |= {f"planar_{k}": values[k] for k in ("L", "rho", "rho_rate", "joints", "joint_rates", "torques")}
-    if srmp is not None:
-        for name in ("launch", "flight"):
-            part = getattr(srmp, name)
-            extra |= {f"srmp_{name}_{k}": np.array(v) for k, v in vars(part).items()}
-    return expand(motion, robot, gravity, extra, values["ground_wrench"])
+    return expand(motion, robot, gravity, extra | _of_stage1(srmp), values["ground_wrench"])
+
+
+def _of_stage1(srmp: SrmpPlan | None) -> dict[str, np.ndarray]:
+    """Stage 1's columns under the names that they have on a tape."""
+    parts = [] if srmp is None else [("launch", srmp.launch), ("flight", srmp.flight)]
+    return {f"srmp_{name}_{k}": np.array(v) for name, part in parts for k, v in vars(part).items()}

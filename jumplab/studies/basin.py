@@ -48,7 +48,7 @@ class BasinGrid:
         return tuple(states[k] for k in np.random.default_rng(SHUFFLE_SEED).permutation(len(states)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BasinReport(TrialReport):
     """States of one basin; each one is a trial whose ``features`` are those of its :class:`BasinState`."""
 

@@ -8,8 +8,8 @@ interrupted map goes on where it stopped.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -19,7 +19,7 @@ import joblib
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.io.files import Log, append, open_log
+from jumplab.io.files import Log, append, made, open_log
 from jumplab.io.tape import Tape
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import SAGITTAL_JOINTS, Robot
@@ -142,11 +142,13 @@ def envelope(
         raise InputError(f"the map has {len(distances)} x {len(heights)} cells, must be 1 to {MAX_CELLS}")
     start = fixed or JumpTask(0.0, heights[0] if axes[1] == "height_m" else 0.4)
     tasks = [[replace(start, **dict(zip(axes, x, strict=True))) for x in product(distances, [y])] for y in heights]
+    from jumplab.studies.trials import in_parallel  # the simulator, which pictures of a map do without
+
     path, rows = None if folder is None else Path(folder) / CELLS, []
     with nullcontext() if path is None else _opened(path, robot) as log:
         done = {} if log is None else log.done
-        run = joblib.Parallel(n_jobs=workers, return_as="generator")
-        for row in run(joblib.delayed(_row)(robot, row, done, path) for row in tasks):
+        work = [joblib.delayed(_row)(robot, row, done, path) for row in tasks]
+        for row in in_parallel(work, workers, "generator"):
             rows.append(row)
             if tell is not None:
                 good, (level, unit) = [getattr(c, axes[0]) for c in row if c.solved], axes[1].split("_")
@@ -182,7 +184,7 @@ _tools: dict[str, tuple[Reach, WholeBodyPlanner]] = {}  # of this process, by th
 
 def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
     """One cell from a neighbour's solution, then, if ``cold``, from the planner's own guess; a guess for the next."""
-    if not task.in_plane:
+    if not (task.in_plane and robot.planar):
         return _solve_away(robot, task, guess, cold=cold)
     guess = None if isinstance(guess, SpatialPlan) else guess
     if robot.hash not in _tools:
@@ -212,13 +214,13 @@ _planners: dict[str, Planner] = {}  # of this process, by the robot's hash
 
 
 def _solve_away(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
-    """The same out of the plane: from the neighbour's plan, then from the planar jump of the same way and rise."""
+    """The same by the spatial program: from the neighbour's plan, then from where that begins by itself."""
     planner = _planners.setdefault(robot.hash, Planner(robot, keep=True))
     spatial, reason = planner.stage("spatial"), ""
     for near in [guess] * isinstance(guess, SpatialPlan) + [None] * cold:
         try:
             start = ()
-            if near is None:
+            if near is None and robot.planar:
                 first = planner.plan(replace(task, side_m=0.0, yaw_rad=0.0), "direct")
                 start = first.tape, first.toe_phase_s
             plan = spatial.plan(task, *start, near=near, patient=False)
@@ -250,15 +252,16 @@ def tape_usage(tape: Tape, robot: Robot, limits: SpatialLimits) -> dict[str, flo
 
 
 # finished cells on file -----------------------------------------------------------------------------------------
-def _opened(path: Path, robot: Robot) -> AbstractContextManager[Log[Place, Cell]]:
+@contextmanager
+def _opened(path: Path, robot: Robot) -> Iterator[Log[Place, Cell]]:
     def entry(line: dict[str, Any]) -> tuple[Place, Cell]:
         if (owner := line.pop("robot")) != robot.hash:
             raise InputError(f"{path}: belongs to another robot ({owner}, not {robot.hash}); choose another folder")
         cell = Cell(**{k: math.nan if v is None else v for k, v in line.items()})
         return cell.place, cell
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return open_log(path, "envelope", entry)
+    with made(path.parent), open_log(path, "envelope", entry) as log:
+        yield log
 
 
 def _keep(cell: Cell, robot: Robot, path: Path | None) -> None:

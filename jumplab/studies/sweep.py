@@ -21,17 +21,24 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import numpy as np
 from tqdm import tqdm
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError, JumplabError
-from jumplab.io.files import Log, ensure_writable, locked, open_log, write_file
+from jumplab.io.files import Log, ensure_writable, locked, made, open_log, settle, write_file
+from jumplab.io.progress import tell
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.stages.planner import METHODS, Planner
+from jumplab.stages.planner import METHODS, JumpPlan, Planner
+from jumplab.studies.atlas import Atlas
+from jumplab.studies.trials import served
 from jumplab.task import JumpTask
 
 CASES, TABLE = "cases.jsonl", "table.csv"
 MAX_CASES = 100_000  # a day on a hundred processors; more is a typing error
+BATCH = 25  # cases that one process takes at a time, in a large sweep
+ATLAS_STEPS = {"distance_m": 0.3, "height_m": 0.15}  # [m] between the nodes of a sweep's atlas, at most
 _HEAD = "head"  # key of the log's first line, which says of what sweep it is
 COLUMNS = (
     *("distance_m", "height_m", "platform_m", "robot", "weights", "method", "planned", "clean", "failed_checks"),
@@ -81,29 +88,34 @@ def grid(
 
 
 @cache
-def _planner(robot: str, method: str) -> Planner:
-    """A planner with its stages built, once per process."""
-    planner = Planner(Robot.load(robot), keep=True)
+def _planner(robot: str, method: str, atlas: Path | None = None) -> Planner:
+    """A planner with its stages built, once per process; ``atlas`` is the folder of one."""
+    planner = Planner(Robot.load(robot), keep=True, atlas=atlas and Atlas.load(atlas))
     planner.prepared(method)
     return planner
 
 
 def run_case(case: Case) -> dict[str, Any]:
     """Plan one case and audit the plan; a case without a plan is a row too, with the reason."""
+    return _planned(case)[0]
+
+
+def _planned(case: Case, atlas: Path | None = None) -> tuple[dict[str, Any], JumpPlan | None]:
+    """The row of a case, and its plan; ``atlas`` is the folder of an atlas of its robot to begin with."""
     row = dict.fromkeys(COLUMNS) | asdict(case) | {"planned": False, "clean": False}
     task = JumpTask(case.distance_m, case.height_m, case.platform_m)
     plan, cpu, wall = None, time.process_time(), time.perf_counter()
     try:
-        planner = _planner(case.robot, case.method)
+        planner = _planner(case.robot, case.method, atlas)
         cpu, wall = time.process_time(), time.perf_counter()  # building is not the case's
         plan = planner.plan(task, case.method, weights=case.weights)
     except JumplabError as e:
         row["reason"] = str(e)
     row |= {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
     if plan is None:
-        return row
+        return row, None
     passport = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
-    return row | {
+    row |= {
         "planned": True,
         "clean": passport.passed,
         "failed_checks": ", ".join(check.name for check in passport.failed),
@@ -114,38 +126,105 @@ def run_case(case: Case) -> dict[str, Any]:
         "cost": plan.whole_body.solution.statistics.objective,
         "iterations": sum(stage.iterations for stage in plan.statistics),
     }
+    return row, plan
 
 
 def run(
-    cases: list[Case], out: str | Path, *, jobs: int = -1, cluster: str | None = None, progress: bool | None = None
+    cases: list[Case],
+    out: str | Path,
+    *,
+    jobs: int = -1,
+    cluster: str | None = None,
+    progress: bool | None = None,
+    atlas: bool = False,
+    tapes_hz: float | None = None,
 ) -> list[dict[str, Any]]:
     """Plan all ``cases`` of a :func:`grid` that have no line in the folder ``out`` yet, and write the table.
 
-    ``jobs`` are processes, -1 for one per processor; a ``cluster``, the address of a Dask scheduler such as
-    "tcp://host:8786", does the work instead. ``progress`` is a bar; by default on a terminal only. Returns one row per
-    case, in their order, with the :data:`COLUMNS`. Raises :class:`InputError` if a robot cannot be read, the folder
-    holds another sweep, or there is no such cluster.
+    Returns one row per case, in their order, with the :data:`COLUMNS`. Raises :class:`InputError` if a robot cannot be
+    read, the folder holds another sweep, an option has no effect, or there is no such cluster.
+
+    Parameters
+    ----------
+    jobs : processes, -1 for one per processor.
+    cluster : address of a Dask scheduler, such as "tcp://host:8786", that does the work instead.
+    progress : a bar; by default on a terminal only.
+    atlas : build a small :class:`jumplab.Atlas` of every robot first, and begin direct plans with it.
+    tapes_hz : also keep the motions, so many rows a second, in ``tapes/``: see :func:`_shard`.
     """
+    if atlas and any(case.method != "direct" for case in cases):
+        raise InputError("an atlas holds direct plans: choose the method 'direct', or leave it away")
+    if tapes_hz is not None and not 1 <= tapes_hz <= 1000:
+        raise InputError(f"tapes_hz = {tapes_hz:g} Hz is outside 1 ... 1000 Hz")
     _check_weights(cases)
     hashes = {name: Robot.load(name).hash for name in sorted({case.robot for case in cases})}
     folder = ensure_writable(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with _opened(folder, cases, hashes) as log, _backend(cluster):
+    how = {"atlas": atlas, "tapes_hz": tapes_hz} if atlas or tapes_hz else {}
+    with _backend(cluster), made(folder), _opened(folder, cases, hashes, how) as (log, head):
+        places = {name: _atlas(folder / "atlas" / str(k), cases, name, jobs) for k, name in enumerate(hashes) if atlas}
         done = {case.key(): log.done.get(case.key()) for case in cases}
-        left = [case for case in cases if done[case.key()] is None]
+        left = [(k, case) for k, case in enumerate(cases) if done[case.key()] is None]
+        size = min(BATCH, 1 + len(left) // 50)
+        batches = [left[k : k + size] for k in range(0, len(left), size)]
         hide = None if progress is None else not progress
         with tqdm(total=len(cases), initial=len(cases) - len(left), unit="plan", disable=hide) as bar:
             work = joblib.Parallel(jobs, return_as="generator_unordered")
-            for key, row in work(joblib.delayed(_keyed)(case) for case in left):
-                log.add({"case": key, "row": row})
-                done[key] = row
-                bar.update()
+            for rows in work(joblib.delayed(_batch)(batch, places, folder, tapes_hz) for batch in batches):
+                if log.empty:
+                    log.add(head)
+                for key, row in rows:
+                    log.add({"case": key, "row": row})
+                    done[key] = row
+                bar.update(len(rows))
+                tell("planned", len(cases) - list(done.values()).count(None), len(cases))
+        settle()
         write_file(folder / TABLE, _csv(list(done.values())).encode())
     return list(done.values())
 
 
-def _keyed(case: Case) -> tuple[str, dict[str, Any]]:
-    return case.key(), run_case(case)
+def _batch(
+    cases: Sequence[tuple[int, Case]], atlases: Mapping[str, Path], folder: Path, tapes_hz: float | None
+) -> list[tuple[str, dict[str, Any]]]:
+    """Rows of some cases with their keys; their motions go into one file of ``tapes/``."""
+    rows, tapes = [], {}
+    for number, case in cases:
+        row, plan = _planned(case, atlases.get(case.robot))
+        rows.append((case.key(), row))
+        if plan is not None and tapes_hz:
+            tapes[number] = plan.tape
+    if tapes:
+        write_file(folder / "tapes" / f"{cases[0][0]:06d}.npz", _shard(tapes, tapes_hz))
+    return rows
+
+
+def _shard(tapes: Mapping[int, Tape], hz: float) -> bytes:
+    """Motions one after the other, as a file of ``numpy.load``.
+
+    ``case`` (n,) are their lines in the table, from 0; motion i has the rows first[i] to first[i + 1] of ``t``, ``q``,
+    ``v``, ``tau`` and ``flying``, in the units and the order of a plan's tape, as float32.
+    """
+    parts, first = [], [0]
+    for tape in tapes.values():
+        rows = np.unique(np.searchsorted(tape.t, np.arange(0.0, tape.t[-1], 1 / hz)).clip(0, len(tape.t) - 1))
+        parts.append([x[rows].astype(np.float32) for x in (tape.t, tape.q, tape.v, tape.tau)])
+        parts[-1].append(tape.phase[rows] == "flight")
+        first.append(first[-1] + len(rows))
+    names = ("t", "q", "v", "tau", "flying")
+    columns = {name: np.concatenate(x) for name, x in zip(names, zip(*parts, strict=True), strict=True)}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, case=np.array(list(tapes)), first=np.array(first), **columns)
+    return buffer.getvalue()
+
+
+def _atlas(folder: Path, cases: Sequence[Case], robot: str, jobs: int) -> Path:
+    """Folder of an atlas that spans the level targets of a robot; built unless it is there."""
+    ours = [case for case in cases if case.robot == robot]
+    axes = []
+    for name, step in ATLAS_STEPS.items():
+        low, high = (extreme(getattr(case, name) for case in ours) for extreme in (min, max))
+        axes.append(np.unique(np.linspace(low, high, 1 + math.ceil((high - low) / step - 1e-9))))
+    Atlas.build(Robot.load(robot), *axes, folder=folder, jobs=jobs)
+    return folder
 
 
 def _check_weights(cases: list[Case]) -> None:
@@ -158,7 +237,7 @@ def _check_weights(cases: list[Case]) -> None:
 def _backend(cluster: str | None) -> AbstractContextManager:
     """Where joblib sends the work: processes of this machine, or a Dask cluster."""
     if not cluster:
-        return joblib.parallel_config("loky", inner_max_num_threads=1)
+        return joblib.parallel_config("loky", inner_max_num_threads=1, **served())
     try:
         from distributed import Client
     except ImportError:
@@ -171,23 +250,23 @@ def _backend(cluster: str | None) -> AbstractContextManager:
 
 
 @contextmanager
-def _opened(folder: Path, cases: list[Case], hashes: Mapping[str, str]) -> Iterator[Log[str, dict[str, Any]]]:
-    """The folder's log, if it is one of this very sweep."""
+def _opened(
+    folder: Path, cases: list[Case], hashes: Mapping[str, str], how: Mapping[str, Any]
+) -> Iterator[tuple[Log[str, dict[str, Any]], dict]]:
+    """The folder's log, if it is one of this very sweep, and the line that it begins with."""
 
     def entry(line: Any) -> tuple[str, dict[str, Any]]:
-        return (line["case"], line["row"]) if "case" in line else (_HEAD, {k: line[k] for k in ("sweep", "robots")})
+        return (line["case"], line["row"]) if "case" in line else (_HEAD, {"sweep": line["sweep"], **line})
 
     wanted = "\n".join(case.key() for case in cases)
-    head = {"sweep": hashlib.sha256(wanted.encode()).hexdigest(), "robots": dict(hashes)}
+    head = {"sweep": hashlib.sha256(wanted.encode()).hexdigest(), "robots": dict(hashes), **how}
     with locked(folder), open_log(folder / CASES, "sweep", entry) as log:
-        if log.empty:
-            log.add(head)
-        elif _HEAD not in log.done:
+        if not log.empty and _HEAD not in log.done:
             raise InputError(f"{str(folder / CASES)!r} is no log of a sweep; choose another folder")
-        elif log.done[_HEAD] != head:
-            other = "a sweep of other targets, robots or weights"
+        if not log.empty and log.done[_HEAD] != head:
+            other = "a sweep of other targets, robots, weights or options"
             raise InputError(f"{str(folder)!r} holds {other}; choose another folder")
-        yield log
+        yield log, head
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:

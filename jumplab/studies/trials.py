@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -26,9 +26,10 @@ import pinocchio as pin
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from jumplab.errors import InputError, SolverError
+from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io import folder as store
 from jumplab.io.files import Log, open_log
+from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
@@ -196,8 +197,8 @@ def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
 
 
 # a series of trials ------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class TrialReport:
+@dataclass(frozen=True, repr=False)
+class TrialReport(Shown):
     """A series of trials, and what they share."""
 
     trials: tuple[Trial, ...]  # in the order of their numbers
@@ -206,6 +207,11 @@ class TrialReport:
     plan: str  # its hash
     target: dict[str, float]  # of the plan, as its summary says it
     resumed: int = 0  # how many were taken from an earlier run
+
+    def line(self) -> str:
+        """How many landed."""
+        low, high = self.interval
+        return f"{self.landed} of {self.count} land, 95 % interval {low:.1%} ... {high:.1%}"
 
     @property
     def conditions(self) -> dict[str, str]:
@@ -343,11 +349,14 @@ def run_series(
 
 
 # processes ------------------------------------------------------------------------------------------
-def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_unordered") -> Iterable[Any]:
+def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_unordered") -> Iterator[Any]:
     """Results, as they come unless ``order`` says otherwise; in ``jobs`` processes, by default one per core."""
     jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
-    options = {} if jobs == 1 else {"backend": "loky", "initializer": _serve, "initargs": (os.getpid(),)}
-    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+    options = {} if jobs == 1 else {"backend": "loky", **served()}
+    results = joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+    for number, result in enumerate(results, 1):
+        yield result
+        tell("done", number, len(work))
 
 
 def _serve(parent: int) -> None:
@@ -360,3 +369,8 @@ def _serve(parent: int) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=leave_with_it, daemon=True).start()
+
+
+def served() -> dict[str, Any]:
+    """Arguments of joblib for workers that heed their parent alone."""
+    return {"initializer": _serve, "initargs": (os.getpid(),)}

@@ -12,7 +12,6 @@ from jumplab.stages.joint_qp.problem import StepQp
 CONFLICT_SHARE = 1e-3  # rows that give way by less than this share of the worst are not named
 PRICE_SHARE = 0.05  # limits with a price below this are not named
 MAX_NAMED = 5
-ADVICE = "ask for another distance, height or fewer turns, or plan it by the method 'direct'"
 # block of rows -> what it says, unit of its linear rows, unit of its angular ones
 WORDS = {
     "base dynamics": ("forces and moments in balance", "N", "N m"),
@@ -126,4 +125,4 @@ def sentence(found: Conflict, phase: str, t: float) -> str:
     if blocks:
         held = (f"{_words(block, phase)[0]} ({', '.join(sorted(rows))})" for block, rows in blocks.items())
         text += f", held back by {' and '.join(held)}"
-    return f"{text}; {ADVICE}"
+    return text

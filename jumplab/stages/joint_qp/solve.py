@@ -13,7 +13,7 @@ import numpy as np
 from proxsuite import proxqp
 
 from jumplab.errors import SolverError
-from jumplab.stages.joint_qp.diagnosis import ADVICE, conflict, lines, row_scale, sentence
+from jumplab.stages.joint_qp.diagnosis import conflict, lines, row_scale, sentence
 from jumplab.stages.joint_qp.problem import StepQp
 
 PARTS = ("A", "b", "E", "e", "G", "h", "R", "lower", "upper")  # of a StepQp
@@ -57,7 +57,7 @@ def checked_answer(
         raise SolverError(sentence(found, phase, t), stage="joint_map", status=status, violations=lines(found, phase))
     missed = f"misses '{worst}' by {residual:.2g} of its size" if np.isfinite(residual) else "is not a finite one"
     text = f"stage 2: at t = {t:.3f} s of the {phase} the search for a joint motion did not settle ({status}): "
-    raise SolverError(f"{text}one exists, but the answer {missed}; {ADVICE}", stage="joint_map", status=status)
+    raise SolverError(f"{text}one exists, but the answer {missed}", stage="joint_map", status=status)
 
 
 class CvxpySolver:

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, Shown, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
+from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
-from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -32,9 +33,11 @@ IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3,
 # the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
 
+Begin = tuple[Tape | None, float, bool]  # a tape or none, when its heels rise [s], whether side and yaw are added
 
-@dataclass(frozen=True)
-class SpatialPlan:
+
+@dataclass(frozen=True, repr=False)
+class SpatialPlan(Shown):
     """Result of the spatial program."""
 
     task: JumpTask
@@ -62,7 +65,7 @@ class SpatialPlanner:
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = SPATIAL_MESH,
+        mesh: Mesh | None = None,
         limits: SpatialLimits = SpatialLimits(),
         weights: SpatialWeights = SpatialWeights(),
         *,
@@ -70,10 +73,11 @@ class SpatialPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.mesh, self.limits, self.weights, self.changes = robot, mesh, limits, weights, changes
+        self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
+        self.limits, self.weights, self.changes = limits, weights, changes
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
         options = dict(options or {})
-        problem = changes.applied(build_problem(robot, mesh, limits, weights))
+        problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
@@ -85,6 +89,7 @@ class SpatialPlanner:
         start: Tape | None = None,
         toe_phase_s: float = 0.0,
         *,
+        ramps: bool = True,
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
         stance: np.ndarray | None = None,
@@ -94,7 +99,8 @@ class SpatialPlanner:
 
         Parameters
         ----------
-        start : planar tape of the same rise whose heels rise at ``toe_phase_s`` [s].
+        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
+        ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
         patient : explain a refusal, and look for a smaller target; otherwise only solve, and not for long.
@@ -113,11 +119,11 @@ class SpatialPlanner:
                 if start is None:
                     raise
         if not patient:
-            return self._solved(self._quick, task, (start, toe_phase_s), how)
+            return self._solved(self._quick, task, (start, toe_phase_s, ramps), how)
         try:
-            return self._solved(self.nlp, task, (start, toe_phase_s), how | {"explain": True})
+            return self._solved(self.nlp, task, (start, toe_phase_s, ramps), how | {"explain": True})
         except SolverError as e:
-            less = self._smaller(task, start, toe_phase_s, how)
+            less = self._smaller(task, (start, toe_phase_s, ramps), how)
             if less is not None and not e.violations:  # there is a motion: perhaps from here
                 try:
                     return self._solved(self._warm, task, less, how)
@@ -126,23 +132,27 @@ class SpatialPlanner:
             words = "" if less is None else f"; at this height, {said(less.task)} is planned"
             raise SolverError(f"{e}{words}", stage=e.stage, status=e.status, violations=e.violations) from e
 
-    def _solved(self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | tuple[Tape, float], how: dict) -> SpatialPlan:
-        """A plan that begins with another one, or with a planar tape and when its heels rise."""
+    def _solved(self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | Begin, how: dict) -> SpatialPlan:
+        """A plan that begins with another one, or with a tape, when its heels rise, and whether it needs ramps."""
         asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
         del how["stance"]
         if isinstance(begin, SpatialPlan):
             guess, how = begin.solution.guess(), how | {"multipliers": begin.solution.multipliers}
         else:
-            guess = from_tape(self.terms, *begin, self.mesh, task)
+            tape, toe_phase_s, ramps = begin
+            if tape is None:
+                tape = generic(self.terms["flat"], task)
+                toe_phase_s = float(tape.extra["toe_phase_start"])
+            guess = from_tape(self.terms, tape, toe_phase_s, self.mesh, task, ramps)
         edge = float(asked["edge"] - self.robot.foot.toe + self.robot.foot.center[0])
         return SpatialPlan(task, nlp.solve(asked, guess, **how), edge, self.limits)
 
-    def _smaller(self, task: JumpTask, start: Tape, toe_phase_s: float, how: dict) -> SpatialPlan | None:
+    def _smaller(self, task: JumpTask, begin: Begin, how: dict) -> SpatialPlan | None:
         """The plan of the largest of a few targets with less way and less turn."""
         for share in SHORTER:
             less = {name: round(share * getattr(task, name), 3) for name in ("distance_m", "side_m", "yaw_rad")}
             try:
-                return self._solved(self._quick, replace(task, **less), (start, toe_phase_s), how)
+                return self._solved(self._quick, replace(task, **less), begin, how)
             except (InfeasibleError, SolverError):
                 continue
         return None
@@ -157,6 +167,8 @@ class SpatialPlanner:
         start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
         values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
+        if not self.robot.planar:
+            values["straight"] = float(task.in_plane)
         ways = np.cos(task.along_rad), np.sin(task.along_rad)
         return values | dict(edge=self._edge(task, np.array(ways)), along=ways, gravity=task.gravity)
 
@@ -175,7 +187,9 @@ class SpatialPlanner:
             least = np.ceil(100 * (way - apart) - 1e-6) / 100
             raise InfeasibleError(
                 f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
-                f"sole of {self.robot.name}; ask for a distance of {least:.2f} m or more"
+                f"sole of {self.robot.name}; that takes a distance of at least {least:.2f} m",
+                number="distance_m",
+                bound=float(least),
             )
         return edge
 

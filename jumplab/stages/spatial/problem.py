@@ -30,8 +30,11 @@ def _boxes(b: SpatialTerms) -> tuple[Bound, ...]:
     wide = np.full(base, ANGLE_BOX_RAD)
     wide[-2] = lim.roll_rad
     low, high = m["lower"] + lim.range_margin_rad, m["upper"] - lim.range_margin_rad
-    knees = [b.joint_names.index(name) for name in b.robot.joints["knee"]]
-    high[knees] = np.minimum(high[knees], lim.knee_rad)
+    for k, sign, angle in b.knees:
+        if sign > 0:
+            high[k] = min(high[k], lim.knee_rad - angle)
+        else:
+            low[k] = max(low[k], angle - lim.knee_rad)
     rates = np.concatenate([np.full(base, RATE_BOX), lim.speed_share * m["speed"]])
     torques, free = lim.torque_share * m["effort"], np.full(b.n_forces or 3, np.inf)
     least = np.zeros(b.n_forces) if b.n_forces else -free
@@ -142,5 +145,5 @@ def build_problem(
     made = (flat, _flat_phase(flat, mesh)), (toe, _toe_phase(toe, mesh)), (flight, _flight_phase(flight, mesh))
     phases = tuple(replace(phase, view=partial(SpatialView, b)) for b, phase in made)
     parameters = dict(stance=len(flat.coordinates), distance=1, side=1, yaw=1, platform=1, edge=1, along=2)
-    parameters |= dict(takeoff_speed=1, rotation=1, gravity=1)
+    parameters |= dict(takeoff_speed=1, rotation=1, gravity=1, **({} if robot.planar else {"straight": 1}))
     return Problem("spatial", phases, (_joined(), *_released(toe)), parameters)

@@ -57,7 +57,9 @@ class SpatialWeights:
     torque: float = 2e-4  # [1] / [N m]^2 / [s]
     force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
     momentum_rate: float = 1.0  # [1] / [N m]^2 / [s]
+    mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
 
 
 SPATIAL_MESH = Mesh(12, 12, 16)  # coarse: the tape is exact between the nodes
+TREE_MESH = Mesh(20, 12, 16)  # of robots that no plane describes: weak ankles pass their limits between fewer nodes
 FLIP_MESH = Mesh(20, 16, 28)  # a flip winds up longer, and turns faster

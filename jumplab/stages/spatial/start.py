@@ -1,20 +1,29 @@
-"""Where the spatial program starts: a planar plan of the same rise, with straight ramps of side and yaw in flight."""
+"""Where the spatial program starts: stage 2's motion, or a planar plan of the same rise with ramps of side and yaw."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import nnls
 
 from jumplab.io.tape import Tape
+from jumplab.models.spatial import spin_slope
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.stages.spatial.terms import MOMENT_ARM_M, PYRAMID, SpatialTerms
 from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
+SMOOTHING_S = 0.05  # about a node's distance
 
-def from_tape(terms: dict[str, SpatialTerms], tape: Tape, toe_phase_s: float, mesh: Mesh, task: JumpTask) -> dict:
-    """Phase name -> :class:`PhaseGuess` from a planar ``tape`` whose heels rise at ``toe_phase_s``."""
+
+def from_tape(
+    terms: dict[str, SpatialTerms], tape: Tape, toe_phase_s: float, mesh: Mesh, task: JumpTask, ramps: bool = True
+) -> dict:
+    """Phase name -> :class:`PhaseGuess` from a ``tape`` whose heels rise at ``toe_phase_s``.
+
+    With ``ramps`` the tape is one straight ahead, and side and yaw are added in flight.
+    """
     split, end = tape.takeoff_time, float(tape.t[-1])
     row, out = tape.takeoff_index, {}
     for name, t in mesh.nodes(toe_phase_s, split, end).items():
@@ -22,12 +31,17 @@ def from_tape(terms: dict[str, SpatialTerms], tape: Tape, toe_phase_s: float, me
         b = terms[name]
         q, v, a, tau, f = (_sampled(t, tape.t[part], x[part]) for x in (tape.q, tape.v, tape.a, tape.tau, tape.f))
         q, v, a = _charts(b, q, v, a)
+        if not ramps:  # a roll-out, which rings where a node may fall anywhere
+            h = (t[-1] - t[0]) / (len(t) - 1)
+            v = gaussian_filter1d(v, SMOOTHING_S / h, axis=0, mode="nearest")
+            a = np.gradient(v, h, axis=0)
         if b.contact is Contact.FLIGHT:
             s = np.linspace(0, 1, len(t))
             flight_s = end - split
             com, speed = _takeoff(b, tape, row)
-            q[:, 3], v[:, 3] = task.yaw_rad * s, task.yaw_rad / flight_s
-            speed[1] = task.side_m / flight_s
+            if ramps:
+                q[:, 3], v[:, 3] = task.yaw_rad * s, task.yaw_rad / flight_s
+                speed[1] = task.side_m / flight_s
             constants = {
                 f"{k}_{x}": y for k, col in (("com", com), ("vel", speed)) for x, y in zip("xyz", col, strict=True)
             }
@@ -47,20 +61,18 @@ def _sampled(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray
 
 
 def _charts(b: SpatialTerms, q, v, a):
-    """Charts of a motion that turns about +y alone."""
+    """Charts of a motion, their rates and accelerations; the inverse of :meth:`SpatialModel.to_pinocchio`."""
     chart = b.model.of_pinocchio(q)
-    pitch = chart[:, 5]
-    c, s = np.cos(pitch), np.sin(pitch)
+    turn, slope = b.model.rotations(chart), spin_slope(chart[:, 4], chart[:, 5])
+    rates = np.linalg.solve(slope, v[:, 3:6, None])[..., 0]
+    drift = b.model.to_pinocchio(chart, np.concatenate([0 * q[:, :3], rates, 0 * q[:, 7:]], 1), 0 * v)[2][:, 3:6]
 
-    def world(x):
-        return np.stack([c * x[:, 0] + s * x[:, 2], x[:, 1], c * x[:, 2] - s * x[:, 0]], -1)
+    def charted(linear, angles, joints):
+        return np.concatenate([np.einsum("nij,nj->ni", turn, linear), angles, joints[:, 6:]], axis=1)
 
-    def charted(linear, x):
-        return np.concatenate([linear, x[:, 5:6], x[:, 3:4], x[:, 4:5], x[:, 6:]], axis=1)
-
-    w = v[:, 4]
-    turning = np.stack([w * v[:, 2], 0 * w, -w * v[:, 0]], -1)  # w cross v in base axes
-    return chart, charted(world(v[:, :3]), v), charted(world(a[:, :3] + turning), a)
+    turning = a[:, :3] + np.cross(v[:, 3:6], v[:, :3])
+    speeds = np.linalg.solve(slope, (a[:, 3:6] - drift)[..., None])[..., 0]
+    return chart, charted(v[:, :3], rates, v), charted(turning, speeds, a)
 
 
 def _takeoff(b: SpatialTerms, tape: Tape, row: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from scipy.integrate import cumulative_trapezoid
 from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.spatial import CHART, SpatialModel
 from jumplab.ocp.solution import PhaseSolution
+from jumplab.robot import Robot
 from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.start import generators
 from jumplab.stages.spatial.terms import SpatialTerms
@@ -41,7 +42,7 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     start = [stood, _flight(terms["flight"], flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
     q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
     wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
-    f, tau, com, spin = _forces(robot, q, v, a, wrench, len(t))
+    f, tau, com, spin = forces(robot, q, v, a, wrench, len(t))
     phase = np.repeat(["launch", "flight"], [len(t), len(late)])
     extra = {
         "com": com[:, :3],
@@ -81,8 +82,8 @@ class Legs:
         self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
         self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
         bodies = sorted({j for k in b.feet for j in b.chain(k)})
-        self.columns = np.array([len(CHART) - 1 + j for j in bodies])
-        self.pitches = np.arange(rows.numel()).reshape(2, -1)[:, -1]  # rows that say how the feet pitch
+        self.columns = np.array([1, 3, 4] * b.short + [len(CHART) - 1 + j for j in bodies])
+        self.pitches = np.cumsum([len(held) + 3 for held in b.held]) - 1  # rows that say how the feet pitch
 
     def held(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, ...]:
         """Charts, rates and accelerations (n, .) with the legs moved so that the feet stay in their places.
@@ -273,7 +274,9 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
     return q, v, a
 
 
-def _forces(robot, q, v, a, wrench, standing: int):
+def forces(
+    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, standing: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
     What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.

@@ -9,9 +9,10 @@ import pinocchio as pin
 from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
-from jumplab.robot.stance import stance_configuration
+from jumplab.robot.reduction import mirror
+from jumplab.robot.stance import knees, stance_configuration
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.shapes import pairs
+from jumplab.stages.spatial.shapes import boxes, pairs
 from jumplab.stages.whole_body.settings import Contact
 from jumplab.stages.whole_body.terms import POSITIVE, cost, row
 from jumplab.task import GRAVITY
@@ -49,8 +50,9 @@ class SpatialTerms:
         self.toes, self.soles = on_foot([foot.toe, 0.0, foot.sole_z]), on_foot(foot.center)
         self.sole_corners = np.array([on_foot(x) for x in foot.corners]).transpose(1, 0, 2)  # (2, 4, 3)
         self.stance = self.model.of_pinocchio(stance_configuration(robot)[None])[0]
-        legs = {0, *(j for k in self.feet for j in self.chain(k))}
-        self.pairs = pairs(robot, self.model, legs, stance_configuration(robot))
+        meeting = {0, *(j for k in self.feet for j in self.chain(k))} if robot.planar else range(len(self.model.bodies))
+        self.pairs = pairs(robot, self.model, set(meeting), stance_configuration(robot))
+        self.knees = knees(robot)
         self.places = self._first_places(frames)
         self.corners = self._ground_corners()
         first = 3 if self.flying else 0
@@ -76,6 +78,16 @@ class SpatialTerms:
             body = self.model.bodies[body].parent
         return found
 
+    @property
+    def short(self) -> bool:
+        """Whether a leg has fewer than six joints: feet that stand then hold yaw and roll of the base."""
+        return min(len(self.chain(k)) for k in self.feet) < 6
+
+    @property
+    def held(self) -> tuple[list[int], list[int]]:
+        """Which components of their feet's places are told to the legs: of short ones, the second's side follows."""
+        return [0, 1, 2], [0, 2] if self.short else [0, 1, 2]
+
     def _first_places(self, frames) -> np.ndarray:
         """Middles of both soles (2, 3) as the robot stands [m]."""
         model, data = self.model.model, self.model.model.createData()
@@ -85,7 +97,7 @@ class SpatialTerms:
 
     def _ground_corners(self) -> np.ndarray:
         lim, foot = self.limits, self.robot.foot
-        half, wide = (foot.toe - foot.heel) / 2, foot.half_width - lim.side_margin_m
+        half, wide = (foot.toe - foot.heel) / 2, foot.half_width - min(lim.side_margin_m, 0.4 * foot.half_width)
         xs = {Contact.FLAT: (lim.heel_margin_m - half, half), Contact.TOE: (half,), Contact.FLIGHT: ()}[self.contact]
         local = np.array([[x, y, 0.0] for x in xs for y in (-wide, wide)]).reshape(-1, 3)
         return self.places[:, None] + local
@@ -155,7 +167,15 @@ class SpatialTerms:
         ]
         if not self.flying:
             terms.append(cost("force", "ours: spread", "N", lambda p: p.z[: self.n_forces], w.force))
+        if not self.robot.planar:
+            terms.append(cost("mirror", "ours: a jump straight ahead is even", "rad", self.uneven, w.mirror))
         return terms
+
+    def uneven(self, p: Point) -> ca.SX:
+        """How far left and right are from mirror images in a jump straight ahead; yaw and roll of the base."""
+        first = len(self.coordinates) - self.model.joints
+        rows = [p.q[first + k] - sign * p.q[first + i] for i, k, sign in mirror(self.model.model)]
+        return p.p.straight * ca.vertcat(p.q[first - 3 : first - 1], *rows)
 
     def dynamics(self) -> list[Term]:
         """Newton and Euler: nothing but the ground moves the base; joint torques go with the motion."""
@@ -187,15 +207,18 @@ class SpatialTerms:
 
     # launch -----------------------------------------------------------------------------------------------------
     def contact_rows(self, q: ca.SX) -> ca.SX:
-        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch."""
+        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch.
+
+        Short legs leave the base no roll and no yaw.
+        """
         s, rows, half = SpatialState(self.model, q, q, q), [], (self.robot.foot.toe - self.robot.foot.heel) / 2
-        for body, own, toe, first in zip(self.feet, self._foot_axes, self.toes, self.places, strict=True):
+        for side, (body, own) in enumerate(zip(self.feet, self._foot_axes, strict=True)):
             axes = s.rotation(body) @ ca.DM(own)
-            place = s.point(body, toe) - ca.DM(first + np.array([half, 0.0, 0.0]))
-            rows += [place, axes[2, 1], axes[0, 1]]
+            place = s.point(body, self.toes[side]) - ca.DM(self.places[side] + np.array([half, 0.0, 0.0]))
+            rows += [place[self.held[side]], axes[2, 1], axes[0, 1]]
             if self.contact is Contact.FLAT:
                 rows.append(axes[2, 0])
-        return ca.vertcat(*rows)
+        return ca.vertcat(*rows, *([q[3], q[4]] if self.short else []))
 
     def pitches(self, q: ca.SX) -> ca.SX:
         """Sines of the feet's pitch (2,); positive is heel up."""
@@ -292,17 +315,23 @@ class SpatialTerms:
 
     @property
     def limb_points(self) -> list[tuple[int, np.ndarray]]:
-        """Knees and hands: (body, place in it)."""
-        robot, bodies, hand = self.robot, self.model.names[5:], self.robot.sagittal.span[4]
-        points = [(bodies.index(name), np.zeros(3)) for name in robot.joints["knee"]]
-        for name in robot.joints["shoulder_pitch"]:
-            body = bodies.index(name)
-            points.append((body, self.model.bodies[body].own.T @ np.array([hand[0], 0.0, hand[1]])))
+        """Knees, and the far ends of the bodies that end a limb but are no feet: (body, place in it)."""
+        points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
+        carrying = {b.parent for b in self.model.bodies} | set(self.feet)
+        for box in boxes(self.robot, self.model)[0]:
+            if box.body not in carrying:
+                along = box.axes[:, np.argmax(box.half)] * box.half.max()
+                points.append((box.body, box.centre + along * (1.0 if along @ box.centre > 0 else -1.0)))
         return points
 
-    def turned(self, p: Point, x: ca.SX | np.ndarray) -> ca.SX:
-        """A vector (3,) turned by the asked yaw."""
-        c, s = ca.cos(p.p.yaw), ca.sin(p.p.yaw)
+    def bend(self, p: Point) -> ca.SX:
+        """Flexion of both knees (2,) [rad]."""
+        first = len(self.coordinates) - self.model.joints
+        return ca.vertcat(*(sign * p.q[first + k] + angle for k, sign, angle in self.knees))
+
+    def turned(self, p: Point, x: ca.SX | np.ndarray, way: int = 1) -> ca.SX:
+        """A vector (3,) turned by the asked yaw, or back."""
+        c, s = ca.cos(p.p.yaw), way * ca.sin(p.p.yaw)
         return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
 
     def feet_at_goal(self, p: Point) -> ca.SX:
@@ -311,8 +340,11 @@ class SpatialTerms:
         for side, body in enumerate(self.feet):
             goal = self.turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
             axes, ahead = self.foot_axes(p, side), self.turned(p, np.array([1.0, 0.0, 0.0]))
-            rows += [self.at(p, body, self.soles[side]) - goal, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
-        return ca.vertcat(*rows)
+            off = self.at(p, body, self.soles[side]) - goal
+            if self.short:
+                off = self.turned(p, off, -1)[self.held[side]]
+            rows += [off, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
+        return ca.vertcat(*rows, *([p.q[0] - p.p.yaw, p.q[1]] if self.short else []))
 
     def capture(self, p: Point) -> ca.SX:
         """How far the middle between the soles is off the place (2,) where it catches the robot [m]."""
@@ -364,12 +396,11 @@ class SpatialTerms:
 
         low = -lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]
         high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
-        knees = [3 + self.joint_names.index(name) for name in self.robot.joints["knee"]]
         return [
             end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal, scale=0.1),
             end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, [0, 0, 1, 0, 0, 1])),
             end("attitude at touchdown", "ours", "rad", attitude, low, high),
-            end("knees at touchdown", "ours: stroke", "rad", lambda p: p.q[knees], *lim.touchdown_knee),
+            end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
             end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
             end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], *within(trunk, [1, 0, 0])),
             self.capture_rows(),

@@ -9,7 +9,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import SolverError
+from jumplab.errors import Shown, SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
 from jumplab.ocp.cache import remembered
@@ -18,7 +18,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach, shipped_reach
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
-from jumplab.stages.srmp.reachable import check_reachable, nearest
+from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import JumpTask
 
@@ -65,8 +65,8 @@ class SrmpFlight(SrmpMotion):
     foot_com_accel: np.ndarray  # (n, 2) [m/s^2]
 
 
-@dataclass(frozen=True)
-class SrmpPlan:
+@dataclass(frozen=True, repr=False)
+class SrmpPlan(Shown):
     """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept in, the target."""
 
     task: JumpTask
@@ -192,18 +192,23 @@ class SrmpPlanner:
         InfeasibleError
             Before solving, if closed forms already say that the robot cannot do it.
         SolverError
-            If there is no solution; names the violated terms, and a target close by that has one.
+            If there is no solution; names the violated terms.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
+        spread = self.changes.spread(self.nlp.problem, weights)
+        if near is not None and task.is_near(near.task) and self.nlp.weighs_as(near.solution, spread):
+            how = {"weights": spread, "off": self.changes.still_there(self.nlp.problem, off)}
+            try:
+                found = self.nlp.settled(parameters(task, self.reach, start), near.solution.guess(), **how)
+                return sample_plan(task, found, self.reach, self.robot.sagittal.total_mass)
+            except SolverError:
+                pass  # ipopt finds more
         if near is not None:
             try:
                 return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)
             except SolverError:
                 pass  # as if there had been none
-        try:
-            return self._solve(task, guess, weights, off, start=start)
-        except SolverError as failure:
-            raise nearest(task, failure, lambda easier: self._solve(easier, None, weights, off, False)) from failure
+        return self._solve(task, guess, weights, off, start=start)
 
     def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
         guess = guess or naive_guess(task, self.reach, self.settings)
@@ -255,14 +260,9 @@ def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float)
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
     c, ones = flight.constants, np.ones_like(t)
     # theta between nodes: the cubic through the node values with the exact rates L / rho
-    theta = _cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
+    theta = cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
     rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
-    # leg length from take-off to touchdown: smooth, only the ends matter (the rod has no mass)
-    s = t / flight.duration
-    d = c["leg"] - takeoff_length
-    leg = takeoff_length + d * (10 * s**3 - 15 * s**4 + 6 * s**5)
-    leg1 = d * ((30 * s**2 - 60 * s**3 + 30 * s**4) / flight.duration)
-    leg2 = d * ((60 * s - 180 * s**2 + 120 * s**3) / flight.duration**2)
+    leg, leg1, leg2 = leg_between(takeoff_length, c["leg"], t)
     along = -np.stack([np.sin(theta), np.cos(theta)], -1)
     across = np.stack([along[:, 1], -along[:, 0]], -1)
     foot = leg[:, None] * along
@@ -274,7 +274,15 @@ def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float)
     return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)
 
 
-def _cubic(nodes, values, rates, t):
+def leg_between(first: float, last: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Leg length from take-off to touchdown with two derivatives: smooth, only the ends matter, the rod has no mass."""
+    s, d = t / t[-1], last - first
+    leg = first + d * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    leg1 = d * ((30 * s**2 - 60 * s**3 + 30 * s**4) / t[-1])
+    return leg, leg1, d * ((60 * s - 180 * s**2 + 120 * s**3) / t[-1] ** 2)
+
+
+def cubic(nodes: np.ndarray, values: np.ndarray, rates: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The cubic pieces through values and rates at nodes, at times ``t``."""
     k = np.clip(np.searchsorted(nodes, t, side="right") - 1, 0, len(nodes) - 2)
     h = nodes[k + 1] - nodes[k]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
+from jumplab.errors import InfeasibleError
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach
 from jumplab.stages.srmp.settings import SrmpSettings
@@ -162,12 +161,12 @@ def _airtime(can: Capability, task: JumpTask) -> float:
 
 
 def check_reachable(task: JumpTask, envelope: Reach, robot: Robot, settings: SrmpSettings = SrmpSettings()) -> None:
-    """Refuse a target that no launch of this robot can meet, in words and with the nearest number that would pass.
+    """Refuse a target that no launch of this robot can meet, in words and with a bound that no plan passes.
 
     The conditions, in this order, are those of :func:`highest` (take-off speed, average force over the stroke),
     :func:`highest_platform` (apex over the bent landing leg), :func:`farthest` (extension speed, falling forward,
     friction, time in the air) and :func:`least_momentum` (rotation). Raises :class:`InfeasibleError` with the value
-    asked for, the limit, where it comes from and what to ask for instead.
+    asked for, the limit, and where it comes from.
     """
     can = capability(envelope, task.gravity, settings)
     for check in (_check_height, _check_platform, _check_distance, _check_rotation):
@@ -188,7 +187,10 @@ def _check_height(task: JumpTask, can: Capability, name: str) -> None:
         raise InfeasibleError(
             f"height = {task.height_m:g} m: take-off at {task.takeoff_speed:.2f} m/s, on average "
             f"{needed_force(can, task.height_m):.0f} N over {can.stroke:.2f} m of leg stroke; the legs of {name} reach "
-            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); ask for {_below(limit)} m or less"
+            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); no plan is higher than "
+            f"{_below(limit)} m",
+            number="height_m",
+            bound=limit,
         )
 
 
@@ -204,11 +206,13 @@ def _check_platform(task: JumpTask, can: Capability, name: str) -> None:
     if task.platform_m <= limit:
         return
     enough = [h for h in _heights(can, task.height_m) if highest_platform(can, h, task.distance_m) >= task.platform_m]
-    higher = f", or for a height of {_above(enough[0])} m" if enough else ""
+    higher = f", and none lands on this one from a height of less than {_above(enough[0])} m" if enough else ""
     raise InfeasibleError(
         f"platform = {task.platform_m:g} m: at a height of {task.height_m:g} m the CoM of {name} rises to at most "
         f"{can.takeoff_length + task.height_m:.2f} m, too low to stand there even on legs bent as far as a landing "
-        f"allows; ask for a platform of {_below(limit)} m or less{higher}"
+        f"allows; no such plan lands above {_below(limit)} m{higher}",
+        number="platform_m",
+        bound=limit,
     )
 
 
@@ -219,12 +223,14 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     heights = [h for h in _heights(can, LOWEST_M) if task.platform_m <= highest_platform(can, h, task.distance_m)]
     best = max(((farthest(can, _at(task, h)), h) for h in heights), default=(0.0, task.height_m))
     found = best[0] > limit + STEP_M
-    more = f"; farthest is {_below(best[0])} m, at a height of {best[1]:.2f} m" if found else ""
-    way, sign = ("forward", "") if task.distance_m >= 0 else ("backward", "-")
+    more = f"; at no height does it cover more than {_below(best[0])} m, at {best[1]:.2f} m" if found else ""
+    way = "forward" if task.distance_m >= 0 else "backward"
     raise InfeasibleError(
         f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, {name} "
         f"covers at most {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at take-off, friction "
-        f"{can.settings.friction:g}); ask for {sign}{_below(limit)} m{more}"
+        f"{can.settings.friction:g}){more}",
+        number="distance_m",
+        bound=limit,
     )
 
 
@@ -243,11 +249,14 @@ def _check_rotation(task: JumpTask, can: Capability, name: str) -> None:
     if needed <= box:
         return
     heights = [h for h in _heights(can, task.height_m) if least_momentum(can, _at(task, h)) <= box]
-    advice = f"ask for a height of {_above(heights[0])} m" if heights else "ask for fewer turns"
+    least = _above(heights[0]) if heights else None
+    advice = f"heights of less than {least} m leave less time" if heights else "no height leaves time enough"
     raise InfeasibleError(
         f"rotation = {math.degrees(task.rotation_rad):g} deg: {_airtime(can, task):.2f} s in the air need an angular "
         f"momentum of at least {needed:.0f} kg m^2/s even with all limbs drawn in; stage 1 allows {name} {box:g}; "
-        f"{advice}"
+        f"{advice}",
+        number="rotation_rad",
+        bound=heights[0] if heights else None,
     )
 
 
@@ -257,35 +266,3 @@ def _below(limit: float) -> str:
 
 def _above(limit: float) -> str:
     return f"{math.ceil(limit / STEP_M - 1e-9) * STEP_M:.2f}"
-
-
-# nearest ------------------------------------------------------------------------------------------
-STEPS = (4, 10)  # the closed forms pass targets that are so many steps too hard, seldom more
-DISTANCE_STEP_M = 0.05  # distance has the widest range of the three
-
-
-def nearest(task: JumpTask, failure: SolverError, plan: Callable[[JumpTask], object]) -> SolverError:
-    """``failure`` again, ending with a target close to ``task`` that ``plan`` was able to plan, if one was found."""
-    for better, words in _easier(task, " ".join(failure.violations)):
-        try:
-            plan(better)
-        except JumplabError:
-            continue
-        text = f"{failure}; {words} can be planned"
-        return SolverError(text, stage=failure.stage, status=failure.status, violations=failure.violations)
-    return failure
-
-
-def _easier(task: JumpTask, violations: str) -> Iterator[tuple[JumpTask, str]]:
-    """Easier targets, the least change first, along the number that the violated terms point to."""
-    high = task.platform_m > 0 and ("touchdown" in violations or "take-off length" in violations)
-    key = "height" if "take-off speed" in violations else "platform" if high else "distance"
-    asked = getattr(task, f"{key}_m")
-    for k in STEPS:
-        easier = float(_below(asked - k * STEP_M))
-        if key == "distance":
-            easier = math.copysign(max(abs(asked) - k * DISTANCE_STEP_M, 0.0), asked)
-        try:
-            yield replace(task, **{f"{key}_m": easier}), f"the same target with a {key} of {easier:.2f} m"
-        except InputError:  # beyond what a target can be
-            return

@@ -130,7 +130,7 @@ class FlipPlanner(WholeBodyPlanner):
         except SolverError as e:
             where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
             text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
-            remedy = "limits, ask for another height or distance"
+            remedy = "limits"
             raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status) from e
         return WholeBodyPlan(task, solution, first, self.limits)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, Shown, SolverError
 from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_angles
@@ -51,8 +51,8 @@ class Asked:
     off: tuple[str, ...] = ()  # terms left out
 
 
-@dataclass(frozen=True)
-class WholeBodyPlan:
+@dataclass(frozen=True, repr=False)
+class WholeBodyPlan(Shown):
     """Result of stage 3 or of the direct planner."""
 
     task: JumpTask
@@ -98,8 +98,10 @@ def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> N
     if task.distance_m < least:
         raise InfeasibleError(
             f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-            f"under a sole of {robot.name}; ask for a distance of {least:.2f} m or more (backward jumps only on the "
-            f"level)"
+            f"under a sole of {robot.name}; that takes a distance of at least {least:.2f} m (backward jumps only on "
+            f"the level)",
+            number="distance_m",
+            bound=least,
         )
 
 
@@ -148,6 +150,7 @@ class WholeBodyPlanner:
         off: tuple[str, ...] = (),
         near: WholeBodyPlan | None = None,
         start: np.ndarray | None = None,
+        settle: bool = True,
     ) -> WholeBodyPlan:
         """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
 
@@ -158,15 +161,16 @@ class WholeBodyPlanner:
         near : this planner's plan for a target close by, to begin with instead of ``guess``; if that leads nowhere, the
             target is solved from ``guess`` all the same.
         start : absolute link angles (5,) in which the robot waits at rest, soles flat; the stance if None.
+        settle : take a few steps from ``near`` if it is close enough, see :meth:`jumplab.ocp.nlp.Nlp.settled`; the
+            least cost is found without.
 
         Raises
         ------
         SolverError
             If there is no plan; names the terms in conflict.
         """
-        guess = guess or self.naive_guess(task)
         asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
-        return replace(self._evened(self._begun(asked, guess, near), asked), limits=self.limits)
+        return replace(self._evened(self._begun(asked, guess, near, settle), asked), limits=self.limits)
 
     def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
         """Call an NLP's ``solve`` or ``approach`` with start values, or with a solution on any mesh.
@@ -185,8 +189,7 @@ class WholeBodyPlanner:
 
     def _evened(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
         """The plan, with a dearer jerk if it jumps too far. Whoever sets the jerk's weight or drops it is obeyed."""
-        set_by_hand = *asked.weights, *asked.off, *self.changes.weights, *self.changes.off
-        if any(name.rpartition("/")[2] == "jerk" for name in set_by_hand):
+        if self._jerk_set(asked):
             return found
         for factor in EVENING:
             if found.jerk_step <= FOLLOWED_JERK_STEP:
@@ -199,19 +202,61 @@ class WholeBodyPlanner:
             found = replace(found, solution=even, uneven=(*found.uneven, found.solution.statistics))
         return found
 
-    def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None) -> WholeBodyPlan:
+    def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None, settle: bool) -> WholeBodyPlan:
         """The solution, from the plan for a target close by, from the coarse mesh or from the guess itself."""
+        if near is not None and settle and asked.task.is_near(near.task):
+            try:
+                return self._beside(asked, near.solution)
+            except SolverError:
+                pass  # ipopt finds more
         if near is not None:
             try:
                 return WholeBodyPlan(asked.task, self._run(self._warm.solve, asked, near.solution, explain=False))
             except SolverError:
                 pass  # as if there had been none
+        guess = guess or self.naive_guess(asked.task)
         if self._coarse is not None:
             try:
                 return self._refine(asked, guess)
             except SolverError:
                 pass  # the fine mesh has the last word, and the better explanation
         return WholeBodyPlan(asked.task, self._run(self.nlp.solve, asked, guess))
+
+    def settled(
+        self,
+        task: JumpTask,
+        near: Mapping[str, PhaseGuess],
+        *,
+        jerk: float | None = None,
+        start: np.ndarray | None = None,
+    ) -> WholeBodyPlan:
+        """The direct plan for a target, a few steps from the motion ``near`` of one close by; without tracking only.
+
+        ``jerk`` is that one's weight of the jerk if the tape asked for a dearer one; ``start`` as in :meth:`plan`.
+        Raises :class:`SolverError` if the target is not that close.
+        """
+        asked = Asked(task, None, self.parameters(task, None, start))
+        found = self._settled(asked, near, {} if jerk is None or self._jerk_set(asked) else {"jerk": jerk})
+        return replace(self._evened(found, asked), limits=self.limits)
+
+    def _settled(self, asked: Asked, near: Mapping[str, PhaseGuess], weights: Mapping[str, float]) -> WholeBodyPlan:
+        how = {"references": self.references(asked.srmp, self.mesh), "off": asked.off}
+        how["weights"] = self.changes.spread(self.nlp.problem, {**asked.weights, **weights})
+        return WholeBodyPlan(asked.task, self.nlp.settled(asked.parameters, near, **how))
+
+    def _beside(self, asked: Asked, near: Solution) -> WholeBodyPlan:
+        """A plan a few steps from one for a target close by, whose jerk may have been made dearer for the tape."""
+        jerk, weights = {row["weight"] for row in near.cost_shares if row["name"] == "jerk"}, {}
+        if not self._jerk_set(asked) and jerk & {factor * self.weights.jerk for factor in EVENING}:
+            weights["jerk"] = jerk.pop()
+        if not self.nlp.weighs_as(near, self.changes.spread(self.nlp.problem, {**asked.weights, **weights})):
+            raise SolverError(f"{self.nlp.problem.name}: the plan to begin with has other weights", stage="whole body")
+        return self._settled(asked, near.guess(), weights)
+
+    def _jerk_set(self, asked: Asked) -> bool:
+        """Whether somebody set the jerk's weight by hand, or dropped it."""
+        set_by_hand = *asked.weights, *asked.off, *self.changes.weights, *self.changes.off
+        return any(name.rpartition("/")[2] == "jerk" for name in set_by_hand)
 
     def _refine(self, asked: Asked, guess) -> WholeBodyPlan:
         """The solution from a few steps on the coarse mesh, or where they lead nowhere, from ipopt's solution there."""

@@ -8,8 +8,11 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pinocchio as pin
+from scipy.interpolate import CubicSpline
 
 from jumplab.errors import InfeasibleError, JumplabError, SolverError
+from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_configuration
 from jumplab.sim import STEP_S
@@ -26,6 +29,7 @@ FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, onc
 STILL_LEG_RAD, STILL_ARM_RAD = 0.15, 0.25  # still enough to begin: what is left fades within BLEND_S
 STILL_RATE, STILL_COM = 1.5, 0.20  # [rad/s] any joint, [m/s]
 BLEND_S = 0.25  # a third of the launch, over before the push begins
+ROWS, NEWTON = 10, 3  # of the tape per inverse kinematics, and its steps: exact to 1e-6 rad
 PATIENCE_S = 3.0  # who is not still this long after touchdown will not be
 LARGEST_BIAS = 0.10  # [m, rad] a robot that misses by more than this has another problem than a wrong model
 LARGEST_OFFSET_RAD = 0.10  # a posture that is farther off the crouch is not the robot standing still
@@ -341,19 +345,78 @@ class ChainPilot:
         ahead.began_s, pose, tape = step * STEP_S, self._pose(q), ahead.plan.tape
         if self.used:
             self._foresight.learn_place(self.used[-1], self._from, self.plans[-1], pose)
-        self._from, self._offset = pose, (q[7:] - tape.q[0, 7:], v[6:].copy())
+        self._from, self._uneven = pose, _over_feet(tape, self._robot, q)
+        self._offset = q[7:] - tape.q[0, 7:] - self._uneven(0.0), v[6:].copy()
         self.used.append(ahead)
         how = dict(lead_s=self._lead_s, start_rad=float(pose[2]))
         self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, **how))
         self.began.append(step)
 
     def _blended(self, command: Command, time: float) -> Command:
-        """The tape's command plus what was left of posture and rates when it began, fading smoothly."""
-        if time >= BLEND_S:
-            return command
-        s, (error, rate) = time / BLEND_S, self._offset
-        angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
-        speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
-        push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
-        moved = dict(q=command.q + angle, rate=command.rate + speed, acceleration=command.acceleration + push)
-        return replace(command, **moved)
+        """The tape's command over the feet as they stand, plus what else was left of posture and rates when it began,
+        fading smoothly; once they are off the ground, the feet are drawn to their places beside each other."""
+        ends, moved = self._uneven.x[-1], np.array([command.q, command.rate, command.acceleration])
+        moved += _fading(*self._offset, time)
+        if time < ends:
+            moved += [self._uneven(time, order) for order in range(3)]
+        else:
+            moved += _fading(self._uneven(ends), self._uneven(ends, 1), time - ends)
+        return replace(command, q=moved[0], rate=moved[1], acceleration=moved[2])
+
+
+def _fading(error: np.ndarray, rate: np.ndarray, time: float) -> np.ndarray:
+    """A cubic from ``error`` and ``rate`` at time 0 to rest at zero: its value, rate and acceleration (3, ...)."""
+    if time >= BLEND_S:
+        return np.zeros((3, *error.shape))
+    s = time / BLEND_S
+    angle = (1 + 2 * s) * (1 - s) ** 2 * error + s * (1 - s) ** 2 * BLEND_S * rate
+    speed = (6 * s * s - 6 * s) / BLEND_S * error + (1 - s) * (1 - 3 * s) * rate
+    push = (12 * s - 6) / BLEND_S**2 * error + (6 * s - 4) / BLEND_S * rate
+    return np.array([angle, speed, push])
+
+
+def _over_feet(tape: Tape, robot: Robot, q: np.ndarray) -> CubicSpline:
+    """Joint angles (nv - 6,) over the time of the launch [s] to add to the tape's, so that its trunk moves as planned
+    between feet that stand as in ``q`` (nq,) instead of side by side.
+
+    Legs that are made even on feet that are not would twist the robot, and turn it further in every jump.
+    """
+    model, data = robot.model, robot.model.createData()
+    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    legs = [[i for i in model.supports[model.frames[f].parentJoint] if i > 1] for f in frames]
+    columns = [[model.idx_vs[i] for i in leg] for leg in legs]
+    pin.framesForwardKinematics(model, data, tape.q[0])
+    planned = [data.oMf[f].act(robot.foot.center) for f in frames]
+    moves = _unevenness(model, data, frames, robot.foot.center, q, planned)
+    launch = np.flatnonzero(tape.phase == "launch")
+    rows = np.unique(np.append(launch[::ROWS], launch[-1]))
+    out = np.zeros((len(rows), model.nv - 6))
+    for k, row in enumerate(rows):
+        pin.framesForwardKinematics(model, data, tape.q[row])
+        goals, now = [move * data.oMf[f] for move, f in zip(moves, frames, strict=True)], tape.q[row].copy()
+        for _ in range(NEWTON):
+            pin.computeJointJacobians(model, data, now)
+            for goal, f, leg in zip(goals, frames, columns, strict=True):
+                off = pin.log6(pin.updateFramePlacement(model, data, f).actInv(goal)).vector
+                slope = pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL)[:, leg]
+                now[np.array(leg) + 1] += np.linalg.lstsq(slope, off, rcond=None)[0]
+        out[k] = now[7:] - tape.q[row, 7:]
+    return CubicSpline(tape.t[rows], out)
+
+
+def _unevenness(model, data, frames: list[int], center: np.ndarray, q: np.ndarray, planned: list) -> list[pin.SE3]:
+    """What moves each foot from its ``planned`` place (sole's middles) to where it stands in ``q``, seen from between
+    both: along the ground, and turned about the vertical."""
+    pin.framesForwardKinematics(model, data, q)
+    soles = [data.oMf[f].act(center) for f in frames]
+    ahead = [data.oMf[f].rotation[:2, 0] for f in frames]
+    x, y = np.sum(ahead, axis=0)
+    own, middle = pin.rpy.rpyToMatrix(0.0, 0.0, -math.atan2(y, x)), np.mean(soles, axis=0)
+    out = []
+    for sole, (c, s), place in zip(soles, ahead, planned, strict=True):
+        off = own @ (sole - middle) - (place - np.mean(planned, axis=0))
+        yaw = math.remainder(math.atan2(s, c) - math.atan2(y, x), math.tau)
+        turn = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
+        there = pin.SE3(np.eye(3), place + off * [1.0, 1.0, 0.0])
+        out.append(there * turn * pin.SE3(np.eye(3), -place))
+    return out

@@ -95,6 +95,8 @@ def _jumps(run: Run, chain: ChainPilot) -> tuple[ChainedJump, ...]:
 def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s) -> None:
     require_type(course, Course, "the course")
     require_type(robot, Robot, "the robot")
+    if not robot.planar:
+        raise InputError(f"robot {robot.name}: chains wait in a crouch of five links, which do not describe it")
     if perturbation is not None:
         require_type(perturbation, Perturbation, "the perturbation")
     for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
@@ -203,7 +205,7 @@ def run_chains(
     check_numbers(n, seed, jobs)
     drawn = [Perturbation.draw(robot, seed + k, ranges, noise or SensorNoise()) for k in range(n)]
     work = [joblib.delayed(_trial)(course, robot, seed + k, one, how) for k, one in enumerate(drawn)]
-    return ChainReport(course, tuple(in_parallel(work, jobs, "list")))
+    return ChainReport(course, tuple(in_parallel(work, jobs, "generator")))
 
 
 def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: dict) -> ChainTrial:

@@ -1,0 +1,44 @@
+"""The book as a static site: the executed notebooks, the reference from docstrings, the gallery and the tuning page.
+
+After ``jumplab run``, in the clone's root: ``python -m sphinx -b html -c notebooks/book notebooks site``.
+"""
+
+from pathlib import Path
+
+from jumplab.io.folder import versions
+
+NOTEBOOKS = Path(__file__).resolve().parent.parent
+EXECUTED = NOTEBOOKS.parent / "executed" / "notebooks"
+
+project, author = "jumplab", "The jumplab authors"
+release = version = versions()["jumplab"]
+root_doc = "book/index"
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["paper", ".ipynb_checkpoints"]
+html_theme, html_title = "furo", f"jumplab {release}"
+html_extra_path = ["../../executed/jump.html"] if (EXECUTED.parent / "jump.html").is_file() else []
+nb_execution_mode = "off"  # `jumplab run` has executed them; what it has not is shown without outputs
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
+myst_heading_anchors = 3
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints = "description"
+suppress_warnings = ["mystnb.unknown_mime_type", "myst.xref_missing", "docutils"]
+
+
+def with_outputs(app, name, source):
+    """Put the executed notebook in the place of the one without outputs."""
+    path = EXECUTED / f"{name}.ipynb"
+    if path.is_file():
+        source[0] = path.read_text(encoding="utf-8")
+
+
+def front_page(app, exception):
+    """The site's first page is the book's."""
+    page = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url=book/index.html">'
+    (Path(app.outdir) / "index.html").write_text(f"{page}<title>jumplab</title>\n", encoding="utf-8")
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("source-read", with_outputs)
+    app.connect("build-finished", front_page)

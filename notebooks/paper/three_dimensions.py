@@ -1,0 +1,236 @@
+"""Jumps in three dimensions, by the dozen: which start pays, and which targets are planned.
+
+``python -m paper.three_dimensions`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve,
+and can be stopped and started again; it takes some minutes. Notebook 13 draws the file.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from scipy.integrate import cumulative_trapezoid
+
+from jumplab.auditing import audit
+from jumplab.errors import JumplabError
+from jumplab.io.files import open_log
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.show.style import FLIGHT, LANDING, LAUNCH, LIMIT, PAGE_IN, REFERENCE_STYLE, VERMILION, new_figure, tint
+from jumplab.stages.plan import JumpPlan
+from jumplab.stages.planner import METHODS, Planner
+from jumplab.stages.srmp.spatial import SpatialSrmpPlan
+from jumplab.task import JumpTask
+
+LOG = Path(__file__).with_name("three_dimensions.jsonl")
+AHEAD, SIDE, YAW_DEG, RISE = (0.0, 0.3, 0.6, 0.9), (0.15, 0.3, 0.45, 0.6), (45, 90, 135, 180), (0.2, 0.3, 0.4, 0.5)
+STARTS = (  # ahead [m], to the left [m], rise [m], turn [deg]: a fair share of sides, turns and both
+    *((0.0, 0.2, 0.3, 0), (0.0, 0.3, 0.4, 0), (0.0, -0.3, 0.4, 0), (0.0, 0.6, 0.5, 0), (0.0, 0.0, 0.3, 45)),
+    *((0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.4, -45), (0.0, 0.0, 0.5, 150), (0.0, 0.0, 0.5, 180), (0.3, 0.3, 0.4, 0)),
+    *((0.8, 0.3, 0.5, 0), (0.5, 0.3, 0.4, 45), (0.6, 0.0, 0.4, 45), (0.3, 0.3, 0.4, 90)),
+)
+MEASURED = ("iterations", "cpu_s", "cost")
+KINDS = {  # name -> targets, methods
+    "starts": (STARTS, METHODS),
+    "side": ([(x, y, 0.4, 0) for y in SIDE for x in AHEAD], METHODS[1:]),
+    "turn": ([(0.0, 0.0, h, yaw) for h in RISE for yaw in YAW_DEG], METHODS[1:]),
+}
+
+
+def usage(plan: JumpPlan) -> tuple[str, float]:
+    """The joints' limit that a plan uses most, and how much of what the robot has: torque at its speed, or speed."""
+    robot, shares = plan.robot, {}
+    for i, name in enumerate(robot.joint_names):
+        a, tau, rate = robot.actuators[name], plan.tape.tau[:, i], plan.tape.v[:, 6 + i]
+        left = np.clip((a["speed"] - np.abs(rate)) / (a["speed"] - a["corner_speed"]), 1e-2, 1.0)
+        joint = name.split("_", 1)[1].replace("_pitch", "").replace("_", " ")
+        for what, share in (
+            ("torque", np.max(np.abs(tau) / (a["effort"] * np.where(tau * rate > 0, left, 1.0)))),
+            ("speed", np.max(np.abs(rate)) / a["speed"]),
+        ):
+            key = f"{joint} {what}"
+            shares[key] = max(float(share), shares.get(key, 0.0))
+    most = max(shares, key=shares.get)
+    return most, shares[most]
+
+
+def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> dict[str, Any]:
+    """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most."""
+    ahead, side, rise, turn = target
+    task, began = JumpTask(ahead, rise, side_m=side, yaw_rad=np.radians(turn)), time.process_time()
+    row = {"kind": kind, "target": list(target), "method": method, "planned": False, "clean": False}
+    try:
+        plan = planner.plan(task, method)
+    except JumplabError as e:
+        return row | {"cpu_s": time.process_time() - began, "reason": str(e)[:160]}
+    row |= {"planned": True, "cpu_s": time.process_time() - began, "skipped": (plan.skipped or "")[:160]}
+    s, (most, share) = plan.whole_body.solution.statistics, usage(plan)
+    row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
+    return row | {"clean": audit(plan.tape, plan.robot, task).passed}
+
+
+def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:
+    """Solve what the file lacks."""
+
+    def entry(line: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return (line["kind"], *line["target"], line["method"]), line
+
+    planner = Planner(Robot.load(), keep=True)
+    for method in METHODS:
+        planner.plan(JumpTask(0.0, 0.3, side_m=0.1), method)  # the first call of anything is not timed
+    with open_log(path, "study", entry) as log:
+        for kind in kinds:
+            targets, methods = KINDS[kind]
+            for target in targets:
+                for method in methods:
+                    if (kind, *target, method) not in log.done:
+                        log.add(solve(planner, kind, target, method))
+
+
+def read(path: str | Path = LOG) -> dict[str, list[dict[str, Any]]]:
+    """Rows of a file that :func:`run` has written, by kind; nothing is solved."""
+    rows = map(json.loads, Path(path).read_text(encoding="utf-8").splitlines())
+    out: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
+    for row in rows:
+        out[row["kind"]].append(row)
+    return out
+
+
+def compared(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per target of the starts, (three steps, direct) side by side, of clean plans alone."""
+    by, out = {(*r["target"], r["method"]): r for r in rows}, []
+    for ahead, side, rise, turn in STARTS:
+        row: dict[str, Any] = {"ahead [m]": ahead, "side [m]": side, "rise [m]": rise, "turn [deg]": turn}
+        for name, method in (("three", METHODS[0]), ("ramps", METHODS[1])):
+            r = by[ahead, side, rise, turn, method]
+            good = r["clean"] and not r.get("skipped")
+            row |= {f"{name}, clean": good, **{f"{name}, {k}": r[k] if good else None for k in MEASURED}}
+        out.append(row)
+    return out
+
+
+def ratio(table: Sequence[Mapping[str, Any]], key: str) -> float:
+    """Median of three steps over ramps where both are clean."""
+    pairs = [(r[f"three, {key}"], r[f"ramps, {key}"]) for r in table if r["three, clean"] and r["ramps, clean"]]
+    return float(np.median([a / b for a, b in pairs]))
+
+
+def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Targets to the side and with a turn: how much of the limit used most, and which that is."""
+    fig = new_figure(PAGE_IN, 3.1)
+    axes = fig.subplots(1, 2)
+    for ax, kind, (i, j), ticks in zip(
+        axes, ("side", "turn"), ((0, 1), (3, 2)), ((AHEAD, SIDE), (YAW_DEG, RISE)), strict=True
+    ):
+        size = [t[1] - t[0] for t in ticks]
+        for r in found[kind]:
+            place = np.array([r["target"][i], r["target"][j]])
+            color = tint(LANDING, 0.15 + 0.6 * min(r["share"], 1.0) ** 3) if r["clean"] else (0.82, 0.82, 0.82)
+            ax.add_patch(Rectangle(place - np.array(size) / 2, *size, facecolor=color, edgecolor="white"))
+            said = f"{r['limiting'].replace(' ', chr(10), 1)}\n{100 * r['share']:.0f} %" if r["clean"] else "none"
+            ax.text(*place, said, ha="center", va="center", fontsize=6.5)
+        x, y = ((min(t) - d / 2, max(t) + d / 2) for t, d in zip(ticks, size, strict=True))
+        ax.set(xlim=x, ylim=y, xticks=ticks[0], yticks=ticks[1])
+        ax.grid(False)
+    axes[0].set(xlabel="ahead [m]", ylabel="to the left [m]", title="(a) rise 0.4 m, no turn")
+    axes[1].set(xlabel="turn [deg]", ylabel="rise of the CoM [m]", title="(b) on the spot")
+    return fig
+
+
+# one turn --------------------------------------------------------------------------------------------------------
+def yaw_sources(tape: Tape, robot: Robot) -> dict[str, dict[str, np.ndarray]]:
+    """Where the angular momentum about the vertical is, and where it comes from.
+
+    Returns
+    -------
+    "limbs" : of legs, arms and trunk about the CoM, moving with it (n,) [kg m^2/s]; their sum is L_z.
+    "ground" : impulse since the start (n,) [kg m^2/s] of the couple of the feet's horizontal forces, of the spin in the
+        soles, and of the common push that passes the CoM; their sum is L_z again.
+    """
+    model, data = robot.model, robot.model.createData()
+    legs = {j for n in robot.foot.frames for j in model.supports[model.frames[model.getFrameId(n)].parentJoint]}
+    limbs = {j: "trunk" if j == 1 else "legs" if j in legs else "arms" for j in range(1, model.njoints)}
+    carried = {name: np.zeros(len(tape.t)) for name in ("legs", "arms", "trunk")}
+    moments = np.zeros((len(tape.t), 3))
+    for k, (q, v) in enumerate(zip(tape.q, tape.v, strict=True)):
+        pin.centerOfMass(model, data, q, v)
+        com, speed = data.com[0], data.vcom[0]
+        for j, name in limbs.items():
+            h = data.oMi[j].act(model.inertias[j] * data.v[j])
+            arm = data.oMi[j].act(model.inertias[j].lever) - com
+            about = h.angular - np.cross(com, h.linear) - np.cross(arm, model.inertias[j].mass * speed)
+            carried[name][k] += about[2]
+        if tape.phase[k] == "launch":
+            pin.updateFramePlacements(model, data)
+            places = [data.oMf[model.getFrameId(n)].translation for n in robot.foot.frames]
+            moments[k] = _about_vertical(np.array(places), tape.f[k], com)
+    impulse = cumulative_trapezoid(moments, tape.t, axis=0, initial=0.0)
+    names = "opposite forces of the feet", "spin in the soles", "push past the CoM"
+    return {"limbs": carried, "ground": dict(zip(names, impulse.T, strict=True))}
+
+
+def _about_vertical(places: np.ndarray, f: np.ndarray, com: np.ndarray) -> np.ndarray:
+    """Moment about the vertical through the CoM (3,) [N m] by its sources, of wrenches (2, 6) at ``places`` (2, 3)."""
+    force, total = f[:, :3], f[:, :3].sum(axis=0)
+    down = np.maximum(f[:, 2], 1e-9)
+    cop = places[:, :2] + (np.stack([-f[:, 4], f[:, 3]], -1) - places[:, 2:] * force[:, :2]) / down[:, None]
+    loaded = f[:, 2:3] > 1.0
+    cop = np.where(loaded, cop, places[:, :2])
+    spin = f[:, 5] - _turn(cop - places[:, :2], force)
+    middle = cop.mean(axis=0)
+    return np.array([_turn(cop - middle, force).sum(), spin.sum(), float(_turn(middle - com[:2], total))])
+
+
+def _turn(arm: np.ndarray, force: np.ndarray) -> np.ndarray:
+    return arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0]
+
+
+def yaw_momentum(tape: Tape, sources: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """L_z by the limbs that carry it, and by what the ground did for it."""
+    fig = new_figure(PAGE_IN, 2.6)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, (kind, parts) in zip(axes, sources.items(), strict=True):
+        shown = tape.t <= (tape.takeoff_time if kind == "ground" else np.inf)
+        for color, (name, values) in zip((LAUNCH, VERMILION, FLIGHT), parts.items(), strict=True):
+            ax.plot(tape.t[shown], values[shown], color=color, label=name)
+        ax.plot(tape.t[shown], sum(parts.values())[shown], **REFERENCE_STYLE, label="sum")
+        ax.axvline(tape.takeoff_time, color=LIMIT, linewidth=0.6)
+        ax.set_xlabel("time [s]")
+        ax.legend(fontsize=6.5, frameon=False)
+    axes[0].set(title="(a) limbs that carry it", ylabel="$L_z$ [kg m$^2$/s]")
+    axes[1].set_title("(b) impulses of the ground")
+    return fig
+
+
+def turning_pendulum(plan: SpatialSrmpPlan) -> Figure:
+    """Stage 1 out of the plane: L_z and L_y, both inertias, how far the body has turned, spin torque."""
+    fig, up, air = new_figure(PAGE_IN, 3.3), plan.launch, plan.flight
+    axes, start = fig.subplots(2, 2, sharex=True).ravel(), up.t[-1]
+    for part, shift, color in ((up, 0.0, LAUNCH), (air, start, FLIGHT)):
+        for ax, values, pale in (
+            (axes[0], part.L[:, 2], part.L[:, 1]),
+            (axes[1], part.rho[:, 1], part.rho[:, 0]),
+            (axes[2], np.degrees(part.yaw), None),
+        ):
+            ax.plot(part.t + shift, values, color=color)
+            if pale is not None:
+                ax.plot(part.t + shift, pale, color=color, alpha=0.4)
+    axes[3].plot(up.t, up.spin_torque, color=LAUNCH)
+    labels = "$L_z$, pale $L_y$ [kg m$^2$/s]", "$\\rho$ yaw, pale pitch [kg m$^2$]"
+    for ax, label in zip(axes, (*labels, "turned [deg]", "spin torque [N m]"), strict=True):
+        ax.set_ylabel(label)
+        ax.axvline(start, color=LIMIT, linewidth=0.6)
+    for ax in axes[2:]:
+        ax.set_xlabel("time [s]")
+    return fig
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,132 @@
+"""What a refusal says to ask for instead has a plan, whoever refuses and whatever was asked.
+
+JUMPLAB_REFUSALS=60 sets how many advices are followed; the everyday run makes do with a few.
+"""
+
+import os
+import random
+import re
+from functools import cache
+
+import pytest
+
+import jumplab as jl
+from jumplab.errors import InfeasibleError, JumplabError, SolverError
+from jumplab.robot.description import SHIPPED
+from jumplab.robot_import.urdf import have_published
+from jumplab.studies import advice
+from jumplab.task import JumpTask
+
+REFUSALS = int(os.environ.get("JUMPLAB_REFUSALS", "8"))
+ASKED = re.compile(r"; ask for (.+), which has a plan$")
+
+
+class Fake:
+    """A planner that can do any jump up to half a metre far and 0.3 m high."""
+
+    def __init__(self):
+        self.asked = []
+
+    def plan(self, task, method):
+        self.asked.append(task)
+        if abs(task.distance_m) > 0.5:
+            raise SolverError("too far", stage="SRMP")
+        if task.height_m > 0.3:
+            raise InfeasibleError("too high", number="height_m", bound=0.3)
+        return task
+
+
+def refused(task, monkeypatch, planner):
+    monkeypatch.setattr(
+        advice, "_refused", lambda p, t, m: SolverError("no") if m == "direct" else raised(p.plan, t, m)
+    )
+    with pytest.raises(JumplabError) as e:
+        advice.plan_or_advise(planner, task)
+    return e.value
+
+
+def raised(call, *given):
+    try:
+        call(*given)
+    except JumplabError as e:
+        return e
+    return None
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        (JumpTask(0.2, 0.9), "too high; ask for a height of 0.22 m, which has a plan"),
+        (JumpTask(0.6, 0.2), "too far; ask for a distance of 0.36 m, which has a plan"),
+        (JumpTask(-0.6, 0.2), "too far; ask for a distance of -0.36 m, which has a plan"),
+        (JumpTask(0.8, 0.5), "too far; ask for a distance of 0.48 m and a height of 0.22 m, which has a plan"),
+    ],
+)
+def test_an_easier_target_that_works_is_named(monkeypatch, task, sentence):
+    error = refused(task, monkeypatch, Fake())
+    assert str(error) == sentence and error.exit_code == 3
+
+
+def test_what_was_known_of_the_refusal_stays_known(monkeypatch):
+    error = refused(JumpTask(0.2, 0.9), monkeypatch, Fake())
+    assert (error.number, error.bound) == ("height_m", 0.3)
+
+
+def test_where_nothing_helps_it_says_so(monkeypatch):
+    planner = Fake()
+    planner.plan = lambda task, method: (_ for _ in ()).throw(SolverError("no", stage="SRMP"))
+    assert str(refused(JumpTask(0.2, 0.3), monkeypatch, planner)) == (
+        "no; none of the easier targets that were tried has a plan either"
+    )
+
+
+def follow(task, text):
+    """The target and the method that an advice names."""
+    changes, method = {}, "usual"
+    for name, key in (
+        ("distance", "distance_m"),
+        ("height", "height_m"),
+        ("platform", "platform_m"),
+        ("side", "side_m"),
+    ):
+        if found := re.search(rf"a {name} of (-?[\d.]+) m", text):
+            changes[key] = float(found[1])
+    if "no rotation" in text:
+        changes["rotation_rad"] = 0.0
+    if "the method 'direct'" in text:
+        method = "direct"
+    return advice.replace(task, **changes), method
+
+
+@cache
+def planner_of(name):
+    return jl.Planner(robot_of(name), keep=True)
+
+
+def robot_of(name):
+    """A shipped robot, or the default one with weaker motors."""
+    return jl.Robot.load("bhr").with_limits(effort=0.75, speed=0.85) if name == "weak" else jl.Robot.load(name)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
+def test_refusals_of_five_robots_are_followed():
+    """Random targets beyond what they can do; each advice is followed by a planner that has not seen it before."""
+    rng, followed, tried = random.Random(7), 0, 0
+    robots = [*(name for name in SHIPPED if name != "romeo"), "weak"]  # romeo cannot jump at all, and says so
+    while followed < REFUSALS and tried < 4 * REFUSALS:
+        name, tried = robots[tried % len(robots)], tried + 1
+        far = 3.0 if name in ("bhr", "weak") else 1.5
+        task = JumpTask(round(rng.uniform(-1.0, far), 2), round(rng.uniform(0.3, 1.4), 2), rng.choice([0.0, 0.0, 0.2]))
+        try:
+            advice.plan_or_advise(planner_of(name), task)
+        except (InfeasibleError, SolverError) as e:
+            if found := ASKED.search(str(e)):
+                other, method = follow(task, found[1])
+                plan = jl.Planner(robot_of(name)).plan(other, method)
+                assert jl.audit(plan).passed, (name, task, found[1])
+                followed += 1
+            else:
+                assert str(e).endswith("; none of the easier targets that were tried has a plan either")
+    print(f"{followed} advices of {tried} targets followed")
+    assert followed == REFUSALS

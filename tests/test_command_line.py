@@ -1,0 +1,123 @@
+"""What all commands share: JSON, quiet, progress on a terminal, completion; no option is ignored without a word."""
+
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+
+import pytest
+from fixtures_core import jump
+from test_cli import ROOT, one_sentence, run
+from test_store import names
+
+from jumplab import auditing
+from jumplab.cli import main as cli
+from jumplab.io import folder as store
+
+NAMES = [work.__name__.rstrip("_") for work in cli.COMMANDS]
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    plan, place = jump(1.0, 0.5), tmp_path_factory.mktemp("shared") / "plan"
+    store.write_plan(place, plan.tape, plan.robot, plan.summary, auditing.write_audit)
+    return place
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_takes_json_and_quiet(capsys, name):
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    said = capsys.readouterr().out
+    assert "--json" in said and "--quiet" in said
+    assert not re.search(r"--(workers|n-jobs|distances-m|heights-m|platforms-m)\b", said)
+    if name in ("trials", "certify", "chain", "envelope", "sweep"):
+        assert "--jobs N" in said
+
+
+def test_json_is_one_object(capsys, planned):
+    code, out, err = run(capsys, "audit", planned, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "") and found["passed"] and found["exit_code"] == 0 and found["error"] is None
+    assert len(found["checks"]) > 40
+
+
+@pytest.mark.parametrize(
+    ("argv", "code"), [(["audit", "nowhere"], 2), (["plan", "--out", "x", "--height-m", "9"], 2), (["plan"], 2)]
+)
+def test_json_tells_refusals_too(capsys, tmp_path, monkeypatch, argv, code):
+    monkeypatch.chdir(tmp_path)
+    got, out, err = run(capsys, *argv, "--json")
+    found = json.loads(out)
+    assert got == code == found["exit_code"] and err == f"jumplab: {found['error']}\n"
+    assert names(tmp_path) == []
+
+
+def test_json_of_a_list(capsys):
+    found = json.loads(run(capsys, "robot", "list", "--json")[1])
+    assert found["robots"][0]["name"] == "bhr"
+
+
+def test_quiet_says_nothing(capsys, planned):
+    assert run(capsys, "--quiet", "audit", planned) == (0, "", "")
+    assert run(capsys, "audit", "nowhere", "--quiet")[2].startswith("jumplab: there is no folder")
+    assert json.loads(run(capsys, "audit", planned, "--quiet", "--json")[1])["passed"]
+
+
+IGNORED = [
+    ("export {} --format csv --fps 30", "--fps is of a motion-clip, not of csv; leave it away"),
+    ("export {} --format npz --order depth-first", "--order is of a motion-clip, not of npz; leave it away"),
+    ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it away"),
+    ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it away"),
+    ("chain --distance-m 0.5 --ranges wide --out x", "--ranges says how perturbed robots differ, and neither --seed "
+     "nor --runs asks for one; leave it away"),
+    ("sweep --out x --cluster tcp://a:1 --jobs 2", "--jobs is for processes of this machine, and --cluster does the "
+     "work elsewhere; leave it away"),
+    ("robot check g1 --repair inertia", "--repair is for a bare URDF; a configuration says itself what is repaired, "
+     "so leave it away"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("line", "sentence"), IGNORED, ids=[line.split()[0] for line, _ in IGNORED])
+def test_no_option_is_ignored(capsys, planned, tmp_path, monkeypatch, line, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert one_sentence(*run(capsys, *line.format(planned).split())) == sentence
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("line", ["view nowhere --out new/a.html", "view nowhere --movie new/a.gif",
+                                  "export nowhere --format csv --out new/a.csv", "sweep --out new/s --robot asimo",
+                                  "envelope --out new/e --robot asimo"])  # fmt: skip
+def test_nothing_is_made_by_what_fails(capsys, tmp_path, monkeypatch, line):
+    monkeypatch.chdir(tmp_path)
+    one_sentence(*run(capsys, *line.split()))
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("shell", "word"), [("bash", "complete -"), ("zsh", "#compdef jumplab"), ("fish", "complete ")]
+)
+def test_completion(capsys, shell, word):
+    code, out, err = run(capsys, "completion", shell)
+    assert (code, err) == (0, "") and word in out and all(name in out for name in ("simulate", "platform-m"))
+
+
+def test_a_terminal_sees_what_is_going_on(planned):
+    """Within a second or two of a slow machine, and the line is gone when the command has ended."""
+    mine, theirs = pty.openpty()
+    argv = [sys.executable, "-m", "jumplab", "view", str(planned), "--out", str(planned / "seen.html")]
+    process = subprocess.Popen(argv, cwd=ROOT, stderr=theirs, stdout=subprocess.DEVNULL)
+    os.close(theirs)
+    seen, end = b"", time.monotonic() + 60
+    while time.monotonic() < end and (process.poll() is None or select.select([mine], [], [], 0.1)[0]):
+        if select.select([mine], [], [], 0.1)[0]:
+            try:
+                seen += os.read(mine, 4096)
+            except OSError:  # the other side is closed
+                break
+    assert process.wait() == 0
+    assert seen == b"" or (seen.startswith(b"\rjumplab view: ") and seen.endswith(b"\r\x1b[K"))

@@ -1,0 +1,148 @@
+"""Robots that no plane describes: canted hips, legs of five joints, uneven sides; from posture to landing."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_robots import canted, config, joint, one_axis_ankle, root, text, write
+
+import jumplab as jl
+from jumplab.errors import InputError, RobotError
+from jumplab.robot import Robot
+from jumplab.robot.reduction import mirror
+from jumplab.robot.stance import knees, stance_configuration
+from jumplab.robot_import.config import read_toml
+from jumplab.robot_import.jumper import make_jumper
+from jumplab.robot_import.roles import draft
+from jumplab.sim import simulate_jump
+from jumplab.stages.spatial.generic import generic
+from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.whole_body.settings import Contact
+from jumplab.studies.chain import Course, run_chain
+
+CANT_RAD = 0.44  # 25 degrees
+
+
+def wide(angle_rad: float) -> tuple[str, str]:
+    """Canted hips whose roll joints have room to turn inward."""
+    robot = canted(angle_rad)[0]
+    return robot.replace('lower="-0.06"', 'lower="-0.4"').replace('upper="0.06"', 'upper="0.4"'), config("wide")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory) -> Robot:
+    return Robot.load(write(tmp_path_factory.mktemp("wide"), wide, CANT_RAD))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory) -> Robot:
+    robot = Robot.load(write(tmp_path_factory.mktemp("short"), one_axis_ankle))
+    return robot.with_mass("left_thigh", factor=1.02)
+
+
+def soles(robot: Robot, q: np.ndarray) -> list[pin.SE3]:
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return [data.oMf[model.getFrameId(n)] * pin.SE3(np.eye(3), robot.foot.center) for n in robot.foot.frames]
+
+
+@pytest.mark.parametrize("name", ["robot", "short"])
+def test_it_stands_on_flat_feet_below_its_centre(name, request):
+    robot = request.getfixturevalue(name)
+    assert not robot.planar
+    q = stance_configuration(robot)
+    for sole in soles(robot, q):
+        assert abs(sole.translation[[0, 2]]).max() < 1e-5
+        np.testing.assert_allclose(sole.rotation, np.eye(3), atol=1e-5)
+    com = pin.centerOfMass(robot.model, robot.model.createData(), q)
+    assert abs(com[0]) < 1e-5
+    bends = [sign * q[7 + k] + angle for k, sign, angle in knees(robot)]
+    assert np.mean(bends) == pytest.approx(robot.stance["knee_rad"], abs=1e-5)
+
+
+def test_joints_that_mirror_each_other_are_found(robot):
+    pairs = [(robot.joint_names[i], robot.joint_names[k], s) for i, k, s in mirror(robot.model)]
+    names = {"hip_yaw": -1, "hip_roll": -1, "hip_pitch": 1, "knee": 1, "ankle_pitch": 1, "ankle_roll": -1}
+    assert set(pairs) == {(f"left_{n}", f"right_{n}", s) for n, s in (names | {"shoulder_pitch": 1}).items()}
+
+
+def test_a_knee_may_be_bent_where_its_angle_is_zero(robot):
+    robot = Robot.from_text(robot.urdf, robot.config_text)
+    turned = np.array([[np.cos(0.3), 0, np.sin(0.3)], [0, 1, 0], [-np.sin(0.3), 0, np.cos(0.3)]])
+    for side in ("left", "right"):
+        j = robot._model.getJointId(f"{side}_knee")
+        robot._model.jointPlacements[j].rotation = turned
+    assert [angle for _, _, angle in knees(robot)] == pytest.approx([0.3, 0.3], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["robot", "short"])
+def test_the_generic_jump_keeps_its_feet_and_lands_where_it_should(name, request):
+    robot = request.getfixturevalue(name)
+    task = jl.JumpTask(distance_m=0.4, height_m=0.2)
+    tape = generic(SpatialTerms(robot, SpatialLimits(), SpatialWeights(), Contact.FLAT), task)
+    first, last = (np.mean([s.translation for s in soles(robot, q)], axis=0) for q in tape.q[[0, -1]])
+    np.testing.assert_allclose(last - first, [0.4, 0.0, 0.0], atol=0.02)
+    toe = np.array([(robot.foot.toe - robot.foot.heel) / 2, 0.0, 0.0])
+    launch = np.array([[s.act(toe) for s in soles(robot, q)] for q in tape.q[: tape.takeoff_index]])
+    assert np.abs(launch - launch[0]).max() < (0.08 if name == "robot" else 0.02)  # canted hips turn in less far
+    assert tape.v[tape.takeoff_index, 2] == pytest.approx(task.takeoff_speed, rel=0.1)
+    com = [pin.centerOfMass(robot.model, robot.model.createData(), q)[2] for q in tape.q[tape.takeoff_index :]]
+    assert max(com) - com[0] == pytest.approx(0.2, abs=0.05)
+
+
+def test_what_moves_besides_and_how_it_rests_is_told():
+    toml = config("x", shoulders="[]").replace(
+        "[feet]", 'free = ["left_shoulder_pitch", "right_shoulder_pitch"]\n[feet]'
+    )
+    rest = "[rest]\nleft_shoulder_pitch = -0.3\nright_shoulder_pitch = -0.3\n"
+    jumper = make_jumper(text(root()), read_toml(toml + rest, "config"), "my.urdf")
+    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    assert len(robot.joint_names) == 14 and not robot.planar and dict(robot.rest)["left_shoulder_pitch"] == -0.3
+    assert stance_configuration(robot)[[13, 20]] == pytest.approx([-0.3, -0.3])
+    with pytest.raises(
+        RobotError, match=r"^robot configuration: \[rest\] names the joint 'neck', which does not move$"
+    ):
+        make_jumper(text(root()), read_toml(toml + "[rest]\nneck = 0.1\n", "config"), "my.urdf")
+
+
+@pytest.mark.parametrize("cant_rad", [0.1, 0.44, 0.79])
+def test_legs_with_any_hip_are_found(tmp_path, cant_rad):
+    path = tmp_path / "any.urdf"
+    path.write_text(canted(cant_rad)[0])
+    roles = draft(path).roles
+    assert roles.joints["hip_pitch"] == ("left_hip_pitch", "right_hip_pitch")
+    assert roles.joints["knee"] == ("left_knee", "right_knee") and roles.forward == "+x"
+
+
+def test_feet_tell_where_a_robot_faces_whose_knees_turn_both_ways(tmp_path):
+    robot = root()
+    for side in ("left", "right"):
+        limit = joint(robot, f"{side}_knee").find("limit")
+        limit.set("lower", "-2.4"), limit.set("upper", "2.4")
+    path = tmp_path / "both.urdf"
+    path.write_text(text(robot))
+    assert draft(path).roles.forward == "+x"
+
+
+def test_what_needs_five_links_is_refused(robot):
+    with pytest.raises(InputError) as e:
+        run_chain(Course.of([0.3, 0.3], 0.3), robot)
+    assert str(e.value) == "robot wide: chains wait in a crouch of five links, which do not describe it"
+    with pytest.raises(InputError) as e:
+        jl.Planner(robot).plan(jl.JumpTask(0.3, 0.2), start=np.zeros(5))
+    said = "robot wide begins in its stance: five links do not describe it; drop start"
+    assert str(e.value) == said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, target", [("robot", (0.5, 0.3)), ("short", (0.4, 0.2))])
+def test_planned_clean_and_landed(name, target, request):
+    robot, task = request.getfixturevalue(name), jl.JumpTask(*target)
+    plan = jl.plan(task, robot)
+    assert [row.stage for row in plan.statistics] == ["spatial"] and plan.planned_side_m == pytest.approx(0, abs=1e-3)
+    assert jl.audit(plan).passed
+    run = simulate_jump(plan.tape, robot, mode="pd")
+    assert run.landed and run.metrics.foot_distance_m == pytest.approx(target[0], abs=0.02)
+    near = jl.Planner(robot)
+    again = near.replan(near.plan(task), jl.JumpTask(target[0] + 0.03, target[1]))
+    assert jl.audit(again).passed and again.planned_distance_m == pytest.approx(target[0] + 0.03, abs=2e-3)
