@@ -39,7 +39,7 @@ class Interrupts:
         self.number: int | None = None  # of the signal that was heard
         self._alone, self._settled, self._over = alone, False, False
         self._raised: weakref.ref[Stopped] | None = None
-        self._stderr = sys.stderr
+        self._stderr, self._hook = sys.stderr, sys.unraisablehook
 
     @property
     def code(self) -> int:
@@ -55,7 +55,7 @@ class Interrupts:
         try:
             yield
         finally:
-            self._over, sys.stderr = True, self._stderr
+            self._over, sys.stderr, sys.unraisablehook = True, self._stderr, self._hook
             files.AT_SETTLE.remove(self._settle)
             for number, handler in before.items():
                 signal.signal(number, signal.SIG_IGN if self._alone else handler)
