@@ -15,8 +15,8 @@ from jumplab.io import files
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 UNCHANGED = "interrupted; what was there before is unchanged"
 AGAIN_S = 0.05  # how often it is looked whether the exception got lost
-LEAVE_S = 0.5  # for what libraries do at the end of a process
-PATIENCE_S = 1.2  # after this long without an end, the process is ended from outside of what it is doing
+LEAVE_S = 0.4  # for what libraries do at the end of a process
+PATIENCE_S = 0.9  # after this long without an end, the process is ended from outside of what it is doing
 
 
 class Stopped(KeyboardInterrupt):
