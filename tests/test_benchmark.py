@@ -44,6 +44,9 @@ def test_the_report_is_plain_and_complete(found):
     assert again["warm_over_direct"] == pytest.approx(steps / cpu[again["peer"]][0])
     assert again["tape_over_direct"] == pytest.approx(cpu["plan"][0] / cpu[again["peer"]][0])
     assert again["replan_over_direct"] == pytest.approx(cpu["re-plan"][0] / cpu[again["peer"]][0])
+    assert again["atlas_over_direct"] == pytest.approx(cpu["atlas"][0] / cpu[again["peer"]][0])
+    assert again["plans_per_s"] == pytest.approx(1 / cpu["atlas, with tape and audit"][0])
+    assert again["three_over_direct_gn"] == again["warm_over_approached"] and again["process_s"] is None
     assert again["cold_over_direct"] is None and again["peak_memory_gib"] is None
     assert [row["intervals"] for row in again["growth"]["nodes"]] == [20, 24, 28]
     (other,) = again["growth"]["spread"]
@@ -53,7 +56,7 @@ def test_the_report_is_plain_and_complete(found):
 
 @pytest.mark.slow
 def test_every_timed_plan_was_audited(found):
-    assert {"plan", "re-plan", *benchmark.DIRECT, benchmark.APPROACHED} == set(found["audits"])
+    assert {"plan", "re-plan", *benchmark.DIRECT, benchmark.APPROACHED, benchmark.ATLAS} == set(found["audits"])
     assert all(a["of"] == 1 for a in found["audits"].values())
 
 
@@ -66,9 +69,9 @@ def test_what_is_not_reached_is_said():
     slow = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
     said = {row["number"].partition(" /")[0]: (row["value"], row["limit"], row["aim"], row["verdict"])
             for row in goals(slow)}  # fmt: skip
-    assert len(said) == 5 and said["new process to finished plan"] == (3.0, 1.5, None, "not reached")
-    assert said["three steps, warm"] == (0.5, 0.6, 0.25, "reached")
-    assert [row["verdict"] for row in goals(made())].count("not measured here") == 2
+    assert len(said) == 8 and said["new process to finished plan"] == (3.0, 1.5, None, "not reached")
+    assert said["three steps, warm"] == (1.0, 1.0, None, "reached")  # against Gauss-Newton steps; the last of two rows
+    assert [row["verdict"] for row in goals(made())].count("not measured here") == 4
     ratios = ("cold_kept_over_direct", "warm_over_approached", "tape_over_direct")
     assert [slow[name] for name in ratios] == pytest.approx([2.0, 1.0, 0.55])
     assert slow["audits"] == {"plan": {"clean": 1, "of": 2}}

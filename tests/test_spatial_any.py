@@ -6,7 +6,7 @@ import pytest
 from fixtures_robots import canted, config, joint, one_axis_ankle, root, text, write
 
 import jumplab as jl
-from jumplab.errors import RobotError
+from jumplab.errors import InputError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.reduction import mirror
 from jumplab.robot.stance import knees, stance_configuration
@@ -18,6 +18,7 @@ from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.whole_body.settings import Contact
+from jumplab.studies.chain import Course, run_chain
 
 CANT_RAD = 0.44  # 25 degrees
 
@@ -121,6 +122,16 @@ def test_feet_tell_where_a_robot_faces_whose_knees_turn_both_ways(tmp_path):
     path = tmp_path / "both.urdf"
     path.write_text(text(robot))
     assert draft(path).roles.forward == "+x"
+
+
+def test_what_needs_five_links_is_refused(robot):
+    with pytest.raises(InputError) as e:
+        run_chain(Course.of([0.3, 0.3], 0.3), robot)
+    assert str(e.value) == "robot wide: chains wait in a crouch of five links, which do not describe it"
+    with pytest.raises(InputError) as e:
+        jl.Planner(robot).plan(jl.JumpTask(0.3, 0.2), start=np.zeros(5))
+    said = "robot wide begins in its stance: five links do not describe it; drop start"
+    assert str(e.value) == said
 
 
 @pytest.mark.slow

@@ -113,6 +113,7 @@ NOMINAL_INERTIA = 5.0  # [kg m^2] pitch inertia of the landed robot, turns a mom
 STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
 STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back
 SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
+SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
 MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 UNBOUNDED = 1e20  # ProxQP's infinity
 TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
@@ -278,7 +279,8 @@ class LandingController:
 
 def _corner_rows(robot: Robot) -> np.ndarray:
     """(20, nx) rows r with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
-    foot, mu, spin = robot.foot, PLANNED_FRICTION / np.sqrt(2), SPIN_FRICTION
+    foot, mu = robot.foot, PLANNED_FRICTION / np.sqrt(2)
+    spin = SPIN_FRICTION * (1.0 if robot.planar else foot.half_width / SPIN_HALF_WIDTH_M)
     half_length, half_width = SOLE_SHARE[0] * (foot.toe - foot.heel) / 2, SOLE_SHARE[1] * foot.half_width
     one, rows = np.zeros((10, 6)), np.zeros((20, robot.model.nv + 12))
     one[:, 2] = np.repeat([mu, mu, half_width, half_length, spin], 2)

@@ -18,7 +18,6 @@ from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
 from jumplab.stages.spatial import SpatialPlan
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.srmp.spatial import SpatialSrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
@@ -60,7 +59,7 @@ class JumpPlan(Shown, Named):
     robot: Robot
     method: str
     tape: Tape
-    srmp: SrmpPlan | SpatialSrmpPlan | None
+    srmp: SrmpPlan | None
     joints: JointPlan | None
     whole_body: WholeBodyPlan | SpatialPlan | None
     statistics: tuple[StageRow, ...]
@@ -204,7 +203,7 @@ class JumpPlan(Shown, Named):
         }
 
 
-def _tracking(tape: Tape, srmp: SrmpPlan | SpatialSrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
+def _tracking(tape: Tape, srmp: SrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
     rows, toe, done = _moved(tape)
     time, k = tape.t[rows], int(np.argmax(tape.phase[rows] == "flight"))
     launch = np.interp(time[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])

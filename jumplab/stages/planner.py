@@ -25,7 +25,8 @@ from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities, turning_inertias
-from jumplab.stages.spatial import SpatialPlan, SpatialPlanner
+from jumplab.stages.spatial import SpatialLimits, SpatialPlan, SpatialPlanner
+from jumplab.stages.spatial.settings import FLIP_MESH
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
@@ -116,8 +117,7 @@ class Planner:
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
-            build["spatial srmp"] = self._spatial_srmp
-            build["spatial"] = lambda flip: SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"])
+            build |= {"spatial srmp": self._spatial_srmp, "spatial": self._away}
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 
@@ -132,6 +132,10 @@ class Planner:
             given = {name: x for name, x in vars(given).items() if name in usual and x != usual[name]}
         settings = replace(SpatialSrmpSettings(), **(given or {}))
         return SpatialSrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["spatial srmp"])
+
+    def _away(self, flip: bool) -> SpatialPlanner:
+        how = dict(mesh=FLIP_MESH, limits=SpatialLimits().of_flip()) if flip else {}
+        return SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"], **how)
 
     def _body(self, flip: bool, tracking: bool) -> WholeBodyPlanner:
         limits, how = settled(Limits, self._given[0], flip), dict(tracking=tracking, changes=self.changes["whole body"])
@@ -196,6 +200,8 @@ class Planner:
         -------
         rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
         """
+        if not self.robot.planar:
+            return self.stage("spatial").nlp.problem.table()
         if method == "direct":
             return self.stage("direct" + " flip" * flip).nlp.problem.table()
         first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
@@ -283,10 +289,8 @@ class Planner:
         begun from the planar jump of the same distance and rise where there is one.
         """
         if start is not None and not self.robot.planar:
-            raise InputError(
-                f"robot {self.robot.name} begins in the stance: no plane describes it; leave its start away"
-            )
-        last, asked = self.stage("spatial"), sorted_out(weights=weights)
+            raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
+        last, asked = self.stage(_away(task)), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
         if asked["spatial"]:
             asked["spatial"].applied(last.nlp.problem)
@@ -323,7 +327,7 @@ class Planner:
         srmp = self.stage("spatial srmp").plan(task, weights=asked["spatial srmp"].weights)
         joints, heels = self._joints(srmp, asked, step_s=STEPS_S), srmp.launch_s - srmp.toe_s
         weights = asked["spatial"].weights
-        body = self.stage("spatial").plan(task, joints.tape(self.robot), heels, ramps=False, weights=weights)
+        body = self.stage(_away(task)).plan(task, joints.tape(self.robot), heels, ramps=False, weights=weights)
         rows = _row("1 SRMP", srmp.solution.statistics), _joint_row(joints), _row("3 spatial", body.solution.statistics)
         return self._placed("three-step", body, rows, srmp, joints)
 
@@ -337,7 +341,7 @@ class Planner:
         skipped: str | None = None,
     ) -> JumpPlan:
         """The plan of a spatial solution; ``rows`` are its stages', the first two those of three steps."""
-        tape, robot = self.stage("spatial").tape(body), self.robot.under_gravity(body.task.gravity)
+        tape, robot = self.stage(_away(body.task)).tape(body), self.robot.under_gravity(body.task.gravity)
         tape = replace(tape, extra=tape.extra | turning_inertias(robot, tape) | _of_stage1(srmp))
         return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, skipped)
 
@@ -409,11 +413,11 @@ class Planner:
                 return self.plan(task, previous.method, start=start)
             try:
                 stance = None if start is None else self._standing(start)
-                body = self.stage("spatial").plan(task, near=near, stance=stance)
+                body = self.stage(_away(task)).plan(task, near=near, stance=stance)
             except SolverError:
                 return self.plan(task, previous.method, start=start)
             return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
-        if task.rotation_rad:
+        if task.rotation_rad or isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
             return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
@@ -424,6 +428,11 @@ class Planner:
             srmp, last = self._pendulum(task, start, near=previous.srmp), "whole body"
         body = self.stage(last).plan(task, srmp, near=previous.whole_body, start=start)
         return self._finished(previous.method, body, srmp)
+
+
+def _away(task: JumpTask) -> str:
+    """The stage for a jump out of the plane."""
+    return "spatial" + " flip" * bool(task.rotation_rad)
 
 
 def _row(stage: str, s: Statistics) -> StageRow:
@@ -514,7 +523,7 @@ def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -
     return expand(motion, robot, gravity, extra | _of_stage1(srmp), values["ground_wrench"])
 
 
-def _of_stage1(srmp: SrmpPlan | SpatialSrmpPlan | None) -> dict[str, np.ndarray]:
+def _of_stage1(srmp: SrmpPlan | None) -> dict[str, np.ndarray]:
     """Stage 1's columns under the names that they have on a tape."""
     parts = [] if srmp is None else [("launch", srmp.launch), ("flight", srmp.flight)]
     return {f"srmp_{name}_{k}": np.array(v) for name, part in parts for k, v in vars(part).items()}

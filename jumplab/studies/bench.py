@@ -30,12 +30,15 @@ from jumplab.robot import Robot
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, guess_from_joints, make_tape
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
 
 AT_ONCE, OVER_COARSE, APPROACHED = "direct, at once", "direct, over a coarse mesh", "direct, Gauss-Newton first"
 DIRECT = (AT_ONCE, OVER_COARSE)  # by ipopt alone, from a cold start
 WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
 TAPE = "plan: tape"
+ATLAS, AUDITED = "atlas", "atlas, with tape and audit"
+SPAN_M = (0.15, 0.075)  # half of an atlas' cell around the target: distance, height
 
 
 def report(
@@ -47,7 +50,10 @@ def report(
     -------
     dict of plain types: ``head``; ratios of CPU times, None if not measured: three steps (``warm``), plan with its tape
     (``tape``), re-plan, and new process (``cold``, ``cold_kept`` with functions on file; over build and solve) over the
-    direct solve, three steps over the approached one; ``node_growth_error``, see :func:`line_error`;
+    direct solve, three steps over the approached one (``three_over_direct_gn``), a plan from an atlas over the direct
+    solve (``atlas_over_direct``); ``process_s``, wall time of a new process with functions on file, from its start to
+    the audit's end; ``plans_per_s``, audited plans from an atlas by one core; ``node_growth_error``, see
+    :func:`line_error`;
     ``peak_memory_gib``; ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s``
     and ``raw_s`` (CPU and wall times), ``where`` (stage -> share of a plan's time), ``growth``, ``machine``.
     """
@@ -71,6 +77,10 @@ def report(
         "tape_over_direct": _ratio(cpu["plan"], cpu[peer]),
         "warm_over_approached": _ratio(steps, cpu[APPROACHED]),
         "cold_kept_over_direct": _ratio(cpu.get("cold, functions kept"), whole),
+        "three_over_direct_gn": _ratio(steps, cpu[APPROACHED]),
+        "atlas_over_direct": _ratio(cpu.get(ATLAS), cpu[peer]),
+        "process_s": medians["wall"].get("process"),
+        "plans_per_s": 1 / medians["cpu"][AUDITED] if AUDITED in cpu else None,
         "audits": {name: {"clean": sum(found), "of": len(found)} for name, found in audits.items()},
         **head,
         "median_s": medians,
@@ -100,7 +110,7 @@ def rows(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     cpu = found["median_s"]["cpu"]
     steps_s = sum(t for name, t in cpu.items() if name.startswith("plan: ") and name != TAPE)
     ratios = {"three steps": "warm", "plan": "tape", "re-plan": "replan", "cold": "cold"}
-    ratios = {name: found[f"{key}_over_direct"] for name, key in ratios.items()}
+    ratios = {name: found[f"{key}_over_direct"] for name, key in ratios.items()} | {ATLAS: found["atlas_over_direct"]}
     ratios |= {"cold, functions kept": found["cold_kept_over_direct"], found["peer"]: 1.0}
     return [{"what": n, "CPU [s]": t, "ratio": ratios.get(n)} for n, t in {"three steps": steps_s, **cpu}.items()]
 
@@ -172,7 +182,7 @@ def bench(
     if repeats < 1:
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
     robot, watch = Robot.load(robot_name), Stopwatch()
-    planner = Planner(robot, mesh=mesh)
+    planner, atlas = Planner(robot, mesh=mesh), _atlas(robot, mesh, task)
     ways = {name: WholeBodyPlanner(robot, mesh, tracking=False, **how).plan for name, how in WAYS.items()}
     audits: dict[str, list[bool]] = {}
     near = planner.plan(replace(task, distance_m=task.distance_m - NEIGHBOUR_M))
@@ -184,7 +194,7 @@ def bench(
             _cold(Stopwatch(), robot_name, task, {}, kept)  # fills the folder
         for k in range(repeats):
             say(f"repeat {k + 1} of {repeats}")
-            plans = _once(watch, planner, ways, near, task)
+            plans = _once(watch, planner, ways, near, task, atlas)
             for name, plan in plans.items():
                 audits.setdefault(name, []).append(audit(plan.tape, robot, task).passed)
             if cold:
@@ -203,9 +213,11 @@ def bench(
 
 
 def _once(
-    watch: Stopwatch, planner: Planner, ways: Mapping[str, Callable], near: JumpPlan, task: JumpTask
+    watch: Stopwatch, planner: Planner, ways: Mapping[str, Callable], near: JumpPlan, task: JumpTask, atlas: Planner
 ) -> dict[str, JumpPlan]:
     """Time everything once, in turn; returns the plans."""
+    answered = watch(ATLAS, atlas.atlas.solve, atlas.stage("direct"), task)
+    watch(AUDITED, lambda: audit(atlas.plan(task).tape, atlas.robot, task))
     robot, last = planner.robot, planner.stage("whole body")
     srmp = watch("plan: 1 SRMP", planner.stage("srmp").plan, task)
     joints = watch("plan: 2 joint map", map_to_joints, srmp, robot, STEPS_S, "direct")
@@ -215,10 +227,19 @@ def _once(
     bodies = {name: watch(name, way, task) for name, way in ways.items()}
     plans = {"plan": watch("plan", planner.plan, task), "re-plan": watch("re-plan", planner.replan, near, task)}
     watch("direct, build", lambda: WholeBodyPlanner(robot, planner.mesh, tracking=False, refine=False).nlp.prepare())
-    for name, body in bodies.items():
+    for name, body in {**bodies, **({ATLAS: answered} if answered else {})}.items():
         rows = body_rows("direct", body)
         plans[name] = JumpPlan(task, robot, "direct", make_tape(body, robot), None, None, body, rows)
     return plans
+
+
+def _atlas(robot: Robot, mesh: Mesh, task: JumpTask) -> Planner:
+    """A planner with an atlas of four nodes around the target."""
+    (d, h), (wide, high) = (task.distance_m, task.height_m), SPAN_M
+    atlas = Atlas.build(robot, (d - wide, d + wide), (max(h - high, 0.05), h + high), mesh=mesh)
+    planner = Planner(robot, mesh=mesh, atlas=atlas)
+    planner.plan(task)  # the first call of anything is not timed
+    return planner
 
 
 def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, list[bool]], kept: str) -> float:
@@ -229,7 +250,10 @@ def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, l
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     for name, how in (("cold", "fresh"), ("cold, functions kept", "keep")):
         command = [sys.executable, "-c", COLD, robot_name, repr(task.distance_m), repr(task.height_m), how]
+        began = time.perf_counter()
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if how == "keep":
+            watch.keep("process", time.perf_counter() - began, time.perf_counter() - began)
         if done.returncode:
             raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
         said = json.loads(done.stdout)

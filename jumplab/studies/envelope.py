@@ -184,7 +184,7 @@ _tools: dict[str, tuple[Reach, WholeBodyPlanner]] = {}  # of this process, by th
 
 def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
     """One cell from a neighbour's solution, then, if ``cold``, from the planner's own guess; a guess for the next."""
-    if not task.in_plane:
+    if not (task.in_plane and robot.planar):
         return _solve_away(robot, task, guess, cold=cold)
     guess = None if isinstance(guess, SpatialPlan) else guess
     if robot.hash not in _tools:
@@ -214,13 +214,13 @@ _planners: dict[str, Planner] = {}  # of this process, by the robot's hash
 
 
 def _solve_away(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
-    """The same out of the plane: from the neighbour's plan, then from the planar jump of the same way and rise."""
+    """The same by the spatial program: from the neighbour's plan, then from where that begins by itself."""
     planner = _planners.setdefault(robot.hash, Planner(robot, keep=True))
     spatial, reason = planner.stage("spatial"), ""
     for near in [guess] * isinstance(guess, SpatialPlan) + [None] * cold:
         try:
             start = ()
-            if near is None:
+            if near is None and robot.planar:
                 first = planner.plan(replace(task, side_m=0.0, yaw_rad=0.0), "direct")
                 start = first.tape, first.toe_phase_s
             plan = spatial.plan(task, *start, near=near, patient=False)

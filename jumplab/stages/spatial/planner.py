@@ -80,7 +80,7 @@ class SpatialPlanner:
         problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
-        self._warm = self.nlp.with_options({**IPOPT, **WARM, **options})
+        self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
         self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
 
     def plan(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jumplab.stages.whole_body.settings import Mesh
 
@@ -37,6 +37,12 @@ class SpatialLimits:
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02
+    capture_moment: float | None = None  # if set, not the window but L about the soles' middle [kg m^2/s], either way
+
+    def of_flip(self) -> SpatialLimits:
+        """The same for a jump that turns over: time to wind up, a trunk that arrives turning, caught by momentum."""
+        turning = dict(touchdown_trunk_rate=5.0, touchdown_foot_rate=8.0, capture_moment=4.0)
+        return replace(self, flat_s=(0.25, 1.3), toe_s=(0.06, 0.45), **turning)
 
 
 @dataclass(frozen=True)
@@ -53,3 +59,4 @@ class SpatialWeights:
 
 SPATIAL_MESH = Mesh(12, 12, 16)  # coarse: the tape is exact between the nodes
 TREE_MESH = Mesh(20, 12, 16)  # of robots that no plane describes: weak ankles pass their limits between fewer nodes
+FLIP_MESH = Mesh(20, 16, 28)  # a flip winds up longer, and turns faster

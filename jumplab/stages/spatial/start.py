@@ -45,6 +45,8 @@ def from_tape(
             constants = {
                 f"{k}_{x}": y for k, col in (("com", com), ("vel", speed)) for x, y in zip("xyz", col, strict=True)
             }
+            if task.rotation_rad:
+                constants |= {f"L_{x}": y for x, y in zip("xyz", _spin(b, tape, row), strict=True)}
             z = np.hstack([np.zeros((len(t), 3)), tau])
             out[name] = PhaseGuess(flight_s, q[:, 3:], v[:, 3:], a[:, 3:], z, constants)
         else:
@@ -77,6 +79,11 @@ def _takeoff(b: SpatialTerms, tape: Tape, row: int) -> tuple[np.ndarray, np.ndar
     model, data = b.model.model, b.model.model.createData()
     pin.centerOfMass(model, data, tape.q[row], tape.v[row])
     return data.com[0].copy(), data.vcom[0].copy()
+
+
+def _spin(b: SpatialTerms, tape: Tape, row: int) -> np.ndarray:
+    model, data = b.model.model, b.model.model.createData()
+    return pin.computeCentroidalMomentum(model, data, tape.q[row], tape.v[row]).angular.copy()
 
 
 def generators(b: SpatialTerms, side: int) -> np.ndarray:

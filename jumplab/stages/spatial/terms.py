@@ -354,10 +354,27 @@ class SpatialTerms:
         speed = ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
         return (middle - self.com(p) - ahead - lim.capture_slope_s * speed)[:2]
 
+    def capture_rows(self) -> Term:
+        """Where the soles meet the ground, so that the robot can be caught."""
+        lim, moment, window = self.limits, self.limits.capture_moment, self.limits.capture_window_m
+        if moment is None:
+            return row(
+                "capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, at="end", scale=0.1
+            )
+
+        def about_soles(p):
+            middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
+            speed = ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z - p.p.gravity * p.time)
+            spin = ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
+            return (spin + self.model.mass * ca.cross(self.com(p) - middle, speed))[:2]
+
+        words = "capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s"
+        return row(*words, about_soles, -lim.capture_moment, lim.capture_moment, at="end", scale=10.0)
+
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: both feet in their new places, flat; posture, rates, and where the soles are against the CoM."""
         lim, rate, foot = self.limits, self.limits.touchdown_joint_rate, self.limits.touchdown_foot_rate
-        trunk, window = lim.touchdown_trunk_rate, lim.capture_window_m
+        trunk = lim.touchdown_trunk_rate
 
         def spins(p):
             return ca.vertcat(*(self.state(p).spin(body) for body in self.feet))
@@ -377,5 +394,5 @@ class SpatialTerms:
             end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
             end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
             end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], -trunk, trunk),
-            end("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, scale=0.1),
+            self.capture_rows(),
         ]

@@ -23,7 +23,7 @@ from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, YawReach, yaw_reach
 from jumplab.stages.changes import StageChanges
-from jumplab.stages.srmp.planner import OPTIONS, cubic, grid, leg_between, reach_of
+from jumplab.stages.srmp.planner import OPTIONS, SrmpMotion, SrmpPlan, cubic, grid, leg_between, reach_of
 from jumplab.stages.srmp.problem import GAUSS, limit
 from jumplab.stages.srmp.settings import SpatialSrmpSettings
 from jumplab.task import GRAVITY, JumpTask
@@ -339,24 +339,10 @@ def build_problem(b: Body, settings: SpatialSrmpSettings = SpatialSrmpSettings()
 
 # plan -----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
-class SpatialSrmpMotion:
-    """Columns of launch and flight; vectors in the axes of the start, inertias level and about the vertical."""
+class SpatialSrmpStance(SrmpMotion):
+    """The launch: vectors have three columns, inertias two, level and about the vertical."""
 
-    t: np.ndarray  # (n,) since this part began [s]
-    com: np.ndarray  # (n, 3) [m]
-    com_velocity: np.ndarray  # (n, 3) [m/s]
-    com_acceleration: np.ndarray  # (n, 3) [m/s^2]
-    L: np.ndarray  # (n, 3) [kg m^2/s]
-    rho: np.ndarray  # (n, 2) [kg m^2]
-    rho_rate: np.ndarray  # (n, 2) [kg m^2/s]
-    rho_accel: np.ndarray  # (n, 2) [kg m^2/s^2]
     yaw: np.ndarray  # (n,) that the body as a whole has turned, the integral of L_z / rho_y [rad]
-
-
-@dataclass(frozen=True)
-class SpatialSrmpStance(SpatialSrmpMotion):
-    """The launch."""
-
     L_rate: np.ndarray  # (n, 3) [N m]
     force: np.ndarray  # (n, 3) of the ground [N]
     moment: np.ndarray  # (n, 3) of the ground about the middle between the soles [N m]
@@ -370,38 +356,22 @@ class SpatialSrmpStance(SpatialSrmpMotion):
 
 
 @dataclass(frozen=True)
-class SpatialSrmpFlight(SpatialSrmpMotion):
-    """The flight; L constant."""
+class SpatialSrmpFlight(SrmpMotion):
+    """The flight, likewise; L constant."""
 
+    yaw: np.ndarray  # as in launch
     foot_com: np.ndarray  # (n, 3) middle between the soles relative to the CoM [m]
     foot_com_rate: np.ndarray  # (n, 3) [m/s]
     foot_com_accel: np.ndarray  # (n, 3) [m/s^2]
 
 
 @dataclass(frozen=True)
-class SpatialSrmpPlan:
+class SpatialSrmpPlan(SrmpPlan):
     """Result of stage 1 out of the plane."""
 
-    task: JumpTask
     launch: SpatialSrmpStance
     flight: SpatialSrmpFlight
-    solution: Solution
     body: Body  # what it knew of the robot
-
-    @property
-    def launch_s(self) -> float:
-        """Duration of the launch [s]."""
-        return float(self.launch.t[-1])
-
-    @property
-    def toe_s(self) -> float:
-        """Duration of the launch's last part, heels up and CoP at the toes [s]."""
-        return self.solution.phases["toe"].duration
-
-    @property
-    def flight_s(self) -> float:
-        """Duration of the flight [s]."""
-        return float(self.flight.t[-1])
 
 
 class SpatialSrmpPlanner:
@@ -481,8 +451,9 @@ class SpatialSrmpPlanner:
 def _evaluator(mass: float, gravity: float) -> ca.Function:
     q, v, a = (ca.SX.sym(n, 8) for n in "qva")
     s = Pendulum(mass, q, v, a, gravity)
-    out = [s.com, s.com_velocity, s.com_acceleration, s.L, s.inertia, s.inertia_rate, s.inertia_accel, q[5]]
-    return ca.Function("pendulum", [q, v, a], [*out, s.L_rate, s.force, s.moment])
+    out = [s.com, s.com_velocity, s.com_acceleration, s.L, s.inertia, s.inertia_rate, s.inertia_accel]
+    lean = ca.acos(ca.fmin(s.com[2] / s.length, 1))
+    return ca.Function("pendulum", [q, v, a], [*out, ca.vertcat(lean, q[5]), s.L_rate, s.force, s.moment])
 
 
 def sampled(task: JumpTask, solution: Solution, body: Body) -> SpatialSrmpPlan:
@@ -493,14 +464,14 @@ def sampled(task: JumpTask, solution: Solution, body: Body) -> SpatialSrmpPlan:
     later = np.minimum(t[~first] - flat.duration, toe.duration)
     parts = (np.concatenate(x).T for x in zip(flat.sample(t[first]), toe.sample(later), strict=True))
     columns = [x.full().T for x in _evaluator(body.mass, task.gravity).map(len(t))(*parts)]
-    columns[7], force, moment = columns[7][:, 0], *columns[-2:]
+    columns[7:8], force, moment = columns[7].T, *columns[-2:]
     up = force[:, 2] > 1.0  # N; at take-off CoP and spin torque are 0/0
     down = np.where(up, force[:, 2], 1.0)
     cop, turn = np.stack([-moment[:, 1], moment[:, 0]], -1) / down[:, None], np.sum(force * moment, axis=1) / down
     cop[~up], turn[~up] = cop[up][-1], 0.0
     launch = SpatialSrmpStance(t, *columns, cop, turn)
     length = float(np.linalg.norm(toe.q[-1, :3]))
-    return SpatialSrmpPlan(task, launch, _flown(flight, length, task.gravity), solution, body)
+    return SpatialSrmpPlan(task, launch, _flown(flight, length, task.gravity), solution, body.reach, body)
 
 
 def _flown(flight, length: float, gravity: float) -> SpatialSrmpFlight:
@@ -518,7 +489,8 @@ def _flown(flight, length: float, gravity: float) -> SpatialSrmpFlight:
     foot2 = np.cross(alpha, foot) + np.cross(omega, foot1)
     leg, leg1, leg2 = (x[:, None] for x in leg_between(length, c["leg"], t))
     com, time = place + speed * t[:, None] + fall * t[:, None] ** 2 / 2, t[:, None]
-    motion = t, com, speed + fall * time, fall * ones, L * ones, rho, rate, accel, z[0]
+    lean = np.arccos(np.minimum(-foot[:, 2], 1.0))
+    motion = t, com, speed + fall * time, fall * ones, L * ones, rho, rate, accel, lean, z[0]
     return SpatialSrmpFlight(
         *motion, leg * foot, leg1 * foot + leg * foot1, leg2 * foot + 2 * leg1 * foot1 + leg * foot2
     )

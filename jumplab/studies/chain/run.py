@@ -95,6 +95,8 @@ def _jumps(run: Run, chain: ChainPilot) -> tuple[ChainedJump, ...]:
 def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s) -> None:
     require_type(course, Course, "the course")
     require_type(robot, Robot, "the robot")
+    if not robot.planar:
+        raise InputError(f"robot {robot.name}: chains wait in a crouch of five links, which do not describe it")
     if perturbation is not None:
         require_type(perturbation, Perturbation, "the perturbation")
     for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
