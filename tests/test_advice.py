@@ -113,7 +113,8 @@ def robot_of(name):
 def test_refusals_of_five_robots_are_followed():
     """Random targets beyond what they can do; each advice is followed by a planner that has not seen it before."""
     rng, followed, tried = random.Random(7), 0, 0
-    robots = [*(n for n in SHIPPED if n not in ("romeo", "g1_arms")), "weak"]  # romeo cannot jump; a refusal in space takes long
+    # romeo cannot jump at all, and says so; to refuse a jump in space takes minutes
+    robots = [*(n for n in SHIPPED if n not in ("romeo", "g1_arms")), "weak"]
     while followed < REFUSALS and tried < 4 * REFUSALS:
         name, tried = robots[tried % len(robots)], tried + 1
         far = 3.0 if name in ("bhr", "weak") else 1.5
