@@ -15,8 +15,8 @@ from jumplab.io import files
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 UNCHANGED = "interrupted; what was there before is unchanged"
 AGAIN_S = 0.05  # how often it is looked whether the exception got lost
-LEAVE_S = 0.5  # for what libraries do at the end of a process
-PATIENCE_S = 1.2  # after this long without an end, the process is ended from outside of what it is doing
+LEAVE_S = 0.4  # for what libraries do at the end of a process
+PATIENCE_S = 0.9  # after this long without an end, the process is ended from outside of what it is doing
 
 
 class Stopped(KeyboardInterrupt):
@@ -39,7 +39,7 @@ class Interrupts:
         self.number: int | None = None  # of the signal that was heard
         self._alone, self._settled, self._over = alone, False, False
         self._raised: weakref.ref[Stopped] | None = None
-        self._stderr = sys.stderr
+        self._stderr, self._hook = sys.stderr, sys.unraisablehook
 
     @property
     def code(self) -> int:
@@ -55,7 +55,7 @@ class Interrupts:
         try:
             yield
         finally:
-            self._over, sys.stderr = True, self._stderr
+            self._over, sys.stderr, sys.unraisablehook = True, self._stderr, self._hook
             files.AT_SETTLE.remove(self._settle)
             for number, handler in before.items():
                 signal.signal(number, signal.SIG_IGN if self._alone else handler)
