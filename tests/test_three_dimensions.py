@@ -285,8 +285,10 @@ def test_three_steps_end_in_a_clean_plan():
         len(e["inertia_rows"]),
         2,
     )
-    figures = jl.plots.inertia_and_momentum(plan.tape), jl.plots.margins(plan.tape, plan.robot)
-    assert [len(fig.axes) for fig in figures] == [6, 9]
+    guess = plan.joints.t, plan.joints.q[:, 7:], plan.joints.v[:, 6:]
+    figures = [jl.plots.inertia_and_momentum(plan.tape), jl.plots.margins(plan.tape, plan.robot)]
+    figures.append(jl.plots.joint_trajectories(plan.tape, plan.robot, guess=guess))
+    assert [len(fig.axes) for fig in figures] == [6, 9, 14]
 
 
 @pytest.mark.slow
