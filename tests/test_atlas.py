@@ -165,7 +165,7 @@ def test_key_follows_weights_and_own_terms():
     for how in (
         {"weights": {"whole body/torque": 2.0}},
         {"off": ["whole body/sole clearance"]},
-        {"mesh": {"flight": 30}},
+        {"mesh": {"flight": 24}},
     ):
         assert key_of(Planner(Robot.load(), **how).stage("direct")) != plain
 

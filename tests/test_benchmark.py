@@ -69,7 +69,7 @@ def test_what_is_not_reached_is_said():
     slow = made(cold=[4.0, 5.0], **{"cold, functions kept": [3.0, 3.0]})
     said = {row["number"].partition(" /")[0]: (row["value"], row["limit"], row["aim"], row["verdict"])
             for row in goals(slow)}  # fmt: skip
-    assert len(said) == 8 and said["new process to finished plan"] == (3.0, 1.5, None, "not reached")
+    assert len(said) == 7 and said["new process to finished plan"] == (3.0, 1.5, None, "not reached")
     assert said["three steps, warm"] == (1.0, 1.0, None, "reached")  # against Gauss-Newton steps; the last of two rows
     assert [row["verdict"] for row in goals(made())].count("not measured here") == 4
     ratios = ("cold_kept_over_direct", "warm_over_approached", "tape_over_direct")

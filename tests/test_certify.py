@@ -180,7 +180,7 @@ def test_what_makes_no_certificate_says_why(folder, physics, monkeypatch, capsys
     with pytest.raises(InputError, match=r"^n = 0 is too small; it must be at least 1$"):
         certify(folder, 0)
     assert cli.main(["certify", str(folder), "--n", "0"]) == 2
-    assert capsys.readouterr().err == "jumplab: --n must be at least 1, got 0\n"
+    assert capsys.readouterr().err == "jumplab: --n must be a whole number from 1 to 100000, got '0'\n"
 
     def refuse(engine, mode, drawn):
         if engine == "mujoco":

@@ -187,7 +187,7 @@ def test_unreadable_and_missing_notebooks(tmp_path, monkeypatch):
     path.unlink()
     monkeypatch.setattr(notebooks, "_PACKAGE_PARENT", tmp_path)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks'; run this in a clone of the repository$"):
+    with pytest.raises(InputError, match=r"^no notebooks in '.*notebooks' nor in '.*notebooks'; install jumplab anew$"):
         notebooks.find_notebooks()
 
 

@@ -65,7 +65,7 @@ def table() -> str:
     flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
     found += [f"of a flip: {line}" for line in flips if line not in found]
     stance = SpatialModel(robot.model).of_pinocchio(stance_configuration(robot)[None])[0]
-    found += lines(spatial.build_problem(robot), {"stance": stance})
+    found += lines(spatial.build_problem(robot), {"stance": stance, "yaw": 2 * np.pi})
     for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
         for part, fields in asdict(options).items():
             rows = fields.items() if isinstance(fields, dict) else [("", fields)]

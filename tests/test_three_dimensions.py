@@ -246,6 +246,15 @@ def test_mirrored_target_has_the_mirrored_motion(bhr):
         np.testing.assert_allclose(y, sign * x, atol=0.03)
 
 
+def test_own_terms_reach_stage2(bhr):
+    def arms_in(p):
+        return p.inertia_acceleration[1] + 400.0 * (p.inertia[1] - 0.6) + 40.0 * p.inertia_rate[1]
+
+    low = jl.Term("arms in", "ours", "kg m^2/s^2", "node", arms_in, weight=3.0)
+    mine = map_to_joints(stage1(TURN), bhr, STEPS_S, "direct", terms={"flight": [low]})
+    assert mine.actual["rho"][-1, 1] < stage2(TURN).actual["rho"][-1, 1] - 0.05
+
+
 def test_feet_turn_to_the_asked_heading(bhr):
     body, plan = TurningBody(bhr), stage2(TURN)
     for turn in body.motion(plan.q[-1], plan.v[-1]).foot_rotation:
@@ -276,8 +285,10 @@ def test_three_steps_end_in_a_clean_plan():
         len(e["inertia_rows"]),
         2,
     )
-    figures = jl.plots.inertia_and_momentum(plan.tape), jl.plots.margins(plan.tape, plan.robot)
-    assert [len(fig.axes) for fig in figures] == [6, 9]
+    guess = plan.joints.t, plan.joints.q[:, 7:], plan.joints.v[:, 6:]
+    figures = [jl.plots.inertia_and_momentum(plan.tape), jl.plots.margins(plan.tape, plan.robot)]
+    figures.append(jl.plots.joint_trajectories(plan.tape, plan.robot, guess=guess))
+    assert [len(fig.axes) for fig in figures] == [6, 9, 14]
 
 
 @pytest.mark.slow

@@ -224,14 +224,25 @@ def _print_chain(result, report) -> None:
     opt("--out DIR", "folder for the map; an interrupted one goes on", None, folder, required=True),
     opt("--distance-m M", f"of the cells: {VALUES} [m] (default 0:1.2:13)", "0:1.2:13", values_of),
     opt("--height-m M", f"of the cells: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
+    opt("--side-m M", f"sides against distances instead, at one height: {VALUES} [m]", None, values_of),
+    opt("--yaw-deg DEG", f"turns on the spot against heights instead: {VALUES}", None, values_of),
     JOBS,
 )
 def envelope(args: Namespace) -> None:
     """Map of the jumps that a robot can do."""
+    if args.side_m is not None and args.yaw_deg is not None:
+        raise InputError("--side-m and --yaw-deg are two maps; leave one of them away")
+    if args.side_m is not None and len(args.height_m) != 1:
+        raise InputError(f"a map of sides has one height, got {len(args.height_m)}; give --height-m one number")
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    axes, jobs = (args.distance_m, args.height_m), args.jobs or os.cpu_count() or 1
-    found = maps.envelope(robot, *axes, folder=args.out, workers=jobs, tell=print)
+    values, more, jobs = (args.distance_m, args.height_m), {}, args.jobs or os.cpu_count() or 1
+    if args.side_m is not None:
+        fixed = JumpTask(0.0, args.height_m[0])
+        values, more = (args.side_m, args.distance_m), dict(axes=("side_m", "distance_m"), fixed=fixed)
+    elif args.yaw_deg is not None:
+        values, more = ([math.radians(x) for x in args.yaw_deg], args.height_m), dict(axes=("yaw_rad", "height_m"))
+    found = maps.envelope(robot, *values, **more, folder=args.out, workers=jobs, tell=print)
     figure, args.found["map"] = pictures.envelope_map(found), asdict(found) | {"hash": robot.hash}
     store.settle()
     text = json.dumps(args.found["map"], indent=1).replace("NaN", "null")
@@ -244,6 +255,8 @@ def envelope(args: Namespace) -> None:
         raise InfeasibleError(f"{robot.name} can do none of these jumps: {reason}")
     for word, cell in (("highest", found.highest), ("farthest", found.farthest)):
         jump = f"{cell.distance_m:.2f} m far with a rise of {cell.height_m:.2f} m"
+        if more:
+            jump += f", {cell.side_m:.2f} m to the left, turned by {math.degrees(cell.yaw_rad):.0f} deg"
         print(f"{word}: {jump}, limited by {cell.limiting} ({100 * cell.share:.0f} % used)")
 
 

@@ -174,7 +174,7 @@ class JumpPlan(Shown, Named):
         """
         if self.stored is not None:
             return self.stored.get("tracking")
-        return None if self.srmp is None or not self.task.in_plane else _tracking(self.tape, self.srmp)
+        return None if self.srmp is None else _tracking(self.tape, self.srmp)
 
     @property
     def summary(self) -> dict:

@@ -29,6 +29,9 @@ class SpatialLimits:
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
+    touchdown_turning: float = (
+        4.0  # [rad/s] of trunk and feet about the vertical besides, per half turn after the first
+    )
     touchdown_knee: tuple[float, float] = (0.95, 1.4)  # [rad]
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
     touchdown_roll: float = 0.10  # [rad] of the base, either way

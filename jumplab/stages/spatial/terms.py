@@ -376,6 +376,15 @@ class SpatialTerms:
         lim, rate, foot = self.limits, self.limits.touchdown_joint_rate, self.limits.touchdown_foot_rate
         trunk = lim.touchdown_trunk_rate
 
+        def within(rates, vertical):
+            """Bounds on rates, those about the vertical wider where more than half a turn has to be stopped."""
+
+            def most(parameters):
+                more = max(0.0, abs(float(parameters["yaw"])) / np.pi - 1)
+                return rates + lim.touchdown_turning * more * np.array(vertical)
+
+            return (lambda parameters: -most(parameters)), most
+
         def spins(p):
             return ca.vertcat(*(self.state(p).spin(body) for body in self.feet))
 
@@ -389,10 +398,10 @@ class SpatialTerms:
         high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
         return [
             end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal, scale=0.1),
-            end("foot rates at touchdown", "ours", "rad/s", spins, -foot, foot),
+            end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, [0, 0, 1, 0, 0, 1])),
             end("attitude at touchdown", "ours", "rad", attitude, low, high),
             end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
             end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
-            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], -trunk, trunk),
+            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], *within(trunk, [1, 0, 0])),
             self.capture_rows(),
         ]
