@@ -16,7 +16,7 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 UNCHANGED = "interrupted; what was there before is unchanged"
 AGAIN_S = 0.05  # how often it is looked whether the exception got lost
 LEAVE_S = 0.4  # for what libraries do at the end of a process
-PATIENCE_S = 0.9  # after this long without an end, the process is ended from outside of what it is doing
+PATIENCE_S = 1.1  # after this long without an end, the process is ended from outside of what it is doing
 
 
 class Stopped(KeyboardInterrupt):

@@ -247,7 +247,7 @@ def _aside(execute: Callable[[], Any], started: list[int]) -> None:
         for group in started:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(group, signal.SIGKILL)
-        thread.join(1.0)
+        thread.join(0.3)
         raise
     if raised:
         raise raised[0]
