@@ -307,7 +307,7 @@ class Robot(Shown):
     @cached_property
     def planar(self) -> bool:
         """Whether five links in the plane stand for it exactly; if not, the spatial program plans its jumps."""
-        return in_plane(self)
+        return bool(in_plane(self))
 
     @cached_property
     def standing(self) -> np.ndarray:
