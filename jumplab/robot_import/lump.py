@@ -23,19 +23,12 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 DUMMY = pin.Inertia(1e-3, np.zeros(3), 1e-6 * np.eye(3))  # as in the default robot; MuJoCo refuses zero
 
 
-@dataclass(frozen=True)
-class Tolerances:
-    """How much left and right may differ; the paper prints none of these numbers."""
-
-    axis_rad: float = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y or z are meant to be
-    alike: float = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
-    cad_m: float = 0.005  # what a CAD export leaves between left and right is evened out without asking
-    cad_share: float = 0.01  # of a body's mass or inertia, likewise
-    pair_m: float = 0.10  # farther apart two joints are no counterparts
-    same: float = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
-
-
-TOLERANCES = Tolerances()
+# how much left and right may differ; the paper prints none of these numbers
+AXIS_RAD = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y or z are meant to be
+ALIKE = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
+CAD_M, CAD_SHARE = 0.005, 0.01  # of places, and of a body's mass or inertia: what a CAD export leaves is evened out
+PAIR_M = 0.10  # farther apart two joints are no counterparts
+SAME = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
 
 @dataclass(frozen=True)
@@ -205,7 +198,7 @@ def _bodies(
 def _snapped(axis: np.ndarray) -> np.ndarray:
     """An axis within rounding of x, y or z as exactly that."""
     exact = np.round(axis)
-    near = np.count_nonzero(exact) == 1 and np.linalg.norm(axis - exact) < TOLERANCES.axis_rad
+    near = np.count_nonzero(exact) == 1 and np.linalg.norm(axis - exact) < AXIS_RAD
     return exact if near else axis
 
 
@@ -247,9 +240,9 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
         out[left.joint] = replace(left, place=middle, inertia=here)
         if right is not left:
             out[right.joint] = replace(right, place=MIRROR @ middle, inertia=away, axis=_same_axis(left, right))
-    even = gap <= TOLERANCES.cad_m and share <= TOLERANCES.cad_share
+    even = gap <= CAD_M and share <= CAD_SHARE
     done = "evened out" if even else "differ, left as they are"
-    if max(gap, share) > TOLERANCES.alike:
+    if max(gap, share) > ALIKE:
         changed[f"left and right {done}, places"] = (1e3 * float(gap), "mm")
         changed[f"left and right {done}, masses"] = (100 * float(share), "%")
     return [out.get(b.joint, b) for b in bodies] if even else bodies
@@ -269,7 +262,7 @@ def _same_axis(left: Body, right: Body) -> np.ndarray:
     """The right joint's axis as the exact mirror image of the left one's, either way round."""
     image = -MIRROR @ left.axis
     image = image if image @ right.axis > 0 else -image
-    return image if np.linalg.norm(image - right.axis) < 10 * TOLERANCES.axis_rad else right.axis
+    return image if np.linalg.norm(image - right.axis) < 10 * AXIS_RAD else right.axis
 
 
 def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
@@ -279,10 +272,10 @@ def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
         if body.name in image:
             continue
         flipped = -MIRROR @ body.axis
-        like = [b for b in bodies[1:] if b.parent == image.get(body.parent) and abs(flipped @ b.axis) > TOLERANCES.same]
+        like = [b for b in bodies[1:] if b.parent == image.get(body.parent) and abs(flipped @ b.axis) > SAME]
         near = [(float(np.abs(MIRROR @ b.place - body.place).max()), b.name, b) for b in like]
         gap, _, other = min(near, default=(np.inf, "", body))
-        if gap < TOLERANCES.pair_m:
+        if gap < PAIR_M:
             image |= {body.name: other.name, other.name: body.name}
             out.append((body, other) if body.place[1] >= other.place[1] else (other, body))
     return out
