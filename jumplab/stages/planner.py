@@ -222,7 +222,8 @@ class Planner:
         task : the target.
         method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold; with side or
             yaw the spatial program, begun from a jump ahead with ramps). "usual" is "three-step" in the plane and
-            "direct" out of it, which there takes less time (``notebooks/13_three_dimensions`` measures it).
+            "direct" out of it, which there ends in less costly jumps
+            in no more time (``notebooks/13_three_dimensions`` measures it).
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
