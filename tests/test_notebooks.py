@@ -384,7 +384,7 @@ def test_readme_tells_what_the_run_measured(chain):
     assert said["rise of the CoM"] == pytest.approx([summary["planned_rise_m"], simulation["com_rise_m"]], abs=0.001)
     assert said["on its feet after touchdown"] == pytest.approx([simulation["standing_s"]], abs=0.01)
     passport = store.read_json(chain.out / "passport.json")
-    assert len(passport["checks"]) == 50 and "passes fifty independent checks" in readme
+    assert len(passport["checks"]) == 51 and "passes 51 independent checks" in readme
 
 
 @pytest.mark.parametrize("stem", STEMS)
