@@ -72,6 +72,10 @@ def test_random_moments(folder, tmp_path_factory):  # noqa: F811
     print(f"{SHOTS} shots, slowest end {max(ends):.2f} s")
 
 
+def heeding():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 LOST = """
 import sys, time
 from jumplab.cli import main as cli
@@ -96,7 +100,9 @@ sys.exit(cli.main())
 def test_an_exception_that_gets_lost_is_raised_again(tmp_path, then):
     """Once lost, the work goes on elsewhere and is stopped there; lost again and again, the process is ended."""
     argv = [sys.executable, "-c", LOST.format(then=then), "plan", "--out", str(tmp_path / "p")]
-    process = subprocess.Popen(argv, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # whoever runs the tests in the background may ignore Ctrl-C, and so would the command
+    how = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heeding)
+    process = subprocess.Popen(argv, cwd=ROOT, **how)
     assert process.stdout.readline() == "working\n" or process.stdout.readline() == "working\n"
     process.send_signal(signal.SIGINT)
     began = time.monotonic()
