@@ -49,7 +49,18 @@ def test_whatever_is_exposed_refuses_to_be_written_to(way):
                     setattr(x, name, 0.0)
         else:
             assert isinstance(x, str | int | float | tuple), path
-    assert kinds == {"Robot", "SagittalModel", "Foot", "ndarray", "mappingproxy", "tuple", "str", "int", "float"}
+    assert kinds == {
+        "Robot",
+        "SagittalModel",
+        "Foot",
+        "ndarray",
+        "mappingproxy",
+        "tuple",
+        "str",
+        "int",
+        "float",
+        "bool",
+    }
     assert alike(robot, way(Robot.load()))
 
 
