@@ -294,9 +294,9 @@ def smooth(values: np.ndarray, step_s: float) -> np.ndarray:
 
 
 def trunk_pitch(q: np.ndarray) -> np.ndarray:
-    """Pitch (N,) of the trunk [rad] from configurations (N, nq), continuous through full turns."""
+    """Pitch (N,) of the trunk in its own heading [rad] from configurations (N, nq), continuous through full turns."""
     x, y, z, w = q[:, 3:7].T
-    return np.unwrap(np.arctan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y)))
+    return np.unwrap(np.arctan2(2 * (w * y - x * z), 1 - 2 * (x * x + y * y)))
 
 
 # Many robots -----------------------------------------------------------------------------------------------------
