@@ -179,9 +179,8 @@ class Nlp:
 
     def weighs_as(self, near: Solution, weights: Mapping[str, float]) -> bool:
         """Whether a solution was found with just the weights that :meth:`solve` would take from ``weights``."""
-        now = {**{f"{o}/{t.name}": t.weight for o, t in self.assembled.cost_terms}, **weights}
-        now |= {f"{o}/{t.name}": weights[t.name] for o, t in self.assembled.cost_terms if t.name in weights}
-        return all(now[f"{row['phase']}/{row['name']}"] == row["weight"] for row in near.cost_shares)
+        now = [weights.get(f"{o}/{t.name}", weights.get(t.name, t.weight)) for o, t in self.assembled.cost_terms]
+        return now == [row["weight"] for row in near.cost_shares]
 
     def _solution(
         self,

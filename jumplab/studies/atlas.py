@@ -24,11 +24,12 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError, require_type
 from jumplab.io.files import locked, made, write_file
+from jumplab.ocp.assembly import pack, unpack
 from jumplab.ocp.cache import fingerprint
-from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
+from jumplab.studies.envelope import usage
 from jumplab.task import JumpTask
 
 FILE, FORMAT = "atlas.npz", 1
@@ -49,30 +50,7 @@ class Node:
     jerk: float | None  # its weight, if the tape asked for a dearer one
     limiting: str  # what is used most
     share: float  # of its limit
-    phases: Mapping[str, PhaseGuess]
-
-    def flat(self) -> np.ndarray:
-        """All numbers of the motion in one row, in the order of :meth:`lifted`."""
-        return np.concatenate([_row(p) for p in self.phases.values()])
-
-    def lifted(self, row: np.ndarray) -> dict[str, PhaseGuess]:
-        """The motion whose numbers :meth:`flat` would give as ``row``."""
-        out, at = {}, 0
-        for name, p in self.phases.items():
-            out[name], at = _phase(p, row[at : at + len(_row(p))]), at + len(_row(p))
-        return out
-
-
-def _row(p: PhaseGuess) -> np.ndarray:
-    return np.concatenate([[p.duration, *p.constants.values()], *(np.ravel(x) for x in (p.q, p.v, p.a, p.z))])
-
-
-def _phase(like: PhaseGuess, row: np.ndarray) -> PhaseGuess:
-    head = 1 + len(like.constants)
-    sizes = np.cumsum([x.size for x in (like.q, like.v, like.a, like.z)])
-    parts = np.split(row[head:], sizes[:-1])
-    q, v, a, z = (x.reshape(y.shape) for x, y in zip(parts, (like.q, like.v, like.a, like.z), strict=True))
-    return PhaseGuess(float(row[0]), q, v, a, z, dict(zip(like.constants, row[1:head].tolist(), strict=True)))
+    x: np.ndarray  # (n,) the motion, as the problem's scaled variables
 
 
 class Atlas:
@@ -199,7 +177,7 @@ class Atlas:
             height_m=task.height_m,
             cost=float(s @ [n.cost for n in nodes]),
             jerk=max((n.jerk for n in nodes if n.jerk is not None), default=None),
-            phases=nearest.lifted(s @ [n.flat() for n in nodes]),
+            x=s @ [n.x for n in nodes],
         )
         return [blend, nearest]
 
@@ -240,7 +218,7 @@ class Atlas:
         best = None
         for node in self.starts(task):
             try:
-                plan = body.settled(task, node.phases, jerk=node.jerk, start=start)
+                plan = _from(body, task, node, start)
             except SolverError:
                 continue
             cost = plan.solution.statistics.objective
@@ -257,10 +235,9 @@ class Atlas:
         head = {"format": FORMAT, "robot": self.robot, "key": self.key}
         head |= {"distances": self.distances, "heights": self.heights}
         head["done"] = sorted(self.heights if done is None else done)
-        head["phases"] = _shapes(nodes[0].phases) if nodes else {}
         head["nodes"] = [(n.distance_m, n.height_m, n.cost, n.jerk, n.limiting, n.share) for n in nodes]
         buffer, folder = io.BytesIO(), Path(folder)
-        np.savez_compressed(buffer, head=np.array(json.dumps(head)), rows=np.array([n.flat() for n in nodes]))
+        np.savez_compressed(buffer, head=np.array(json.dumps(head)), rows=np.array([n.x for n in nodes]))
         with made(folder), locked(folder):
             return write_file(folder / FILE, buffer.getvalue())
 
@@ -297,15 +274,11 @@ def _between(axis: Sequence[float], x: float) -> tuple[int, float]:
 
 
 def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
-    from jumplab.studies.envelope import usage
-
     jerks = {row["weight"] for row in plan.solution.cost_shares if row["name"] == "jerk"}
     jerk = jerks.pop() if len(jerks) == 1 and jerks != {body.weights.jerk} else None
     shares, cost = usage(plan, body.robot), plan.solution.statistics.objective
-    most = max(shares, key=shares.get)
-    return Node(
-        plan.task.distance_m, plan.task.height_m, cost, jerk, most, min(shares[most], 1.0), plan.solution.guess()
-    )
+    most, x = max(shares, key=shares.get), pack(body.nlp.assembled, plan.solution.guess())
+    return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, most, min(shares[most], 1.0), x)
 
 
 _here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew
@@ -333,7 +306,7 @@ def _cheaper(body: WholeBodyPlanner, node: Node, near: Node) -> Node | None:
     """``node`` with the motion of a neighbour, if that costs less."""
     task = JumpTask(node.distance_m, node.height_m)
     try:
-        plan = body.settled(task, near.phases, jerk=near.jerk)
+        plan = _from(body, task, near)
         if plan.solution.statistics.objective >= CHEAPER * node.cost:
             return None
         found = _node(body, body.plan(task, near=plan, settle=False))
@@ -342,8 +315,10 @@ def _cheaper(body: WholeBodyPlanner, node: Node, near: Node) -> Node | None:
         return None
 
 
-def _shapes(phases: Mapping[str, PhaseGuess]) -> dict[str, Any]:
-    return {n: [[x.shape for x in (p.q, p.v, p.a, p.z)], list(p.constants)] for n, p in phases.items()}
+def _from(body: WholeBodyPlanner, task: JumpTask, node: Node, start: np.ndarray | None = None) -> WholeBodyPlan:
+    """The plan for a target a few steps from a node; raises :class:`SolverError` if it is not that close."""
+    near = {name: phase.guess() for name, phase in unpack(body.nlp.assembled, node.x).items()}
+    return body.settled(task, near, jerk=node.jerk, start=start)
 
 
 def _loaded(path: Path) -> tuple[Atlas, set[float]]:
@@ -353,12 +328,8 @@ def _loaded(path: Path) -> tuple[Atlas, set[float]]:
             head, rows = json.loads(str(file["head"])), file["rows"]
         if head["format"] != FORMAT or not np.all(np.isfinite(rows)):
             raise ValueError("other format, or numbers that are none")
-        like, nodes = {}, {}
-        for name, (shapes, constants) in head["phases"].items():
-            like[name] = PhaseGuess(1.0, *(np.zeros(s) for s in shapes), dict.fromkeys(constants, 0.0))
-        for (distance, height, *rest), row in zip(head["nodes"], rows, strict=True):
-            node = Node(distance, height, *rest, like)
-            nodes[distance, height] = replace(node, phases=node.lifted(row))
+        known = zip(head["nodes"], rows, strict=True)
+        nodes = {(d, h): Node(d, h, *rest, row) for (d, h, *rest), row in known}
         return Atlas(head["robot"], head["distances"], head["heights"], nodes, head["key"]), set(head["done"])
     except FileNotFoundError:
         raise InputError(f"{str(path.parent)!r} has no {FILE}; build one with 'jumplab atlas'") from None

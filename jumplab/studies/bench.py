@@ -253,7 +253,7 @@ def _cold(watch: Stopwatch, robot_name: str, task: JumpTask, audits: dict[str, l
         began = time.perf_counter()
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         if how == "keep":
-            watch.keep("process", time.perf_counter() - began, time.perf_counter() - began)
+            watch.wall.setdefault("process", []).append(time.perf_counter() - began)
         if done.returncode:
             raise SolverError(f"the new process failed: {done.stderr.strip().splitlines()[-1]}", stage="cold")
         said = json.loads(done.stdout)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, Shown, SolverError
+from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import WARM, Nlp, Solution
+from jumplab.ocp.nlp import WARM, Nlp
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.generic import generic
@@ -19,6 +19,7 @@ from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimi
 from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.whole_body.planner import BodyPlan
 from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
@@ -37,23 +38,11 @@ Begin = tuple[Tape | None, float, bool]  # a tape or none, when its heels rise [
 
 
 @dataclass(frozen=True, repr=False)
-class SpatialPlan(Shown):
+class SpatialPlan(BodyPlan):
     """Result of the spatial program."""
 
-    task: JumpTask
-    solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
     edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
     limits: SpatialLimits = SpatialLimits()  # that it was made with
-
-    @property
-    def launch_s(self) -> float:
-        """Duration of the launch [s]."""
-        return self.solution.phases["flat"].duration + self.solution.phases["toe"].duration
-
-    @property
-    def flight_s(self) -> float:
-        """Duration of the flight [s]."""
-        return self.solution.phases["flight"].duration
 
 
 class SpatialPlanner:

@@ -52,15 +52,11 @@ class Asked:
 
 
 @dataclass(frozen=True, repr=False)
-class WholeBodyPlan(Shown):
-    """Result of stage 3 or of the direct planner."""
+class BodyPlan(Shown):
+    """A jump of the whole body, in the plane or out of it."""
 
     task: JumpTask
     solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
-    coarse: Statistics | None = None  # of the coarse mesh before it; None if there was none, or it found nothing
-    limits: Limits = Limits()  # that it was made with
-    # of the solves before it whose jerk jumped farther than a tape can follow; after each, the jerk's weight was raised
-    uneven: tuple[Statistics, ...] = ()
 
     @property
     def launch_s(self) -> float:
@@ -71,6 +67,16 @@ class WholeBodyPlan(Shown):
     def flight_s(self) -> float:
         """Duration of the flight [s]."""
         return self.solution.phases["flight"].duration
+
+
+@dataclass(frozen=True, repr=False)
+class WholeBodyPlan(BodyPlan):
+    """Result of stage 3 or of the direct planner."""
+
+    coarse: Statistics | None = None  # of the coarse mesh before it; None if there was none, or it found nothing
+    limits: Limits = Limits()  # that it was made with
+    # of the solves before it whose jerk jumped farther than a tape can follow; after each, the jerk's weight was raised
+    uneven: tuple[Statistics, ...] = ()
 
     @property
     def jerk_step(self) -> float:
