@@ -9,7 +9,7 @@ from jumplab.errors import require_type
 from jumplab.io import folder as folders
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
-from jumplab.stages.planner import Planner
+from jumplab.stages.planner import USUAL, Planner
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
@@ -29,17 +29,17 @@ def plan(
     task: JumpTask,
     robot: Robot | str | Path = "bhr",
     *,
-    method: str = "usual",
+    method: str = USUAL,
     **changes: Any,
 ) -> JumpPlan:
-    """Plan one jump: three optimisations, then the 1 kHz tape (Sec. III to V of the paper).
+    """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz tape.
 
     Parameters
     ----------
     task : what to reach.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
-    method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, from a crouch). The
-        default is "three-step" in the plane, and "direct" for a jump to the side or with a turn, see
+    method : "direct" (the whole body alone, from a crouch) or "three-step" (SRMP, joint-space QPs, whole body: what the
+        paper does). The default is "direct", but "three-step" for flips, and where stages 1 or 2 are changed, see
         :meth:`jumplab.Planner.plan`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
         :class:`jumplab.Planner`, which plans many targets with them.

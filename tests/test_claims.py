@@ -195,7 +195,7 @@ def test_what_is_drawn_in_counts_for_the_limbs_that_move(bhr):
 
 def test_the_stored_study_holds_every_case_in_both_ways():
     rows, asked = hard_cases.read(), hard_cases.cases()
-    assert len(asked) == 200 and {case.kind for case in asked} == set(hard_cases.KINDS)
+    assert len(asked) == 240 and {case.kind for case in asked} == set(hard_cases.KINDS)
     assert [(r["number"], r["method"]) for r in rows] == [(c.number, m) for c in asked for m in METHODS]
     for case, row in zip(asked, rows[::2], strict=True):
         t = case.task

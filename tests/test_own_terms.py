@@ -232,7 +232,7 @@ def test_what_a_method_would_ignore_is_refused(bhr):
     ):
         refused(start + what + end, jl.Planner(bhr, **how).plan, task, "direct")
     refused(start + "'srmp'" + end, planner().plan, task, "direct", weights={"srmp/turn": 1.0})
-    with pytest.raises(InputError, match="'track inertia': the problem 'direct' has no such term"):
+    with pytest.raises(InputError, match="'track inertia': the problem 'whole body' has no such term"):
         jl.Planner(bhr, weights={"track inertia": 1.0}, mesh=SMALL).plan(task, "direct")
 
 
@@ -352,7 +352,7 @@ def test_a_weight_of_zero_in_one_plan_drops_that_term_alone():
 
 
 def test_a_solved_plan_lists_its_terms():
-    plan = armed(0.1).plan(jl.JumpTask(0.4, 0.3))
+    plan = armed(0.1).plan(jl.JumpTask(0.4, 0.3), "three-step")
     rows = {(r["stage"], r["phase"], r["name"]): r for r in plan.terms()}
     own, place = rows["whole body", "flight", "calm arms"], rows["whole body", "flight", "touchdown place"]
     assert 0 < own["share"] < 1 and own["node"] is None and own["value"] == "weight 0.1"

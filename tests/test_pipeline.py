@@ -15,7 +15,7 @@ from jumplab.stages import planner as pipeline
 from jumplab.stages.joint_qp import Limits as JointLimits
 from jumplab.stages.joint_qp import Options, rollout
 from jumplab.stages.joint_qp.settings import GENTLE
-from jumplab.stages.planner import METHODS, Planner, guess_from_joints, plan_jump
+from jumplab.stages.planner import METHODS, Planner, guess_from_joints
 from jumplab.task import JumpTask
 
 
@@ -39,7 +39,7 @@ def test_a_stage_two_that_follows_gently_says_so(monkeypatch, plan):
     """Usual weights without the torques for it, and a fallback with them: the plan tells which it was, and why."""
     weak = Options(limits=JointLimits(torque_share=0.2))
     monkeypatch.setattr(rollout, "Options", lambda: weak)
-    gentle = planner().plan(JumpTask(0.5, 0.3))
+    gentle = planner().plan(JumpTask(0.5, 0.3), "three-step")
     assert gentle.statistics[1].stage == "2 joint map, gentle" and gentle.joints.options == GENTLE
     reason = gentle.summary["manifest"]["solvers"]["joint map"]["gentle"]
     assert reason == gentle.joints.gentle and reason.startswith("stage 2: at t = ")
@@ -170,13 +170,8 @@ def test_a_failed_map_feeds_nothing(monkeypatch):
 
     monkeypatch.setattr(pipeline, "map_to_joints", fail)
     with pytest.raises(SolverError) as e:
-        one.plan(JumpTask(1.0, 0.5))
+        one.plan(JumpTask(1.0, 0.5), "three-step")
     assert e.value is failure
-
-
-def test_plan_jump_is_a_planner_for_one(monkeypatch):
-    monkeypatch.setattr(Planner, "plan", lambda self, task, method: (self.robot.name, task.distance_m, method))
-    assert plan_jump(JumpTask(0.7, 0.3), Robot.load(), method="direct") == ("bhr", 0.7, "direct")
 
 
 def test_guess_is_stage_twos_motion(plan):

@@ -13,7 +13,7 @@ from fixtures_core import planner
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import DirectSolver
 from jumplab.stages.joint_qp.solve import Program
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,7 +55,7 @@ def test_a_plan_made_three_times_is_the_same(tmp_path):
         here = planner().plan(JumpTask(*target)).tape.arrays()
         assert worst_difference(here, Tape.load(tmp_path / f"{i}.npz").arrays()) <= SAME, target
         if i < 2:
-            assert worst_difference(here, plan_jump(JumpTask(*target), Robot.load()).tape.arrays()) <= SAME, target
+            assert worst_difference(here, Planner(Robot.load()).plan(JumpTask(*target)).tape.arrays()) <= SAME, target
 
 
 def test_joint_map_is_the_same_to_the_last_bit():

@@ -13,7 +13,7 @@ from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
 from jumplab.sim.playback import Motors
 from jumplab.sim.result import STAND_S
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 bullet = pytest.importorskip("pybullet", reason="PyBullet, behind whose back most of the cheats go, is not installed")
@@ -25,7 +25,7 @@ IN_FLIGHT = 1200  # step; the tape takes off a little after one second and flies
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return plan_jump(JumpTask(0.6, 0.3), bhr, method="direct").tape
+    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
 
 
 def failed(result) -> set[str]:

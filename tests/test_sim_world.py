@@ -16,7 +16,7 @@ from jumplab.sim import engine as engines
 from jumplab.sim.kinematics import Gauge
 from jumplab.sim.playback import AIR, FLAT, Actuators, Command, Delay, Motors
 from jumplab.sim.servo import Servo
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 with_bullet = pytest.mark.skipif("bullet" not in INSTALLED, reason="PyBullet is not installed")
@@ -210,7 +210,7 @@ def test_foot_sensors_weigh_the_robot(engine, bhr):
 
 @pytest.fixture(scope="module")
 def front_flip(bhr):
-    return plan_jump(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi), bhr).tape
+    return Planner(bhr).plan(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi)).tape
 
 
 def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):

@@ -225,7 +225,7 @@ def test_names_are_unique_within_a_phase(bhr):
 def test_unknown_names_are_refused():
     with pytest.raises(InputError) as e:
         planner().stage("direct").plan(JumpTask(0.5, 0.3), off=("gravity",))
-    assert str(e.value).startswith("weight or switch 'gravity': the problem 'direct' has no such term; it has ")
+    assert str(e.value).startswith("weight or switch 'gravity': the problem 'whole body' has no such term; it has ")
 
 
 def test_a_switched_off_limit_is_gone():
@@ -273,7 +273,7 @@ def test_a_robot_too_weak_is_told_so(bhr):
     weak = WholeBodyPlanner(Robot.from_text(urdf, config), Mesh(8, 6, 8), tracking=False, options={"max_iter": 60})
     with pytest.raises(SolverError) as e:
         weak.plan(JumpTask(0.3, 0.3))
-    assert e.value.stage == "direct" and e.value.violations
+    assert e.value.stage == "whole body" and e.value.violations
     sentence = str(e.value)
     assert "torque" in sentence or "take-off" in sentence
     assert "\n" not in sentence

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import least_squares
 
 from jumplab.errors import RobotError
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, rotated
@@ -172,6 +171,8 @@ def standing(robot: Robot) -> np.ndarray:
         for axes in (data.oMf[f].rotation for f in frames):
             rows += [axes[2, 0], axes[2, 1], axes[1, 0]]
         return np.array([*rows, WIDTH_WEIGHT * (y1 - y2 - wide)])
+
+    from scipy.optimize import least_squares  # slow to import, and for robots that no plane describes
 
     low, high = (x[legs] for x in (model.lowerPositionLimit, model.upperPositionLimit))
     room = np.minimum(STANCE_ROOM_RAD, (high - low) / 3)

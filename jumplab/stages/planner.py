@@ -20,7 +20,7 @@ from jumplab.ocp import PhaseGuess, Statistics, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
-from jumplab.stages.changes import StageChanges, settled, sorted_out
+from jumplab.stages.changes import LAST, StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
@@ -37,6 +37,8 @@ from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS, USUAL = ("three-step", "direct"), "usual"
+FIRST_STAGES = "srmp", "spatial srmp", "joint qp"  # those that the direct method leaves out ...
+FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
@@ -144,7 +146,7 @@ class Planner:
         return WholeBodyPlanner(self.robot, self.mesh, limits, keep=self.keep, **how)
 
     def prepared(
-        self, method: str = "three-step", weights: Mapping[str, float] | None = None, *, flip: bool = False
+        self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False
     ) -> dict[str, StageChanges]:
         """Build the stages of a method, so that nothing is refused after the first has solved.
 
@@ -152,7 +154,7 @@ class Planner:
         the method has no place for, and for names that do not exist.
         """
         asked, turn = sorted_out(weights=weights), " flip" * flip
-        if method == "direct":
+        if self.chosen(method, weights, flip=flip) == "direct":
             ignored = [f"{s!r}" for s in ("srmp", "joint qp") if self.changes[s] or asked[s]]
             if ignored := ignored + ["the settings of 'srmp'"] * (self._given[1] is not None):
                 raise InputError(
@@ -167,6 +169,28 @@ class Planner:
             if (stage := self.stage(name)) and changes:
                 changes.applied(stage.nlp.problem)
         return asked
+
+    def chosen(
+        self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False
+    ) -> str:
+        """The method that is meant: "usual" is "three-step" for a flip in the plane, and where something is changed that
+        only that has; else "direct".
+
+        Raises :class:`InputError` for a method that does not exist, and for one that this planner cannot follow.
+        """
+        if not isinstance(method, str) or method not in (USUAL, *METHODS):
+            raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
+        asked = sorted_out(weights=weights)
+        first = flip or any(self.changes[stage] or asked[stage] for stage in FIRST_STAGES) or self._given[1] is not None
+        names = (n for x in (self.changes[LAST], asked[LAST]) for n in (*x.weights, *x.off))
+        first = first or any(n.rpartition("/")[2].startswith(FOLLOWING) for n in names)
+        if method == USUAL:
+            method = METHODS[0 if first else 1]
+        if self.atlas is not None and method != "direct":
+            raise InputError(f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave it away")
+        if not self.robot.planar and method != "direct":
+            raise InputError(f"method {quoted(method)}: no plane describes robot {self.robot.name}; choose 'direct'")
+        return method
 
     def _less(self, asked: Mapping[str, StageChanges]) -> Planner:
         """This planner; where one plan gives an own term the weight 0, one that has these weights and not that term.
@@ -193,7 +217,7 @@ class Planner:
         body, stance = FullBody(self.robot), stance_configuration(self.robot)
         return changed(Options(), body, stance, own.terms, {**own.weights, **weights}, own.off)
 
-    def terms(self, *, flip: bool = False, method: str = "three-step") -> list[dict[str, Any]]:
+    def terms(self, *, flip: bool = False, method: str = USUAL) -> list[dict[str, Any]]:
         """All terms and bounds of the stages as they are now, own ones included; ``jl.plots.table`` shows them.
 
         Returns
@@ -202,7 +226,7 @@ class Planner:
         """
         if not self.robot.planar:
             return self.stage("spatial").nlp.problem.table()
-        if method == "direct":
+        if self.chosen(method, flip=flip) == "direct":
             return self.stage("direct" + " flip" * flip).nlp.problem.table()
         first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
         return [*first, *terms_table(self._joint_options()), *last]
@@ -220,10 +244,12 @@ class Planner:
         Parameters
         ----------
         task : the target.
-        method : "three-step" (SRMP, joint-space QPs, whole body) or "direct" (the whole body alone, cold; with side or
-            yaw the spatial program, begun from a jump ahead with ramps). "usual" is "three-step" in the plane and
-            "direct" out of it, which there ends in less costly jumps
-            in no more time (``notebooks/13_three_dimensions`` measures it).
+        method : "direct" (the whole body alone, from a crouch; with side or yaw the spatial program, begun from a jump
+            ahead with ramps) or "three-step" (SRMP, joint-space QPs, whole body; what the paper does). "usual" is
+            "direct", which takes less time and finds a plan at least as often (``notebooks/10_benchmark``,
+            ``13_three_dimensions``), but "three-step" for flips in the plane, of which the direct one leaves more
+            outside the audit's limits (``08_flips``), and where something of stages 1 and 2, or of stage 3's tracking,
+            is changed.
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
@@ -235,14 +261,7 @@ class Planner:
             If a stage refuses or fails; no later stage is run.
         """
         require_type(task, JumpTask, "the target")
-        if isinstance(method, str) and method == USUAL:
-            method = METHODS[0 if task.in_plane and self.robot.planar and self.atlas is None else 1]
-        if not isinstance(method, str) or method not in METHODS:
-            raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
-        if self.atlas is not None and method != "direct":
-            raise InputError(f"method {quoted(method)}: an atlas holds direct plans; choose 'direct', or leave it away")
-        if not self.robot.planar and method != "direct":
-            raise InputError(f"method {quoted(method)}: no plane describes robot {self.robot.name}; choose 'direct'")
+        method = self.chosen(method, weights, flip=bool(task.rotation_rad) and task.in_plane and self.atlas is None)
         if not (task.in_plane and self.robot.planar):
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)

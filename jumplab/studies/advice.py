@@ -13,7 +13,7 @@ from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverErro
 from jumplab.io.progress import tell
 from jumplab.ocp.nlp import EXPLAINED
 from jumplab.stages.plan import JumpPlan
-from jumplab.stages.planner import Planner
+from jumplab.stages.planner import USUAL, Planner
 from jumplab.task import JumpTask
 
 NEAR = {"height_m": 0.75, "distance_m": 0.55, "platform_m": 0.6}  # of a bound, which plans do not reach
@@ -27,7 +27,7 @@ LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 NUMBERS = {"distance_m": "distance", "height_m": "height", "platform_m": "platform", "side_m": "side"}
 
 
-def plan_or_advise(planner: Planner, task: JumpTask, method: str = "usual") -> JumpPlan:
+def plan_or_advise(planner: Planner, task: JumpTask, method: str = USUAL) -> JumpPlan:
     """The plan of a target, as :meth:`jumplab.Planner.plan`; a refusal ends with an easier target that has a plan.
 
     Looking for that takes some seconds, so studies of many targets leave it out.
@@ -38,7 +38,7 @@ def plan_or_advise(planner: Planner, task: JumpTask, method: str = "usual") -> J
         raise advised(e, planner, task, method) from e
 
 
-def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str = "usual") -> JumplabError:
+def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str = USUAL) -> JumplabError:
     """The ``refusal`` again, ending with an easier target that has a clean plan, or saying that none was found.
 
     Each target that is tried is changed in the number that the one before was refused for.

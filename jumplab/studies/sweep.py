@@ -56,7 +56,7 @@ class Case:
     platform_m: float = 0.0
     robot: str = "bhr"
     weights: Mapping[str, float] = field(default_factory=dict)
-    method: str = "three-step"
+    method: str = "direct"
 
     def key(self) -> str:
         """What tells this case from all others."""
@@ -69,7 +69,7 @@ def grid(
     platforms: Sequence[float] = (0.0,),
     robots: Sequence[str] = ("bhr",),
     weights: Sequence[Mapping[str, float]] = ({},),
-    method: str = "three-step",
+    method: str = "direct",
 ) -> list[Case]:
     """All combinations, distances running fastest; refuses none, too many, and impossible targets or methods."""
     if method not in METHODS:

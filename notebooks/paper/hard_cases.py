@@ -1,4 +1,4 @@
-"""Three steps against one program where it is hard: far targets, platforms, tight limits, other robots, bad guesses.
+"""Three steps against one program where it is hard: far targets, platforms, flips, tight limits, other robots, bad guesses.
 
 ``python -m paper.hard_cases`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve, and can
 be stopped and started again; it takes some minutes. Notebook 10 draws the file.
@@ -33,7 +33,7 @@ from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("hard_cases.jsonl")
-KINDS = ("targets", "platforms", "tight limits", "other robots", "bad guesses")
+KINDS = ("targets", "platforms", "flips", "tight limits", "other robots", "bad guesses")
 PER_KIND = 40
 LIMITS = ({"torque_share": 0.6}, {"torque_share": 0.5}, {"speed_share": 0.65})
 ROBOTS = ("heavy trunk", "weak joints", "slow joints")
@@ -62,7 +62,8 @@ def cases() -> list[Case]:
         step = round(0.05 + 0.45 * b, 3)
         high = JumpTask(round(0.5 + 0.4 * a, 3), round(step + 0.05 + 0.1 * a, 3), step)
         target = JumpTask(*NOISE_TARGETS[k % len(NOISE_TARGETS)])
-        chosen = (far, -1), (high, -1), (near, k % len(LIMITS)), (near, k % len(ROBOTS)), (target, k)
+        turn = JumpTask(round(0.2 * a, 3), round(0.4 + 0.3 * b, 3), rotation_rad=2 * np.pi * (-1) ** k)
+        chosen = (far, -1), (high, -1), (turn, -1), (near, k % len(LIMITS)), (near, k % len(ROBOTS)), (target, k)
         found += [Case(len(found) + i, kind, *chosen[i]) for i, kind in enumerate(KINDS)]
     return found
 
@@ -81,7 +82,7 @@ def _planner(kind: str, variant: int) -> Planner:
     planner = Planner(robot, limits=limits)
     for method in METHODS:
         with suppress(JumplabError):  # the first call of anything is not timed
-            planner.plan(JumpTask(0.5, 0.3), method)
+            planner.plan(JumpTask(0.0, 0.5, rotation_rad=2 * np.pi) if kind == "flips" else JumpTask(0.5, 0.3), method)
     return planner
 
 
@@ -102,6 +103,9 @@ def _noisy(guess: Mapping[str, PhaseGuess], case: Case) -> dict[str, PhaseGuess]
 def _solved(planner: Planner, method: str, case: Case) -> tuple[WholeBodyPlan, Any]:
     """Whole body and tape, as :meth:`Planner.plan` makes them, but for the noise on the guess."""
     task, robot = case.task, planner.robot
+    if case.kind == "flips":
+        plan = planner.plan(task, method)
+        return plan.whole_body, plan.tape
     if method == "direct":
         last = planner.stage("direct")
         body = last.plan(task, guess=_noisy(last.naive_guess(task), case))
@@ -118,7 +122,7 @@ def _solved(planner: Planner, method: str, case: Case) -> tuple[WholeBodyPlan, A
 
 def solve(case: Case, method: str) -> dict[str, Any]:
     """One solve as a row of plain types: what was asked, whether it is planned and clean, time [s], effort, reason."""
-    planner = _planner(case.kind, case.variant if case.kind in KINDS[2:4] else -1)
+    planner = _planner(case.kind, case.variant if case.kind in KINDS[3:5] else -1)
     t, began = case.task, time.process_time()
     row = {"number": case.number, "method": method, "kind": case.kind, "variant": case.variant, "planned": False}
     row |= {"distance_m": t.distance_m, "height_m": t.height_m, "platform_m": t.platform_m, "clean": False}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from scipy.interpolate import BPoly
 
 from jumplab.io.tape import Tape
 from jumplab.stages.spatial.settings import SpatialLimits
@@ -22,6 +21,8 @@ IK_STEPS, DAMPING = 8, 1e-4
 
 def generic(b: SpatialTerms, task: JumpTask) -> Tape:
     """A tape at 100 Hz of a jump straight ahead with the task's rise; ``b`` are terms of a phase on the ground."""
+    from scipy.interpolate import BPoly  # slow to import
+
     gravity, chart0, leg = task.gravity, b.stance, _leg(b)
     z, speed = chart0[2] + leg * np.array([0.0, CROUCH, STRETCH, LANDED]), task.takeoff_speed
     push_s = 2 * (z[2] - z[1]) / speed

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import nnls
 
 from jumplab.io.tape import Tape
 from jumplab.models.spatial import spin_slope
@@ -24,6 +22,8 @@ def from_tape(
 
     With ``ramps`` the tape is one straight ahead, and side and yaw are added in flight.
     """
+    from scipy.ndimage import gaussian_filter1d  # as all of scipy here, slow to import, and not for jumps in the plane
+
     split, end = tape.takeoff_time, float(tape.t[-1])
     row, out = tape.takeoff_index, {}
     for name, t in mesh.nodes(toe_phase_s, split, end).items():
@@ -98,6 +98,8 @@ def generators(b: SpatialTerms, side: int) -> np.ndarray:
 
 def spread(b: SpatialTerms, q: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Forces along the cones' edges (n, 2 * 4 k) that come nearest to wrenches (n, 2, 6) at the feet's frames."""
+    from scipy.optimize import nnls
+
     model, data = b.model.model, b.model.model.createData()
     frames = [model.getFrameId(name) for name in b.robot.foot.frames]
     edges, weight, out = [generators(b, side) for side in (0, 1)], np.repeat([1.0, 1 / MOMENT_ARM_M], 3), []

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from scipy.integrate import cumulative_trapezoid
 
 from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.spatial import CHART, SpatialModel
@@ -130,6 +129,8 @@ def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: floa
 
     Heels up, no ground force has a moment about the line of the toes: what the motion between nodes needs of it goes.
     """
+    from scipy.integrate import cumulative_trapezoid  # slow to import
+
     up, model = np.flatnonzero(~flat), legs.b.model
     x = float(legs.b.places[:, 0].mean() + (legs.b.robot.foot.toe - legs.b.robot.foot.heel) / 2)
     q, v, a = (y.copy() for y in motion)

@@ -108,7 +108,7 @@ def build_problem(
     joints = (_continuity(flat, toe), _continuity(toe, flight), _ballistic(toe))
     parameters = dict(stance=5, distance=1, platform=1, edge=1, takeoff_speed=1, rotation=1, gravity=1)
     if not tracking:
-        return Problem("direct", tuple(phases), joints, parameters)
+        return Problem("whole body", tuple(phases), joints, parameters)
     phases = [_tracking(b, phase) for b, phase in zip(terms, phases, strict=True)]
     return Problem(
         "whole body", tuple(phases), (*joints, _durations(weights)), parameters | dict(momentum=1, launch_s=2)

@@ -22,7 +22,7 @@ from jumplab.sim.pilot import AFTER_FALL_S, EXTRA_S, Pilot
 from jumplab.sim.playback import Command
 from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
-from jumplab.stages.planner import JumpPlan, Planner, to_link_angles
+from jumplab.stages.planner import USUAL, JumpPlan, Planner, to_link_angles
 from jumplab.studies.chain.course import Course, placed, seen_from
 
 FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
@@ -55,7 +55,7 @@ class Rehearsal:
     plans: tuple[JumpPlan, ...]  # one per jump; jumps with equal targets share one
 
     @classmethod
-    def of(cls, course: Course, planner: Planner, method: str = "three-step") -> Rehearsal:
+    def of(cls, course: Course, planner: Planner, method: str = USUAL) -> Rehearsal:
         """Plan every jump of the course; raises what the planner raises, with the number of the jump."""
         known: dict = {}
         for k in range(course.count):
@@ -130,7 +130,7 @@ class Foresight:
         planner: Planner,
         rehearsal: Rehearsal | None,
         solve_s: float | None = None,
-        method: str = "three-step",
+        method: str = "direct",
     ):
         self.course, self.robot, self.planner, self.rehearsal = course, robot, planner, rehearsal
         self._solve_s, self._method, self._offset = solve_s, method, np.zeros(5)

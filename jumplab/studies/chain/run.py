@@ -14,7 +14,7 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.sim import DEFAULT_ENGINE, SLIGHT, STEP_S, Perturbation, Ranges, SensorNoise
 from jumplab.sim.loop import Run
 from jumplab.sim.pilot import LANDINGS
-from jumplab.stages.planner import METHODS, Planner
+from jumplab.stages.planner import USUAL, Planner
 from jumplab.studies.chain.course import Course, crouched
 from jumplab.studies.chain.pilot import ChainPilot, Foresight, Rehearsal
 from jumplab.studies.chain.result import ChainedJump, ChainResult
@@ -37,7 +37,7 @@ def run_chain(
     look_s: float = LOOK_S,
     revise_s: float | None = REVISE_S,
     landing: str = "spring",
-    method: str = "three-step",
+    method: str = USUAL,
     engine: str = DEFAULT_ENGINE,
 ) -> ChainResult:
     """Let a simulated robot jump a course, planning every jump from what is measured on the way.
@@ -60,13 +60,14 @@ def run_chain(
         neither: it begins with the latest plan that is there.
     landing : "planned" or "spring", see :func:`jumplab.sim.simulate_jump`.
     engine : as in :func:`jumplab.sim.simulate_jump`.
-    method : "three-step" or "direct".
+    method : as of :meth:`jumplab.Planner.plan`.
     """
-    _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s)
+    _check(course, robot, perturbation, landing, solve_s, look_s, revise_s)
     waiting = crouched(robot)
     planner = planner or Planner(waiting, keep=True)
     if planner.robot.hash != waiting.hash:
         raise InputError(f"the planner is for {planner.robot.name} in another posture; make it for crouched(robot)")
+    method = planner.chosen(method)
     course.check(waiting, planner.stage("reach"))
     if rehearsal is None and rehearse:
         rehearsal = Rehearsal.of(course, planner, method)
@@ -92,16 +93,15 @@ def _jumps(run: Run, chain: ChainPilot) -> tuple[ChainedJump, ...]:
     return tuple(jumps)
 
 
-def _check(course, robot, perturbation, landing, method, solve_s, look_s, revise_s) -> None:
+def _check(course, robot, perturbation, landing, solve_s, look_s, revise_s) -> None:
     require_type(course, Course, "the course")
     require_type(robot, Robot, "the robot")
     if not robot.planar:
         raise InputError(f"robot {robot.name}: chains wait in a crouch of five links, which do not describe it")
     if perturbation is not None:
         require_type(perturbation, Perturbation, "the perturbation")
-    for name, value, known in (("landing", landing, LANDINGS), ("method", method, METHODS)):
-        if not isinstance(value, str) or value not in known:
-            raise InputError(f"{name} {quoted(value)}: choose one of {', '.join(known)}")
+    if not isinstance(landing, str) or landing not in LANDINGS:
+        raise InputError(f"landing {quoted(landing)}: choose one of {', '.join(LANDINGS)}")
     solve_s, revise_s = (0.0 if x is None else x for x in (solve_s, revise_s))
     rows = ("solve_s", solve_s, 0.0, 60.0), ("look_s", look_s, EARLIEST_LOOK_S, 2.0), ("revise_s", revise_s, 0.0, 2.0)
     for name, value, low, high in rows:
@@ -220,7 +220,7 @@ def _trial(course: Course, robot: Robot, seed: int, drawn: Perturbation, how: di
 
 def _prepared(course: Course, robot: Robot, how: dict) -> tuple[Planner, Rehearsal | None]:
     """Planner and rehearsal of this process, made by its first trial."""
-    method, rehearse = how.get("method", "three-step"), how.get("rehearse", True)
+    method, rehearse = how.get("method", USUAL), how.get("rehearse", True)
     planner = how.get("planner")
     key = robot.hash, course, method, rehearse, planner and planner.token
     if key not in _ready:
