@@ -14,6 +14,7 @@ import pinocchio as pin
 import pytest
 
 from jumplab.auditing import audit
+from jumplab.auditing.replay import replay
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
@@ -352,3 +353,20 @@ def test_every_amount_instant_and_place(seed):
         assert c.value == pytest.approx(value, rel=1e-5, abs=1e-6), c.name
         assert c.time == time, c.name
         assert label is None or c.note.endswith(f"; worst: {label}"), c.name
+
+
+def test_where_the_surfaces_change_on_the_way_to_a_side():
+    """3, 4 and 5 tenths: the way to a platform at the side, and where on it the two surfaces meet."""
+    tape, task = random_tape(0), JumpTask(0.3, 0.2, 0.1, side_m=0.4)
+    told, found = (replay(tape, ROBOT, task, x) for x in (0.2, None))
+    points = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, 7.0], [2.0, -1.0, 0.0]])
+    np.testing.assert_allclose(told.along(points), [0.6, 0.8, 0.4])
+    assert told.heading == found.heading == 1.0
+    soles = told.sole_points
+    middle = soles[0].reshape(-1, 3).mean(axis=0)
+    toes = 0.6 * middle[0] + 0.8 * middle[1] + ROBOT.foot.toe - ROBOT.foot.center[0]
+    assert told.edge == pytest.approx(toes + 0.2, abs=1e-12)
+    launched, landed = (x[..., 0] * 0.6 + x[..., 1] * 0.8 for x in (soles[0], soles[-1]))
+    natural = min(max(landed.min() - 0.05, launched.max()), landed.min())
+    assert found.edge == pytest.approx(natural, abs=1e-12)
+    np.testing.assert_array_equal(told.surface(told.edge + np.array([-1e-3, 0.0, 1e-3])), [0.0, 0.1, 0.1])

@@ -1,5 +1,7 @@
 """Problems kept between processes: the same functions, and no trust in a file that was touched."""
 
+import os
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +12,7 @@ from fixtures_core import import_graph
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
-from jumplab.ocp import cache
+from jumplab.ocp import cache, compiled
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import Nlp
 from jumplab.robot.reach import reach, shipped_reach
@@ -18,6 +20,8 @@ from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp import planner as srmp_planner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+
+BEGIN = compiled._begin
 
 
 @pytest.fixture
@@ -164,3 +168,87 @@ def test_the_shipped_reach_is_what_sampling_gives(bhr):
         else:
             np.testing.assert_allclose(getattr(shipped, name), value, rtol=1e-9, atol=1e-12)
     assert shipped_reach(bhr.with_limits(speed=0.9)) is None
+
+
+# ------------------------------------------------------------------------------------------ as machine code
+
+
+@pytest.fixture
+def by_compiler(place, monkeypatch):
+    """Compile in this process, at once, with the system's compiler."""
+    if shutil.which("cc") is None:
+        pytest.skip("this system has no C compiler")
+    monkeypatch.setenv("JUMPLAB_CC", "cc")
+    monkeypatch.setattr(compiled, "_begin", compiled.build)
+
+
+def kept(place, ending):
+    return [path for path in place.iterdir() if path.name.endswith(ending)]
+
+
+def test_machine_code_gives_the_same_numbers(place, by_compiler):
+    first = cache.assembled(toy(), "a")
+    cache.assembled(toy(), "a")  # finds the file, and compiles it
+    again = cache.assembled(toy(), "a")
+    assert len(kept(place, ".so")) == len(kept(place, ".sum")) == 1 and not kept(place, ".working")
+    assert all(f.is_a("External") for e in again.elements for f, *_ in e.made.values())
+    x, p, rng = random_point(first, 3)
+    lam = rng.normal(size=first.n_rows)
+    functions = dict.fromkeys(("nlp", "grad_f", "jac_g", "cost_parts", "gauss_newton"), (x, p))
+    for name, arguments in {**functions, "hess_lag": (x, p, 1.0, lam)}.items():
+        for u, v in zip(*(getattr(a, name).call(list(arguments)) for a in (first, again)), strict=True):
+            np.testing.assert_array_equal(u.full(), v.full())
+
+
+def test_code_that_was_touched_is_not_loaded(place, by_compiler):
+    for _ in range(2):
+        cache.assembled(toy(), "a")
+    code = kept(place, ".so")[0]
+    sound = code.read_bytes()
+    code.write_bytes(sound[:-100])
+    again = cache.assembled(toy(), "a")  # compiles anew
+    assert not any(f.is_a("External") for e in again.elements for f, *_ in e.made.values())
+    assert compiled._sum(code.read_bytes()) == code.with_suffix(".sum").read_text()
+
+
+@pytest.mark.parametrize("command", ["false", "no-such-compiler", "true"])
+def test_a_compiler_that_fails_is_asked_once(place, by_compiler, monkeypatch, command):
+    monkeypatch.setenv("JUMPLAB_CC", command)
+    for _ in range(2):
+        cache.assembled(toy(), "a")
+    said = kept(place, ".failed")[0].read_text()
+    assert command in said and not kept(place, ".so") and not kept(place, ".working")
+    monkeypatch.setattr(compiled, "_begin", BEGIN)
+    monkeypatch.setattr(compiled.subprocess, "Popen", lambda *a, **k: pytest.fail("it was asked again"))
+    cache.assembled(toy(), "a")
+
+
+def test_code_with_other_numbers_is_not_kept(place, by_compiler, monkeypatch):
+    wrong = place.parent / "wrong"
+    swap = r"s/=\((a[0-9]+)\+/=(\1-/"  # sums become differences
+    wrong.write_text(f'#!/bin/sh\nsed -E \'{swap}\' "$8" > "$8.c"\nexec cc -O1 -fPIC -shared -o "$7" "$8.c" -lm\n')
+    wrong.chmod(0o755)
+    monkeypatch.setenv("JUMPLAB_CC", str(wrong))
+    for _ in range(2):
+        cache.assembled(toy(), "a")
+    assert "other numbers" in kept(place, ".failed")[0].read_text() and not kept(place, ".so")
+
+
+def test_the_compiler_works_beside_the_plan(place, monkeypatch):
+    """In a process of its own, once; without a compiler nothing happens."""
+    monkeypatch.setenv("JUMPLAB_CC", "")
+    for _ in range(2):
+        cache.assembled(toy(), "a")
+    assert compiled.compiler() is None and len(list(place.iterdir())) == 1
+    begun = []
+    monkeypatch.setenv("JUMPLAB_CC", "cc -v")
+    monkeypatch.setattr(compiled.subprocess, "Popen", lambda command, **how: begun.append((command, how)))
+    for _ in range(3):
+        cache.assembled(toy(), "a")
+    (command, how), claim = begun[0], kept(place, ".working")
+    assert len(begun) == len(claim) == 1 and compiled.compiler() == ["cc", "-v"]
+    assert command[1:] == ["-m", "jumplab.ocp.compiled", str(claim[0].with_suffix(".casadi"))]
+    assert how["start_new_session"] and how["stdout"] == how["stderr"] == compiled.subprocess.DEVNULL
+    os.utime(claim[0], (0, 0))  # whoever claimed it is long gone
+    cache.assembled(toy(), "a")
+    assert len(begun) == 2

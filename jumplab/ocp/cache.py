@@ -23,6 +23,7 @@ from platformdirs import user_cache_path
 
 from jumplab.errors import InputError
 from jumplab.io.files import write_file
+from jumplab.ocp import compiled
 from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.derivatives import FUNCTIONS, JERK_CHAIN, Element, chain_term
 from jumplab.ocp.problem import Problem
@@ -140,9 +141,12 @@ def _read(path: Path, problem: Problem) -> list[Element] | None:
             return None
         terms = {(owner, t.name): t for owner, t in problem.terms()}
         terms |= {(phase.name, JERK_CHAIN): chain_term(phase) for phase in problem.phases}
-        found = []
-        for owner, place, costs, rows, functions in json.loads(body):
-            made = {n: (ca.Function.deserialize(f), np.array(i, int), np.array(j, int)) for n, f, i, j in functions}
+        found, code = [], compiled.library(path)
+        for k, (owner, place, costs, rows, functions) in enumerate(json.loads(body)):
+            made = {}
+            for name, f, i, j in functions:
+                function = compiled.function(code, k, name) if code else ca.Function.deserialize(f)
+                made[name] = function, np.array(i, int), np.array(j, int)
             counts = [(terms[owner, name], n) for name, n in rows]
             found.append(Element(owner, place, [terms[owner, name] for name in costs], counts, made=made))
         return found

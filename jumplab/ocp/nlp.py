@@ -94,7 +94,8 @@ class Nlp:
         a = self.assembled
         options = {"ipopt": self._options, "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": a.hess_lag}
         quiet = ("print_time", "error_on_fail", "show_eval_warnings", "calc_lam_p")
-        return ca.nlpsol("solver", "ipopt", a.nlp, options | dict.fromkeys(quiet, False))
+        options |= dict.fromkeys(quiet, False) | {"no_nlp_grad": True}  # all derivatives are given
+        return ca.nlpsol("solver", "ipopt", a.nlp, options)
 
     def _steps_of(self) -> GaussNewton:
         try:
@@ -318,6 +319,7 @@ def _least_violation(a: Assembled, posed: Posed) -> tuple[np.ndarray, np.ndarray
         "ipopt": ELASTIC,
         "print_time": False,
         "error_on_fail": False,
+        "no_nlp_grad": True,
         "grad_f": ca.Function("nlp_grad_f", [w, p], [cost, gradient], names, ["f", "grad_f_x"]),
         "jac_g": ca.Function("nlp_jac_g", [w, p], [relaxed, jacobian], names, ["g", "jac_g_x"]),
         "hess_lag": ca.Function("nlp_hess_l", [w, p, lam_f, lam_g], [hessian], of_hessian, ["triu_hess_gamma_x_x"]),

@@ -170,11 +170,9 @@ class Planner:
                 changes.applied(stage.nlp.problem)
         return asked
 
-    def chosen(
-        self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False
-    ) -> str:
-        """The method that is meant: "usual" is "three-step" for a flip in the plane, and where something is changed that
-        only that has; else "direct".
+    def chosen(self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False) -> str:
+        """The method that is meant: "usual" is "three-step" for a flip in the plane, and where something is changed
+        that only that has; else "direct".
 
         Raises :class:`InputError` for a method that does not exist, and for one that this planner cannot follow.
         """
@@ -248,8 +246,8 @@ class Planner:
             ahead with ramps) or "three-step" (SRMP, joint-space QPs, whole body; what the paper does). "usual" is
             "direct", which takes less time and finds a plan at least as often (``notebooks/10_benchmark``,
             ``13_three_dimensions``), but "three-step" for flips in the plane, of which the direct one leaves more
-            outside the audit's limits (``08_flips``), and where something of stages 1 and 2, or of stage 3's tracking,
-            is changed.
+            outside the audit's limits (``10_benchmark``), and where something of stages 1 and 2, or of stage 3's
+            tracking, is changed.
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if

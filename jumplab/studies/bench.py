@@ -226,7 +226,10 @@ def _once(
     body = watch("plan: 3 whole body", last.plan, task, srmp, guess=guess)
     watch(TAPE, make_tape, body, robot, srmp)
     bodies = {name: watch(name, way, task) for name, way in ways.items()}
-    plans = {"plan": watch("plan", planner.plan, task, "three-step"), "re-plan": watch("re-plan", planner.replan, near, task)}
+    plans = {
+        "plan": watch("plan", planner.plan, task, "three-step"),
+        "re-plan": watch("re-plan", planner.replan, near, task),
+    }
     watch("direct, build", lambda: WholeBodyPlanner(robot, planner.mesh, tracking=False, refine=False).nlp.prepare())
     for name, body in {**bodies, **({ATLAS: answered} if answered else {})}.items():
         rows = body_rows("direct", body)

@@ -1,4 +1,4 @@
-"""Three steps against one program where it is hard: far targets, platforms, flips, tight limits, other robots, bad guesses.
+"""Three steps against one program where it is hard: far, high, flips, tight limits, other robots, bad guesses.
 
 ``python -m paper.hard_cases`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve, and can
 be stopped and started again; it takes some minutes. Notebook 10 draws the file.
