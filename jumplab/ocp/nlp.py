@@ -320,6 +320,7 @@ def _least_violation(a: Assembled, posed: Posed) -> tuple[np.ndarray, np.ndarray
         "print_time": False,
         "error_on_fail": False,
         "no_nlp_grad": True,
+        "calc_lam_p": False,
         "grad_f": ca.Function("nlp_grad_f", [w, p], [cost, gradient], names, ["f", "grad_f_x"]),
         "jac_g": ca.Function("nlp_jac_g", [w, p], [relaxed, jacobian], names, ["g", "jac_g_x"]),
         "hess_lag": ca.Function("nlp_hess_l", [w, p, lam_f, lam_g], [hessian], of_hessian, ["triu_hess_gamma_x_x"]),
