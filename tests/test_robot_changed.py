@@ -109,6 +109,28 @@ def test_a_mass_in_kilograms(bhr):
     assert alike(robot, bhr.with_mass(["trunk"], mass_kg=22.0))
 
 
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_longer_legs_weigh_the_same_and_spread_along_them(bhr, factor):
+    robot = bhr.with_legs(factor)
+    assert robot.total_mass == bhr.total_mass and robot.planar and (robot is bhr) == (factor == 1.0)
+    there, here = ({name: body_of(r.model, name) for name in LINKS} for r in (robot, bhr))
+    long = {f"{side}_{part}" for side in ("left", "right") for part in ("thigh", "shank")}
+    for name in LINKS:
+        turn = np.diag([1.0, 1.0, factor if name in long else 1.0])  # of every particle, about the link's origin
+        one, two = (x[name].toPseudoInertia().toMatrix() for x in (here, there))
+        np.testing.assert_allclose(two[:3, :3], turn @ one[:3, :3] @ turn, atol=1e-9)
+        np.testing.assert_allclose(two[:3, 3], turn @ one[:3, 3], atol=1e-9)
+    for r, share in ((bhr, 1.0), (robot, factor)):
+        model, data = r.model, r.model.createData()
+        pin.forwardKinematics(model, data, pin.neutral(model))
+        hip, knee, ankle = (data.oMi[model.getJointId(r.joints[role][0])].translation for role in list(r.joints)[:3])
+        np.testing.assert_allclose([hip[2] - knee[2], knee[2] - ankle[2]], 0.35 * share, atol=1e-12)
+
+
+def test_all_of_it_heavier(bhr):
+    assert bhr.with_mass(factor=1.1).total_mass == pytest.approx(1.1 * bhr.total_mass, rel=1e-9)
+
+
 # every robot ----------------------------------------------------------------------------------------------------
 def check_changes(robot: Robot) -> None:
     foot = list(robot.foot.frames)
@@ -146,6 +168,7 @@ def test_published_robots_take_the_same_changes(name):
 # refused --------------------------------------------------------------------------------------------------------
 NAMES = ", ".join(BHR.joint_names)
 REFUSED = {
+    "robot bhr: the factor on the legs must be a positive number, got -1": lambda r: r.with_legs(-1),
     "robot bhr: the factor on effort must be a positive number, got 0": lambda r: r.with_limits(effort=0),
     "robot bhr: the factor on effort must be a positive number, got nan": lambda r: r.with_limits(effort=np.nan),
     "robot bhr: the factor on speed must be a positive number, got '1'": lambda r: r.with_limits(speed="1"),

@@ -14,7 +14,7 @@ from test_cli import one_sentence, run
 from test_store import names
 
 from jumplab.cli.common import values_of
-from jumplab.cli.studies import weights_of
+from jumplab.cli.studies import choices_of
 from jumplab.errors import InputError
 from jumplab.robot.description import SHIPPED
 from jumplab.studies import sweep
@@ -38,7 +38,19 @@ def test_values_as_they_are_typed():
     assert values_of("--x", "0:1.2:13") == [round(0.1 * k, 9) for k in range(13)]
     assert values_of("--x", "0.5") == [0.5] and values_of("--x", "1,-2,3e-1") == [1.0, -2.0, 0.3]
     assert values_of("--x", "2:3:1") == [2.0]
-    assert weights_of(["a=1,2", "b=3"]) == [{"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 3.0}]
+    assert choices_of("--weight must be TERM", ["a=1,2", "b=3"]) == [{"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 3.0}]
+
+
+def test_robots_that_differ():
+    names = sweep.varied(["bhr", "g1"], choices_of("--vary must be WHAT", ["mass=0.9,1", "leg=1.1"]))
+    assert names == ["bhr mass=0.9 leg=1.1", "bhr leg=1.1", "g1 mass=0.9 leg=1.1", "g1 leg=1.1"]
+    robot, bhr = sweep._robot(names[0]), sweep._robot("bhr")
+    assert robot.total_mass == pytest.approx(0.9 * bhr.total_mass) and robot.hash == bhr.with_mass(
+        factor=0.9
+    ).with_legs(1.1).hash
+    with pytest.raises(InputError) as e:
+        sweep.varied(["bhr"], [{"arm": 1.1}])
+    assert str(e.value) == "a sweep varies mass, effort, speed, leg of a robot, not 'arm'"
 
 
 @pytest.mark.slow
@@ -146,6 +158,8 @@ REFUSALS = [
     ("sweep --out s --height-m low", "--height-m must be a number, got 'low'"),
     ("sweep --out s --height-m 9", "height = 9 m is outside 0.02 ... 1.5 m"),
     ("sweep --out s --weight torque", "--weight must be TERM=A,B,..., got 'torque'"),
+    ("sweep --out s --vary mass", "--vary must be WHAT=A,B,..., got 'mass'"),
+    ("sweep --out s --vary arm=1.1", "a sweep varies mass, effort, speed, leg of a robot, not 'arm'"),
     ("sweep --out s --jobs many", "--jobs must be a number, got 'many'"),
     (
         "sweep --out s --method magic",

@@ -280,14 +280,14 @@ def atlas(args: Namespace) -> None:
     print(f"whole atlas: {time.perf_counter() - began:.1f} s")
 
 
-def weights_of(pairs: list[str]) -> list[dict[str, float]]:
-    """All combinations of the weights that were given."""
+def choices_of(option: str, pairs: list[str]) -> list[dict[str, float]]:
+    """All combinations of what was given as NAME=VALUES, several times."""
     found: list[dict[str, float]] = [{}]
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not (name and equals):
-            raise InputError(f"--weight must be TERM=A,B,..., got {pair!r}")
-        found = [{**known, name: value} for known in found for value in values_of(f"--weight {name}", text)]
+            raise InputError(f"{option}=A,B,..., got {pair!r}")
+        found = [{**known, name: value} for known in found for value in values_of(f"{option.split()[0]} {name}", text)]
     return found
 
 
@@ -296,6 +296,7 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
     opt("--height-m M", f"{VALUES} [m] (default 0.1:0.6:11)", "0.1:0.6:11", values_of),
     opt("--platform-m M", f"{VALUES} [m] (default 0)", "0", values_of),
     opt("--robot NAME...", "robot; may be repeated (default bhr)"),
+    opt("--vary WHAT=VALUES...", "factors on mass, effort, speed or leg of every robot; may be repeated", []),
     opt("--weight TERM=VALUES...", "weights of a term, as TERM=A,B,... or STAGE/TERM=A,B,...; may be repeated", []),
     opt("--method", "of planning (default direct)", "direct", METHODS),
     opt("--out DIR", "folder of the table; an unfinished sweep goes on", None, folder, required=True),
@@ -306,11 +307,12 @@ def weights_of(pairs: list[str]) -> list[dict[str, float]]:
 )
 def sweep(args: Namespace) -> None:
     """Plans for a grid of targets, robots and weights, in one table."""
-    began, weights = time.perf_counter(), weights_of(args.weight)
+    began, weights = time.perf_counter(), choices_of("--weight must be TERM", args.weight)
     if args.cluster:
         without(args, "is for processes of this machine, and --cluster does the work elsewhere", jobs=None)
     axes = (args.distance_m, args.height_m, args.platform_m)
-    cases = sweeps.grid(*axes, robots=args.robot or ["bhr"], weights=weights, method=args.method)
+    names = sweeps.varied(args.robot or ["bhr"], choices_of("--vary must be WHAT", args.vary))
+    cases = sweeps.grid(*axes, robots=names, weights=weights, method=args.method)
     rows = sweeps.run(
         cases,
         args.out,

@@ -1,8 +1,9 @@
-"""Other limits and masses in the text of a robot's URDF, and a remark on each for its TOML file."""
+"""Other limits, masses and legs in the text of a robot's URDF, and a remark on each for its TOML file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
@@ -56,7 +57,7 @@ def limits(robot: Robot, factors: Mapping, ranges: Mapping) -> tuple[str, list[s
 
 
 def masses(
-    robot: Robot, links: str | Sequence[str], mass_kg: float | None, factor: float | None
+    robot: Robot, links: str | Sequence[str] | None, mass_kg: float | None, factor: float | None
 ) -> tuple[str, list[str]]:
     """The URDF with other masses, inertias scaled alike, and the remarks: none where nothing changes.
 
@@ -66,6 +67,8 @@ def masses(
         raise RobotError(f"robot {robot.name}: a mass is changed by mass_kg or by factor, give one of them")
     root, remarks = _parsed(robot), []
     bodies = _bodies(root)
+    if links is None:
+        links = [name for name, parts in bodies.items() if any(float(x.find("mass").get("value")) > 0 for x in parts)]
     names = links if isinstance(links, list | tuple) and links else [links]
     for link in names:
         if not isinstance(link, str) or link not in bodies:
@@ -86,6 +89,46 @@ def masses(
                 scale(part.find("inertia"), MOMENTS, share)
             remarks.append(f"mass of link {link!r}, {old:.12g} -> {old * share:.12g} kg")
     return _text(root), remarks
+
+
+def legs(robot: Robot, factor: float) -> tuple[str, list[str]]:
+    """The URDF with longer or shorter thighs and shanks, stretched from their joint on to the next, and the remarks.
+
+    Raises :class:`RobotError` as :meth:`.Robot.with_legs` says.
+    """
+    factor = _number(robot, "the factor on the legs", factor, positive=True)
+    root, remarks = _parsed(robot), []
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    links = {link.get("name"): link for link in root.findall("link")}
+    for here, there in pairwise(ROLES[:3]):
+        for name, end in zip(robot.joints[here], robot.joints[there], strict=True):
+            link = joints[name].find("child").get("link")
+            way = np.array(joints[end].find("origin").get("xyz").split(), float)
+            turned = [x.get("rpy") for x in (*links[link].iter("origin"), joints[end].find("origin"))]
+            straight = abs(way[2]) == np.abs(way).max() and not np.any([np.array(x.split(), float) for x in turned if x])
+            if joints[end].find("parent").get("link") != link or not straight:
+                said = f"robot {robot.name}: the link {link!r} does not run along its own z"
+                raise RobotError(f"{said}; stretch it in its URDF")
+            if factor != 1.0:
+                _stretched(links[link], [j for j in joints.values() if j.find("parent").get("link") == link], factor)
+                remarks.append(f"length of link {link!r}, {abs(way[2]):.12g} -> {abs(way[2]) * factor:.12g} m")
+    return _text(root), remarks
+
+
+def _stretched(link: ET.Element, joints: Sequence[ET.Element], factor: float) -> None:
+    """A link along its z, in place: its mass stays, and spreads as the shapes do."""
+    for origin in (*link.iter("origin"), *(joint.find("origin") for joint in joints)):
+        x, y, z = map(float, origin.get("xyz").split())
+        origin.set("xyz", f"{x:.12g} {y:.12g} {factor * z:.12g}")
+    for box in link.iter("box"):
+        *sides, height = map(float, box.get("size").split())
+        box.set("size", " ".join(f"{x:.12g}" for x in (*sides, factor * height)))
+    moments = link.find("inertial/inertia")
+    xx, yy, zz = (float(moments.get(key)) for key in ("ixx", "iyy", "izz"))
+    along = (xx + yy - zz) / 2  # the mass' second moment along z
+    moments.set("ixx", f"{xx + (factor**2 - 1) * along:.12g}")
+    moments.set("iyy", f"{yy + (factor**2 - 1) * along:.12g}")
+    scale(moments, ("ixz", "iyz"), factor)
 
 
 def _bodies(root: ET.Element) -> dict[str, list[ET.Element]]:

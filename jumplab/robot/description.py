@@ -246,9 +246,10 @@ class Robot(Shown):
         return self._changed(*changes.limits(self, factors, joints))
 
     def with_mass(
-        self, link: str | Sequence[str], *, mass_kg: float | None = None, factor: float | None = None
+        self, link: str | Sequence[str] | None = None, *, mass_kg: float | None = None, factor: float | None = None
     ) -> Robot:
-        """Another robot, some links of which weigh otherwise: each ``mass_kg`` [kg], or ``factor`` times as much.
+        """Another robot, some links of which weigh otherwise: each ``mass_kg`` [kg], or ``factor`` times as much; all
+        of them if None is named.
 
         The inertia scales with the mass, the CoM of the link stays. Name both of a pair, ``("left_thigh",
         "right_thigh")``: with one of them the robot is no longer :attr:`planar`. The URDF gets the new numbers, the
@@ -256,6 +257,15 @@ class Robot(Shown):
         that have no mass, for numbers that are none, and if the robot cannot stand so.
         """
         return self._changed(*changes.masses(self, link, mass_kg, factor))
+
+    def with_legs(self, factor: float) -> Robot:
+        """Another robot, whose thighs and shanks are ``factor`` times as long, and weigh the same.
+
+        The URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new. Raises
+        :class:`RobotError` for links that do not run along their own z from joint to joint, as those of imported
+        robots may not, for numbers that are no factor, and if the robot cannot stand so.
+        """
+        return self._changed(*changes.legs(self, factor))
 
     def _changed(self, urdf: str, remarks: list[str]) -> Robot:
         """The robot of another URDF, checked to the end, with remarks in its TOML; itself without any."""

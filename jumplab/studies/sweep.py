@@ -25,7 +25,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jumplab.auditing.audit import audit
-from jumplab.errors import InputError, JumplabError
+from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.io.files import Log, ensure_writable, locked, made, open_log, settle, write_file
 from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
@@ -87,10 +87,35 @@ def grid(
     return out
 
 
+VARIED = {  # what of a robot a sweep varies -> the robot with a factor on it
+    "mass": lambda robot, x: robot.with_mass(factor=x),
+    "effort": lambda robot, x: robot.with_limits(effort=x),
+    "speed": lambda robot, x: robot.with_limits(speed=x),
+    "leg": lambda robot, x: robot.with_legs(x),
+}
+
+
+def varied(robots: Sequence[str], factors: Sequence[Mapping[str, float]]) -> list[str]:
+    """Names of robots, each with all the factors on :data:`VARIED`, such as "bhr mass=1.1 leg=0.9"."""
+    unknown = next((what for each in factors for what in each if what not in VARIED), None)
+    if unknown is not None:
+        raise InputError(f"a sweep varies {', '.join(VARIED)} of a robot, not {quoted(unknown)}")
+    told = ["".join(f" {what}={x:g}" for what, x in each.items() if x != 1.0) for each in factors]
+    return [robot + words for robot in robots for words in told]
+
+
+@cache
+def _robot(name: str) -> Robot:
+    """A robot by its name in a sweep, see :func:`varied`."""
+    first, _, last = name.rpartition(" ")
+    what, equals, factor = last.partition("=")
+    return VARIED[what](_robot(first), float(factor)) if equals and what in VARIED else Robot.load(name)
+
+
 @cache
 def _planner(robot: str, method: str, atlas: Path | None = None) -> Planner:
     """A planner with its stages built, once per process; ``atlas`` is the folder of one."""
-    planner = Planner(Robot.load(robot), keep=True, atlas=atlas and Atlas.load(atlas))
+    planner = Planner(_robot(robot), keep=True, atlas=atlas and Atlas.load(atlas))
     planner.prepared(method)
     return planner
 
@@ -157,7 +182,7 @@ def run(
     if tapes_hz is not None and not 1 <= tapes_hz <= 1000:
         raise InputError(f"tapes_hz = {tapes_hz:g} Hz is outside 1 ... 1000 Hz")
     _check_weights(cases)
-    hashes = {name: Robot.load(name).hash for name in sorted({case.robot for case in cases})}
+    hashes = {name: _robot(name).hash for name in sorted({case.robot for case in cases})}
     folder = ensure_writable(out)
     how = {"atlas": atlas, "tapes_hz": tapes_hz} if atlas or tapes_hz else {}
     with _backend(cluster), made(folder), _opened(folder, cases, hashes, how) as (log, head):
@@ -223,7 +248,7 @@ def _atlas(folder: Path, cases: Sequence[Case], robot: str, jobs: int) -> Path:
     for name, step in ATLAS_STEPS.items():
         low, high = (extreme(getattr(case, name) for case in ours) for extreme in (min, max))
         axes.append(np.unique(np.linspace(low, high, 1 + math.ceil((high - low) / step - 1e-9))))
-    Atlas.build(Robot.load(robot), *axes, folder=folder, jobs=jobs)
+    Atlas.build(_robot(robot), *axes, folder=folder, jobs=jobs)
     return folder
 
 
