@@ -3,16 +3,18 @@
 import json
 import math
 
+import numpy as np
 import pytest
 from fixtures_robots import child, write
 
+from jumplab.auditing.audit import audit
 from jumplab.cli.main import main
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.show.jumps import envelope_map
+from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import WholeBodyPlanner
-from jumplab.stages.whole_body.settings import Limits
-from jumplab.studies.envelope import BEYOND, CELLS, OPEN, VERDICT, Cell, Envelope, envelope, usage
+from jumplab.studies.envelope import BEYOND, CELLS, OPEN, VERDICT, Cell, Envelope, envelope, most_used
 from jumplab.task import JumpTask
 
 
@@ -20,21 +22,29 @@ def test_cells_are_plans_within_the_limits(bhr, tmp_path):
     told = []
     found = envelope(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
     near, far, *refused = found.cells
-    assert near.solved and far.solved and all(0.3 < c.share < 1.05 for c in (near, far))
+    assert near.solved and far.solved and all(0.3 < c.share <= 1.0 for c in (near, far))
     assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "no plan is higher than" in refused[0].reason
-    assert far.iterations <= near.iterations  # warm
+    assert 0 < far.iterations < 60 and 0 < near.iterations < 60 and far.solve_s > 0
     assert (found.highest, found.farthest) == (far, far)
     assert told[0] == "height 0.30 m: 2 of 2 cells, up to 0.60 m"
 
 
-def test_usage_is_that_of_the_plan(bhr):
-    plan = WholeBodyPlanner(bhr, tracking=False).plan(JumpTask(0.5, 0.3))
-    shares = usage(plan, bhr)
-    assert set(shares) == {
-        f"{j} {what}" for j in ("hip", "knee", "ankle", "shoulder") for what in ("torque", "speed")
-    } | {"friction"}
-    assert max(shares.values()) < 1.05
-    assert Limits().torque_share * shares["ankle torque"] > 0.2
+def test_what_is_used_most_is_the_plans(bhr):
+    """Torque at its speed, speed and friction, each worked out here once more."""
+    plan = Planner(bhr).plan(JumpTask(0.5, 0.3))
+    tape, shares = plan.tape, {}
+    for i, name in enumerate(bhr.joint_names):
+        motor, tau, rate = bhr.actuators[name], np.abs(tape.tau[:, i]), np.abs(tape.v[:, 6 + i])
+        drives = tape.tau[:, i] * tape.v[:, 6 + i] > 0
+        left = np.where(drives, (motor["speed"] - rate) / (motor["speed"] - motor["corner_speed"]), 1.0)
+        joint = name.split("_", 1)[1].replace("_", " ")
+        for what, share in (
+            ("torque", tau / motor["effort"] / np.minimum(left, 1.0)),
+            ("speed", rate / motor["speed"]),
+        ):
+            shares[f"{joint} {what}"] = max(share.max(), shares.get(f"{joint} {what}", 0.0))
+    name, share = most_used(audit(tape, bhr, plan.task))
+    assert name == max(shares, key=shares.get) and share == pytest.approx(shares[name], rel=1e-3) and 0.3 < share <= 1.0
 
 
 def test_an_interrupted_map_goes_on(bhr, tmp_path, monkeypatch):

@@ -45,9 +45,10 @@ def test_robots_that_differ():
     names = sweep.varied(["bhr", "g1"], choices_of("--vary must be WHAT", ["mass=0.9,1", "leg=1.1"]))
     assert names == ["bhr mass=0.9 leg=1.1", "bhr leg=1.1", "g1 mass=0.9 leg=1.1", "g1 leg=1.1"]
     robot, bhr = sweep._robot(names[0]), sweep._robot("bhr")
-    assert robot.total_mass == pytest.approx(0.9 * bhr.total_mass) and robot.hash == bhr.with_mass(
-        factor=0.9
-    ).with_legs(1.1).hash
+    assert (
+        robot.total_mass == pytest.approx(0.9 * bhr.total_mass)
+        and robot.hash == bhr.with_mass(factor=0.9).with_legs(1.1).hash
+    )
     with pytest.raises(InputError) as e:
         sweep.varied(["bhr"], [{"arm": 1.1}])
     assert str(e.value) == "a sweep varies mass, effort, speed, leg of a robot, not 'arm'"

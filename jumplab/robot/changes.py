@@ -105,8 +105,8 @@ def legs(robot: Robot, factor: float) -> tuple[str, list[str]]:
             link = joints[name].find("child").get("link")
             way = np.array(joints[end].find("origin").get("xyz").split(), float)
             turned = [x.get("rpy") for x in (*links[link].iter("origin"), joints[end].find("origin"))]
-            straight = abs(way[2]) == np.abs(way).max() and not np.any([np.array(x.split(), float) for x in turned if x])
-            if joints[end].find("parent").get("link") != link or not straight:
+            upright = not np.any([np.array(x.split(), float) for x in turned if x])
+            if joints[end].find("parent").get("link") != link or not upright or abs(way[2]) < np.abs(way).max():
                 said = f"robot {robot.name}: the link {link!r} does not run along its own z"
                 raise RobotError(f"{said}; stretch it in its URDF")
             if factor != 1.0:

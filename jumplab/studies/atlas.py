@@ -22,14 +22,15 @@ from typing import Any
 import joblib
 import numpy as np
 
+from jumplab.auditing.audit import audit
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError, require_type
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.assembly import pack, unpack
 from jumplab.ocp.cache import fingerprint
 from jumplab.robot import Robot
-from jumplab.stages.planner import Planner
+from jumplab.stages.planner import Planner, make_tape
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
-from jumplab.studies.envelope import usage
+from jumplab.studies.envelope import most_used
 from jumplab.task import JumpTask
 
 FILE, FORMAT = "atlas.npz", 1
@@ -276,9 +277,9 @@ def _between(axis: Sequence[float], x: float) -> tuple[int, float]:
 def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
     jerks = {row["weight"] for row in plan.solution.cost_shares if row["name"] == "jerk"}
     jerk = jerks.pop() if len(jerks) == 1 and jerks != {body.weights.jerk} else None
-    shares, cost = usage(plan, body.robot), plan.solution.statistics.objective
-    most, x = max(shares, key=shares.get), pack(body.nlp.assembled, plan.solution.guess())
-    return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, most, min(shares[most], 1.0), x)
+    most = most_used(audit(make_tape(plan, body.robot), body.robot, plan.task))
+    cost, x = plan.solution.statistics.objective, pack(body.nlp.assembled, plan.solution.guess())
+    return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, *most, x)
 
 
 _here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew

@@ -1,4 +1,4 @@
-"""The jumps that a robot can do: a map over two numbers of the target, each cell one solve of the direct planner.
+"""The jumps that a robot can do: a map over two numbers of the target, each cell a plan by the direct method, audited.
 
 Rows of equal height are solved side by side; within a row each cell starts from its neighbour's solution, first from
 near to far, then, where that failed, from far to near. Every finished cell is a line of ``cells.jsonl``, so that an
@@ -16,31 +16,22 @@ from pathlib import Path
 from typing import Any
 
 import joblib
-import numpy as np
 
+from jumplab.auditing.audit import audit
+from jumplab.auditing.report import AuditReport
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.io.files import Log, append, made, open_log
-from jumplab.io.tape import Tape
-from jumplab.ocp.solution import PhaseGuess
-from jumplab.robot import SAGITTAL_JOINTS, Robot
-from jumplab.robot.reach import Reach
-from jumplab.sim.playback import Actuators
+from jumplab.ocp.nlp import EXPLAINED
+from jumplab.robot import Robot
+from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.stages.reconstruction import planar_motion, planar_quantities
-from jumplab.stages.spatial import SpatialLimits, SpatialPlan
-from jumplab.stages.srmp.planner import reach_of
-from jumplab.stages.srmp.reachable import check_reachable
-from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
-from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
-Guess = dict[str, PhaseGuess] | SpatialPlan
 Place = tuple[float, ...]  # distance, height and side [m], yaw [rad]
 AXES = "distance_m", "height_m"
 CELLS = "cells.jsonl"
-MAX_ITERATIONS = 160  # solves that succeed need 20 to 110
+USES = {"torque at speed": "torque", "joint speed": "speed", "friction used": "friction"}  # checks of the audit
 GIVE_UP = 2  # so many cells in a row without a plan, and the farther ones of the row are not tried
-LOADED_N = 50.0  # friction is a quotient, looked at above this force
 MAX_CELLS = 2500  # an hour or two of work
 
 OPEN, VERDICT, BEYOND = "no plan found", "refused before solving", "not tried, beyond cells without a plan"
@@ -54,7 +45,7 @@ class Cell:
     height_m: float
     solved: bool
     limiting: str  # what is used most ("hip torque", "knee speed", "friction"), or why there is no plan
-    share: float  # how much of what the planner allows of it is used, 1 at the limit; nan without a plan
+    share: float  # how much of what the robot has of it is used, 1 at the limit; nan without a plan
     iterations: int = 0
     solve_s: float = 0.0
     reason: str = ""  # the sentence of the refusal
@@ -93,29 +84,15 @@ class Envelope:
         return max((c for c in self.cells if c.solved), key=lambda c: (c.distance_m, c.height_m), default=None)
 
 
-def usage(plan: WholeBodyPlan, robot: Robot) -> dict[str, float]:
-    """Greatest share of every limit that the planner allows: joint torque at its speed, joint speed, friction.
-
-    Ranges are left out: a crouch rests on one in almost every jump, and has no share.
-    """
-    limits = Limits()
-    m, gravity = robot.sagittal, plan.task.gravity
-    motion = planar_motion(plan.solution.phases, gravity, robot)
-    states = (motion[k] for k in ("angles", "rates", "accels", "toe_acceleration"))
-    x = planar_quantities(robot, *states, gravity)
-    rates, torques = x["joint_rates"], x["torques"]  # (n, 4)
-    left = (m.speed - np.abs(rates)) / (m.speed - m.corner_speed)
-    available = limits.torque_share * m.effort * np.where(torques * rates > 0, np.clip(left, 1e-2, 1.0), 1.0)
-    out = {}
-    for i, joint in enumerate(SAGITTAL_JOINTS):
-        if i == 3 and not robot.joints["shoulder_pitch"]:
-            continue
-        out[f"{joint} torque"] = float(np.max(np.abs(torques[:, i]) / available[:, i]))
-        out[f"{joint} speed"] = float(np.max(np.abs(rates[:, i]) / m.speed[i]) / limits.speed_share)
-    force = x["ground_wrench"][~motion["flying"]]
-    force = force[force[:, 1] > LOADED_N]
-    out["friction"] = float(np.max(np.abs(force[:, 0]) / force[:, 1])) / limits.friction
-    return out
+def most_used(report: AuditReport) -> tuple[str, float]:
+    """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the share of it [1]."""
+    found = []
+    for check in report.checks:
+        if what := USES.get(check.name):
+            joint = check.note.rpartition("; worst: ")[2].removeprefix("left_").removeprefix("right_")
+            found.append((check.value / check.limit, what if what == "friction" else f"{joint} {what}"))
+    share, name = max(found)
+    return name.replace("_", " "), float(share)
 
 
 def envelope(
@@ -179,76 +156,33 @@ def _row(robot: Robot, tasks: Sequence[JumpTask], done: Mapping[Place, Cell], pa
     return cells
 
 
-_tools: dict[str, tuple[Reach, WholeBodyPlanner]] = {}  # of this process, by the robot's hash
-
-
-def _solve(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
-    """One cell from a neighbour's solution, then, if ``cold``, from the planner's own guess; a guess for the next."""
-    if not (task.in_plane and robot.planar):
-        return _solve_away(robot, task, guess, cold=cold)
-    guess = None if isinstance(guess, SpatialPlan) else guess
-    if robot.hash not in _tools:
-        # on the fine mesh at once: most cells begin with a neighbour's solution, which is nearer than steps would lead
-        options = {"max_iter": MAX_ITERATIONS}
-        _tools[robot.hash] = reach_of(robot), WholeBodyPlanner(robot, tracking=False, options=options, refine=False)
-    known, planner = _tools[robot.hash]
-    try:
-        check_reachable(task, known, robot)
-    except InfeasibleError as e:
-        return Cell.of(task, False, VERDICT, math.nan, reason=str(e)), guess
-    reason = ""
-    for start in [guess] * bool(guess) + [None] * cold:
-        try:
-            plan = planner.plan(task, guess=start)
-        except SolverError as e:
-            reason = str(e)
-            continue
-        shares, s = usage(plan, robot), plan.solution.statistics
-        most = max(shares, key=shares.get)
-        cell = Cell.of(task, True, most, shares[most], s.iterations, s.solve_s)
-        return cell, plan.solution.guess()
-    return Cell.of(task, False, OPEN, math.nan, reason=reason), guess if cold else None
-
-
 _planners: dict[str, Planner] = {}  # of this process, by the robot's hash
 
 
-def _solve_away(robot: Robot, task: JumpTask, guess: Guess | None, *, cold: bool) -> tuple[Cell, Guess | None]:
-    """The same by the spatial program: from the neighbour's plan, then from where that begins by itself."""
+def _solve(robot: Robot, task: JumpTask, near: JumpPlan | None, *, cold: bool) -> tuple[Cell, JumpPlan | None]:
+    """One cell as `jumplab plan` plans it, or begun with a neighbour's plan; a plan for the next."""
     planner = _planners.setdefault(robot.hash, Planner(robot, keep=True))
-    spatial, reason = planner.stage("spatial"), ""
-    for near in [guess] * isinstance(guess, SpatialPlan) + [None] * cold:
+    ways = [lambda: planner.plan(task, "direct")] * cold
+    if near is not None:  # in the plane a farther neighbour is a worse start than none
+        first = task.is_near(near.task) or not (task.in_plane and robot.planar)
+        ways.insert(0 if first else len(ways), lambda: planner.replan(near, task))
+    for way in ways:
+        unread = EXPLAINED.set(False)
         try:
-            start = ()
-            if near is None and robot.planar:
-                first = planner.plan(replace(task, side_m=0.0, yaw_rad=0.0), "direct")
-                start = first.tape, first.toe_phase_s
-            plan = spatial.plan(task, *start, near=near, patient=False)
+            plan = way()
         except InfeasibleError as e:
-            return Cell.of(task, False, VERDICT, math.nan, reason=str(e)), guess
+            return Cell.of(task, False, VERDICT, math.nan, reason=str(e)), near
         except SolverError as e:
-            reason = str(e)
+            reason, work = str(e), ()
             continue
-        shares, s = tape_usage(spatial.tape(plan), robot, plan.limits), plan.solution.statistics
-        most = max(shares, key=shares.get)
-        return Cell.of(task, True, most, shares[most], s.iterations, s.solve_s), plan
-    return Cell.of(task, False, OPEN, math.nan, reason=reason), guess if cold else None
-
-
-def tape_usage(tape: Tape, robot: Robot, limits: SpatialLimits) -> dict[str, float]:
-    """As :func:`usage`, of a jump out of the plane: of every joint, the more used one of left and right."""
-    motors, out = Actuators(robot), {}
-    low, high = motors.range(tape.v[:, 6:])
-    room = limits.torque_share * np.maximum(np.where(tape.tau > 0, high, -low), 1e-2 * motors.effort)
-    shares = {"torque": np.abs(tape.tau) / room, "speed": np.abs(tape.v[:, 6:]) / motors.speed / limits.speed_share}
-    for what, share in shares.items():
-        for name, most in zip(robot.joint_names, share.max(axis=0).tolist(), strict=True):
-            joint = f"{name.removeprefix('left_').removeprefix('right_').replace('_', ' ')} {what}"
-            out[joint] = max(most, out.get(joint, 0.0))
-    force = tape.f[..., :3].reshape(-1, 3)
-    force = force[force[:, 2] > LOADED_N]
-    out["friction"] = float(np.max(np.linalg.norm(force[:, :2], axis=1) / force[:, 2])) / limits.friction
-    return out
+        finally:
+            EXPLAINED.reset(unread)
+        report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
+        work = sum(x.iterations for x in plan.statistics), sum(x.solve_s for x in plan.statistics)
+        if report.passed:
+            return Cell.of(task, True, *most_used(report), *work), plan
+        reason = f"outside the limits of the audit: {', '.join(check.name for check in report.failed)}"
+    return Cell.of(task, False, OPEN, math.nan, *work, reason=reason), near if cold else None
 
 
 # finished cells on file -----------------------------------------------------------------------------------------

@@ -24,9 +24,9 @@ from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import FLIGHT, LANDING, LAUNCH, LIMIT, PAGE_IN, REFERENCE_STYLE, VERMILION, new_figure, tint
-from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.srmp.spatial import SpatialSrmpPlan
+from jumplab.studies.envelope import most_used
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("three_dimensions.jsonl")
@@ -44,23 +44,6 @@ KINDS = {  # name -> targets, methods
 }
 
 
-def usage(plan: JumpPlan) -> tuple[str, float]:
-    """The joints' limit that a plan uses most, and how much of what the robot has: torque at its speed, or speed."""
-    robot, shares = plan.robot, {}
-    for i, name in enumerate(robot.joint_names):
-        a, tau, rate = robot.actuators[name], plan.tape.tau[:, i], plan.tape.v[:, 6 + i]
-        left = np.clip((a["speed"] - np.abs(rate)) / (a["speed"] - a["corner_speed"]), 1e-2, 1.0)
-        joint = name.split("_", 1)[1].replace("_pitch", "").replace("_", " ")
-        for what, share in (
-            ("torque", np.max(np.abs(tau) / (a["effort"] * np.where(tau * rate > 0, left, 1.0)))),
-            ("speed", np.max(np.abs(rate)) / a["speed"]),
-        ):
-            key = f"{joint} {what}"
-            shares[key] = max(float(share), shares.get(key, 0.0))
-    most = max(shares, key=shares.get)
-    return most, shares[most]
-
-
 def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> dict[str, Any]:
     """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most."""
     ahead, side, rise, turn = target
@@ -71,9 +54,10 @@ def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> 
     except JumplabError as e:
         return row | {"cpu_s": time.process_time() - began, "reason": str(e)[:160]}
     row |= {"planned": True, "cpu_s": time.process_time() - began, "skipped": (plan.skipped or "")[:160]}
-    s, (most, share) = plan.whole_body.solution.statistics, usage(plan)
+    s, report = plan.whole_body.solution.statistics, audit(plan.tape, plan.robot, task)
+    most, share = most_used(report)
     row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
-    return row | {"clean": audit(plan.tape, plan.robot, task).passed}
+    return row | {"clean": report.passed}
 
 
 def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import WARM, Nlp
+from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.generic import generic
@@ -82,7 +82,6 @@ class SpatialPlanner:
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
         stance: np.ndarray | None = None,
-        patient: bool = True,
     ) -> SpatialPlan:
         """Solve for a target.
 
@@ -92,13 +91,13 @@ class SpatialPlanner:
         ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
-        patient : explain a refusal, and look for a smaller target; otherwise only solve, and not for long.
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's places; it if None.
 
         Raises
         ------
         SolverError
             If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
+            Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
         how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
         if near is not None:
@@ -107,7 +106,7 @@ class SpatialPlanner:
             except SolverError:
                 if start is None:
                     raise
-        if not patient:
+        if not EXPLAINED.get():
             return self._solved(self._quick, task, (start, toe_phase_s, ramps), how)
         try:
             return self._solved(self.nlp, task, (start, toe_phase_s, ramps), how | {"explain": True})
