@@ -97,7 +97,7 @@ def test_three_starts_end_in_a_jump(bhr):
     assert all(r.iterations > 0 and 0 < r.alone_s <= r.total_s for r in rows), rows
     crouch, guess, loose = rows
     assert loose.total_s > loose.alone_s and guess.total_s > guess.alone_s
-    planned = Planner(bhr).plan(JumpTask(0.5, 0.3)).whole_body.solution.statistics
+    planned = Planner(bhr).plan(JumpTask(0.5, 0.3), "three-step").whole_body.solution.statistics
     assert guess.cost == pytest.approx(planned.objective, rel=1e-6)
     assert loose.cost == pytest.approx(crouch.cost, rel=0.05)
 

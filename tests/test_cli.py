@@ -321,7 +321,7 @@ def test_real_plan_is_self_contained(planned):
             "distance = 2.9 m: in the time that a height of 0.1 m leaves in the air",
         ),
         ("--rotation-deg -360 --height-m 0.05", 3, "rotation = -360 deg: 0."),
-        ("--distance-m -1.0", 3, "stage 2: at t = 0."),
+        ("--distance-m -1.0 --method three-step", 3, "stage 2: at t = 0."),
         ("--distance-m 9", 2, "distance = 9 m is outside -3 ... 3 m"),
     ],
 )

@@ -346,7 +346,7 @@ def test_a_weight_of_zero_in_one_plan_drops_that_term_alone():
     asked = {"srmp/launch/upright": 0, "calm arms": 0.2}
     for _ in range(2):
         plan = both.plan(task, weights=asked)
-        same(plan, armed(0.2).plan(task))
+        same(plan, armed(0.2).plan(task, "three-step"))
         assert "toe/upright" not in plan.weights["SRMP"] and plan.weights["whole body"]["flight/calm arms"] == 0.2
     assert both.plan(task).weights["SRMP"]["toe/upright"] == 1.0
 

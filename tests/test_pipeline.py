@@ -110,7 +110,7 @@ def test_the_robots_hash_ties_plan_and_robot(plan):
 @pytest.mark.slow
 def test_the_same_twice():
     """Planning the same target again with the same planner gives the same tape, to the solver's tolerance."""
-    again, first = planner().plan(JumpTask(0.8, 0.3, -0.2)), jump(0.8, 0.3, -0.2)
+    again, first = planner().plan(JumpTask(0.8, 0.3, -0.2), "three-step"), jump(0.8, 0.3, -0.2)
     np.testing.assert_allclose(again.tape.q, first.tape.q, atol=1e-5)
 
 
@@ -211,7 +211,7 @@ def test_another_gravity_is_planned():
 def test_refusal_of_stage_two_is_one_sentence():
     """One backward metre: phase, time, what is missed and by how much, and what holds it back."""
     with pytest.raises(SolverError) as e:
-        planner().plan(JumpTask(-1.0, 0.5))
+        planner().plan(JumpTask(-1.0, 0.5), "three-step")
     said = (
         r"^stage 2: at t = \d\.\d{3} s of the (launch|flight) no joint motion follows stage 1; the nearest one misses "
         r"'.+' by [\d.e+-]+ .+ \(.+\), held back by [^;]+$"
@@ -238,4 +238,4 @@ def test_refusal_of_stage_one_names_what_it_misses():
     """Two metres at half a metre of rise pass the closed forms, but not the optimisation."""
     said = r"^SRMP: no plan .* by [\d.]+ m/s at t = .*"
     with pytest.raises(SolverError, match=said):
-        planner().plan(JumpTask(2.0, 0.5))
+        planner().plan(JumpTask(2.0, 0.5), "three-step")
