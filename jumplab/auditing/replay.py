@@ -191,24 +191,20 @@ def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: in
 
 def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.ndarray]:
     """The kinematic fields of :class:`Replay`, by name."""
-    data, rows, mass = model.createData(), [], pin.computeTotalMass(model)
-    for q, v, a in zip(tape.q, tape.v, tape.a, strict=True):
+    data, mass, n, k = model.createData(), pin.computeTotalMass(model), len(tape.t), len(frames)
+    points = "com", "com_velocity", "com_acceleration", "momentum", "base"
+    found = {name: np.empty((n, 3)) for name in points} | {"energy": np.empty(n), "base_rotation": np.empty((n, 3, 3))}
+    found |= {"foot": np.empty((n, k, 3)), "foot_rotation": np.empty((n, k, 3, 3))}
+    com, velocity, acceleration, momentum, base, energy, rotation, foot, foot_rotation = found.values()
+    for i, (q, v, a) in enumerate(zip(tape.q, tape.v, tape.a, strict=True)):
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         pin.updateFramePlacements(model, data)
-        energy, base, feet = pin.computeMechanicalEnergy(model, data, q, v), data.oMi[1], [data.oMf[i] for i in frames]
-        row = {
-            "com": data.com[0],
-            "com_velocity": data.hg.linear / mass,
-            "com_acceleration": data.dhg.linear / mass,
-            "momentum": data.hg.angular,
-            "energy": energy,
-            "base": base.translation,
-            "base_rotation": base.rotation,
-            "foot": [foot.translation for foot in feet],
-            "foot_rotation": [foot.rotation for foot in feet],
-        }
-        rows.append({name: np.array(value) for name, value in row.items()})
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        energy[i] = pin.computeMechanicalEnergy(model, data, q, v)
+        com[i], velocity[i], acceleration[i] = data.com[0], data.hg.linear / mass, data.dhg.linear / mass
+        momentum[i], base[i], rotation[i] = data.hg.angular, data.oMi[1].translation, data.oMi[1].rotation
+        for j, frame in enumerate(frames):
+            foot[i, j], foot_rotation[i, j] = data.oMf[frame].translation, data.oMf[frame].rotation
+    return found
 
 
 def _inverse_dynamics(tape: Tape, model: pin.Model, frames: list[int], motion: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -217,10 +213,11 @@ def _inverse_dynamics(tape: Tape, model: pin.Model, frames: list[int], motion: d
     # (N, K, 2, 3) force and moment at the contact frame's origin, in its axes
     local = np.einsum("nkji,nkcj->nkci", motion["foot_rotation"], tape.f.reshape(*tape.f.shape[:2], 2, 3))
     contacts = [(model.frames[i].parentJoint, model.frames[i].placement) for i in frames]
-    need = np.empty_like(tape.v)
+    need, external, none = np.empty_like(tape.v), pin.StdVec_Force(), pin.Force.Zero()
+    external.extend([none for _ in range(model.njoints)])
     for i in range(len(tape.t)):
-        external = pin.StdVec_Force()
-        external.extend([pin.Force.Zero() for _ in range(model.njoints)])
+        for joint, _ in contacts:
+            external[joint] = none
         for (joint, place), wrench in zip(contacts, local[i], strict=True):
             external[joint] = external[joint] + place.act(pin.Force(*wrench))
         need[i] = pin.rnea(model, data, tape.q[i], tape.v[i], tape.a[i], external)

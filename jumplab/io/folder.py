@@ -19,6 +19,7 @@ import os
 import platform
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -101,6 +102,11 @@ def _remove(path: Path) -> None:
 
 def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
+    return dict(_versions())
+
+
+@cache  # a sweep audits thousands of plans
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         for build in (name, BUILDS.get(name, name)):
