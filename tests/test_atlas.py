@@ -13,6 +13,7 @@ from jumplab.robot import Robot
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body.planner import Asked
 from jumplab.studies.atlas import Atlas, Node, key_of
+from jumplab.studies.envelope import envelope
 from jumplab.task import JumpTask
 
 DISTANCES, HEIGHTS = (0.5, 0.7, 0.9), (0.3, 0.45)
@@ -176,3 +177,11 @@ def test_a_cheaper_neighbour_replaces_a_dear_node():
     assert other._swept(planner().stage("direct")) == 1
     assert isinstance(other.nodes[0.7, 0.45], Node)
     assert other.nodes[0.7, 0.45].cost == pytest.approx(atlas().nodes[0.7, 0.45].cost, rel=0.01)
+
+
+def test_a_map_begins_with_an_atlas():
+    one, (cell,) = atlas(), envelope(Robot.load(), (0.55,), (0.35,), atlas=atlas()).cells
+    assert cell.solved and 0 < cell.iterations <= 4 and 0.3 < cell.share <= 1.0
+    other = Robot.load().with_mass("trunk", factor=1.1)
+    with pytest.raises(InputError, match="the atlas is of robot bhr with other limits, terms or mesh"):
+        envelope(other, (0.55,), (0.35,), atlas=one)

@@ -226,6 +226,7 @@ def _print_chain(result, report) -> None:
     opt("--height-m M", f"of the cells: {VALUES} [m] (default 0.1:0.6:6)", "0.1:0.6:6", values_of),
     opt("--side-m M", f"sides against distances instead, at one height: {VALUES} [m]", None, values_of),
     opt("--yaw-deg DEG", f"turns on the spot against heights instead: {VALUES}", None, values_of),
+    opt("--atlas DIR", "folder of an atlas to begin with ('jumplab atlas')", None, folder),
     JOBS,
 )
 def envelope(args: Namespace) -> None:
@@ -242,7 +243,10 @@ def envelope(args: Namespace) -> None:
         values, more = (args.side_m, args.distance_m), dict(axes=("side_m", "distance_m"), fixed=fixed)
     elif args.yaw_deg is not None:
         values, more = ([math.radians(x) for x in args.yaw_deg], args.height_m), dict(axes=("yaw_rad", "height_m"))
-    found = maps.envelope(robot, *values, **more, folder=args.out, workers=jobs, tell=print)
+    if more:
+        without(args, "holds jumps straight ahead", atlas=None)
+    known = args.atlas and memory.Atlas.load(args.atlas)
+    found = maps.envelope(robot, *values, **more, folder=args.out, workers=jobs, tell=print, atlas=known)
     figure, args.found["map"] = pictures.envelope_map(found), asdict(found) | {"hash": robot.hash}
     store.settle()
     text = json.dumps(args.found["map"], indent=1).replace("NaN", "null")

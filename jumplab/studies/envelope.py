@@ -105,6 +105,7 @@ def envelope(
     folder: str | Path | None = None,
     workers: int = 1,
     tell: Callable[[str], None] | None = None,
+    atlas: Any | None = None,
 ) -> Envelope:
     """Solve the whole map: ``distances`` and ``heights`` of its cells [m], rising.
 
@@ -112,8 +113,8 @@ def envelope(
     sides and distances of jumps of one height, ``axes=("yaw_rad", "height_m")`` turns and heights.
 
     Finished cells are kept in ``folder``, and not solved again. ``workers`` are processes that share the rows; ``tell``
-    is called with a line per finished row. Raises :class:`InputError` if the grid is empty or too large, or the folder
-    holds cells of another robot.
+    is called with a line per finished row; ``atlas`` is one of this robot (:class:`jumplab.Atlas`) to begin with.
+    Raises :class:`InputError` if the grid is empty or too large, or folder or atlas are of another robot.
     """
     if not 0 < len(distances) * len(heights) <= MAX_CELLS:
         raise InputError(f"the map has {len(distances)} x {len(heights)} cells, must be 1 to {MAX_CELLS}")
@@ -124,7 +125,8 @@ def envelope(
     path, rows = None if folder is None else Path(folder) / CELLS, []
     with nullcontext() if path is None else _opened(path, robot) as log:
         done = {} if log is None else log.done
-        work = [joblib.delayed(_row)(robot, row, done, path) for row in tasks]
+        planner = Planner(robot, keep=True, atlas=atlas)
+        work = [joblib.delayed(_row)(planner, row, done, path) for row in tasks]
         for row in in_parallel(work, workers, "generator"):
             rows.append(row)
             if tell is not None:
@@ -135,7 +137,7 @@ def envelope(
     return Envelope(robot.name, tuple(distances), tuple(heights), cells, tuple(axes))
 
 
-def _row(robot: Robot, tasks: Sequence[JumpTask], done: Mapping[Place, Cell], path: Path | None) -> list[Cell]:
+def _row(planner: Planner, tasks: Sequence[JumpTask], done: Mapping[Place, Cell], path: Path | None) -> list[Cell]:
     """Cells of one row, solved from near to far, then back."""
     cells, guesses, guess, failed = [], {}, None, 0
     for i, task in enumerate(tasks):
@@ -144,27 +146,27 @@ def _row(robot: Robot, tasks: Sequence[JumpTask], done: Mapping[Place, Cell], pa
             cell = done[cell.place]
         else:
             if failed < GIVE_UP:
-                cell, guess = _solve(robot, task, guess, cold=True)
+                cell, guess = _solve(planner, task, guess, cold=True)
                 guesses[i] = guess if cell.solved else None
-            _keep(cell, robot, path)
+            _keep(cell, planner.robot, path)
         failed = 0 if cell.solved else failed + 1
         cells.append(cell)
     for i in reversed(range(len(cells) - 1)):
         if cells[i].limiting == OPEN and guesses.get(i + 1):
-            cells[i], guesses[i] = _solve(robot, tasks[i], guesses[i + 1], cold=False)
-            _keep(cells[i], robot, path)
+            cells[i], guesses[i] = _solve(planner, tasks[i], guesses[i + 1], cold=False)
+            _keep(cells[i], planner.robot, path)
     return cells
 
 
-_planners: dict[str, Planner] = {}  # of this process, by the robot's hash
+_here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew
 
 
-def _solve(robot: Robot, task: JumpTask, near: JumpPlan | None, *, cold: bool) -> tuple[Cell, JumpPlan | None]:
+def _solve(planner: Planner, task: JumpTask, near: JumpPlan | None, *, cold: bool) -> tuple[Cell, JumpPlan | None]:
     """One cell as `jumplab plan` plans it, or begun with a neighbour's plan; a plan for the next."""
-    planner = _planners.setdefault(robot.hash, Planner(robot, keep=True))
+    planner = _here.setdefault(planner.token, planner)
     ways = [lambda: planner.plan(task, "direct")] * cold
     if near is not None:  # in the plane a farther neighbour is a worse start than none
-        first = task.is_near(near.task) or not (task.in_plane and robot.planar)
+        first = task.is_near(near.task) or not (task.in_plane and planner.robot.planar)
         ways.insert(0 if first else len(ways), lambda: planner.replan(near, task))
     for way in ways:
         unread = EXPLAINED.set(False)
