@@ -111,7 +111,8 @@ SOLE_SHARE = 0.95, 0.5  # of the sole's length and width for the wished CoP; mor
 PLANNED_FRICTION = 0.45  # below the lowest floor friction of the perturbed trials, 0.5
 NOMINAL_INERTIA = 5.0  # [kg m^2] pitch inertia of the landed robot, turns a momentum rate into rad/s^2
 STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
-STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back
+STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back ...
+STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so much
 SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
 SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
 MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
@@ -247,9 +248,11 @@ class LandingController:
         weight = self._posture_weight.copy()
         ahead = q[7:] + v[6:] * STOP_HORIZON_S
         for stop, side in ((motors.lower + STOP_MARGIN_RAD, 1.0), (motors.upper - STOP_MARGIN_RAD, -1.0)):
-            needed = 2 * (stop - ahead) / STOP_HORIZON_S**2
-            near = side * needed > 0
-            wish[near], weight[near] = np.clip(needed[near], -MAX_TURN, MAX_TURN), g.stop_weight
+            needed = side * 2 * (stop - ahead) / STOP_HORIZON_S**2
+            near = needed > 0
+            away = np.clip(side * wish, 0.0, STOP_LEAVE)  # or a joint that is to go back would rest just there
+            wish[near] = side * np.clip(np.maximum(needed, away), 0.0, MAX_TURN)[near]
+            weight[near] = g.stop_weight
         return wish, weight
 
     def _solve(self, rows, targets, weights, joint_wish, joint_weight, v):
