@@ -162,3 +162,19 @@ def test_reports_an_unsolvable_problem(bhr):
     tau = controller.torque(0.0, q, v, np.array([200.0, 200.0]))
     assert controller.failures == 1
     assert np.isfinite(tau).all() and (np.abs(tau) <= Actuators(bhr).effort).all()
+
+
+def test_a_joint_at_its_stop_is_led_away_from_it(bhr):
+    """Arms that land overhead come back: at rest by the stop the wish is not to stay there."""
+    control, q = LandingController(bhr), stance_configuration(bhr)
+    arm = bhr.joint_names.index("left_shoulder_pitch")
+    lower = bhr.actuators["left_shoulder_pitch"]["lower"]
+    for angle, rate, least in ((lower + 0.0499, 0.0, 10.0), (lower + 0.02, 0.0, 20.0), (lower + 0.1, -3.0, 70.0)):
+        q[7 + arm], v = angle, np.zeros(bhr.model.nv)
+        v[6 + arm] = rate
+        control._terms.update(q, v)
+        wish, weight = control._posture(q, v)
+        assert least - 1e-6 <= wish[arm] <= 300.0 and weight[arm] == control.gains.stop_weight, angle
+    q[7 + arm] = lower + 0.06  # beyond the margin the posture's own wish has it
+    wish, weight = control._posture(q, np.zeros(bhr.model.nv))
+    assert wish[arm] > 100.0 and weight[arm] == control.gains.arm_posture_weight
