@@ -27,7 +27,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import Scene, simulate_jump
 from jumplab.stages.joint_qp import map_to_joints
-from jumplab.stages.planner import METHODS, Planner, plan_jump
+from jumplab.stages.planner import METHODS, Planner
 from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -93,9 +93,9 @@ def robot_text(rng, folder):
 def plan_options(rng, folder):
     task, bad = JumpTask(1.0, 0.5), rng.choice(SILLY)
     return rng.choice([
-        lambda: plan_jump(task, ROBOT, method=bad),
-        lambda: plan_jump(bad, ROBOT),
-        lambda: plan_jump(task, bad),
+        lambda: Planner(ROBOT).plan(task, bad),
+        lambda: Planner(ROBOT).plan(bad),
+        lambda: Planner(bad).plan(task),
         lambda: Planner("bhr" if bad is None else bad),
         lambda: map_to_joints(bad, ROBOT),
         lambda: map_to_joints(pendulum(0.3, 0.2), ROBOT, method=bad),

@@ -31,7 +31,7 @@ from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, Scene, engine_class, simulate_jump
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 FREE = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="{0}"/></joint>'
@@ -164,7 +164,7 @@ def test_from_urdf_alone(tmp_path, bhr):
                                              (held_arms, (0.6, 0.3)), (child, (0.3, 0.2))],
                          ids=["mirrored", "one-axis ankle", "held arms", "child"])  # fmt: skip
 def test_planned_clean_and_landed(tmp_path, variant, target):
-    plan = plan_jump(JumpTask(*target), load(tmp_path, variant))
+    plan = Planner(load(tmp_path, variant)).plan(JumpTask(*target))
     report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
     result = simulate_jump(plan.tape, plan.robot, scene=Scene.of_plan(plan.summary, plan.robot)).to_json()
@@ -174,7 +174,7 @@ def test_planned_clean_and_landed(tmp_path, variant, target):
 
 @pytest.mark.slow
 def test_mirrored_axes_give_the_same_plan(tmp_path):
-    a, b = (plan_jump(JumpTask(0.5, 0.3), load(tmp_path, v), method="direct") for v in (plain, mirrored))
+    a, b = (Planner(load(tmp_path, v)).plan(JumpTask(0.5, 0.3), "direct") for v in (plain, mirrored))
     assert a.statistics[0].iterations == b.statistics[0].iterations
     np.testing.assert_allclose(a.tape.extra["planar_angles"], b.tape.extra["planar_angles"], atol=1e-9)
     knee = list(a.tape.joint_names).index("right_knee")

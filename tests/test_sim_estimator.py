@@ -7,7 +7,7 @@ import pytest
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Perturbation, SensorNoise, simulate_jump
 from jumplab.sim.estimator import Estimator, Perception, Sensors, estimation_error
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 STILL = np.zeros((2, 6))
@@ -15,7 +15,7 @@ STILL = np.zeros((2, 6))
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return plan_jump(JumpTask(0.6, 0.3), bhr, method="direct").tape
+    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.reference import Forecast
 from jumplab.sim.result import Recorder, _events
 from jumplab.sim.scene import Contacts
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
 from jumplab.task import JumpTask
 
@@ -40,7 +40,7 @@ SHORT_S = 0.3  # enough to compare launches and flights
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return plan_jump(JumpTask(DISTANCE, HEIGHT), bhr, method="direct").tape
+    return Planner(bhr).plan(JumpTask(DISTANCE, HEIGHT), "direct").tape
 
 
 @pytest.fixture(scope="module", params=[(mode, engine) for engine in INSTALLED for mode in ("position", "pd")])

@@ -10,13 +10,13 @@ from jumplab.sim.kinematics import headed
 from jumplab.sim.landing import BodyTerms
 from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Motors, Playback
 from jumplab.sim.servo import GAINS, Servo
-from jumplab.stages.planner import plan_jump
+from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return plan_jump(JumpTask(0.6, 0.3), bhr, method="direct").tape
+    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
 
 
 def told(robot, posture, **changed) -> Command:

@@ -58,9 +58,8 @@ def library(path: Path) -> Path | None:
 
 def function(code: Path, number: int, name: str) -> ca.Function:
     """One of the functions in ``code``: ``name`` of element ``number``."""
-    return ca.external(
-        _symbol(number, name), str(code), {"enable_fd": True}
-    )  # slopes are asked for to explain failures
+    how = {"enable_fd": True}  # by differences, slopes that only the explanation of a failure asks for
+    return ca.external(_symbol(number, name), str(code), how)
 
 
 def _symbol(number: int, name: str) -> str:

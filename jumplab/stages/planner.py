@@ -469,11 +469,6 @@ def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
     return (*coarse, *uneven, _row(stage, body.solution.statistics))
 
 
-def plan_jump(task: JumpTask, robot: Robot, *, method: str = USUAL) -> JumpPlan:
-    """Plan one jump from scratch; see :meth:`Planner.plan`. Keep a :class:`Planner` to plan several."""
-    return Planner(robot, keep=True).plan(task, method)
-
-
 def guess_from_joints(
     joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float, own_arms: float | None = None
 ) -> dict[str, PhaseGuess]:
