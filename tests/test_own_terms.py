@@ -236,6 +236,18 @@ def test_what_a_method_would_ignore_is_refused(bhr):
         jl.Planner(bhr, weights={"track inertia": 1.0}, mesh=SMALL).plan(task, "direct")
 
 
+def test_the_usual_method(bhr):
+    """Direct; three steps for flips in the plane, and where something is changed that only they have."""
+    lopsided = bhr.with_mass("left_thigh", factor=1.2)
+    assert not lopsided.planar
+    assert planner().chosen() == jl.Planner(lopsided).chosen() == jl.Planner(lopsided).chosen(flip=True) == "direct"
+    assert planner().chosen(flip=True) == "three-step" and planner().chosen("direct", flip=True) == "direct"
+    assert planner().chosen(weights={"srmp/turn": 1.0}) == planner().chosen(weights={"track inertia": 1.0})
+    for how in ({"off": ["joint qp/friction"]}, {"settings": {"friction": 0.3}}, {"off": ["launch/track inertia"]}):
+        assert jl.Planner(bhr, **how).chosen() == "three-step", how
+    assert jl.Planner(bhr, terms={"whole body/flight": [calm()]}).chosen() == "direct"
+
+
 def test_nothing_solves_before_all_is_checked(bhr, monkeypatch):
     monkeypatch.setattr(Nlp, "solve", lambda *a, **k: pytest.fail("a stage was solved"))
     one = jl.Planner(bhr, mesh=SMALL, terms={"whole body/flight": [cost(lambda p: p.joints.elbow)]})

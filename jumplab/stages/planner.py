@@ -179,7 +179,8 @@ class Planner:
         if not isinstance(method, str) or method not in (USUAL, *METHODS):
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
         asked = sorted_out(weights=weights)
-        first = flip or any(self.changes[stage] or asked[stage] for stage in FIRST_STAGES) or self._given[1] is not None
+        first = any(self.changes[stage] or asked[stage] for stage in FIRST_STAGES) or self._given[1] is not None
+        first = first or (flip and self.robot.planar and self.atlas is None)
         names = (n for x in (self.changes[LAST], asked[LAST]) for n in (*x.weights, *x.off))
         first = first or any(n.rpartition("/")[2].startswith(FOLLOWING) for n in names)
         if method == USUAL:
@@ -259,7 +260,7 @@ class Planner:
             If a stage refuses or fails; no later stage is run.
         """
         require_type(task, JumpTask, "the target")
-        method = self.chosen(method, weights, flip=bool(task.rotation_rad) and task.in_plane and self.atlas is None)
+        method = self.chosen(method, weights, flip=bool(task.rotation_rad) and task.in_plane)
         if not (task.in_plane and self.robot.planar):
             return self._spatial(task, method, weights, start)
         check_platform(task, self.robot, self.limits)
