@@ -449,6 +449,17 @@ class Planner:
         return self._finished(previous.method, body, srmp)
 
 
+_HERE: dict[tuple, Planner] = {}
+
+
+def here(planner: Planner) -> Planner:
+    """This process's own of a planner that came with a piece of work: each copy would build its stages anew."""
+    if planner.token not in _HERE:
+        _HERE.clear()  # one at a time: stages are large
+        _HERE[planner.token] = planner
+    return _HERE[planner.token]
+
+
 def _away(task: JumpTask) -> str:
     """The stage for a jump out of the plane."""
     return "spatial" + " flip" * bool(task.rotation_rad)

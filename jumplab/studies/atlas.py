@@ -28,7 +28,7 @@ from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.assembly import pack, unpack
 from jumplab.ocp.cache import fingerprint
 from jumplab.robot import Robot
-from jumplab.stages.planner import Planner, make_tape
+from jumplab.stages.planner import Planner, here, make_tape
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.studies.envelope import most_used
 from jumplab.task import JumpTask
@@ -282,13 +282,9 @@ def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
     return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, *most, x)
 
 
-_here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew
-
-
 def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tuple[float, list[Node]]:
     """Nodes of one height, from near to far, each from its neighbour's solution."""
-    planner = _here.setdefault(planner.token, planner)
-    body, plan, row, failed = planner.stage("direct"), None, [], 0
+    body, plan, row, failed = here(planner).stage("direct"), None, [], 0
     for distance in distances:
         task = JumpTask(distance, height)
         try:

@@ -24,7 +24,7 @@ from jumplab.io.files import Log, append, made, open_log
 from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
-from jumplab.stages.planner import Planner
+from jumplab.stages.planner import Planner, here
 from jumplab.task import JumpTask
 
 Place = tuple[float, ...]  # distance, height and side [m], yaw [rad]
@@ -158,16 +158,12 @@ def _row(planner: Planner, tasks: Sequence[JumpTask], done: Mapping[Place, Cell]
     return cells
 
 
-_here: dict[tuple, Planner] = {}  # of this process: copies that come with each row would build their stages anew
-
-
 def _solve(planner: Planner, task: JumpTask, near: JumpPlan | None, *, cold: bool) -> tuple[Cell, JumpPlan | None]:
     """One cell as `jumplab plan` plans it, or begun with a neighbour's plan; a plan for the next."""
-    planner = _here.setdefault(planner.token, planner)
+    planner = here(planner)
     ways = [lambda: planner.plan(task, "direct")] * cold
-    if near is not None:  # in the plane a farther neighbour is a worse start than none
-        first = task.is_near(near.task) or not (task.in_plane and planner.robot.planar)
-        ways.insert(0 if first else len(ways), lambda: planner.replan(near, task))
+    if near is not None and not (cold and planner.atlas):
+        ways.insert(0, lambda: planner.replan(near, task))
     for way in ways:
         unread = EXPLAINED.set(False)
         try:
@@ -176,7 +172,7 @@ def _solve(planner: Planner, task: JumpTask, near: JumpPlan | None, *, cold: boo
             return Cell.of(task, False, VERDICT, math.nan, reason=str(e)), near
         except SolverError as e:
             reason, work = str(e), ()
-            continue
+            break  # a re-plan that led nowhere has begun anew as well
         finally:
             EXPLAINED.reset(unread)
         report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from jumplab.task import JumpTask
 CASES, TABLE = "cases.jsonl", "table.csv"
 MAX_CASES = 100_000  # a day on a hundred processors; more is a typing error
 BATCH = 25  # cases that one process takes at a time, in a large sweep
+KEPT = 2  # planners that a process keeps: robots run slowest, so a batch has one robot or two
 ATLAS_STEPS = {"distance_m": 0.3, "height_m": 0.15}  # [m] between the nodes of a sweep's atlas, at most
 _HEAD = "head"  # key of the log's first line, which says of what sweep it is
 COLUMNS = (
@@ -112,9 +113,9 @@ def _robot(name: str) -> Robot:
     return VARIED[what](_robot(first), float(factor)) if equals and what in VARIED else Robot.load(name)
 
 
-@cache
+@lru_cache(KEPT)
 def _planner(robot: str, method: str, atlas: Path | None = None) -> Planner:
-    """A planner with its stages built, once per process; ``atlas`` is the folder of one."""
+    """A planner with its stages built, kept while its robot is at work; ``atlas`` is the folder of one."""
     planner = Planner(_robot(robot), keep=True, atlas=atlas and Atlas.load(atlas))
     planner.prepared(method)
     return planner

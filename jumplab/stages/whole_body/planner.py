@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -209,24 +210,30 @@ class WholeBodyPlanner:
         return found
 
     def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None, settle: bool) -> WholeBodyPlan:
-        """The solution, from the plan for a target close by, from the coarse mesh or from the guess itself."""
-        if near is not None and settle and asked.task.is_near(near.task):
-            try:
-                return self._beside(asked, near.solution)
-            except SolverError:
-                pass  # ipopt finds more
+        """The solution: from the plan for a target close by, from the coarse mesh, or from the guess itself.
+
+        Direct plans for targets farther away begin with the coarse mesh: it takes less time, and costs no more.
+        """
+        close = near is not None and asked.task.is_near(near.task)
+        ways: list[Callable[[], WholeBodyPlan]] = []
+
+        def fresh() -> Mapping[str, PhaseGuess]:
+            return guess or self.naive_guess(asked.task)
+
+        if close and settle:
+            ways.append(lambda: self._beside(asked, near.solution))
         if near is not None:
-            try:
-                return WholeBodyPlan(asked.task, self._run(self._warm.solve, asked, near.solution, explain=False))
-            except SolverError:
-                pass  # as if there had been none
-        guess = guess or self.naive_guess(asked.task)
+            ways.append(
+                lambda: WholeBodyPlan(asked.task, self._run(self._warm.solve, asked, near.solution, explain=False))
+            )
         if self._coarse is not None:
-            try:
-                return self._refine(asked, guess)
-            except SolverError:
-                pass  # the fine mesh has the last word, and the better explanation
-        return WholeBodyPlan(asked.task, self._run(self.nlp.solve, asked, guess))
+            ways.insert(len(ways) if close or self.tracking else 0, lambda: self._refine(asked, fresh()))
+        for way in ways:
+            with suppress(SolverError):
+                return way()
+        return WholeBodyPlan(
+            asked.task, self._run(self.nlp.solve, asked, fresh())
+        )  # the last word, and the explanation
 
     def settled(
         self,
