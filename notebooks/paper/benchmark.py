@@ -1,15 +1,28 @@
-"""What a benchmark's numbers should reach, in words and limits; plans from ever denser atlases."""
+"""What a benchmark's numbers should reach, in words and limits; plans from ever denser atlases; ever larger sweeps.
+
+``python -m paper.benchmark`` in the folder of the notebooks measures the sweeps anew, in an hour of two idle cores, and
+writes :data:`SWEEPS`; notebook 10 draws that file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from time import process_time
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jumplab.auditing import audit
+from jumplab.io.files import write_file
 from jumplab.robot import Robot
+from jumplab.show.style import COLUMN_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.studies.atlas import Atlas
@@ -69,3 +82,60 @@ def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
         row |= {"dearer": 100 * float(np.median(dearer)), "most": 100 * max(dearer), "clean": clean, "of": TARGETS}
         rows.append(row)
     return rows
+
+
+SWEEPS = Path(__file__).with_name("sweeps.json")
+# plans -> how many distances, heights, masses, leg lengths; with one robot up to ten plans, with ten robots beyond
+GRIDS = {1: (1, 1, 1, 1), 10: (5, 2, 1, 1), 100: (5, 2, 5, 2), 1000: (10, 10, 5, 2), 10_000: (40, 25, 5, 2)}
+WAYS = ((1, False), (1, True), (2, True))  # processes, and whether an atlas is built first
+LONGEST = {(1, False): 100, (1, True): 1000, (2, True): 10_000}  # plans that each way is asked for
+
+
+def sweeps(counts: Sequence[int] = tuple(GRIDS)) -> list[dict[str, Any]]:
+    """One ``jumplab sweep`` each, in processes of its own: plans, processes, atlas, clean ones, wall time, memory.
+
+    Targets lie between 0.2 and 1.0 m far, 0.2 and 0.5 m high; robots differ by 5 % in masses and in lengths of the
+    legs. With an atlas the motions are kept as well, at 50 Hz. ``peak_gib`` is the largest process' memory.
+    """
+    rows = []
+    for count, (jobs, atlas) in ((count, way) for count in counts for way in WAYS):
+        if count > LONGEST[jobs, atlas]:
+            continue
+        far, high, masses, legs = GRIDS[count]
+        command = ["--distance-m", f"0.2:1.0:{far}" if far > 1 else "0.6", "--jobs", str(jobs)]
+        command += ["--height-m", f"0.2:0.5:{high}" if high > 1 else "0.35"]
+        command += ["--vary", f"mass=0.95:1.05:{masses}", "--vary", f"leg=0.95:1.05:{legs}"] * (masses > 1)
+        command += ["--atlas", "--tapes", "50"] * atlas
+        with TemporaryDirectory() as folder:
+            began = perf_counter()
+            command = [sys.executable, "-m", "jumplab", "sweep", "--json", *command, "--out", folder]
+            child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            said = child.stdout.read()
+            _, status, used = os.wait4(child.pid, 0)
+            wall_s = perf_counter() - began
+        if status:
+            raise RuntimeError(f"{' '.join(command)}: {said}")
+        found = json.loads(said)["rows"]
+        row = {"plans": len(found), "robots": masses * legs, "processes": jobs, "atlas": atlas, "wall_s": wall_s}
+        row |= {"clean": sum(r["clean"] for r in found), "peak_gib": used.ru_maxrss / 2**20}
+        rows.append(row | {"cpu_s": used.ru_utime + used.ru_stime})
+    return rows
+
+
+def sweeps_picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Wall time of a plan, everything in it, over the number of plans."""
+    fig = new_figure(COLUMN_IN, 2.2)
+    ax, handles = fig.subplots(), []
+    looks = dict(zip(WAYS, (dict(REFERENCE_STYLE), dict(color=PURPLE), dict(color=VERMILION)), strict=True))
+    for (jobs, atlas), look in looks.items():
+        ours = [r for r in rows if (r["processes"], r["atlas"]) == (jobs, atlas)]
+        label = f"{jobs} process{'es' * (jobs > 1)}, {'atlas' if atlas else 'each by itself'}"
+        count, wall = [r["plans"] for r in ours], [r["wall_s"] / r["plans"] for r in ours]
+        handles += ax.plot(count, wall, marker="o", markersize=3, label=label, **look)
+    ax.set(xscale="log", yscale="log", xlabel="plans in the sweep", ylabel="wall time per plan [s]")
+    legend_above(fig, handles)
+    return fig
+
+
+if __name__ == "__main__":
+    write_file(SWEEPS, (json.dumps({"cpus": os.cpu_count(), "rows": sweeps()}, indent=1) + "\n").encode())
