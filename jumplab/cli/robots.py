@@ -1,5 +1,6 @@
 """The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
 
+import hashlib
 import os
 from argparse import Namespace
 from pathlib import Path
@@ -11,6 +12,7 @@ robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup")
 store, jumper = Late("jumplab.io.folder"), Late("jumplab.robot_import.jumper")
 configs = Late("jumplab.robot_import.config")
 starters = Late("jumplab.robot_import.roles")
+MARK = b"# unless edited, the sum of what is above: "
 tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
 
 
@@ -34,6 +36,7 @@ def list_(args: Namespace) -> None:
     opt("URDF", "the robot's URDF, or the name of a shipped robot"),
     opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
     opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
+    opt("--force", "overwrite a configuration in DIR that somebody has edited"),
     opt("--repair WHAT...", "allow a repair: inertia or massless; may be repeated", []),
 )
 def check(args: Namespace) -> None:
@@ -50,7 +53,7 @@ def check(args: Namespace) -> None:
             raise InputError(f"--config {args.config}: cannot be read as text ({type(e).__name__})") from e
         result = checkup.check(args.urdf, text)
     elif args.urdf not in describe.SHIPPED:
-        result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out))
+        result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out, args.force))
     elif "[source]" in describe.SHIPPED[args.urdf].read_text():
         result = checkup.examine(args.urdf)
     else:
@@ -72,23 +75,34 @@ def robot(args: Namespace) -> None:
     raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
 
 
-def _draft(urdf: str, repair: tuple[str, ...], out: str | None) -> str:
-    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``."""
-    first, *others = checkup.all_faults(urdf, repair) or [None]
-    if first:
-        print("".join(f"{sentence}\n" for sentence in others), end="")
-        raise RobotError(first + (f" ({len(others)} further faults are printed above)" if others else ""))
-    found = starters.draft(urdf, repair)
-    for note in found.roles.notes:
+def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
+    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``.
+
+    Faults of limits alone do not hinder the writing: they are mended there.
+    """
+    found, faults = checkup.first_look(urdf, repair)
+    for note in found.roles.notes if found else ():
         print(f"note: {note}")
-    print(f"sole: {found.sole.source}")
-    if out is not None:
+    for role, pair in found.roles.joints.items() if found and faults else ():
+        print(f"{role.replace('_', ' ')}: {', '.join(pair) or 'held'}")
+    if found:
+        print(f"sole: {found.sole.source}")
+    if out is not None and found and (not faults or found.faults == tuple(faults)):
         path = Path(out) / f"{configs.read_toml(found.text, 'starter')['name']}.toml"
-        if os.path.exists(path):
-            raise InputError(f"{path}: is there already, perhaps with corrections; choose another --out or remove it")
+        if os.path.exists(path) and not force and path.read_bytes() != _marked(path.read_bytes()):
+            raise InputError(f"{path}: has been edited; choose another --out, or overwrite it with --force")
         try:
-            store.write_file(path, found.text.encode())
+            store.write_file(path, _marked(found.text.encode()))
         except InputError as e:
             raise InputError(f"{path}: cannot be written ({getattr(e.__cause__, 'strerror', e)})") from e
         print(f"starter configuration: {path}")
+    if faults:
+        print("".join(f"{sentence}\n" for sentence in faults[1:]), end="")
+        raise RobotError(faults[0] + (f" ({len(faults) - 1} further faults are printed above)" if faults[1:] else ""))
     return found.text
+
+
+def _marked(text: bytes) -> bytes:
+    """A configuration with a last line that tells whether it is still as it was written."""
+    own = text.rpartition(MARK)[0] or text
+    return own + MARK + hashlib.sha256(own).hexdigest()[:12].encode() + b"\n"

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from jumplab.errors import RobotError
 from jumplab.robot.description import Robot, files_of
 from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.config import read_toml
-from jumplab.robot_import.jumper import Jumper
-from jumplab.robot_import.roles import draft
+from jumplab.robot_import.jumper import REPAIRS, Jumper
+from jumplab.robot_import.roles import Draft, draft
 from jumplab.robot_import.urdf import MOVING, parse, read_urdf
 
 
@@ -58,10 +59,20 @@ class Checkup:
         return out + [f"changed: {what}: {x:.3g} {unit}" for what, (x, unit) in self.jumper.lumped.changed.items()]
 
 
-def all_faults(path: str | Path, repair: tuple[str, ...] = ()) -> list[str]:
-    """Every fault of a URDF file, one sentence each; raises :class:`RobotError` if it is no URDF at all."""
+def first_look(path: str | Path, repair: tuple[str, ...] = ()) -> tuple[Draft | None, list[str]]:
+    """A first description of a URDF, and every fault of the file, else of the limits of the joints with a role.
+
+    With faults of the file the roles are those that it has once all repairs are allowed; None if not even then. Raises
+    :class:`RobotError` if it is no URDF at all, or has no two legs.
+    """
     path = Path(path)
-    return list(urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair))
+    if not (faults := urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair)):
+        found = draft(path, repair)
+        return found, list(found.faults)
+    try:
+        return draft(path, REPAIRS), faults
+    except RobotError:
+        return None, faults
 
 
 def check(path: str | Path, config_text: str) -> Checkup:

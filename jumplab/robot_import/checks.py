@@ -14,7 +14,18 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.urdf import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, inertia_matrix, numbers
+from jumplab.robot_import.urdf import (
+    FRAME_KG,
+    LIMITS,
+    MOVING,
+    SIZES,
+    TENSOR,
+    Tree,
+    inertia_matrix,
+    leftover,
+    numbers,
+    unsolid,
+)
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 
@@ -26,9 +37,8 @@ class Plausible:
     mass_kg: tuple[float, float] = (0.5, 400.0)  # hand-sized, to twice the heaviest published one
     size_m: tuple[float, float] = (0.1, 5.0)  # longest chain of joints in the neutral pose, likewise
     gyration_m: float = 1.0  # of one link; the longest published limb link has 0.2 m
-    triangle: float = 1e-3  # relative; rounding to four digits must not refuse a robot
     effort_nm: float = 2000.0  # five times the strongest published electric humanoid joint
-    speed_rad_s: float = 60.0  # twice the fastest published humanoid joint; above it, deg/s or a placeholder
+    speed_rad_s: float = 120.0  # the fastest published humanoid joint turns at 100.7; above it, deg/s or a placeholder
     angle_rad: float = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
 
 
@@ -49,12 +59,33 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     """
     found = _structure_faults(root, where)
     for link in root.findall("link") if not found else ():
-        found += _inertial_faults(link, f"{where}: link {link.get('name')!r}", "inertia" not in repair)
+        found += _inertial_faults(link, f"{where}: link {link.get('name')!r}")
     if found:  # what follows reads what was refused
         return found
-    tree = Tree(root, where, repair_inertia="inertia" in repair)
-    massless = [] if "massless" in repair else list(_massless_bodies(tree))
-    return massless or list(_unit_faults(tree)) or list(_shape_faults(root, where))
+    for link in root.findall("link") if "inertia" not in repair else ():
+        found += _tensor_faults(link, f"{where}: link {link.get('name')!r}", leftover(root))
+    tree = Tree(root, where, repair_inertia=True)
+    found += [] if "massless" in repair else _massless_bodies(tree)
+    return found + list(_shape_faults(root, where)) or list(_unit_faults(tree))
+
+
+def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
+    """What is left over in a URDF without faults, passed over or mended because no jump would notice."""
+    for element in root:
+        if "xacro" in str(element.tag):
+            yield f"the call <{element.tag.rpartition('}')[2]}> of a xacro macro is left over, and passed over"
+    for link in root.findall("link"):
+        name, tensor, mass = link.get("name"), link.find("inertial/inertia"), link.find("inertial/mass")
+        if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):
+            yield f"link {name!r}: a sphere of radius 0 is taken as a point"
+        heavy = mass is not None and float(mass.get("value")) >= FRAME_KG
+        if heavy and (gap := unsolid(inertia_matrix(tensor))) and ("inertia" in repair or gap <= leftover(root)):
+            yield f"link {name!r}: its inertia, which no solid has, is replaced by the nearest, {gap:.2g} kg m^2 apart"
+    for joint in root.findall("joint/mimic/.."):
+        yield f"joint {joint.get('name')!r} follows {joint.find('mimic').get('joint')!r}: held"
+    for joint in root.findall("joint/limit[@effort]/.."):
+        if joint.get("type") in MOVING and numbers(joint.find("limit").get("effort"), 1) == 0:
+            yield f"joint {joint.get('name')!r} has no motor (effort = 0): held"
 
 
 def _triple_faults(element: ET.Element | None, at: str, *keys: str) -> Iterator[str]:
@@ -144,7 +175,7 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
 
 
 # inertials ------------------------------------------------------------------------------------------------------
-def _inertial_faults(link: ET.Element, at: str, strict: bool) -> list[str]:
+def _inertial_faults(link: ET.Element, at: str) -> list[str]:
     inertial, mass, tensor = (link.find(path) for path in ("inertial", "inertial/mass", "inertial/inertia"))
     if inertial is None:
         return []
@@ -161,18 +192,21 @@ def _inertial_faults(link: ET.Element, at: str, strict: bool) -> list[str]:
     wrong = next((key for key in TENSOR if numbers(tensor.get(key), 1) is None), None)
     if wrong:
         found.append(f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2")
-    elif strict and value[0] >= FRAME_KG:
-        found += _tensor_faults(inertia_matrix(tensor), float(value[0]), at)
     return found
 
 
-def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
+def _tensor_faults(link: ET.Element, at: str, most: float) -> Iterator[str]:
+    """Of a link's inertia, if it is farther than ``most`` [kg m^2] from one that a solid can have, or too large."""
+    mass = 0.0 if link.find("inertial") is None else float(link.find("inertial/mass").get("value"))
+    if mass < FRAME_KG:
+        return
+    matrix = inertia_matrix(link.find("inertial/inertia"))
     low, middle, high = np.linalg.eigvalsh(matrix)
-    remedy = 'correct <inertia>, or let it be repaired with [source] repair = ["inertia"]'
-    gyration = np.sqrt(abs(high) / mass)
-    if low <= 0:
+    remedy = 'correct <inertia>, or let it be repaired: --repair inertia, or [source] repair = ["inertia"]'
+    gyration, gap = np.sqrt(abs(high) / mass), unsolid(matrix)
+    if low <= 0 and gap > most:
         yield f"{at}: principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
-    elif high > (low + middle) * (1 + PLAUSIBLE.triangle):
+    elif gap > most:
         said = f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2"
         yield f"{said}: the largest must not exceed the sum of the others, no solid has this; {remedy}"
     elif gyration > PLAUSIBLE.gyration_m:
@@ -181,10 +215,10 @@ def _tensor_faults(matrix: np.ndarray, mass: float, at: str) -> Iterator[str]:
 
 
 def _massless_bodies(tree: Tree) -> Iterator[str]:
-    """Joints that move a link without mass, and nothing fixed to it has any."""
+    """Joints that move a link without mass, and nothing fixed to it has any; but what hangs on it weighs something."""
     for joint in tree.joints.values():
         at, links = f"{tree.where}: link {joint.child!r}", [tree.links[name] for name in tree.fixed_to(joint.child)]
-        if joint.kind == "fixed" or sum(link.inertia.mass for link in links) > 0:
+        if joint.kind == "fixed" or sum(link.inertia.mass for link in links) > 0 or not tree.carried(joint.child):
             continue
         if not tree.links[joint.child].weighed:
             read = f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet 1 kg"
@@ -217,7 +251,7 @@ def _shape_faults(root: ET.Element, where: str) -> Iterator[str]:
         for shape in link.findall("collision/geometry/*"):
             for key, count in SIZES.get(shape.tag, {}).items():
                 values = numbers(shape.get(key), count)
-                if values is None or np.any(values <= 0):
+                if values is None or np.any(values < 0) or (shape.tag != "sphere" and np.any(values == 0)):
                     wanted = "three positive numbers" if count == 3 else "a positive number"
                     yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
             if shape.tag == "mesh" and not shape.get("filename"):

@@ -74,7 +74,8 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
     hips = [turn @ pose[tree.joints[n].child].translation for n in roles["hip_pitch"]]
     middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
     placed = {n: pin.SE3(turn @ p.rotation, turn @ p.translation - middle) for n, p in pose.items()}
-    bodies = _bodies(tree, placed, source["trunk"], feet, _limits(tree, config, roles, moving))
+    edges = entry(config, "feet", "sole_y_m", count=2)
+    bodies = _bodies(tree, placed, source["trunk"], feet, _limits(tree, config, roles, moving), sum(edges) / 2)
     changed = {}
     if "massless" in source["repair"]:
         bodies = _with_mass(bodies, changed)
@@ -167,9 +168,12 @@ def _groups(tree: Tree, moving: Collection[str]) -> dict[str, list[str]]:
 
 
 def _bodies(
-    tree: Tree, placed: dict[str, pin.SE3], trunk: str, feet: Sequence[str], limits: dict[str, dict]
+    tree: Tree, placed: dict[str, pin.SE3], trunk: str, feet: Sequence[str], limits: dict[str, dict], beside: float
 ) -> list[Body]:
-    """The trunk, then outwards a body for each joint of ``limits``; all their mass must hang on the trunk."""
+    """The trunk, then outwards a body for each joint of ``limits``; all their mass must hang on the trunk.
+
+    The middle of the left sole is ``beside`` [m] the origin of its link, to the left.
+    """
     group, left = _groups(tree, limits), [joint for joint in tree.joints.values() if joint.name in limits]
     origin = placed[trunk].translation * [1.0, 0.0, 1.0]
     bodies = [Body(trunk, "", "", origin, np.zeros(3), {}, _sum(tree, placed, group[trunk], origin))]
@@ -184,6 +188,9 @@ def _bodies(
             away, place = group[next_link], placed[joint.child].translation
             name = next((foot for foot in feet if foot in away), next_link)
             axis = _snapped(sign * placed[joint.child].rotation @ joint.axis)
+            if name in feet and abs(axis[1]) == 1:  # an origin may lie anywhere on its axis: in the middle of the sole
+                middle = placed[name].translation[1] + (beside if name == feet[0] else -beside)
+                place = np.array([place[0], middle, place[2]])
             inertia = _sum(tree, placed, away, place)
             bodies.append(Body(name, parent, joint.name, place, axis, limits[joint.name], inertia))
             todo.append((next_link, name))

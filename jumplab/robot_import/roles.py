@@ -6,7 +6,7 @@ Which joint is which is found from how it moves its links, never from its name.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import NoReturn
@@ -25,9 +25,11 @@ PARALLEL = 0.999  # cosine: shoulders canted by less than 2.6 deg swing arms in 
 LOWEST = 0.15  # share of the robot's height within which the ankles are above the lowest joint: arms end higher
 EVEN_RAD = 0.3  # a knee whose range is as even as this says nothing of where the robot faces: its feet do
 SAME_M = 0.02  # how far from mirror images two limbs may stand
+# ranges of joints that turn without stops, or whose stops nobody told: a person's, nearly
+ASSUMED_RAD = {"hip_pitch": (-2.0, 0.6), "knee": (0.0, 2.3), "ankle_pitch": (-0.9, 0.7), "other": (-0.4, 0.4)}
+ASSUMED_RAD["shoulder_pitch"] = (-2.0, 2.0)
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
-SOLE_M = 0.012  # points this near the lowest one belong to the sole
 SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
 # a sole where nothing is known: the default robot's, as shares of the leg's length from hip to ankle
 GUESS_X, GUESS_Y, GUESS_Z = (-0.143, 0.2), (-0.071, 0.071), -0.107
@@ -39,13 +41,14 @@ LEG = ROLES[:3]
 
 @dataclass(frozen=True)
 class Roles:
-    """What was found."""
+    """What was found; ``ranges`` are assumed (lower, upper) [rad] of leg joints for which the URDF has none."""
 
     trunk: str  # link that carries both legs
     forward: str  # axis of the trunk's frame in the neutral pose, such as "+x"
     up: str
     joints: dict[str, tuple[str, ...]]  # role -> (left, right); shoulder_pitch is () where the arms are held
     feet: tuple[str, str]  # (left, right) links moved by the last joints of the legs
+    ranges: dict[str, tuple[float, float]]
     notes: tuple[str, ...]  # what a person should know, one sentence each
 
 
@@ -138,10 +141,6 @@ class _Finder:
                 return min(found, key=lambda x: x[-1])[:-1]
         return None
 
-    def mass(self, link: str) -> float:
-        """Mass of a link and of all that hangs on it [kg]."""
-        return self.tree.links[link].inertia.mass + sum(self.mass(j.child) for j in self.tree.below[link])
-
 
 def find_roles(tree: Tree) -> Roles:
     """Find legs, knees, feet, arms and the forward direction; raises :class:`RobotError` with what is missing."""
@@ -153,7 +152,7 @@ def find_roles(tree: Tree) -> Roles:
     if abs(middle) < EVEN_RAD:
         ahead = np.cross(left, up)
         soles = [(_foot(finder, x, chain, lateral), x[2].name) for x, chain in zip(threes, limb, strict=True)]
-        reach = [_ahead(finder, *sole, ahead) for sole in soles]
+        reach = [_ahead(finder, *sole, ahead, up) for sole in soles]
         left = left * (1.0 if max(reach) >= 0 else -1.0)
     forward = np.cross(left, up)
     order = (1, 0) if left @ lateral > 0 else (0, 1)
@@ -161,12 +160,28 @@ def find_roles(tree: Tree) -> Roles:
     feet = tuple(_foot(finder, threes[i], limb[i], lateral) for i in order)
     notes = []
     joints["shoulder_pitch"] = _shoulders(finder, lateral, limb, order, notes)
-    ahead = max(_ahead(finder, foot, ankle, forward) for foot, ankle in zip(feet, joints["ankle_pitch"], strict=True))
+    ankles = joints["ankle_pitch"]
+    ahead = max(_ahead(finder, foot, ankle, forward, up) for foot, ankle in zip(feet, ankles, strict=True))
     if ahead < -BACKWARD_M:
         notes.append(f"the feet point backwards ({ahead:.3f} m) for a robot whose knees bend backwards; check forward")
     trunk = tree.joining(*feet)
     frame = finder.pose[trunk].rotation.T
-    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, tuple(notes))
+    ranges = _ranges(finder, trunk, feet, joints, left)
+    for name, (low, high) in ranges.items():
+        notes.append(f"joint {name!r} has no range: {low:g} ... {high:g} rad is assumed; correct [limits.{name}]")
+    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, ranges, tuple(notes))
+
+
+def _ranges(finder: _Finder, trunk: str, feet: tuple, joints: dict, left: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Ranges [rad] for the legs' joints that have none, by their role."""
+    out, roles = {}, {name: role for role, pair in joints.items() for name in pair}
+    roles = {j.name: "other" for foot in feet for j in finder.tree.path_between(trunk, foot) if j.driven} | roles
+    for joint in (finder.tree.joints[name] for name in roles):
+        if {"lower", "upper"} <= set(joint.limits):
+            continue
+        low, high = ASSUMED_RAD[roles[joint.name]]
+        out[joint.name] = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
+    return out
 
 
 def _foot(finder: _Finder, three: tuple, chain: Chain, lateral: np.ndarray) -> str:
@@ -177,13 +192,13 @@ def _foot(finder: _Finder, three: tuple, chain: Chain, lateral: np.ndarray) -> s
     return chain[at].child
 
 
-def _ahead(finder: _Finder, foot: str, ankle: str, forward: np.ndarray) -> float:
+def _ahead(finder: _Finder, foot: str, ankle: str, forward: np.ndarray, up: np.ndarray) -> float:
     """How far the foot reaches ahead of the ankle minus how far behind, half of it [m]."""
-    points, pose = finder.tree.points(foot), finder.pose[foot]
+    pose = finder.pose[foot]
+    points = finder.tree.sole(foot, np.stack([forward, np.cross(up, forward), up]))[:, 0]
     if not len(points):
-        points = finder.tree.links[foot].inertia.lever[None]
-    x = (points @ pose.rotation.T + pose.translation - finder.at[ankle]) @ forward
-    return float((x.max() + x.min()) / 2)
+        points = (pose.rotation @ finder.tree.links[foot].inertia.lever)[None] @ forward
+    return float((points.max() + points.min()) / 2 + (pose.translation - finder.at[ankle]) @ forward)
 
 
 def _shoulders(
@@ -195,7 +210,7 @@ def _shoulders(
     if not arms:
         notes.append("no arms were found: the shoulder is left out")
         return ()
-    pair = [limb[0] for limb in max(arms, key=lambda x: finder.mass(x[0][0].child))]
+    pair = [limb[0] for limb in max(arms, key=lambda x: finder.tree.carried(x[0][0].child))]
     cosine = min(abs(finder.axis[joint.name] @ lateral) for joint in pair)
     if cosine > PARALLEL:
         return tuple(pair[i].name for i in order)
@@ -212,6 +227,7 @@ def _explain(finder: _Finder) -> NoReturn:
         for role, joint in zip(LEG, three, strict=True):
             if not joint.driven:
                 kind = f"mimics {joint.mimic[0]!r}" if joint.mimic else f"is of type {joint.kind!r}"
+                kind = "has effort = 0 N m" if joint.limits.get("effort") == 0 else kind
                 said = f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}"
                 raise RobotError(f"{said}, which must be revolute with a range and a motor of its own")
     tips = finder.tips()
@@ -243,15 +259,9 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip to ankle, a sole is
     guessed if the link ``foot`` has no shape.
     """
-    pose, found, kinds = tree.poses(), [], set()
-    for link in tree.fixed_to(foot):
-        points = tree.points(link)
-        if len(points):
-            found.append((points @ pose[link].rotation.T + pose[link].translation - pose[foot].translation) @ turn.T)
-            kinds |= {shape.tag for _, shape in tree.links[link].shapes}
-    if found:
-        points = np.concatenate(found)
-        low = points[points[:, 2] < points[:, 2].min() + SOLE_M]
+    low, links = tree.sole(foot, turn), tree.fixed_to(foot)
+    if len(low):
+        kinds = {shape.tag for link in links if len(tree.points(link)) for _, shape in tree.links[link].shapes}
         (x0, y0, z), (x1, y1, _) = low.min(axis=0).tolist(), low.max(axis=0).tolist()
         if x1 - x0 > SMALLEST_M and y1 - y0 > SMALLEST_M:
             return Sole((x0, x1), (y0, y1), z, f"from its {' and '.join(sorted(kinds))}")
@@ -281,6 +291,10 @@ def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> t
         sole=sole,
         knee=_inside(tree, pose, turn, roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
+        ranges="".join(
+            f"\n[limits.{texts([name])[1:-1]}]  # assumed: the URDF has no range\nlower = {low:g}\nupper = {high:g}\n"
+            for name, (low, high) in roles.ranges.items()
+        ),
         shoulder=_inside(tree, pose, turn, roles.joints["shoulder_pitch"], 0.0),
     )
     return text, roles, sole
@@ -304,11 +318,15 @@ def safe_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class Draft:
-    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found."""
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found.
+
+    ``faults`` are those of the limits of the joints that were found, one sentence each.
+    """
 
     text: str
     roles: Roles
     sole: Sole
+    faults: tuple[str, ...]
 
 
 def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
@@ -317,4 +335,12 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     root = parse(read_urdf(path), path.name)
     urdf_checks.check(root, path.name, repair)
     tree = Tree(root, path.name, path, "inertia" in repair)
-    return Draft(*starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair))
+    text, roles, sole = starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair)
+    roles = replace(roles, notes=(*urdf_checks.notes(root, repair), *roles.notes))
+    names, wrong = dict.fromkeys(name for pair in roles.joints.values() for name in pair), []
+    names |= {j.name: None for foot in roles.feet for j in tree.path_between(roles.trunk, foot) if j.driven}
+    for name in names:
+        told = dict(zip(("lower", "upper"), roles.ranges.get(name, ()), strict=False))
+        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, told):
+            wrong.append(f"{sentence}, or tell it in [limits.{name}] of the configuration")
+    return Draft(text, roles, sole, tuple(wrong))

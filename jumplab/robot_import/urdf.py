@@ -6,8 +6,9 @@ is a web page, or is not a URDF at all. Here each of these is said in one senten
 
 from __future__ import annotations
 
+import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from itertools import product
 from pathlib import Path
@@ -34,6 +35,9 @@ SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, 
 SIZES["capsule"] = SIZES["cylinder"]
 KNOWN = (*SIZES, "mesh")
 FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is ignored
+TRIANGLE = 1e-3  # relative, by which a moment may exceed the sum of the others: rounding must not refuse a robot
+LEFTOVER_M = 0.01  # radius of gyration of the whole robot: a link's tensor that is wrong by less is mended with a note
+SOLE_M = 0.012  # points this near the lowest one belong to the sole
 THINNEST = 1e-3  # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 
 
@@ -112,9 +116,10 @@ def parse(text: str, where: str) -> ET.Element:
         ends = text.rstrip().endswith("</robot>")
         kind = "is not well-formed XML" if ends else "ends before </robot>; it is cut short or is no URDF"
         raise RobotError(f"{where}: line {line}, column {column}: {kind} ({said})") from None
-    # a "${...}" in a simulator's plug-in does no harm, in a link or a joint it was meant as a number
-    parts = (e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter())
-    if any("xacro" in str(e.tag) for e in root.iter()) or any("${" in v for e in parts for v in e.attrib.values()):
+    # a "${...}" in a simulator's plug-in or a call left over beside whole links does no harm
+    parts = [e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter()]
+    left = [e for e in (parts or root.iter()) if "xacro" in str(e.tag)]
+    if left or any("${" in v for e in parts for v in e.attrib.values()):
         raise RobotError(xacro)
     tag = str(root.tag).rpartition("}")[2]
     if tag != "robot":
@@ -145,12 +150,14 @@ class Joint:
     axis: np.ndarray
     limits: dict[str, float]
     mimic: tuple[str, float, float] | None
+    coupled: bool  # another joint, on another limb, follows it
     element: ET.Element = field(repr=False, compare=False)
 
     @property
     def driven(self) -> bool:
-        """True if it turns between two stops by a motor of its own."""
-        return self.kind == "revolute" and self.mimic is None
+        """True if it turns by a motor of its own, between two stops or without."""
+        own = self.mimic is None and not self.coupled and self.limits.get("effort") != 0
+        return self.kind in ("revolute", "continuous") and own
 
     def turned(self, angle: float) -> pin.SE3:
         """Place of the child in the parent at an angle [rad] or a displacement [m]."""
@@ -175,16 +182,28 @@ def inertia_matrix(element: ET.Element) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def _link(e: ET.Element, repair: bool) -> Link:
+def _link(e: ET.Element, most: float) -> Link:
     inertial, total = e.find("inertial"), pin.Inertia.Zero()
     mass = 0.0 if inertial is None else float(inertial.find("mass").get("value"))
     if mass > 0:
         place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
-        if repair or mass < FRAME_KG:
+        if most == np.inf or mass < FRAME_KG or 0 < unsolid(matrix) <= most:
             matrix = repaired(matrix)
         total = pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
     shapes = [(c, s) for c in e.findall("collision") for s in c.findall("geometry/*") if s.tag in KNOWN]
     return Link(e.get("name"), inertial is not None, total, shapes)
+
+
+def unsolid(matrix: np.ndarray) -> float:
+    """How far an inertia is from the nearest that a solid can have [kg m^2]; 0 for those of solids."""
+    low, middle, high = np.linalg.eigvalsh(matrix)
+    solid = low > 0 and high <= (low + middle) * (1 + TRIANGLE)
+    return 0.0 if solid else max(float(np.abs(repaired(matrix) - matrix).max()), 1e-15)
+
+
+def leftover(root: ET.Element) -> float:
+    """The largest error of a link's inertia that no jump would notice, by the mass of all links [kg m^2]."""
+    return LEFTOVER_M**2 * sum(float(mass.get("value")) for mass in root.findall("link/inertial/mass"))
 
 
 def repaired(matrix: np.ndarray) -> np.ndarray:
@@ -206,7 +225,7 @@ def _joint(e: ET.Element) -> Joint:
     if mimic is not None:
         follows = mimic.get("joint"), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
     unit = direction / max(np.linalg.norm(direction), 1e-12)
-    return Joint(name, kind, parent, child, _place(e), unit, limits, follows, e)
+    return Joint(name, kind, parent, child, _place(e), unit, limits, follows, False, e)
 
 
 class Tree:
@@ -218,9 +237,14 @@ class Tree:
 
     def __init__(self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False):
         self.where, self.path = where, path
-        self.links = {e.get("name"): _link(e, repair_inertia) for e in root.findall("link")}
+        most = np.inf if repair_inertia else leftover(root)
+        self.links = {e.get("name"): _link(e, most) for e in root.findall("link")}
         self.joints = {e.get("name"): _joint(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}
+        for follower in [j for j in self.joints.values() if j.mimic]:
+            leader = self.joints[follower.mimic[0]]
+            if leader not in self.chain(follower.child) and follower not in self.chain(leader.child):
+                self.joints[leader.name] = self.above[leader.child] = replace(leader, coupled=True)
         self.root = next(name for name in self.links if name not in self.above)
         self.below = {name: [j for j in self.joints.values() if j.parent == name] for name in self.links}
 
@@ -228,6 +252,10 @@ class Tree:
     def mass(self) -> float:
         """Mass of all links [kg]."""
         return float(sum(link.inertia.mass for link in self.links.values()))
+
+    def carried(self, link: str) -> float:
+        """Mass of a link and of all that hangs on it [kg]."""
+        return self.links[link].inertia.mass + sum(self.carried(j.child) for j in self.below[link])
 
     def poses(self, angles: dict[str, float] | None = None) -> dict[str, pin.SE3]:
         """Place of every link in the root's frame; joints not named in ``angles`` are at 0."""
@@ -272,17 +300,30 @@ class Tree:
             found.append(local @ place.rotation.T + place.translation)
         return np.concatenate(found)
 
+    def sole(self, foot: str, turn: np.ndarray) -> np.ndarray:
+        """(n, 3) the lowest points of a foot, all links fixed to it, from its origin along the axes ``turn`` (3, 3)."""
+        pose, found = self.poses(), [np.zeros((0, 3))]
+        for link in self.fixed_to(foot):
+            inside = self.points(link) @ pose[link].rotation.T + pose[link].translation
+            found.append((inside - pose[foot].translation) @ turn.T)
+        points = np.concatenate(found)
+        return points[points[:, 2] < points[:, 2].min(initial=np.inf) + SOLE_M]
+
     def _mesh(self, shape: ET.Element) -> np.ndarray:
         """(n, 3) vertices of a mesh: from beside the URDF, or from a folder above it; none if it is not there."""
         inside = shape.get("filename").split("://", 1)[-1].lstrip("/")
-        folders = self.path.resolve().parents if self.path else ()
+        told = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
+        folders = [*(self.path.resolve().parents if self.path else ()), *map(Path, told)]
         places = (folder / part for folder in folders for part in (inside, inside.split("/", 1)[-1]))
         file = next((place for place in places if place.is_file()), None)
         if file is None:
             return np.zeros((0, 3))
         import coal
 
-        mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), np.ones(3))
+        try:
+            mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), np.ones(3))
+        except (RuntimeError, ValueError):  # a pointer to a mesh that was not downloaded, or a format of its own
+            return np.zeros((0, 3))
         return np.array(mesh.vertices()) * numbers(shape.get("scale", "1 1 1"), 3)
 
 
