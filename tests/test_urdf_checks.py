@@ -173,10 +173,11 @@ TEXTS = [
      "link 'left_shank': inertial origin xyz = 'a 0 0 -0.14' must be three finite numbers"),
     ("inertia negative", changed('ixx="', 'ixx="-', SHANK),
      "link 'left_shank': principal moment of inertia -0.0319 kg m^2 must be positive; correct <inertia>, or let it be "
-     'repaired with [source] repair = ["inertia"]'),
+     'repaired: --repair inertia, or [source] repair = ["inertia"]'),
     ("triangle", changed('ixx="', 'ixx="1', SHANK),
      "link 'left_shank': principal moments 0.00245, 0.0319, 10 kg m^2: the largest must not exceed the sum of the "
-     'others, no solid has this; correct <inertia>, or let it be repaired with [source] repair = ["inertia"]'),
+     'others, no solid has this; correct <inertia>, or let it be repaired: --repair inertia, or [source] repair = '
+     '["inertia"]'),
     ("g mm^2", changed('ixx="1e-06" ixy="0" ixz="0" iyy="1e-06" iyz="0" izz="1e-06"',
                        'ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"'),
      "link 'left_hip_yaw_link': moment of inertia 1 kg m^2 on 0.001 kg is a radius of gyration of 31.6 m, at most 1 is "

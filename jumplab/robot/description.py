@@ -37,7 +37,7 @@ def files_of(name_or_path: str | Path) -> tuple[Path, str | None]:
         raise RobotError(f"a robot must be a name or the path of a TOML file, got {quoted(name_or_path)}")
     name = str(name_or_path)
     path = SHIPPED.get(name) or Path(name)
-    if path.suffix.lower() == ".urdf":
+    if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return path, None
     try:
         text = path.read_text()

@@ -38,7 +38,7 @@ class Plausible:
     size_m: tuple[float, float] = (0.1, 5.0)  # longest chain of joints in the neutral pose, likewise
     gyration_m: float = 1.0  # of one link; the longest published limb link has 0.2 m
     effort_nm: float = 2000.0  # five times the strongest published electric humanoid joint
-    speed_rad_s: float = 120.0  # the fastest published humanoid joint turns at 100.7; above it, deg/s or a placeholder
+    speed_rad_s: float = 60.0  # twice the fastest published humanoid pitch joint; above it, deg/s or a placeholder
     angle_rad: float = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
 
 

@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot_import import checks as urdf_checks
+from jumplab.robot_import.checks import PLAUSIBLE
 from jumplab.robot_import.config import ROLES, filled, texts
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, parse, read_urdf
 
@@ -41,14 +42,14 @@ LEG = ROLES[:3]
 
 @dataclass(frozen=True)
 class Roles:
-    """What was found; ``ranges`` are assumed (lower, upper) [rad] of leg joints for which the URDF has none."""
+    """What was found; ``assumed`` are limits of joints for which the URDF has none, as in a table [limits]."""
 
     trunk: str  # link that carries both legs
     forward: str  # axis of the trunk's frame in the neutral pose, such as "+x"
     up: str
     joints: dict[str, tuple[str, ...]]  # role -> (left, right); shoulder_pitch is () where the arms are held
     feet: tuple[str, str]  # (left, right) links moved by the last joints of the legs
-    ranges: dict[str, tuple[float, float]]
+    assumed: dict[str, dict[str, float]]
     notes: tuple[str, ...]  # what a person should know, one sentence each
 
 
@@ -166,21 +167,27 @@ def find_roles(tree: Tree) -> Roles:
         notes.append(f"the feet point backwards ({ahead:.3f} m) for a robot whose knees bend backwards; check forward")
     trunk = tree.joining(*feet)
     frame = finder.pose[trunk].rotation.T
-    ranges = _ranges(finder, trunk, feet, joints, left)
-    for name, (low, high) in ranges.items():
-        notes.append(f"joint {name!r} has no range: {low:g} ... {high:g} rad is assumed; correct [limits.{name}]")
-    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, ranges, tuple(notes))
+    assumed = _assumed(finder, trunk, feet, joints, left)
+    for name, limits in assumed.items():
+        told = ", ".join(f"{key} = {value:g}" for key, value in limits.items())
+        notes.append(f"joint {name!r}: {told} assumed, the URDF has none that can be meant; correct [limits.{name}]")
+    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, assumed, tuple(notes))
 
 
-def _ranges(finder: _Finder, trunk: str, feet: tuple, joints: dict, left: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Ranges [rad] for the legs' joints that have none, by their role."""
-    out, roles = {}, {name: role for role, pair in joints.items() for name in pair}
+def _assumed(finder: _Finder, trunk: str, feet: tuple, joints: dict, left: np.ndarray) -> dict[str, dict[str, float]]:
+    """Ranges [rad] of joints that have none, by their role; speeds [rad/s] of joints beside the roles, not too high."""
+    out, roles, fastest = {}, {name: role for role, pair in joints.items() for name in pair}, PLAUSIBLE.speed_rad_s
     roles = {j.name: "other" for foot in feet for j in finder.tree.path_between(trunk, foot) if j.driven} | roles
     for joint in (finder.tree.joints[name] for name in roles):
-        if {"lower", "upper"} <= set(joint.limits):
-            continue
-        low, high = ASSUMED_RAD[roles[joint.name]]
-        out[joint.name] = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
+        limits: dict[str, float] = {}
+        if not {"lower", "upper"} <= set(joint.limits):
+            low, high = ASSUMED_RAD[roles[joint.name]]
+            ends = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
+            limits = dict(zip(("lower", "upper"), ends, strict=True))
+        if roles[joint.name] == "other" and fastest < joint.limits.get("velocity", 0.0) <= 2 * fastest:
+            limits["velocity"] = fastest
+        if limits:
+            out[joint.name] = limits
     return out
 
 
@@ -291,9 +298,9 @@ def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> t
         sole=sole,
         knee=_inside(tree, pose, turn, roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
-        ranges="".join(
-            f"\n[limits.{texts([name])[1:-1]}]  # assumed: the URDF has no range\nlower = {low:g}\nupper = {high:g}\n"
-            for name, (low, high) in roles.ranges.items()
+        assumed="".join(
+            f"\n[limits.{texts([name])[1:-1]}]  # assumed\n" + "".join(f"{key} = {x:g}\n" for key, x in limits.items())
+            for name, limits in roles.assumed.items()
         ),
         shoulder=_inside(tree, pose, turn, roles.joints["shoulder_pitch"], 0.0),
     )
@@ -340,7 +347,6 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     names, wrong = dict.fromkeys(name for pair in roles.joints.values() for name in pair), []
     names |= {j.name: None for foot in roles.feet for j in tree.path_between(roles.trunk, foot) if j.driven}
     for name in names:
-        told = dict(zip(("lower", "upper"), roles.ranges.get(name, ()), strict=False))
-        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, told):
+        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, roles.assumed.get(name)):
             wrong.append(f"{sentence}, or tell it in [limits.{name}] of the configuration")
     return Draft(text, roles, sole, tuple(wrong))

@@ -75,11 +75,16 @@ def read_urdf(path: str | Path) -> str:
         if (size := path.stat().st_size) > MAX_BYTES:
             most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
             raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
-        return decode(path.read_bytes(), str(path))
+        text = decode(path.read_bytes(), str(path))
     except FileNotFoundError:
         raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
     except (OSError, ValueError) as e:
         raise RobotError(f"{path}: cannot be read ({type(e).__name__}); give the path of a readable URDF") from e
+    if not re.search(r"<mujoco[\s>/]", text):
+        return text
+    from jumplab.robot_import.mjcf import as_urdf
+
+    return as_urdf(path)
 
 
 def decode(raw: bytes, where: str) -> str:

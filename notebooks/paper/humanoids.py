@@ -25,7 +25,7 @@ from jumplab.task import JumpTask
 TABLE = Path(__file__).with_name("humanoids.json")
 LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
-PLAN_S = 150.0  # longest time for one plan with its audit and simulation
+PLAN_S = 400.0  # longest time for one plan with its audit and simulation
 
 
 def rows() -> list[dict[str, Any]]:
