@@ -29,8 +29,13 @@ def test_check_finds_draws_and_writes_what_can_be_loaded(capsys, tmp_path):
     assert (tmp_path / "out" / "bhr.png").stat().st_size > 10_000
     robot = Robot.load(str(tmp_path / "out" / "bhr.toml"))
     assert robot.joints["knee"] == ("left_knee", "right_knee")
-    code, _, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
-    assert code == 2 and "is there already" in err
+    again = ("check", tmp_path / "my.urdf", "--out", tmp_path / "out")
+    assert quoted(capsys, *again)[0] == 0  # unedited, it is written anew
+    toml = tmp_path / "out" / "bhr.toml"
+    toml.write_text(toml.read_text().replace("knee_rad = 0.5", "knee_rad = 0.6"))
+    code, _, err = quoted(capsys, *again)
+    assert (code, err) == (2, f"jumplab: {toml}: has been edited; choose another --out, or overwrite it with --force\n")
+    assert quoted(capsys, *again, "--force")[0] == 0 and "knee_rad = 0.5" in toml.read_text()
 
 
 def test_check_takes_a_persons_word(capsys, tmp_path):
@@ -57,6 +62,19 @@ def test_all_faults_are_shown(capsys, tmp_path):
     (tmp_path / "my.urdf").write_text(GOOD.replace('mass value="5"', 'mass value="-5"'))
     code, out, err = quoted(capsys, "check", tmp_path / "my.urdf")
     assert code == 2 and "left_thigh" in err and "(1 further faults are printed above)" in err and "right_thigh" in out
+
+
+def test_roles_are_told_in_spite_of_faults_and_limits_all_at_once(capsys, tmp_path):
+    """An inertia far from a solid's is refused with the flag that mends it; placeholders of torque after each other."""
+    wrong = GOOD.replace('<inertia ixx="', '<inertia ixx="-', 1)
+    (tmp_path / "my.urdf").write_text(wrong)
+    code, out, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
+    assert code == 2 and "--repair inertia" in err and "knee: left_knee, right_knee" in out
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "my.urdf").write_text(GOOD.replace('effort="210"', 'effort="1e9"'))
+    code, out, err = quoted(capsys, "check", tmp_path / "my.urdf", "--out", tmp_path / "out")
+    assert code == 2 and "effort = 1e+09 N m is above 2000" in err and "(1 further faults are printed above)" in err
+    assert (tmp_path / "out" / "bhr.toml").is_file()  # there the limits are told
 
 
 def test_a_configuration_without_source_is_refused(capsys, tmp_path):

@@ -10,8 +10,9 @@ from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, root
 from jumplab.errors import RobotError
 from jumplab.robot.checkup import check
 from jumplab.robot_import.roles import draft, find_roles, find_sole, starter
-from jumplab.robot_import.urdf import Tree, repaired
+from jumplab.robot_import.urdf import Tree, parse, read_urdf, repaired
 
+SIDES = (("left", 0.1), ("right", -0.1))
 LEGS = {
     "hip_pitch": ("left_hip_pitch", "right_hip_pitch"),
     "knee": ("left_knee", "right_knee"),
@@ -70,6 +71,13 @@ def with_knee(kind: str) -> ET.Element:
     return robot
 
 
+def without_torque() -> ET.Element:
+    robot = root()
+    for side in ("left", "right"):
+        joint(robot, f"{side}_knee").find("limit").set("effort", "0")
+    return robot
+
+
 def with_mimic() -> ET.Element:
     robot = root()
     for side in ("left", "right"):
@@ -98,7 +106,7 @@ def no_knees() -> ET.Element:
 PLACE = "but has the place of a knee, which must be revolute with a range and a motor of its own"
 SENTENCES = [
     (with_knee("fixed"), f"my.urdf: joint 'right_knee' is of type 'fixed', {PLACE}"),
-    (with_knee("continuous"), f"my.urdf: joint 'right_knee' is of type 'continuous', {PLACE}"),
+    (without_torque(), f"my.urdf: joint 'right_knee' has effort = 0 N m, {PLACE}"),
     (with_knee("prismatic"), f"my.urdf: joint 'right_knee' is of type 'prismatic', {PLACE}"),
     (with_mimic(), f"my.urdf: joint 'right_knee' mimics 'right_hip_pitch', {PLACE}"),
     (one_leg(), "my.urdf: one leg only: the chain that ends with joint 'left_ankle_roll' has no mirror image among 9 "
@@ -108,9 +116,7 @@ SENTENCES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("robot", "sentence"), SENTENCES, ids=["fixed", "continuous", "prismatic", "mimic", "one", "none"]
-)
+@pytest.mark.parametrize(("robot", "sentence"), SENTENCES, ids=["fixed", "torque", "prismatic", "mimic", "one", "none"])
 def test_legs_that_are_no_legs(robot, sentence):
     with pytest.raises(RobotError) as e:
         find_roles(tree(robot))
@@ -133,6 +139,103 @@ def test_sole_from_boxes_spheres_or_nothing():
             ET.SubElement(ET.SubElement(shape, "geometry"), "sphere", radius="0.005")
     ball = find_sole(tree(robot), "left_foot", np.eye(3), 0.7)
     assert (*ball.x, *ball.y, ball.z) == pytest.approx((-0.055, 0.125, -0.035, 0.035, -0.065))
+
+
+def test_joints_without_stops_get_a_range_that_is_told(tmp_path):
+    """Knees that turn for ever bend backwards, as a person's; a fast ankle roll is counted as slower."""
+    robot = with_knee("continuous")
+    for side in ("left", "right"):
+        limit = joint(robot, f"{side}_knee").find("limit")
+        del limit.attrib["lower"], limit.attrib["upper"]
+    joint(robot, "right_knee").find("axis").set("xyz", "0 -1 0")
+    joint(robot, "left_ankle_roll").find("limit").set("velocity", "100")
+    path = tmp_path / "my.urdf"
+    path.write_bytes(ET.tostring(robot))
+    found = draft(path)
+    assert found.roles.assumed == {
+        "left_knee": {"lower": 0.0, "upper": 2.3},
+        "right_knee": {"lower": -2.3, "upper": 0.0},
+        "left_ankle_roll": {"velocity": 60.0},
+    }
+    assert set(found.roles.notes) == {
+        "joint 'left_knee': lower = 0, upper = 2.3 assumed, the URDF has none that can be meant; correct "
+        "[limits.left_knee]",
+        "joint 'right_knee': lower = -2.3, upper = 0 assumed, the URDF has none that can be meant; correct "
+        "[limits.right_knee]",
+        "joint 'left_ankle_roll': velocity = 60 assumed, the URDF has none that can be meant; correct "
+        "[limits.left_ankle_roll]",
+    }
+    assert found.faults == () and check(path, found.text).robot.sagittal.upper[1] == 2.3
+
+
+def test_hips_that_are_coupled_are_held(tmp_path):
+    """Where the right hip yaw follows the left one, neither can move alone."""
+    robot = root()
+    ET.SubElement(joint(robot, "right_hip_yaw"), "mimic", joint="left_hip_yaw")
+    path = tmp_path / "my.urdf"
+    path.write_bytes(ET.tostring(robot))
+    found = draft(path)
+    assert found.roles.notes == ("joint 'right_hip_yaw' follows 'left_hip_yaw': held",)
+    moving = set(check(path, found.text).robot.joint_names)
+    assert not moving & {"left_hip_yaw", "right_hip_yaw"} and {"left_hip_roll", "right_hip_roll"} <= moving
+
+
+def test_a_foot_beside_its_pitch_axis_origin_keeps_its_width(tmp_path):
+    """The origin of a link may lie anywhere on its joint's axis: H1's lies at the edge of the foot."""
+    robot = ET.fromstring(one_axis_ankle()[0])
+    for side, sign in (("left", 1), ("right", -1)):
+        pitch = joint(robot, f"{side}_ankle_pitch").find("origin")
+        x, y, z = map(float, pitch.get("xyz").split())
+        pitch.set("xyz", f"{x} {y - 0.04 * sign} {z}")
+        for origin in link(robot, f"{side}_foot").iter("origin"):
+            x, y, z = map(float, origin.get("xyz").split())
+            origin.set("xyz", f"{x} {y + 0.04 * sign} {z}")
+    path = tmp_path / "my.urdf"
+    path.write_bytes(ET.tostring(robot))
+    assert check(path, draft(path).text).robot.foot.half_width == pytest.approx(0.05)
+
+
+MJCF = """<mujoco model="biped"><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 1"><freejoint/>
+<geom type="box" size=".1 .15 .2" pos="0 0 .2" mass="15"/>{left}{right}</body></worldbody>
+<actuator><motor joint="left_knee" ctrllimited="true" ctrlrange="-2 2" gear="50"/></actuator></mujoco>"""
+LEG = """<body name="{0}_thigh" pos="0 {1} 0"><joint name="{0}_roll" axis="1 0 0" {2}/><joint name="{0}_hip" {2}
+axis="0 1 0"/><geom type="capsule" size=".04 .1" pos="0 0 -.15" mass="4"/><body name="{0}_shank" pos="0 0 -.3">
+<joint name="{0}_knee" axis="0 1 0" range="0 2" pos="0 0 .01"/><geom type="capsule" size=".03 .1"
+pos="0 0 -.15" mass="3"/>
+<body name="{0}_foot" pos="0 0 -.3"><joint name="{0}_ankle" axis="0 1 0" {2}/>
+<geom type="box" size=".12 .05 .02" pos=".03 0 -.05" mass="1"/></body></body></body>"""
+
+
+def test_a_robot_of_mujoco_is_the_same_robot(tmp_path):
+    """Masses and centre of mass as MuJoCo has them, several joints of a body one after the other; no speeds."""
+    import mujoco
+
+    legs = {side: LEG.format(side, y, 'range="-1 1" actuatorfrcrange="-90 90"') for side, y in SIDES}
+    path = tmp_path / "biped.xml"
+    path.write_text(MJCF.format(**legs))
+    found = Tree(parse(read_urdf(path), "biped.xml"), "biped.xml")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[7:] = angles = np.linspace(-0.5, 0.8, model.nq - 7)
+    data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
+    mujoco.mj_forward(model, data)
+    pose = found.poses({model.joint(i + 1).name: x for i, x in enumerate(angles)})
+    inertias = [pose[name].act(link.inertia) for name, link in found.links.items() if link.inertia.mass > 0]
+    com = sum(x.mass * x.lever for x in inertias) / found.mass
+    assert found.mass == pytest.approx(31.0) and com == pytest.approx(data.subtree_com[0], abs=1e-9)
+    foot = found.links["left_foot"].inertia.inertia
+    assert np.linalg.eigvalsh(foot) == pytest.approx(np.sort(model.body("left_foot").inertia))
+    roles = find_roles(found)
+    assert [roles.joints[k] for k in LEGS] == [(f"left_{k}", f"right_{k}") for k in ("hip", "knee", "ankle")]
+    assert found.joints["left_knee"].limits == {"lower": 0.0, "upper": 2.0, "effort": 100.0}
+    assert found.joints["left_hip"].limits == {"lower": -1.0, "upper": 1.0, "effort": 90.0}
+    assert draft(path, ("massless",)).faults[0] == (
+        "biped.xml: joint 'left_hip': <limit> has no velocity, which Pinocchio reads as 0; add it, or tell it in "
+        "[limits.left_hip] of the configuration"
+    )
+    path.write_text("<mujoco><worldbody><body name='a'><joint/></body></worldbody></mujoco>")
+    with pytest.raises(RobotError, match=r"^biped\.xml: MuJoCo cannot read this MJCF file: "):
+        read_urdf(path)
 
 
 def test_starter_is_a_configuration():

@@ -8,7 +8,7 @@ from paper import bhr_table as table
 
 from jumplab.errors import RobotError
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.urdf import decode, locate, parse, read_urdf
+from jumplab.robot_import.urdf import Tree, decode, locate, parse, read_urdf
 
 GOOD = table.URDF_PATH.read_text()
 FILE = "my.urdf"
@@ -145,6 +145,10 @@ TEXTS = [
      "joint 'left_knee': mimic offset = 'inf' must be a finite number"),
     ("loop", added('<joint name="rod" type="fixed"><parent link="left_foot"/><child link="right_foot"/></joint>'),
      "link 'right_foot' hangs on 2 joints ('right_ankle_roll', 'rod'): a closed loop; cut it to leave a tree"),
+    ("parent and child swapped",
+     changed('<parent link="left_thigh" />\n    <child link="left_shank" />',
+             '<parent link="left_shank" />\n    <child link="left_thigh" />', KNEE),
+     "link 'left_thigh' hangs on 2 joints ('left_hip_pitch', 'left_knee'): a closed loop; cut it to leave a tree"),
     ("cycle", cycle(), "no link is the root: the joints form a cycle; each robot needs one link without a parent"),
     ("two roots", added('<link name="table"/>'),
      "2 links have no parent ('table', 'trunk'), Pinocchio keeps one tree and drops the rest; connect them"),
@@ -222,7 +226,7 @@ LIMITS = [
 
 
 def test_there_are_enough_kinds():
-    assert len(FILES) + len(TEXTS) + len(LIMITS) >= 40
+    assert len(FILES) + len(TEXTS) + len(LIMITS) >= 60
 
 
 @pytest.mark.parametrize(("raw", "sentence"), [x[1:] for x in FILES], ids=[x[0] for x in FILES])
@@ -251,6 +255,48 @@ def test_a_good_robot_has_no_fault():
     root = parse(GOOD, FILE)
     assert list(urdf_checks.faults(root, FILE)) == []
     assert [s for j in root.findall("joint") for s in urdf_checks.limit_faults(j, FILE)] == []
+
+
+def test_what_a_cad_leaves_over_is_a_note():
+    """A macro call beside whole links, a sphere of radius 0, an inertia that is wrong by rounding or by little."""
+    text = GOOD.replace("<robot ", '<robot xmlns:xacro="http://ros.org/wiki/xacro" ', 1)
+    text = text.replace(END, '<xacro:sensors side="left"/>' + END)
+    point = '<collision><geometry><sphere radius="0.0"/></geometry></collision></link>'
+    text = text.replace("</link>", point, 1)
+    link = next(e for e in ET.fromstring(text).findall("link") if e.get("name") == "left_shank")
+    ixx = float(link.find("inertial/inertia").get("ixx"))
+    text = text.replace(f'ixx="{ixx:g}"', f'ixx="{ixx + 0.006:.6g}"')
+    root = parse(text, FILE)
+    assert list(urdf_checks.faults(root, FILE)) == []
+    notes = list(urdf_checks.notes(root))
+    assert notes[:2] == [
+        "the call <sensors> of a xacro macro is left over, and passed over",
+        "link 'trunk': a sphere of radius 0 is taken as a point",
+    ]
+    assert [note.split(",")[0] for note in notes[2:]] == [
+        "link 'left_shank': its inertia",
+        "link 'right_shank': its inertia",
+    ]
+
+
+def test_a_mesh_that_was_not_downloaded_is_not_there(tmp_path, monkeypatch):
+    """A pointer of Git LFS is no mesh; packages are also looked for where ROS_PACKAGE_PATH says."""
+    mesh = '<mesh filename="package://feet/meshes/foot.stl"/>'
+    text = re.sub(r"<collision>.*?</collision>", "", GOOD[GOOD.index('<link name="left_foot">') :], flags=re.DOTALL)
+    text = GOOD[: GOOD.index('<link name="left_foot">')] + text.replace(
+        "</link>", f"<collision><geometry>{mesh}</geometry></collision></link>", 1
+    )
+    (tmp_path / "ros" / "feet" / "meshes").mkdir(parents=True)
+    file, path = tmp_path / "ros" / "feet" / "meshes" / "foot.stl", tmp_path / "robot" / "my.urdf"
+    tree = Tree(parse(text, FILE), FILE, path)
+    corners = ("0 0 0", "1 0 0", "0 1 0")
+    facet = "facet normal 0 0 1\nouter loop\n" + "".join(f"vertex {c}\n" for c in corners) + "endloop\nendfacet\n"
+    file.write_text(f"solid foot\n{facet}endsolid foot\n")
+    assert len(tree.points("left_foot")) == 0
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "ros"))
+    assert len(tree.points("left_foot")) == 3
+    file.write_text("version https://git-lfs.github.com/spec/v1\n")
+    assert len(tree.points("left_foot")) == 0
 
 
 def test_all_faults_are_listed():

@@ -80,7 +80,8 @@ def read_urdf(path: str | Path) -> str:
         raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
     except (OSError, ValueError) as e:
         raise RobotError(f"{path}: cannot be read ({type(e).__name__}); give the path of a readable URDF") from e
-    if not re.search(r"<mujoco[\s>/]", text):
+    first = re.match(r"(?:\s|<\?.*?\?>|<!--.*?-->)*<([\w:]+)", text, re.DOTALL)  # URDFs may hold a <mujoco> of settings
+    if first is None or first[1] != "mujoco":
         return text
     from jumplab.robot_import.mjcf import as_urdf
 

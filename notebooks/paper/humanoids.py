@@ -7,9 +7,10 @@ and writes what became of it; ``--jump`` also plans and simulates what has not b
 from __future__ import annotations
 
 import json
+import resource
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures import TimeoutError as TooLong
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from jumplab.task import JumpTask
 TABLE = Path(__file__).with_name("humanoids.json")
 LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
-PLAN_S = 400.0  # longest time for one plan with its audit and simulation
+PLAN_S = 120.0  # longest processor time for one plan with its audit and simulation
 
 
 def rows() -> list[dict[str, Any]]:
@@ -81,22 +82,34 @@ def jumped(path: Path) -> dict[str, Any]:
 
 def within_time(path: Path) -> dict[str, Any]:
     """:func:`jumped` in a process of its own, given up after :data:`PLAN_S`."""
-    with ProcessPoolExecutor(1) as pool:
+    limit = resource.RLIMIT_CPU, (int(PLAN_S), int(PLAN_S))
+    with ProcessPoolExecutor(1, initializer=resource.setrlimit, initargs=limit) as pool:
         work = pool.submit(jumped, path)
         try:
-            return work.result(PLAN_S)
-        except TooLong:
-            for process in list(pool._processes.values()):
-                process.kill()
-            return {"clean": None, "landed": None, "reason": f"no plan within {PLAN_S:g} s"}
+            return work.result()
+        except BrokenProcessPool:
+            return {"clean": None, "landed": None, "reason": f"no plan within {PLAN_S:g} s of one core"}
         except Exception as e:  # an internal error is a result as well: the aim is none
             return {"clean": None, "landed": None, "reason": f"internal error: {type(e).__name__}: {e}"}
+
+
+def verdicts(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per robot for a table: mass, roles, program, jump, and the first reason where something is refused."""
+    out = []
+    for row in table:
+        told, jump = row["import"], row.get("jump", {})
+        reason = (told["faults"] or [jump.get("reason", "") if not jump.get("landed") else ""])[0]
+        landed = {True: "lands", False: "does not land"}.get(jump.get("landed"), "none" if jump else "not tried")
+        target = f"{jump['distance_m']:.2f} m, {jump['rise_m']:.2f} m: " if "distance_m" in jump else ""
+        line = {"robot": row["name"], "kg": told["kg"] or "", "roles": "right" if told["legs right"] else "none"}
+        out.append(line | {"program": told["planner"] or "", "jump": target + landed, "reason": reason})
+    return out
 
 
 def main(folder: str, *options: str) -> None:
     """Fill the table from the robots in a folder, a line each."""
     table = rows()
-    for row in table:
+    for row in sorted(table, key=lambda row: row.get("import", {}).get("planner") != "planar"):  # quick ones first
         path = Path(folder, row["name"], row["file"])
         robot, told = imported(path, row["legs"])
         row["import"] = told
