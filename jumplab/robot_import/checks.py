@@ -14,18 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.urdf import (
-    FRAME_KG,
-    LIMITS,
-    MOVING,
-    SIZES,
-    TENSOR,
-    Tree,
-    inertia_matrix,
-    leftover,
-    numbers,
-    unsolid,
-)
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, MOVING, SIZES, TENSOR, Tree, numbers, slight, tensor_of, unsolid
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 
@@ -63,7 +52,7 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     if found:  # what follows reads what was refused
         return found
     for link in root.findall("link") if "inertia" not in repair else ():
-        found += _tensor_faults(link, f"{where}: link {link.get('name')!r}", leftover(root))
+        found += _tensor_faults(link, f"{where}: link {link.get('name')!r}", slight(root))
     tree = Tree(root, where, repair_inertia=True)
     found += [] if "massless" in repair else _massless_bodies(tree)
     return found + list(_shape_faults(root, where)) or list(_unit_faults(tree))
@@ -79,7 +68,7 @@ def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
         if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):
             yield f"link {name!r}: a sphere of radius 0 is taken as a point"
         heavy = mass is not None and float(mass.get("value")) >= FRAME_KG
-        if heavy and (gap := unsolid(inertia_matrix(tensor))) and ("inertia" in repair or gap <= leftover(root)):
+        if heavy and (gap := unsolid(tensor_of(tensor))) and ("inertia" in repair or gap <= slight(root)):
             yield f"link {name!r}: its inertia, which no solid has, is replaced by the nearest, {gap:.2g} kg m^2 apart"
     for joint in root.findall("joint/mimic/.."):
         yield f"joint {joint.get('name')!r} follows {joint.find('mimic').get('joint')!r}: held"
@@ -200,7 +189,7 @@ def _tensor_faults(link: ET.Element, at: str, most: float) -> Iterator[str]:
     mass = 0.0 if link.find("inertial") is None else float(link.find("inertial/mass").get("value"))
     if mass < FRAME_KG:
         return
-    matrix = inertia_matrix(link.find("inertial/inertia"))
+    matrix = tensor_of(link.find("inertial/inertia"))
     low, middle, high = np.linalg.eigvalsh(matrix)
     remedy = 'correct <inertia>, or let it be repaired: --repair inertia, or [source] repair = ["inertia"]'
     gyration, gap = np.sqrt(abs(high) / mass), unsolid(matrix)

@@ -58,24 +58,24 @@ def _body(robot: ET.Element, model: mujoco.MjModel, i: int) -> None:
             continue
         anchor = pin.SE3(np.eye(3), np.array(model.jnt_pos[k]))
         child = f"{name}_{model.joint(k).name or k}"
-        ET.SubElement(robot, "link", name=child)
+        _add(robot, "link", name=child)
         joint = _joint(robot, model.joint(k).name or f"joint_{k}", kind, above, child, place * anchor)
         _add(joint, "axis", xyz=model.jnt_axis[k])
         _add(joint, "limit", **_limits(model, k))
         above, place = child, anchor.inverse()
     if body.parentid[0] or above != "world":
         _joint(robot, f"{name}_fixed", "fixed", above, name, place)
-    link = _add(robot, "link", name=name)
-    inertial, (xx, yy, zz) = ET.SubElement(link, "inertial"), model.body_inertia[i]
+    link, (xx, yy, zz) = _add(robot, "link", name=name), model.body_inertia[i]
+    inertial = _add(link, "inertial")
     _origin(inertial, _place(model.body_ipos[i], model.body_iquat[i]))
     _add(inertial, "mass", value=model.body_mass[i])
     _add(inertial, "inertia", ixx=xx, ixy=0.0, ixz=0.0, iyy=yy, iyz=0.0, izz=zz)
     for g in range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0])):
         if model.geom_contype[g] | model.geom_conaffinity[g] and model.geom_type[g] != int(mujoco.mjtGeom.mjGEOM_PLANE):
             middle, half = model.geom_aabb[g].reshape(2, 3)
-            shape = ET.SubElement(link, "collision")
+            shape = _add(link, "collision")
             _origin(shape, _place(model.geom_pos[g], model.geom_quat[g]) * pin.SE3(np.eye(3), np.array(middle)))
-            _add(ET.SubElement(shape, "geometry"), "box", size=np.maximum(2 * half, 1e-6))
+            _add(_add(shape, "geometry"), "box", size=np.maximum(2 * half, 1e-6))
 
 
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, place: pin.SE3) -> ET.Element:
@@ -88,14 +88,13 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, pla
 
 def _limits(model: mujoco.MjModel, k: int) -> dict[str, float]:
     """What a joint is limited to: its range, and the torque of the joint or of the motor that drives it."""
-    low, high = model.jnt_range[k]
-    told = {"lower": low, "upper": high} if model.jnt_limited[k] else {}
+    told = dict(zip(("lower", "upper"), model.jnt_range[k], strict=True)) if model.jnt_limited[k] else {}
     if model.jnt_actfrclimited[k]:
         return told | {"effort": model.jnt_actfrcrange[k, 1]}
     for a in np.flatnonzero(model.actuator_trnid[:, 0] == k):
         gear = abs(model.actuator_gear[a, 0])
         if model.actuator_forcelimited[a]:
             told["effort"] = gear * model.actuator_forcerange[a, 1]
-        elif model.actuator_ctrllimited[a] and model.actuator_biastype[a] == int(mujoco.mjtBias.mjBIAS_NONE):
+        elif model.actuator_ctrllimited[a] and not model.actuator_biastype[a]:  # a motor
             told["effort"] = gear * model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a, 1]
     return told

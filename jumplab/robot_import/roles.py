@@ -179,11 +179,10 @@ def _assumed(finder: _Finder, trunk: str, feet: tuple, joints: dict, left: np.nd
     out, roles, fastest = {}, {name: role for role, pair in joints.items() for name in pair}, PLAUSIBLE.speed_rad_s
     roles = {j.name: "other" for foot in feet for j in finder.tree.path_between(trunk, foot) if j.driven} | roles
     for joint in (finder.tree.joints[name] for name in roles):
-        limits: dict[str, float] = {}
-        if not {"lower", "upper"} <= set(joint.limits):
-            low, high = ASSUMED_RAD[roles[joint.name]]
-            ends = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
-            limits = dict(zip(("lower", "upper"), ends, strict=True))
+        low, high = ASSUMED_RAD[roles[joint.name]]
+        ends = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
+        lost = not {"lower", "upper"} <= set(joint.limits)
+        limits = dict(zip(("lower", "upper"), ends, strict=True)) if lost else {}
         if roles[joint.name] == "other" and fastest < joint.limits.get("velocity", 0.0) <= 2 * fastest:
             limits["velocity"] = fastest
         if limits:
@@ -344,9 +343,11 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     tree = Tree(root, path.name, path, "inertia" in repair)
     text, roles, sole = starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair)
     roles = replace(roles, notes=(*urdf_checks.notes(root, repair), *roles.notes))
-    names, wrong = dict.fromkeys(name for pair in roles.joints.values() for name in pair), []
-    names |= {j.name: None for foot in roles.feet for j in tree.path_between(roles.trunk, foot) if j.driven}
-    for name in names:
-        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, roles.assumed.get(name)):
-            wrong.append(f"{sentence}, or tell it in [limits.{name}] of the configuration")
+    names = [name for pair in roles.joints.values() for name in pair]
+    names += [j.name for foot in roles.feet for j in tree.path_between(roles.trunk, foot) if j.driven]
+    wrong = [
+        f"{sentence}, or tell it in [limits.{name}] of the configuration"
+        for name in dict.fromkeys(names)
+        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, roles.assumed.get(name))
+    ]
     return Draft(text, roles, sole, tuple(wrong))

@@ -182,7 +182,7 @@ def _place(element: ET.Element) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
 
 
-def inertia_matrix(element: ET.Element) -> np.ndarray:
+def tensor_of(element: ET.Element) -> np.ndarray:
     """(3, 3) of an ``<inertia>`` [kg m^2]."""
     xx, xy, xz, yy, yz, zz = (float(element.get(key)) for key in TENSOR)
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -192,7 +192,7 @@ def _link(e: ET.Element, most: float) -> Link:
     inertial, total = e.find("inertial"), pin.Inertia.Zero()
     mass = 0.0 if inertial is None else float(inertial.find("mass").get("value"))
     if mass > 0:
-        place, matrix = _place(inertial), inertia_matrix(inertial.find("inertia"))
+        place, matrix = _place(inertial), tensor_of(inertial.find("inertia"))
         if most == np.inf or mass < FRAME_KG or 0 < unsolid(matrix) <= most:
             matrix = repaired(matrix)
         total = pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
@@ -207,7 +207,7 @@ def unsolid(matrix: np.ndarray) -> float:
     return 0.0 if solid else max(float(np.abs(repaired(matrix) - matrix).max()), 1e-15)
 
 
-def leftover(root: ET.Element) -> float:
+def slight(root: ET.Element) -> float:
     """The largest error of a link's inertia that no jump would notice, by the mass of all links [kg m^2]."""
     return LEFTOVER_M**2 * sum(float(mass.get("value")) for mass in root.findall("link/inertial/mass"))
 
@@ -243,7 +243,7 @@ class Tree:
 
     def __init__(self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False):
         self.where, self.path = where, path
-        most = np.inf if repair_inertia else leftover(root)
+        most = np.inf if repair_inertia else slight(root)
         self.links = {e.get("name"): _link(e, most) for e in root.findall("link")}
         self.joints = {e.get("name"): _joint(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}

@@ -74,7 +74,8 @@ def jumped(path: Path) -> dict[str, Any]:
         row |= {"clean": not failed, "reason": ", ".join(failed)}
         result = api.simulate(plan, engine="mujoco")
         row |= {"landed": result.landed, "reason": row["reason"] or result.reason}
-        row["simulated_m"] = round(result.metrics.foot_distance_m, 3)
+        if result.metrics.foot_distance_m is not None:  # it touched down
+            row["simulated_m"] = round(result.metrics.foot_distance_m, 3)
     except JumplabError as e:
         row["reason"] = str(e)
     return row
