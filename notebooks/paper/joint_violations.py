@@ -34,7 +34,7 @@ def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None
     """Largest violations of a roll-out, by the names of :data:`MEANING`.
 
     ``cop_outside`` is of the sole, of the toe edge once the heel is up; ``pull`` is a negative F_z; ``friction`` the
-    largest F_xy / F_z; ``torque_excess`` counts from the actuator's torque-speed line; ``asymmetry`` is of mirrored joints.
+    largest F_xy / F_z; ``torque_excess`` counts from the motor's line; ``asymmetry`` is of mirrored joints.
     """
     body, launch, flight = FullBody(robot, gravity), plan.rows("launch"), plan.rows("flight")
     nodes = [body.motion(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
