@@ -48,7 +48,6 @@ from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Metrics, Scene, SimulationResult
-    from jumplab.studies.basin import BasinReport
     from jumplab.studies.chain import ChainResult, ChainTrial
     from jumplab.studies.trials import Trial
     from jumplab.task import JumpTask

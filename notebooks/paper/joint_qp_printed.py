@@ -1,4 +1,4 @@
-"""Stage 2's QPs by the letter of the paper, one reading at a time: the library's with rows changed, and what they do."""
+"""Stage 2's QPs by the letter of the paper, one reading at a time: the library's with rows changed, and their fate."""
 
 from __future__ import annotations
 

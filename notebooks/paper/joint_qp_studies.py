@@ -92,7 +92,7 @@ def shared_numbers(terms: FullTerms, wish: Any, qp: Any, state: State, step_s: f
 
 
 def alone(mapper: JointMapper, qp: Any, k: int, plan: JointPlan) -> tuple[FullTerms, StepQp, np.ndarray]:
-    """Step ``k`` of a phase of ``plan`` once more: quantities in its middle, its program, the direct solver's optimum."""
+    """Step ``k`` of a phase of ``plan`` again: quantities in its middle, its program, the direct solver's optimum."""
     row = plan.rows(qp.name).start + k
     terms, _, matrices = mapper.problem(qp, k, plan.state(row))
     return terms, matrices, DirectSolver(matrices).solve(matrices, qp.name, plan.t[row]).x

@@ -1,4 +1,4 @@
-"""The simulated experiments of Sec. VI: several jumps at once, their table, and many trials that were run beforehand."""
+"""The simulated experiments of Sec. VI: several jumps at once, their table; and many trials that ran beforehand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import joblib
 
-from jumplab.io.files import write_text
+from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, SimulationResult, simulate_jump
@@ -86,7 +86,7 @@ def study(folder: str | Path, path: Path = LOG) -> None:
         settings = TrialSettings(engine=engine)
         done = *run_trials(folder, ROBOTS, settings=settings).trials, *landing_basin(folder, None, settings).trials
         rows += [row(engine, trial) for trial in done]
-    write_text(path, "".join(json.dumps(r) + "\n" for r in rows))
+    write_file(path, "".join(json.dumps(r) + "\n" for r in rows).encode())
 
 
 def row(engine: str, trial: Trial) -> dict[str, Any]:
