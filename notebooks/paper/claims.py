@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import coal  # noqa: F401  (its shapes are what Pinocchio's geometry objects hold)
 import numpy as np
@@ -71,6 +72,14 @@ def judge(claim: str, ok: bool | None, measured: str, where: str, change: str = 
         )
     verdict = OPEN if ok is None else FAILS if not ok else CHANGED if change else HOLDS
     return {"claim": claim, "verdict": verdict, "measured": measured, "change": change, "where": where}
+
+
+class Verdicts(list):
+    """Lines of the table of claims, in their order."""
+
+    def add(self, *claim: Any, **change: str) -> None:
+        """One more, see :func:`judge`."""
+        self.append(judge(*claim, **change))
 
 
 # ---------------------------------------------------------------------------------------------- measurements
