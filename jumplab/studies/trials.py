@@ -354,6 +354,7 @@ def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_
     jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
     options = {} if jobs == 1 else {"backend": "loky", **served()}
     results = joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+    tell("done", 0, len(work))
     for number, result in enumerate(results, 1):
         yield result
         tell("done", number, len(work))

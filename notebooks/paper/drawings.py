@@ -51,6 +51,7 @@ from paper.experiments import trunk_pitch as trunk_angle  # of a flip: whole tur
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
+    from paper.claims import Start
 
 # stage1 ------------------------------------------------------------------------------------------
 SPEED_SCALE_S = 0.10  # length of a drawn velocity, metres per m/s
@@ -410,21 +411,21 @@ def _tracked(plan: JointPlan):
 
 # starts of stage 3 ----------------------------------------------------------------------------------------------
 @styled
-def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> Figure:
-    """One panel per quantity, one column of dots per start, a thin line per target, a bar at the median.
+def guess_comparison(rows: Iterable[Start], quantities: Mapping[str, str]) -> Figure:
+    """One panel per quantity, one column of dots per start and mesh, a thin line per target, a bar at the median.
 
     Parameters
     ----------
-    rows : one mapping per target and start: "target", "start", the quantities (NaN or None without a solution).
-    quantities : key -> axis label with unit.
+    rows : one per target, start and mesh.
+    quantities : attribute of a row -> axis label with unit.
     """
-    rows = list(rows)
-    starts, targets = (list(dict.fromkeys(r[k] for r in rows)) for k in ("start", "target"))
+    by = {(r.task, f"{r.start},\n" + r.mesh.replace(" ", "\n")): r for r in rows}
+    targets, starts = (list(dict.fromkeys(keys)) for keys in zip(*by, strict=True))
     fig = new_figure(PAGE_IN, 2.5)
     axes = fig.subplots(1, len(quantities), squeeze=False)[0]
     for ax, (key, label) in zip(axes, quantities.items(), strict=True):
-        found = {(r["target"], r["start"]): np.nan if r[key] is None else float(r[key]) for r in rows}
-        table = np.array([[found.get((target, start), np.nan) for start in starts] for target in targets])
+        found = [[getattr(by.get((target, start)), key, None) for start in starts] for target in targets]
+        table = np.array(found, float)  # None becomes nan
         _dots(ax, table)
         ax.set_ylabel(label)
         ax.set_xticks(range(len(starts)), starts)

@@ -48,7 +48,6 @@ from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Metrics, Scene, SimulationResult
-    from jumplab.studies.basin import BasinReport
     from jumplab.studies.chain import ChainResult, ChainTrial
     from jumplab.studies.trials import Trial
     from jumplab.task import JumpTask
@@ -347,26 +346,27 @@ def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
 
 # Wrong states in flight ------------------------------------------------------------------------------------------
 @styled
-def basin_map(basin: BasinReport) -> Figure:
+def basin_map(states: Sequence[Trial]) -> Figure:
     """The landing basin: which wrong states at the apex land (dots) or fall (crosses).
 
     Across: error of the horizontal speed, up: error of the pitch. One panel for each height (columns) and friction
-    (rows) of the grid; its title counts.
+    (rows) that was tried; its title counts.
     """
-    heights, frictions = sorted(set(basin.grid.height_m)), sorted(set(basin.grid.friction))
+    tried = {name: sorted({t.features[name] for t in states}) for name in states[0].features}
+    heights, frictions = tried["height_m"], tried["friction"]
     shape = len(frictions), len(heights)
     width, height = (COLUMN_IN, BASIN_SINGLE_IN) if shape == (1, 1) else (PAGE_IN, BASIN_ROW_IN * shape[0])
     fig = new_figure(width, height)
     axes = fig.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     for line, friction in zip(axes, frictions, strict=True):
         for ax, rise in zip(line, heights, strict=True):
-            states = [t for t in basin.trials if (t.features["height_m"], t.features["friction"]) == (rise, friction)]
-            _basin_panel(ax, states)
-            ax.set_title(f"{_height_text(rise)}, friction {friction:g}: {sum(t.landed for t in states)}/{len(states)}")
+            here = [t for t in states if (t.features["height_m"], t.features["friction"]) == (rise, friction)]
+            _basin_panel(ax, here)
+            ax.set_title(f"{_height_text(rise)}, friction {friction:g}: {sum(t.landed for t in here)}/{len(here)}")
     for ax in axes[-1]:
-        ax.set(xlabel="horizontal speed [%]", xticks=[100 * (x - 1) for x in sorted(set(basin.grid.speed_factor))])
+        ax.set(xlabel="horizontal speed [%]", xticks=[100 * (x - 1) for x in tried["speed_factor"]])
     for ax in axes[:, 0]:
-        ax.set(ylabel="pitch [deg]", yticks=sorted(set(basin.grid.pitch_deg)))
+        ax.set(ylabel="pitch [deg]", yticks=tried["pitch_deg"])
     marks = ((LANDING, "o", "lands"), (VERMILION, "x", "falls"))
     legend_above(fig, [Line2D([], [], color=c, marker=m, linestyle="none", label=text) for c, m, text in marks])
     return fig
