@@ -276,14 +276,14 @@ class Tree:
         return np.concatenate(found)
 
     def meshes(self, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Points (n, 3) in a link's frame and triangles (m, 3) of the meshes that are seen of it, where they are found."""
+        """Points (n, 3) in a link's frame and triangles (m, 3) of the meshes seen of it, where they are found."""
         found = [(_place(visual), *self._mesh(shape)) for visual, shape in self.links[link].seen]
         corners = [[[m.tri_indices(k)[i] for i in range(3)] for k in range(m.num_tris)] if m else [] for *_, m in found]
         moved = [points @ place.rotation.T + place.translation for place, points, _ in found]
         return [(x, np.array(f)) for x, f in zip(moved, corners, strict=True) if f]
 
     def _mesh(self, shape: ET.Element) -> tuple[np.ndarray, Any]:
-        """(n, 3) vertices of a mesh, and the mesh: from beside the URDF or a folder above it; None if it is not there."""
+        """(n, 3) vertices of a mesh, and the mesh, from beside the URDF or above it; None if it is not there."""
         inside = shape.get("filename").split("://", 1)[-1].lstrip("/")
         folders = self.path.resolve().parents if self.path else ()
         places = (folder / part for folder in folders for part in (inside, inside.split("/", 1)[-1]))

@@ -63,8 +63,8 @@ function pose(clip, time) {
   }
 }
 
-// forces of the ground, and where they act: an arrow for each foot, a dot for both
-const solid = (shape) => new Mesh(shape, new MeshPhongMaterial({ color: facts.arrow, transparent: true }));
+// forces of the ground, and where they act: an arrow for each foot, a dot for both, seen through the legs
+const solid = (shape) => new Mesh(shape, new MeshPhongMaterial({ color: facts.arrow, transparent: true, depthTest: false }));
 const ARROW_M = 0.4, HEAD_M = 0.07, LONGEST_M = 1.2; // length for the robot's weight, of the head, and at most
 for (const clip of clips.filter(({ forces }) => forces)) {
   clip.arrows = [0, 1].map(() => {
@@ -111,19 +111,21 @@ function seek(time) {
   viewer.set_dirty();
 }
 
+const said = (x, digits) => x.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−"); // never "−0.0"
+
 // plan and simulation in figures, as long as both last
 const ROWS = [["travel of the toes", 0], ["rise of the CoM", 1]];
 function compare() {
   const [simulation, plan] = ["simulation", "plan"].map((name) => clips.find((clip) => clip.name === name));
   if (!simulation || !plan) return;
   const end = Math.min(simulation.duration, plan.duration), at = Math.min(now, end);
-  const away = base(simulation, at).sub(base(plan, at)), mm = (x) => `${(1000 * x).toFixed(1).replace("-", "−")} mm`;
+  const away = base(simulation, at).sub(base(plan, at)), mm = (x) => `${said(1000 * x, 1)} mm`;
   away.y += plan.aside - simulation.aside;
   const rows = ROWS.map(([name, column]) => {
     const [a, b] = [simulation, plan].map((clip) => value(clip, column, at));
-    return [name, `${a.toFixed(3)} m`, `${b.toFixed(3)} m`, mm(a - b)];
+    return [name, `${said(a, 3)} m`, `${said(b, 3)} m`, mm(a - b)];
   });
-  const last = ["base", `x ${mm(away.x)}`, `z ${mm(away.z)}`, mm(away.length())];
+  const last = ["base, apart", `x ${mm(away.x)}`, `z ${mm(away.z)}`, mm(away.length())];
   const table = [[now > end ? `at ${end.toFixed(2)} s, the plan's end` : "now", "simulation", "plan", "apart"], ...rows, last];
   table.forEach((row, i) => row.forEach((text, k) => { byId("apart").rows[i].cells[k].textContent = text; }));
 }
@@ -165,7 +167,7 @@ const plots = facts.curves.map((curve, i) => {
   const numbers = lines(curve).map(([name, color]) => {
     const number = document.createElement("b");
     number.style.color = color;
-    title.append(number);
+    title.append(number, " "); // so that a line can break between them
     return { name, number, digits: curve.unit === "°" ? 0 : 2 };
   });
   plot.className = "plot";
@@ -212,7 +214,7 @@ const plots = facts.curves.map((curve, i) => {
   function point() {
     cursor.style.left = `${(100 * now) / duration}%`;
     for (const [n, { name, number, digits }] of numbers.entries())
-      number.textContent = `${name} ${value(lead, first + n, now).toFixed(digits).replace("-", "−")}`;
+      number.textContent = `${name} ${said(value(lead, first + n, now), digits)}`;
   }
   return { draw, point };
 });
@@ -226,7 +228,7 @@ const upright = ({ x, y, z }) => new Vector3(x, z, -y); // the engine's y points
 function look() {
   const [w, h] = [stage.clientWidth, stage.clientHeight];
   if (!w || !h) return; // a frame that is not on the page yet
-  const free = Math.max(0.3, 1 - 110 / h); // below the title
+  const free = Math.max(0.3, 1 - 50 / h); // below the title
   const [yaw, pitch] = { side: [0, 0.1], corner: [-0.75, 0.3], front: [Math.PI / 2, 0.15] }[byId("view").value];
   const [c, s] = [Math.abs(Math.cos(yaw)), Math.abs(Math.sin(yaw))];
   const long = following ? Math.min(1.5, size[0]) : size[0], across = following ? 1 : size[2];

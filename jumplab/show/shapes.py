@@ -18,12 +18,14 @@ from scipy.spatial import ConvexHull
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.description import SHIPPED, files_of
+from jumplab.robot_import.config import LEG
 
 TRIANGLES = 45_000  # of all meshes of a robot: plan and simulation together are 4 MB of a page
 CELL_M, COARSER = 0.003, 1.3  # points within such a cell become one; while there are too many triangles, it grows
 ORIGIN = re.compile(r"lumped by jumplab from a URDF with the SHA-256\n# ([0-9a-f]{64})")
 # the rounded body, drawn around boxes; none of these numbers is the robot's
-WAIST, CHIN = 0.72, 0.55  # how much narrower a trunk and a head are at the bottom
+WAIST, CHIN = 0.72, 0.8  # how much narrower a trunk and a head are at the bottom
+NECK = 0.3  # share of a head's box that is neck, and of its width
 LIMB_ENDS, ARM_ENDS = (1.2, 0.8), (1.0, 0.7)  # radius of a limb at its joint and at the next, in half widths of its box
 TRUNK_ROUNDING, SOLE_M = 0.4, 0.008  # share of the smallest half width; radius of the soles' edges
 LIMB_M = 0.04  # half width of limbs without a box
@@ -45,25 +47,25 @@ class Part:
     faceted: bool = False  # triangles are seen as flat; else they are parts of a round surface
 
 
-def parts_of(robot: Robot) -> tuple[list[Part], str]:
-    """The parts of a robot, and a sentence on where they come from, if there is something to say."""
+def parts_of(robot: Robot) -> tuple[list[Part], list[str]]:
+    """The parts of a robot, and what there is to say of where they come from."""
     meshes, said = _published(robot)
     return (meshes, said) if meshes else (list(_rounded(robot)), said)
 
 
 # meshes ---------------------------------------------------------------------------------------------------------
-def _published(robot: Robot) -> tuple[list[Part], str]:
+def _published(robot: Robot) -> tuple[list[Part], list[str]]:
     """Meshes of the published robot that this one was made from, if their files are on this machine."""
     told = ORIGIN.search(robot.config_text)
     if told is None:
-        return [], ""
+        return [], []
     try:
         path, config = files_of(SHIPPED[robot.name])
         jumper, like = Robot.imported(path, config or "")
     except (KeyError, RobotError):
-        return [], "drawn as boxes: its mesh files are not known on this machine"
+        return [], ["drawn from boxes: its meshes are not known on this machine"]
     if told[1] not in jumper.config_text or like.joint_names != robot.joint_names:
-        return [], "drawn as boxes: its mesh files are those of another version"
+        return [], ["drawn from boxes: its meshes here are those of another version"]
     found = []
     for link, (body, place) in jumper.lumped.links.items():
         joint = robot.model.frames[robot.model.getFrameId(body)].parentJoint
@@ -74,7 +76,7 @@ def _published(robot: Robot) -> tuple[list[Part], str]:
     while sum(len(part.triangles) for part in found) > TRIANGLES:
         found = [_coarser(part, cell) for part in found]
         cell *= COARSER
-    return found, "shapes are the published meshes, made coarser" if found else "drawn as boxes: its meshes are missing"
+    return found, ["published meshes, made coarser" if found else "drawn from boxes: its meshes are missing"]
 
 
 def _coarser(part: Part, cell_m: float) -> Part:
@@ -98,7 +100,7 @@ def _rounded(robot: Robot) -> Iterator[Part]:
     """Trunk, head, limbs, drums at the joints and feet, from the boxes of the URDF and the places of its joints."""
     boxes, model = _boxes(robot), robot.model
     feet = {model.frames[model.getFrameId(name)].parentJoint for name in robot.foot.frames}
-    legs = [[model.getJointId(robot.joints[role][s]) for role in ("hip_pitch", "knee", "ankle_pitch")] for s in (0, 1)]
+    legs = [[model.getJointId(robot.joints[role][s]) for role in LEG] for s in (0, 1)]
     width = {joint: min(size[:2]) / 2 for joint, _, size in boxes}
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
@@ -126,7 +128,7 @@ def _rounded(robot: Robot) -> Iterator[Part]:
 
 
 def _boxes(robot: Robot) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Joint, middle (3,) and size (3,) [m] of the box around each visual shape of the URDF; none if those are meshes."""
+    """Joint, middle (3,), size (3,) [m] of the box around each visual shape of the URDF; none if those are meshes."""
     try:
         shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL).geometryObjects
     except ValueError as e:
@@ -149,10 +151,14 @@ def _trunk(boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> Iterator[Part]:
     largest = max((float(np.prod(size)) for _, size in boxes), default=0.0)
     shoulders = max((m[2] + s[2] / 2 for m, s in boxes if np.prod(s) == largest), default=0.0)
     for middle, size in boxes:
-        head = middle[2] > shoulders
-        low = CHIN if head else WAIST if np.prod(size) == largest else 1.0
-        radius = (0.95 if head else TRUNK_ROUNDING) * min(size) / 2
-        yield _hull(1, "trunk", *_cornered(middle, size, radius, low))
+        torso = np.prod(size) == largest
+        if middle[2] > shoulders:
+            bottom, neck = middle - size * (0, 0, 0.5), NECK * size[2]
+            yield _hull(1, "trunk", [bottom, middle], [NECK * size[1]] * 2)
+            middle, size = middle - (0, 0, -neck / 2), size - (0, 0, neck)
+            yield _hull(1, "trunk", *_cornered(middle, size, 0.9 * min(size) / 2, CHIN))
+        else:
+            yield _hull(1, "trunk", *_cornered(middle, size, TRUNK_ROUNDING * min(size) / 2, WAIST if torso else 1.0))
 
 
 def _arm(joint: int, middle: np.ndarray, size: np.ndarray) -> Part:
@@ -169,15 +175,14 @@ def _foot(joint: int, middle: np.ndarray, size: np.ndarray, ankle: np.ndarray) -
     """The sole as a slab, and an instep that falls from the ankle to its middle."""
     yield _hull(joint, "rest", *_cornered(middle, size, SOLE_M))
     radius = 0.4 * size[1]
-    top = middle + [0.0, 0.0, size[2] / 2]
-    front, rear = (top + [x * size[0], 0.0, -radius / 2] for x in (0.22, -0.3))
+    front, rear = (middle + size * [x, 0.0, 0.5] - [0.0, 0.0, radius / 2] for x in (0.22, -0.3))
     yield _hull(joint, "rest", [ankle, front, rear], [0.9 * radius, radius / 2, radius / 2])
 
 
 def _drum(joint: int, half: float) -> Part:
     """A short cylinder about a pitch axis."""
     ring = np.stack([np.cos(a := np.arange(24) * np.pi / 12), np.zeros(24), np.sin(a)], -1) * half
-    return _hull(joint, "rest", [*(ring + [0, half, 0]), *(ring - [0, half, 0])], np.full(48, 0.003))
+    return _hull(joint, "rest", np.concatenate([ring - (0, y, 0) for y in (-half, half)]), np.full(48, 0.003))
 
 
 def _cornered(middle: np.ndarray, size: np.ndarray, radius: float, low: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -27,9 +27,10 @@ from jumplab.errors import InputError
 from jumplab.io.folder import write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
+from jumplab.robot_import.config import LEG
 from jumplab.show.bodies import ABOVE_M, LIMB_SHARE
 from jumplab.show.shapes import Part, parts_of
-from jumplab.show.style import INK, PHASE_COLORS, PURPLE, VERMILION, describe_task, tint
+from jumplab.show.style import INK, PHASE_COLORS, VERMILION, describe_task, tint
 from jumplab.sim.result import CONTACT_FORCE_N
 from jumplab.sim.scene import Scene
 from jumplab.task import GRAVITY, JumpTask
@@ -47,10 +48,11 @@ TRAIL_AFTER_TOUCHDOWN_S = 0.6  # later the CoM hardly moves
 TRACK_COLOR, TRACK_SIDE = "#F4F5F7", "#C9CED6"
 GRIDS = {"fine": (0.1, 1.0, "#DDE1E7"), "coarse": (0.5, 1.3, "#AEB6C2")}  # spacing [m], lift [LINE_LIFT_M], colour
 REST_COLOR = "#42474F"  # feet and joints, whose colour stays
-ROLE_COLORS = {"hip": INK, "knee": VERMILION, "ankle": PURPLE}  # not those of the phases, which lie behind
-CURVES = (  # title, unit, limit or None, lines: names and colours; columns of _values() in this order, after the first two
+ROLE_COLORS = {"hip": INK, "knee": VERMILION, "ankle": "#9C5480"}  # not those of the phases, which lie behind
+FORCE_COLOR = "#B3125F"
+CURVES = (  # title, unit, limit or None, names and colours of lines, in the order of _values() after its first two
     ("CoM height", "m", None, {"": INK}),
-    ("angle", "°", None, ROLE_COLORS),
+    ("left angle", "°", None, ROLE_COLORS),
     ("torque / limit", "", 1.0, ROLE_COLORS),
     ("ground force / weight", "", None, {"": INK}),
 )
@@ -122,12 +124,10 @@ def page(
     rest = tint(REST_COLOR, 1.0)
     facts = {  # what player.js reads
         "title": title or (describe_task(task) if task else "A jump"),
-        "note": " · ".join(
-            [f"robot {robot.name}, {robot.total_mass:.0f} kg", f"{fps:g} frames per second", *([said] * bool(said))]
-        ),
+        "note": " · ".join([f"robot {robot.name}, {robot.total_mass:.0f} kg", f"{fps:g} frames per second", *said]),
         "fps": fps,
         "weight": robot.total_mass * GRAVITY,
-        "arrow": PURPLE,
+        "arrow": FORCE_COLOR,
         "curves": [dict(title=title, unit=unit, limit=limit, lines=lines) for title, unit, limit, lines in CURVES],
         "clips": clips,
         "ruler": _ruler(scene, span, toe),
@@ -319,13 +319,19 @@ def _values(whole: Motion, motion: Motion, robot: Robot, trace: _Trace, forces: 
     """
     air = np.flatnonzero(whole.phase == "flight")
     start = pin.centerOfMass(robot.model, robot.model.createData(), whole.q[air[0] if len(air) else 0])[2]
-    left, names = {role: (name, sign) for name, role, sign in robot.role_signs()[::-1]}, robot.joint_names
-    angles = [np.degrees(left[role][1] * motion.q[:, 7 + names.index(left[role][0])]) for role in range(3)]
+    names = robot.joint_names
+    pairs = [[names.index(name) for name in robot.joints[role]] for role in LEG]
+    angles = [np.degrees(motion.q[:, 7 + pair[0]]) for pair in pairs]
     shares = np.abs(motion.tau) / [robot.actuators[name]["effort"] for name in names]
-    pairs = [[names.index(name) for name in robot.joints[role]] for role in ("hip_pitch", "knee", "ankle_pitch")]
     pressed = np.full(len(motion.t), np.nan) if forces is None else np.nansum(forces[:, :, 5], axis=1)
     height = trace.com[:, 2]
-    columns = [trace.toes - trace.toes[0], height - start, height, *angles, *(shares[:, p].max(axis=1) for p in pairs)]
+    columns = [
+        trace.toes - trace.toes[0],
+        height - start,
+        height,
+        *angles,
+        *(shares[:, pair].max(axis=1) for pair in pairs),
+    ]
     return np.stack([*columns, pressed / (robot.total_mass * GRAVITY)], -1)
 
 
