@@ -302,6 +302,7 @@ def _forces(motion: Motion, times: np.ndarray, feet: np.ndarray, scene: Scene) -
         return None
     half = (times[1] - times[0]) / 2 if len(times) > 1 else 1.0
     first, last = np.searchsorted(motion.t, times - half), np.searchsorted(motion.t, times + half, side="right")
+    first = np.minimum(first, last - 1)  # frames may be closer than samples
     sums = np.concatenate([np.zeros((1, 2, 6)), np.cumsum(motion.wrench, axis=0)])
     fx, fy, fz, mx, my, _ = np.moveaxis((sums[last] - sums[first]) / (last - first)[:, None, None], -1, 0)
     fz = np.where(fz > CONTACT_FORCE_N, fz, np.nan)
