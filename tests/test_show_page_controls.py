@@ -18,6 +18,7 @@ from jumplab.sim import simulate_jump
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install -e '.[browser]'")
 pytestmark = [pytest.mark.slow, browser]
+GRAPHICS = [f for f in FLAGS if not f.startswith(("--headless", "--virtual-time", "--enable-logging"))]
 SIZES = {"desktop": (1280, 720), "phone": (390, 844)}
 PATIENCE_MS = 180_000  # a machine that does much else besides
 # what is too small to read or to touch, or lies or reaches out of its place
@@ -60,9 +61,8 @@ def url(tmp_path_factory, simulation):
 @pytest.fixture
 def tab():
     """A browser that is offline, and what its pages asked for or complained of."""
-    flags = [f for f in FLAGS if not f.startswith(("--headless", "--virtual-time", "--enable-logging"))]
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
         tab = chromium.new_context(viewport={"width": 1280, "height": 720}, offline=True).new_page()
         tab.set_default_timeout(PATIENCE_MS)
         tab.set_default_navigation_timeout(PATIENCE_MS)
