@@ -39,20 +39,22 @@ class Motion:
     tau: np.ndarray  # (N, nv - 6) joint torques [N m]
     phase: np.ndarray  # (N,) "launch", "flight" or "landing"
     source: str  # "plan" or "simulation"
+    wrench: np.ndarray | None = None  # (N, 2, 6) on the feet: force, moment, world axes, at the foot links' origins
 
     @classmethod
     def of(cls, record: Record) -> Motion:
         """The motion of a ``Tape`` (it alone carries accelerations) or of a ``SimulationResult``."""
         source = "plan" if hasattr(record, "a") else "simulation"
-        return cls(record.t, record.q, record.v, record.tau, record.phase, source)
+        wrench = getattr(record, "f" if source == "plan" else "foot_wrench", None)
+        return cls(record.t, record.q, record.v, record.tau, record.phase, source, wrench)
 
     @classmethod
     def of_simulation_file(cls, folder: str | Path, robot: Robot) -> Motion:
         """Read ``simulation.npz`` from a result folder; raises :class:`InputError` if it is missing or damaged."""
         if not (Path(folder) / SIMULATION_NAME).is_file():
             raise InputError(f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first")
-        data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase"))
-        return cls(**data, source="simulation")
+        data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase", "foot_wrench"))
+        return cls(wrench=data.pop("foot_wrench"), **data, source="simulation")
 
     @property
     def duration(self) -> float:
@@ -75,12 +77,13 @@ class Motion:
         share[gap <= 0] = 1.0  # the last instant stands twice
 
         def between(x: np.ndarray) -> np.ndarray:
-            return x[row] + share[:, None] * (x[row + 1] - x[row])
+            return x[row] + share.reshape(-1, *[1] * (x.ndim - 1)) * (x[row + 1] - x[row])
 
         q = between(self.q)
         q[:, 3:7] = _between_attitudes(self.q[row, 3:7], self.q[row + 1, 3:7], share)
         phase = np.where(share < 1.0, self.phase[row], self.phase[row + 1])
-        return Motion(times, q, between(self.v), between(self.tau), phase, self.source)
+        wrench = None if self.wrench is None else between(self.wrench)
+        return Motion(times, q, between(self.v), between(self.tau), phase, self.source, wrench)
 
     def every(self, rate_hz: float) -> Motion:
         """The motion on a grid of ``rate_hz`` samples a second, from its start to the last grid point within it."""
@@ -103,8 +106,8 @@ def read_simulation(folder: str | Path, robot: Robot, names: Sequence[str]) -> d
     except DAMAGE as e:
         raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e
     n, nq, nv = data["t"].size, robot.model.nq, robot.model.nv
-    shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,))
-    fits = all(data[k].shape == shape for k, shape in shapes.items())
+    shapes = dict(t=(n,), q=(n, nq), v=(n, nv), tau=(n, nv - 6), phase=(n,), foot_wrench=(n, 2, 6))
+    fits = all(data[k].shape == shape for k, shape in shapes.items() if k in data)
     if schema != SIMULATION_SCHEMA or joints != robot.joint_names or not fits:
         raise InputError(f"{path}: not a simulation of this folder's robot; simulate the plan again")
     return data
