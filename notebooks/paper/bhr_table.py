@@ -148,12 +148,7 @@ def _joint(root, name, parent, child, origin, axis, lower, upper, effort, speed)
     ET.SubElement(joint, "origin", xyz=_numbers(*origin), rpy="0 0 0")
     ET.SubElement(joint, "axis", xyz=_numbers(*axis))
     ET.SubElement(
-        joint,
-        "limit",
-        lower=_numbers(lower),
-        upper=_numbers(upper),
-        effort=_numbers(effort),
-        velocity=_numbers(speed),
+        joint, "limit", lower=_numbers(lower), upper=_numbers(upper), effort=_numbers(effort), velocity=_numbers(speed)
     )
 
 

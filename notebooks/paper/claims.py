@@ -32,11 +32,7 @@ from jumplab.task import GRAVITY, JumpTask
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
-MESHES = {
-    "fine mesh": {"refine": False},
-    "coarse first": {"approach": False},
-    "steps first": {},
-}  # of stage 3
+MESHES = {"fine mesh": {"refine": False}, "coarse first": {"approach": False}, "steps first": {}}  # of stage 3
 LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 SAME_COST = 1.01  # more than this times the least cost known is another jump
