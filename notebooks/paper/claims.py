@@ -109,16 +109,9 @@ def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[st
     angles = random.uniform([0.0, -0.2, -1.2, -0.2, -2.0], [0.6, 1.2, 0.6, 0.9, 1.0], (samples, 5))
     rates, accels = random.normal(0, 4, (samples, 5)), random.normal(0, 40, (samples, 5))
     rest = np.zeros((samples, 2))
-    motion = dict(
-        t=np.arange(samples) / 1000,
-        angles=angles,
-        rates=rates,
-        accels=accels,
-        toe=rest,
-        toe_velocity=rest,
-        toe_acceleration=rest,
-        flying=np.zeros(samples, bool),
-    )
+    motion = dict.fromkeys(("toe", "toe_velocity", "toe_acceleration"), rest)
+    motion |= dict(t=np.arange(samples) / 1000, angles=angles, rates=rates, accels=accels)
+    motion["flying"] = np.zeros(samples, bool)
     tape = expand(motion, robot, GRAVITY)
     five = planar_quantities(robot, angles, rates, accels, rest, GRAVITY)
     body = FullBody(robot)
