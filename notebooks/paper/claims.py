@@ -32,11 +32,7 @@ from jumplab.task import GRAVITY, JumpTask
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
-MESHES = {
-    "fine mesh": {"refine": False},
-    "coarse first": {"approach": False},
-    "steps first": {},
-}  # of stage 3
+MESHES = {"fine mesh": {"refine": False}, "coarse first": {"approach": False}, "steps first": {}}  # of stage 3
 LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 SAME_COST = 1.01  # more than this times the least cost known is another jump
@@ -113,16 +109,9 @@ def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[st
     angles = random.uniform([0.0, -0.2, -1.2, -0.2, -2.0], [0.6, 1.2, 0.6, 0.9, 1.0], (samples, 5))
     rates, accels = random.normal(0, 4, (samples, 5)), random.normal(0, 40, (samples, 5))
     rest = np.zeros((samples, 2))
-    motion = dict(
-        t=np.arange(samples) / 1000,
-        angles=angles,
-        rates=rates,
-        accels=accels,
-        toe=rest,
-        toe_velocity=rest,
-        toe_acceleration=rest,
-        flying=np.zeros(samples, bool),
-    )
+    motion = dict.fromkeys(("toe", "toe_velocity", "toe_acceleration"), rest)
+    motion |= dict(t=np.arange(samples) / 1000, angles=angles, rates=rates, accels=accels)
+    motion["flying"] = np.zeros(samples, bool)
     tape = expand(motion, robot, GRAVITY)
     five = planar_quantities(robot, angles, rates, accels, rest, GRAVITY)
     body = FullBody(robot)

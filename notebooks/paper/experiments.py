@@ -312,23 +312,11 @@ def trial_map(trials: Sequence[Trial]) -> Figure:
         values = factor * np.array([t.features[name] for t in trials])
         _rates(ax, values, landed)
         for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
-            ax.plot(
-                values[mask],
-                np.full(mask.sum(), height),
-                linestyle="none",
-                marker=marker,
-                color=color,
-                markersize=3.0,
-                markeredgewidth=0.8,
-                alpha=0.7,
-            )
+            look = dict(color=color, markersize=3.0, markeredgewidth=0.8, alpha=0.7)
+            ax.plot(values[mask], np.full(mask.sum(), height), marker, **look)
         ax.margins(x=0.04)
-        ax.set(
-            xlabel=label,
-            ylim=(-0.3, 1.3),
-            yticks=[-0.2, 0, 0.5, 1, 1.2],
-            yticklabels=["fell", "0 %", "50 %", "100 %", "landed"],
-        )
+        ax.set(xlabel=label, ylim=(-0.3, 1.3))
+        ax.set_yticks([-0.2, 0, 0.5, 1, 1.2], ["fell", "0 %", "50 %", "100 %", "landed"])
     panel_letters(axes.flat)
     return fig
 
@@ -429,15 +417,7 @@ def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figu
     clock.plot(number, air, color=FLIGHT, marker="o", markersize=4, label="in the air")
     for in_air, face, label in ((True, PURPLE, "planned in the air"), (False, "white", "planned standing")):
         known = [(1 + p.number, p.solve_s) for j in result.jumps for p in j.plans if p.air == in_air]
-        clock.plot(
-            *np.reshape(known, (-1, 2)).T,
-            color=PURPLE,
-            linestyle="",
-            marker="o",
-            markersize=4,
-            markerfacecolor=face,
-            label=label,
-        )
+        clock.plot(*np.reshape(known, (-1, 2)).T, "o", color=PURPLE, markersize=4, markerfacecolor=face, label=label)
     clock.set(xlabel="jump", ylabel="time [s]", ylim=(0.0, None))
     for ax in (error, clock):
         ax.set_xticks(number)
