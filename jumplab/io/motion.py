@@ -53,8 +53,8 @@ class Motion:
         """Read ``simulation.npz`` from a result folder; raises :class:`InputError` if it is missing or damaged."""
         if not (Path(folder) / SIMULATION_NAME).is_file():
             raise InputError(f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first")
-        data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase", "foot_wrench"))
-        return cls(wrench=data.pop("foot_wrench"), **data, source="simulation")
+        data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase"), ("foot_wrench",))
+        return cls(wrench=data.pop("foot_wrench", None), **data, source="simulation")
 
     @property
     def duration(self) -> float:
@@ -93,15 +93,17 @@ class Motion:
         return self.at(np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1]))
 
 
-def read_simulation(folder: str | Path, robot: Robot, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Arrays ``names`` (t, q, v, tau, phase among them) of the ``simulation.npz`` in ``folder``.
+def read_simulation(
+    folder: str | Path, robot: Robot, names: Sequence[str], more: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """Arrays ``names`` (t, q, v, tau, phase among them) of the ``simulation.npz`` in ``folder``, and ``more`` if there.
 
     Raises :class:`InputError` if the file is damaged or not one of ``robot``.
     """
     path = Path(folder) / SIMULATION_NAME
     try:
         with np.load(path, allow_pickle=False) as file:
-            data = {k: file[k] for k in names}
+            data = {k: file[k] for k in (*names, *(k for k in more if k in file.files))}
             schema, joints = str(file["schema"]), tuple(str(n) for n in file["joint_names"])
     except DAMAGE as e:
         raise InputError(f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again") from e

@@ -174,9 +174,8 @@ def _arm(joint: int, middle: np.ndarray, size: np.ndarray) -> Part:
 def _foot(joint: int, middle: np.ndarray, size: np.ndarray, ankle: np.ndarray) -> Iterator[Part]:
     """The sole as a slab, and an instep that falls from the ankle to its middle."""
     yield _hull(joint, "rest", *_cornered(middle, size, SOLE_M))
-    radius = 0.4 * size[1]
-    front, rear = (middle + size * [x, 0.0, 0.5] - [0.0, 0.0, radius / 2] for x in (0.22, -0.3))
-    yield _hull(joint, "rest", [ankle, front, rear], [0.9 * radius, radius / 2, radius / 2])
+    front, rear = (middle + size * (x, 0.0, 0.05) for x in (0.22, -0.3))
+    yield _hull(joint, "rest", [ankle, front, rear], [0.36 * size[1], 0.45 * size[2], 0.45 * size[2]])
 
 
 def _drum(joint: int, half: float) -> Part:
