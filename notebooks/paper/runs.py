@@ -95,7 +95,7 @@ def row(engine: str, trial: Trial) -> dict[str, Any]:
     kept = {"engine": engine, "number": trial.key.index, "features": seen, "landed": trial.landed}
     if not trial.landed or m is None:
         return {**kept, "reason": trial.reason}
-    return {**kept, "travel_m": round(m.foot_distance_m, 5), "rise_m": round(m.com_rise_m, 5)}
+    return {**kept, "foot_distance_m": round(m.foot_distance_m, 5), "com_rise_m": round(m.com_rise_m, 5)}
 
 
 def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]:
@@ -104,7 +104,11 @@ def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]
     "delay_s" is of the robots, "speed_factor" of the basin's states.
     """
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    here = (SimpleNamespace(**r) for r in rows if r["engine"] == engine and feature in r["features"])
+    here = (
+        SimpleNamespace(**{"foot_distance_m": None, **r})
+        for r in rows
+        if r["engine"] == engine and feature in r["features"]
+    )
     return sorted(here, key=lambda r: r.number)
 
 
