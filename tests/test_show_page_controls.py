@@ -58,20 +58,26 @@ def url(tmp_path_factory, simulation):
     return page.save(tmp_path_factory.mktemp("page") / "jump.html").as_uri()
 
 
-@pytest.fixture
-def tab():
-    """A browser that is offline, and what its pages asked for or complained of."""
+@pytest.fixture(scope="module")
+def chromium():
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
-        tab = chromium.new_context(viewport={"width": 1280, "height": 720}, offline=True).new_page()
-        tab.set_default_timeout(PATIENCE_MS)
-        tab.set_default_navigation_timeout(PATIENCE_MS)
-        tab.asked, tab.trouble = [], []
-        tab.on("request", lambda r: tab.asked.append(r.url.split("#")[0]))
-        tab.on("pageerror", lambda e: tab.trouble.append(str(e)))
-        tab.on("console", lambda m: m.type == "error" and tab.trouble.append(m.text))
-        yield tab
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS, timeout=PATIENCE_MS)
+        yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def tab(chromium):
+    """A tab that is offline, and what its pages asked for or complained of."""
+    tab = chromium.new_context(viewport={"width": 1280, "height": 720}, offline=True).new_page()
+    tab.set_default_timeout(PATIENCE_MS)
+    tab.set_default_navigation_timeout(PATIENCE_MS)
+    tab.asked, tab.trouble = [], []
+    tab.on("request", lambda r: tab.asked.append(r.url.split("#")[0]))
+    tab.on("pageerror", lambda e: tab.trouble.append(str(e)))
+    tab.on("console", lambda m: m.type == "error" and tab.trouble.append(m.text))
+    yield tab
+    tab.context.close()
 
 
 def clock(tab) -> float:
