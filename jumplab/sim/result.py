@@ -61,7 +61,7 @@ class Finding:
 class Metrics:
     """Numbers of one jump, all measured in the simulation; None where the jump did not get so far.
 
-    Loads are ratios |value| / limit, largest over the run; vectors are (x, z), those of the landing along the heading
+    Loads are ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the landing along the heading
     in which the robot was meant to land, those of the launch along the one in which it began.
     """
 
