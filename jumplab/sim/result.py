@@ -61,8 +61,8 @@ class Finding:
 class Metrics:
     """Numbers of one jump, all measured in the simulation; None where the jump did not get so far.
 
-    Loads are ratios |value| / limit, largest over the run; vectors are (x, z), those of the landing along the heading
-    in which the robot was meant to land, those of the launch along the one in which it began.
+    Loads are ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the landing along the
+    heading in which the robot was meant to land, those of the launch along the one in which it began.
     """
 
     foot_distance_m: float | None = None  # travel of the toes from the start to where they stand at the end

@@ -54,6 +54,7 @@ def formula(translator, node):
 
 def setup(app):
     """Called by Sphinx."""
+    app.add_generic_role("mpltype", nodes.literal)  # of matplotlib's own docstrings, which figures inherit
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", with_outputs)
     app.connect("build-finished", front_page)
