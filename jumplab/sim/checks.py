@@ -85,6 +85,18 @@ def _kick(result: SimulationResult, robot: Robot, row: int) -> np.ndarray:
     return kick
 
 
+def _pushes(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Stated external forces (N, 3) in every step [N], and the place (3,) in the base link's frame on which they act.
+
+    The place is the centre of mass of the planned trunk, and not that of the real one with its payload.
+    """
+    force = np.zeros((len(result.t), 3))
+    for told in result.settings.get("pushes", ()):
+        begin = max(0, told["step"])
+        force[begin : max(0, told["step"] + told["steps"])] += told["force_n"]
+    return force, np.array(result.settings.get("push_place_m", (0.0, 0.0, 0.0)))
+
+
 def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Generalised forces that neither torques nor foot forces explain: on the base (N - 1, 6), in the joints.
 
@@ -94,7 +106,7 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
     model, data = robot.model, robot.model.createData()
     frames, axes = [model.getFrameId(n) for n in robot.foot.frames], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     states = _steps(result, robot)
-    left = np.empty_like(states[2])
+    left, (pushes, place) = np.empty_like(states[2]), _pushes(result, robot)
     for k, (q, v, a) in enumerate(zip(*states, strict=True)):
         pin.computeJointJacobians(model, data, q)
         left[k] = pin.rnea(model, data, q, v, a)
@@ -102,6 +114,9 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
             if wrench.any():
                 pin.updateFramePlacement(model, data, frame)
                 left[k] -= pin.getFrameJacobian(model, data, frame, axes).T @ wrench
+        if pushes[k].any():
+            force = rotation(q[3:7]).T @ pushes[k]
+            left[k, :6] -= [*force, *np.cross(place, force)]
     if result.settings["engine"]["substeps"] > 1:
         left[:, :6] = _momentum_unexplained(result, robot)
     left[:, 6:] -= result.tau[:-1]
@@ -125,7 +140,10 @@ def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:
     linear, spin, com, *feet = (np.array(column) for column in zip(*rows, strict=True))
     angular, gravity = spin + np.cross(com, linear), np.cross(com, weight)
     force, moment = weight + result.foot_wrench[:, :, :3].sum(axis=1), result.foot_wrench[:, :, 3:].sum(axis=1)
-    for place, push in zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True):
+    pushes, arm = _pushes(result, robot)
+    points = result.q[:, :3] + [rotation(q[3:7]) @ arm for q in result.q]
+    force = force + pushes
+    for place, push in ((points, pushes), *zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True)):
         moment = moment + np.cross(place, push)
     moment[:-1] += (gravity[:-1] + gravity[1:]) / 2
     return np.hstack([np.diff(linear, axis=0), np.diff(angular, axis=0)]) / STEP_S - np.hstack([force, moment])[:-1]
