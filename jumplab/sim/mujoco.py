@@ -77,7 +77,7 @@ class MujocoEngine(Engine):
         for geom, block in zip(np.flatnonzero(model.geom_bodyid == 0), self.scene.blocks, strict=True):
             if block.soft_m:
                 k, b = np.array(self.spring(block.soft_m)) * inverse * (1 - SOFT_SHARE) / SOFT_SHARE
-                model.geom_solref[geom] = [-k * SOFT_SHARE**2, -b * SOFT_SHARE]  # the engine divides so
+                model.geom_solref[geom] = [-k * SOFT_SHARE, -b * SOFT_SHARE]  # by which the engine divides
                 model.geom_solimp[geom, :2] = SOFT_SHARE
                 model.geom_priority[geom], model.geom_friction[geom, 0] = SOFT_FIRST, friction
                 model.opt.impratio = SOFT_CONE_RATIO

@@ -318,7 +318,9 @@ def _further(robot: Robot, rng: np.random.Generator, ranges: Ranges, noise: Sens
     low, high = _trunk_box(robot) if ranges.payload_kg[1] else (np.zeros(3), np.zeros(3))
     found = dict(payload_kg=float(rng.uniform(*ranges.payload_kg)), payload_m=tuple(rng.uniform(low, high).tolist()))
     found |= dict(torque_loss=each(*ranges.torque_loss), speed_loss=each(*ranges.speed_loss))
-    found |= dict(sag_per_kw=float(rng.uniform(*ranges.sag_per_kw)), ground_m=ranges.ground_m * rng.uniform(-1, 1) + 0.0)
+    found |= dict(
+        sag_per_kw=float(rng.uniform(*ranges.sag_per_kw)), ground_m=ranges.ground_m * rng.uniform(-1, 1) + 0.0
+    )
     found |= dict(ground_tilt_rad=tuple(np.radians(ranges.ground_tilt_deg * rng.uniform(-1, 1, 2) + 0.0).tolist()))
     found |= dict(soft_m=float(rng.uniform(*ranges.soft_m)))
     pushes = []
@@ -328,7 +330,9 @@ def _further(robot: Robot, rng: np.random.Generator, ranges: Ranges, noise: Sens
         pushes += [Shove(phase, float(share), float(impulse), float(direction))] if range_n_s[1] else []
     half = float(np.radians(ranges.posture_deg))
     found |= dict(shoves=tuple(pushes), posture_rad=each(-half, half))
-    return found | dict(noise=noise if ranges.sensors == (1.0, 1.0) else noise.times(float(rng.uniform(*ranges.sensors))))
+    return found | dict(
+        noise=noise if ranges.sensors == (1.0, 1.0) else noise.times(float(rng.uniform(*ranges.sensors)))
+    )
 
 
 def _trunk_box(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -358,6 +362,11 @@ def _load(root: ET.Element, mass_kg: float, place_m: Sequence[float]) -> None:
     ET.SubElement(joint, "parent", link=base)
     ET.SubElement(joint, "child", link="payload")
     ET.SubElement(joint, "origin", xyz=" ".join(f"{x:.12g}" for x in place_m), rpy="0 0 0")
+
+
+def is_pair(name: str) -> bool:
+    """Whether a disturbance is drawn from ... to, and not around nothing."""
+    return isinstance(getattr(Ranges, name, None), tuple)
 
 
 def ranges_of(told: Mapping[str, tuple[float, ...]], base: Ranges | None = None) -> Ranges:

@@ -153,6 +153,14 @@ class Scene:
         along = JumpTask(**summary["target"]).along_rad
         return cls("platform", (Block(-REACH_M, edge, 0.0), Block(edge, REACH_M, top)), along)
 
+    @classmethod
+    def of_run(cls, report: Mapping[str, Any], summary: Mapping[str, Any], robot: Robot) -> Scene:
+        """The ground of a simulation, from its ``report``, the content of ``simulation.json``, or that of its plan."""
+        told = report.get("settings", {}).get("ground")
+        if told is None:
+            return cls.of_plan(summary, robot)
+        return cls(told["name"], tuple(Block(**block) for block in told["blocks"]), told["along_rad"])
+
     def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
         """The ground seen along a heading: itself if all is straight ahead, else what is under the soles of ``q``."""
         if heading_rad == self.along_rad == 0:
@@ -228,7 +236,7 @@ class Scene:
         return replace(scene, name=f"{scene.name}, landing moved", blocks=tuple(blocks))
 
     def height_of(self, q: np.ndarray, robot: Robot, planned: Scene) -> float:
-        """How much higher than the blocks of the ``planned`` scene, untilted, the ground is under the soles of ``q``."""
+        """How much higher the ground is than the blocks of the ``planned`` scene, under the soles of ``q`` [m]."""
         soles = Gauge(robot).soles(q)
         real, meant = self.below(soles[:2]), planned.below(soles[:2])
         return 0.0 if real is None or meant is None else self.top_at(*self._along(soles)) - real.soft_m - meant.top
