@@ -6,6 +6,8 @@ They leave no room for a hand that holds the base, a motor that gives more than 
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 
@@ -15,6 +17,7 @@ from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import STAND_S, Finding, SimulationResult
+from jumplab.sim.scene import Scene
 
 WINDOW = 100  # [steps] 0.1 s; a push shorter than that counts by its mean
 # Sound jumps and flips leave 1e-10 N, 0.02 N m, and in the joints up to 1 N m at an impact.
@@ -194,7 +197,8 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     """Friction and CoP of each foot, from its measured wrench."""
     model, data, foot = robot.model, robot.model.createData(), robot.foot
     frames = [model.getFrameId(name) for name in foot.frames]
-    slip, outside = 0.0, 0.0
+    slip, outside, told = 0.0, 0.0, result.settings.get("ground")
+    ground = None if told is None else Scene.told(told)
     for k in np.flatnonzero((result.foot_wrench[:-1, :, 2] > LOADED_N).any(axis=1)):
         places = []  # a foot may move within a step: where it is at both ends of it
         for q in result.q[k : k + 2]:
@@ -202,8 +206,11 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
             places.append([data.oMf[frame].copy() for frame in frames])
         for wrench, before, after in zip(result.foot_wrench[k], *places, strict=True):
             if wrench[2] > LOADED_N:
-                slip = max(slip, np.hypot(*wrench[:2]) / wrench[2])
-                outside = max(outside, min(_outside(foot, before, place, wrench) for place in (before, after)))
+                slip = max(slip, _slip(wrench[:3], before, ground))
+                corners = np.array([before.act(corner) for corner in foot.corners])
+                sunk = (0.0,) if ground is None else (0.0, ground.depth_of(corners))
+                pairs = product((before, after), sunk)
+                outside = max(outside, min(_outside(foot, before, place, wrench, deep) for place, deep in pairs))
     stated = result.settings["perturbation"]["friction"]
     return (
         Finding("friction used, of the stated coefficient", slip / stated, FRICTION_USE, "", "sticky feet"),
@@ -211,11 +218,22 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     )
 
 
-def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray) -> float:
-    """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m]."""
+def _slip(force: np.ndarray, place: pin.SE3, ground: Scene | None) -> float:
+    """Friction that a force (3,) on a foot at ``place`` uses, along the ground there over across it [1]."""
+    if ground is None:
+        return float(np.hypot(*force[:2]) / force[2])
+    up = ground.normal_at(place.translation[:2])
+    return float(np.linalg.norm(force - up @ force * up) / (up @ force))
+
+
+def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray, deep: float) -> float:
+    """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m].
+
+    The CoP is in the plane of the sole, or ``deep`` [m] above: ground that has given way presses on its sides as well.
+    """
     moment = wrench[3:] + pin.skew(origin.translation - place.translation) @ wrench[:3]
     force, moment = place.rotation.T @ wrench[:3], place.rotation.T @ moment
-    x, y = (foot.sole_z * force[:2] + [-moment[1], moment[0]]) / force[2]
+    x, y = ((foot.sole_z + deep) * force[:2] + [-moment[1], moment[0]]) / force[2]
     return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)
 
 

@@ -91,7 +91,7 @@ class Run:
         """The checked record of one part of the run; ``solves`` are the QPs posed and failed in it."""
         settings |= dict(scene=self.scene.name, robot=self.robot.name, robot_hash=self.robot.hash, step_s=STEP_S)
         settings |= dict(perturbation=self.perturbation.to_json(), perception=self.perception)
-        if self.ground is not self.scene:
+        if self.ground is not self.scene or not self.ground.plain:
             settings["ground"] = asdict(self.ground)
         if self.pushes:  # what the checks know of them
             told = [asdict(replace(push, step=push.step - self._begun)) for push in self.pushes]

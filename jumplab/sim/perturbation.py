@@ -23,6 +23,7 @@ LIGHT_KG = 0.01  # links below this are the massless dummies of multi-axis joint
 PAYLOAD_SIDE_M = 0.1  # of the cube that a payload is
 PUSH_S, AFTER_S = 0.05, 1.0  # how long a shove lasts, and how long after the tape's end a landing is shoved
 PHASES = ("launch", "flight", "landing")
+BASE_GIVES = 1e4  # [1] how much more readily the base moves than a joint, to close the legs over the ground
 CLOSE_RAD, CLOSINGS = 1e-10, 20  # a wrong posture's feet are put back to so much; two or three steps do
 
 
@@ -294,7 +295,9 @@ class Perturbation:
             miss = np.concatenate([pin.log6(gauge.data.oMf[f].actInv(place)).vector for f, place in pairs])
             if np.abs(miss).max() < CLOSE_RAD:
                 break
-            wrong = pin.integrate(gauge.model, wrong, rows.T @ solved(rows @ rows.T + 1e-12 * np.eye(12), miss))
+            light = BASE_GIVES * rows.T
+            light[6:] = rows.T[6:]
+            wrong = pin.integrate(gauge.model, wrong, light @ solved(rows @ light + 1e-12 * np.eye(12), miss))
         return wrong
 
     def to_json(self) -> dict:

@@ -157,9 +157,17 @@ class Scene:
     def of_run(cls, report: Mapping[str, Any], summary: Mapping[str, Any], robot: Robot) -> Scene:
         """The ground of a simulation, from its ``report``, the content of ``simulation.json``, or that of its plan."""
         told = report.get("settings", {}).get("ground")
-        if told is None:
-            return cls.of_plan(summary, robot)
-        return cls(told["name"], tuple(Block(**block) for block in told["blocks"]), told["along_rad"])
+        return cls.of_plan(summary, robot) if told is None else cls.told(told)
+
+    @classmethod
+    def told(cls, data: Mapping[str, Any]) -> Scene:
+        """The scene of plain data, those of :func:`dataclasses.asdict`."""
+        return cls(data["name"], tuple(Block(**block) for block in data["blocks"]), data["along_rad"])
+
+    @property
+    def plain(self) -> bool:
+        """Whether all of it is hard and level."""
+        return all(block.even and not block.soft_m for block in self.blocks)
 
     def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
         """The ground seen along a heading: itself if all is straight ahead, else what is under the soles of ``q``."""
@@ -205,6 +213,21 @@ class Scene:
     def below(self, point: np.ndarray) -> Block | None:
         """The highest block at a ``point`` (2,) of the world."""
         return self._at(*self._along(point))
+
+    def normal_at(self, point: np.ndarray) -> np.ndarray:
+        """(3,) upward, across the top below a ``point`` (2,) of the world."""
+        block = self.below(point)
+        up = np.array([0.0, 0.0, 1.0]) if block is None else block.turn[:, 2]
+        return pin.rpy.rpyToMatrix(0.0, 0.0, self.along_rad) @ up
+
+    def depth_of(self, points: np.ndarray) -> float:
+        """How deep the lowest of some ``points`` (k, 3) of the world lies in soft ground; zero in hard one [m]."""
+        depths = [0.0]
+        for point in points:
+            block = self.below(point[:2])
+            if block is not None and block.soft_m:
+                depths.append(block.height_at(*self._along(point[:2])) - float(point[2]))
+        return max(depths)
 
     def _along(self, point: np.ndarray) -> tuple[float, float]:
         c, s = np.cos(self.along_rad), np.sin(self.along_rad)
