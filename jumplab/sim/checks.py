@@ -32,6 +32,7 @@ SWING = 3.0  # [1] where a contact begins or ends, velocities swing within a ste
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
 LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
 SOLE_M = 0.001  # contact points of sound feet lie within the sole to 1e-7 m
+FACING = 0.7  # [1] a sole that is turned by less than 45 degrees is what touches the ground of a foot
 FRICTION_USE = 1.01  # 1.0001 was seen where feet slide
 
 
@@ -207,6 +208,8 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
         for wrench, before, after in zip(result.foot_wrench[k], *places, strict=True):
             if wrench[2] > LOADED_N:
                 slip = max(slip, _slip(wrench[:3], before, ground))
+                if before.rotation[2, 2] < FACING:
+                    continue  # a foot that lies on its side presses with that
                 corners = np.array([before.act(corner) for corner in foot.corners])
                 sunk = (0.0,) if ground is None else (0.0, ground.depth_of(corners))
                 pairs = product((before, after), sunk)

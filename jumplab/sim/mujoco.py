@@ -207,7 +207,7 @@ class MujocoEngine(Engine):
         force = data.efc_force[contact.efc_address[acting, None] + THREE]  # along the axes of the contact's frame
         pairs, places = self._model.geom_bodyid[contact.geom[acting]], contact.pos[acting]
         pushes = np.einsum("ki,kij->kj", force, contact.frame[acting].reshape(-1, 3, 3))
-        points = ([], [])
+        points, depths = ([], []), contact.dist[acting, None] / 2 * contact.frame[acting].reshape(-1, 3, 3)[:, 0]
         for k, (one, other) in enumerate(pairs.tolist()):
             if force[k, 0] <= 0:
                 continue
@@ -221,7 +221,7 @@ class MujocoEngine(Engine):
                 push, place = (pushes[k] if other else -pushes[k]), places[k]
                 self._wrench[side, :3] += push
                 self._wrench[side, 3:] += pin.skew(place - origins[body]) @ push
-                points[side].append(place)
+                points[side].append(place + depths[k] if other else place - depths[k])  # on the robot's own surface
         for body, side in self._feet.items():
             if points[side]:
                 self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))
