@@ -49,7 +49,7 @@ def _size(name: str, share: float) -> float:
     limit = next(f.metadata for f in fields(Ranges) if f.name == name)
     nothing = getattr(Ranges.none(), name)
     nothing = nothing[0] if isinstance(nothing, tuple) else nothing
-    return nothing + share * (limit["least" if name == "friction" else "most"] - nothing)
+    return (1 - share) * nothing + share * limit["least" if name == "friction" else "most"]
 
 
 @dataclass(frozen=True)
