@@ -35,7 +35,7 @@ def test_every_command_takes_json_and_quiet(capsys, name):
     said = capsys.readouterr().out
     assert "--json" in said and "--quiet" in said
     assert not re.search(r"--(workers|n-jobs|distances-m|heights-m|platforms-m)\b", said)
-    if name in ("trials", "certify", "chain", "envelope", "sweep"):
+    if name in ("trials", "margins", "certify", "chain", "envelope", "sweep"):
         assert "--jobs N" in said
 
 

@@ -9,7 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
+from jumplab.cli.common import (
+    DISTURB,
+    ENGINE,
+    JUMP,
+    METHODS,
+    MODE,
+    PLAN,
+    SEED,
+    Late,
+    command,
+    folder,
+    needing,
+    number,
+    opt,
+)
 from jumplab.errors import InputError
 from jumplab.sim import ENGINES
 from jumplab.task import JumpTask
@@ -108,13 +122,19 @@ def _audited(report: Any) -> dict[str, Any]:
     return json.loads(report.to_json())
 
 
-@command(PLAN, MODE, ENGINE)
+@command(PLAN, MODE, ENGINE, DISTURB, SEED)
 def simulate(args: Namespace) -> None:
     """Simulate a plan in PyBullet or MuJoCo."""
+    fixed = {k: (x * 2 if len(x) == 1 and sim.is_pair(k) else x)
+             for k, x in common.disturbances("--disturb", args.disturb).items()}  # fmt: skip
+    ranges = sim.ranges_of(fixed)
+    if not fixed:
+        common.without(args, "says where --disturb acts, which is not given", seed=None)
     tape, robot, summary = store.read_plan(args.dir)
     store.ensure_writable(args.dir)
     scene = sim.Scene.of_plan(summary, robot)
-    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine)
+    drawn = sim.Perturbation.draw(robot, args.seed or 0, ranges) if fixed else None
+    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine, perturbation=drawn)
     store.write_simulation(args.dir, result, summary)
     args.found |= result.to_json()
     common.print_simulation(result.to_json())
@@ -134,7 +154,8 @@ def view(args: Namespace) -> None:
     store.ensure_writable(path.parent)
     simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
     simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None
-    task, scene = JumpTask(**summary["target"]), sim.Scene.of_plan(summary, robot)
+    told = store.read_json(Path(args.dir, "simulation.json")) if simulated else {}
+    task, scene = JumpTask(**summary["target"]), sim.Scene.of_run(told, summary, robot)
     if args.movie:
         made = movies.write_movie(path, robot, simulation or tape, scene)
         size = path.stat().st_size

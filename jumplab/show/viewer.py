@@ -229,16 +229,18 @@ def _put(node: meshcat.Visualizer, shape: Any, place: pin.SE3 | Sequence[float] 
 # the ground -----------------------------------------------------------------------------------------------------
 def _lay_ground(vis: meshcat.Visualizer, scene: Scene, span: tuple[float, float], marks: Sequence[float]) -> None:
     """Blocks of the scene between ``span`` [m] with a grid on top, and lines across at ``marks`` [m]."""
-    seen = [b for b in scene.blocks if max(b.x_from, span[0]) < min(b.x_to, span[1])]
-    across = 2 * TRACK_HALF_WIDTH_M
+    seen, across = scene.within(*span, TRACK_HALF_WIDTH_M).blocks, 2 * TRACK_HALF_WIDTH_M
     for number, block in enumerate(seen):
-        start, end = max(block.x_from, span[0]), min(block.x_to, span[1])
-        node, size, middle = vis[f"{ROOT}/ground/{number}"], [float(end - start), across], (start + end) / 2
+        node, wide = vis[f"{ROOT}/ground/{number}"], float(block.y_to - block.y_from)
+        size, (x, y) = [float(block.x_to - block.x_from), wide], (block.x_from + block.x_to, block.y_from + block.y_to)
         depth = float(block.top - min(b.top for b in seen) + TRACK_DEPTH_M - TOP_M)
-        _put(node["side"], shapes.Box([*size, depth]), (middle, 0.0, block.top - TOP_M - depth / 2), TRACK_SIDE)
-        _put(node["top"], shapes.Box([*size, TOP_M]), (middle, 0.0, block.top - TOP_M / 2), TRACK_COLOR)
-        for name, (step, lift, color) in GRIDS.items():
-            _grid(node[name], start, end, block.top + LINE_LIFT_M * lift, step, color)
+        _put(node["side"], shapes.Box([*size, depth]), (x / 2, y / 2, block.top - TOP_M - depth / 2), TRACK_SIDE)
+        _put(node["top"], shapes.Box([*size, TOP_M]), (x / 2, y / 2, block.top - TOP_M / 2), TRACK_COLOR)
+        if not block.even:
+            pivot = np.array([block.pivot_m, 0.0, block.top])
+            node.set_transform(pin.SE3(block.turn, pivot - block.turn @ pivot).homogeneous)
+        for name, (step, lift, color) in GRIDS.items() if wide == across else ():
+            _grid(node[name], block.x_from, block.x_to, block.top + LINE_LIFT_M * lift, step, color)
     for number, x in enumerate(marks):
         line = shapes.Box([MARK_M, across, 0.003])
         _put(vis[f"{ROOT}/marks/{number}"], line, (x, 0.0, scene.top_at(x) + 0.0025), VERMILION)

@@ -201,13 +201,13 @@ class Recorder:
     """Raw log of one run; :meth:`result` derives everything else.
 
     ``robot`` is the simulated one, perturbed as it is; ``planned_end`` (nq,), the last configuration of the tape, tells
-    the height to land on; ``links`` are the names of all links.
+    the height to land on, where the ground really is ``higher_m`` higher; ``links`` are the names of all links.
     """
 
-    def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...]):
+    def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...], higher_m: float = 0.0):
         self._robot, self._links, self._feet = robot, links, frozenset(robot.foot.frames)
         self._planned_end, self._rows, self._gauge = planned_end, [], Gauge(robot)
-        self.fallen_steps = 0
+        self.fallen_steps, self._higher_m = 0, higher_m
 
     def add(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, contacts: Contacts) -> None:
         """Log one step: the state before it, and what acted during it."""
@@ -308,7 +308,7 @@ class Recorder:
             return standing, False, f"still moving at {speed:.2f} m/s at the end"
         if not (log["foot_wrench"][-1, :, 2] > CONTACT_FORCE_N).all():
             return standing, False, "a foot was in the air at the end"
-        miss = self._gauge.soles(log["q"][-1])[2] - self._gauge.soles(self._planned_end)[2]
+        miss = self._gauge.soles(log["q"][-1])[2] - self._gauge.soles(self._planned_end)[2] - self._higher_m
         if abs(miss) > LEVEL_TOLERANCE_M:
             return standing, False, f"stands {miss:+.2f} m from the height it was meant to land on"
         return standing, True, f"stood for {standing:.2f} s on its feet alone"

@@ -531,11 +531,12 @@ def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float)
     fill = dict(facecolor=tint(GROUND, 0.35), edgecolor="none", zorder=1)
     for block in sorted(scene.blocks, key=lambda b: b.top):
         start, end = max(left, block.x_from), min(right, block.x_to)
-        if start >= end or block.top <= bottom:
+        if start >= end or block.top <= bottom or not block.y_from <= 0 <= block.y_to:
             continue
-        ax.add_patch(Rectangle((start, bottom), end - start, block.top - bottom, **fill))
-        ax.plot([start, end], [block.top] * 2, **line)
-        for x in (block.x_from, block.x_to):
+        tops = [block.height_at(x) for x in (start, end)]
+        ax.fill([start, start, end, end], [bottom, *tops, bottom], **fill)
+        ax.plot([start, end], tops, **line)
+        for x, top in zip((start, end), tops, strict=True):
             if left < x < right:
-                below = max((b.top for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to), default=bottom)
-                ax.plot([x, x], [max(below, bottom), block.top], **line)
+                others = (b.height_at(x) for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to)
+                ax.plot([x, x], [max(max(others, default=bottom), bottom), top], **line)

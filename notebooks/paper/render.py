@@ -161,7 +161,11 @@ def _ground(scene: Scene, marks: Sequence[float]) -> list[Shape]:
         for a, b in itertools.pairwise(cuts):
             if b - a > 1e-9:
                 grey = GREYS[int(np.floor((a + b) / 2 / STRIPE_M)) % 2]
-                slab = _box((a, -HALF_WIDTH_M, block.top - depth), (b, HALF_WIDTH_M, block.top))
+                sides = np.clip((block.y_from, block.y_to), -HALF_WIDTH_M, HALF_WIDTH_M)
+                slab = _box((a, sides[0], block.top - depth), (b, sides[1], block.top))
+                if not block.even:
+                    pivot = np.array([block.pivot_m, 0.0, block.top])
+                    slab = pivot + (slab - pivot) @ block.turn.T
                 out.append(Shape(0, slab, (grey,) * 3))
     for x in marks:
         low = (x - MARK_M / 2, -HALF_WIDTH_M, scene.top_at(x) - 0.002)
