@@ -52,6 +52,7 @@ class Lumped:
     foot_offset: np.ndarray  # (3,) from the foot body's origin to the origin of the told foot link [m]
     changed: dict[str, tuple[float, str]]  # what evening out and repairs changed: name -> (amount, unit)
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
+    placed: dict[str, pin.SE3]  # link -> its place in the robot's axes, those joints held and all others at 0
 
     def body(self, joint: str) -> Body:
         """The body that a joint moves."""
@@ -80,7 +81,7 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
         bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     offset = placed[feet[0]].translation - next(b for b in bodies if b.name == feet[0]).place
-    return Lumped(tuple(bodies), offset, changed, held)
+    return Lumped(tuple(bodies), offset, changed, held, placed)
 
 
 # what moves, and how far ----------------------------------------------------------------------------------------
