@@ -9,7 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
+from jumplab.cli.common import (
+    ENGINE,
+    EXPORTED,
+    FPS,
+    JUMP,
+    METHODS,
+    MODE,
+    PLAN,
+    Late,
+    command,
+    folder,
+    needing,
+    number,
+    opt,
+)
 from jumplab.errors import InputError
 from jumplab.sim import ENGINES
 from jumplab.task import JumpTask
@@ -20,8 +34,6 @@ sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("
 advice, memory = Late("jumplab.studies.advice"), Late("jumplab.studies.atlas")
 movies = Late("jumplab.show.movies")
 
-TRACKERS = ("unitree-csv", "gmr-pkl", "mjlab-npz", "beyondmimic-npz", "holosoma-npz", "mujoco")
-FORMATS = ("csv", "npz", "urdf-replay", *TRACKERS)  # of jumplab.io.export
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
 MOVIE = needing("name a file that ends in .gif or .mp4", lambda text: text.lower().endswith((".gif", ".mp4")))
 
@@ -149,10 +161,10 @@ def view(args: Namespace) -> None:
 
 @command(
     PLAN,
-    opt("--format", "joint table, arrays, folder to replay; what trackers read", None, FORMATS, required=True),
+    opt("--format", "joint table, arrays, folder to replay; what trackers read", None, EXPORTED, required=True),
     opt("--out PATH", "file, or folder of urdf-replay and mujoco (default: in DIR)", None, folder),
     opt("--simulated", "the simulated jump, to its standing end, instead of the planned one, to touchdown"),
-    opt("--fps N", "frames per second (default: 1000, 100 or, for trackers, 50 or 30)", None, number),
+    FPS,
 )
 def export(args: Namespace) -> None:
     """A jump of the whole robot for other programs."""

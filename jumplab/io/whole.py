@@ -89,7 +89,8 @@ class Whole:
         while waiting:
             name, link, kind = waiting.pop(0)
             if kind != "fixed":
-                joints, links = joints + [name], links + [link]
+                joints.append(name)
+                links.append(link)
             found = below[link]
             waiting = found + waiting if order == ORDERS[0] else waiting + found
         return tuple(joints[1:]), tuple(links)

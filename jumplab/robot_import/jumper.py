@@ -62,7 +62,9 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     sole = _sole(config, lumped, where)
     lumped = _cut_hips(lumped, roles, _urdf(config, roles, lumped, sole))
     text = _urdf(config, roles, lumped, sole)
-    told = _toml(config, roles, feet, sole, urdf, lumped) + _published(tree, lumped, _boxes(config, roles, lumped, sole))
+    told = _toml(config, roles, feet, sole, urdf, lumped) + _published(
+        tree, lumped, _boxes(config, roles, lumped, sole)
+    )
     return Jumper(text, told, lumped, tree)
 
 
@@ -201,9 +203,10 @@ def _link(
     inertia: pin.Inertia,
     boxes: Boxes,
     seen: Boxes | None = None,
-    axes: pin.SE3 = pin.SE3.Identity(),
+    axes: pin.SE3 | None = None,
 ) -> None:
     """A link with boxes that collide and are seen, and boxes that are only ``seen``; they lie along ``axes`` in it."""
+    axes = axes or pin.SE3.Identity()
     link = _add(robot, "link", name=name)
     inertial = _add(link, "inertial")
     _add(inertial, "origin", xyz=inertia.lever, rpy="0 0 0")
