@@ -99,8 +99,8 @@ def test_every_plain_array():
 
 
 # clips ----------------------------------------------------------------------------------------------------------
-KEYS = ["fps", "joint_pos", "joint_vel", "joint_torque", "body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w",
-        "contact", "phase", "joint_names", "body_names"]  # fmt: skip
+KEYS = ["fps", "joint_pos", "joint_vel", "joint_torque", "body_pos_w", "body_quat_w", "body_lin_vel_w",
+        "body_ang_vel_w", "contact", "phase", "joint_names", "body_names"]  # fmt: skip
 
 
 def test_names_and_kinds_of_what_trackers_read():
@@ -315,7 +315,8 @@ def test_where_a_motion_comes_from(tmp_path):
     assert list(read_simulation(str(tmp_path), ROBOT, ("more", "t", "q", "v", "tau", "phase"))["more"]) == [0, 1, 2]
     foreign = f"{path}: not a simulation of this folder's robot; simulate the plan again"
     wrong = {"q": good["q"][:, 1:], "v": good["v"][1:], "tau": good["tau"][:, 1:], "phase": good["phase"][1:],
-             "foot_wrench": wrench[1:], "schema": np.array("x"), "joint_names": good["joint_names"][::-1], "t": good["t"][None]}  # fmt: skip
+             "foot_wrench": wrench[1:],
+             "schema": np.array("x"), "joint_names": good["joint_names"][::-1], "t": good["t"][None]}  # fmt: skip
     for name, value in wrong.items():
         np.savez(path, **(good | {name: value}))
         assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == foreign

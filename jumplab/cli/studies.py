@@ -144,11 +144,7 @@ def certify(args: Namespace) -> None:
 @command(
     ROBOT,
     opt(
-        "--out DIR",
-        "folder for index.json and a folder per clip; an interrupted library goes on",
-        None,
-        folder,
-        required=True,
+        "--out DIR", "folder for index.json and the clips; an interrupted library goes on", None, folder, required=True
     ),
     opt("--format", "of the clips (default mjlab-npz)", "mjlab-npz", EXPORTED),
     FPS,
@@ -162,9 +158,7 @@ def clips(args: Namespace) -> None:
     try:
         found = libraries.make_clips(robot, args.out, args.format, **how)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            "interrupted; finished clips are kept, and the same command goes on from there"
-        ) from None
+        raise KeyboardInterrupt(KEPT.replace("trials", "clips")) from None
     args.found |= {"out": args.out} | found.to_json()
     count = len(found.rows) + len(found.left_out)
     print(f"{len(found.rows)} of {count} clips passed; index.json in {args.out}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.io.folder import EXPORTS, transaction, write_file
-from jumplab.io.motion import Motion
+from jumplab.io.motion import Motion, checked_rate
 from jumplab.io.whole import ORDERS, Frames, Whole
 from jumplab.robot import Robot
 
@@ -29,6 +29,13 @@ def default_name(format_name: str, source: str) -> str:
     return name if source == "plan" else f"simulated_{name}"
 
 
+def rate_of(format_name: str, fps: float | None = None) -> float:
+    """Frames a second of a format, ``fps`` where given; raises :class:`InputError` if either cannot be meant."""
+    if format_name not in FORMATS:
+        raise InputError(f"format {format_name!r}: must be one of {', '.join(FORMATS)}")
+    return checked_rate(FORMATS[format_name][1] if fps is None else fps)
+
+
 def write(format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float | None = None) -> Path:
     """Write a motion of the whole robot in one of :data:`FORMATS` to a file, or to a folder.
 
@@ -36,11 +43,8 @@ def write(format_name: str, motion: Motion, robot: Robot, path: str | Path, *, f
     Raises :class:`InputError`, and leaves nothing behind, if the format is unknown, the rate cannot be meant, or the
     path cannot be written.
     """
-    path = Path(path)
-    if format_name not in FORMATS:
-        raise InputError(f"format {format_name!r}: must be one of {', '.join(FORMATS)}")
-    file, usual = FORMATS[format_name]
-    ending, rate = Path(file).suffix, usual if fps is None else fps
+    path, rate = Path(path), rate_of(format_name, fps)
+    ending = Path(FORMATS[format_name][0]).suffix
     if ending and path.suffix.lower() != ending:
         raise InputError(f"--out must name a file that ends in {ending}, got {str(path)!r}")
     whole = Whole(robot)

@@ -97,11 +97,17 @@ class Motion:
 
         With ``end`` its last instant follows, where it is none of the grid: touchdown, in a plan.
         """
-        if not 0 < rate_hz <= MAX_RATE_HZ:
-            raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
+        checked_rate(rate_hz)
         count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
         times = np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1])
         return self.at(np.append(times, self.t[-1]) if end and self.t[-1] - times[-1] > END_TOLERANCE else times)
+
+
+def checked_rate(rate_hz: float) -> float:
+    """A rate [1/s] that a motion can be sampled with; raises :class:`InputError` if it is none."""
+    if not 0 < rate_hz <= MAX_RATE_HZ:
+        raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
+    return rate_hz
 
 
 def read_simulation(folder: str | Path, robot: Robot, names: Sequence[str]) -> dict[str, np.ndarray]:

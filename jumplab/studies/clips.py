@@ -1,6 +1,6 @@
 """A library of clips: jumps of one robot to all sides, each planned, audited, landed alike by all engines, exported.
 
-Every clip is a folder, put in its place whole: a library that was stopped goes on with those that are missing.
+Every clip is a folder, put in its place whole: a library that was stopped goes on with those that are missing or failed.
 """
 
 from __future__ import annotations
@@ -104,8 +104,7 @@ def make_clips(
 
     Raises :class:`InputError` for formats, names or a folder that cannot be meant, or if an engine is not installed.
     """
-    if format_name not in export.FORMATS:
-        raise InputError(f"format {format_name!r}: must be one of {', '.join(export.FORMATS)}")
+    export.rate_of(format_name, fps)
     tasks = targets(robot)
     unknown = [name for name in only or () if name not in tasks]
     if unknown:
@@ -120,6 +119,7 @@ def make_clips(
         say(f"{row['name']}: {'passed' if row['passed'] else 'left out, ' + row['reasons'][0]}")
     parts = [tuple(row for row in rows.values() if row["passed"] is passed) for passed in (True, False)]
     head = {"schema": SCHEMA, "robot": {"name": robot.name, "hash": robot.hash}, "format": format_name, "fps": fps}
+    shutil.rmtree(out / STAGING, ignore_errors=True)
     store.settle()
     store.write_file(out / INDEX, store.to_json(head | Clips(*parts).to_json()).encode())
     return Clips(*parts)
@@ -128,11 +128,11 @@ def make_clips(
 def _clip(
     planner: Planner, name: str, task: JumpTask, out: Path, format_name: str, fps: float | None
 ) -> dict[str, Any]:
-    """The row of one clip, which is made unless its folder holds it; one that fails leaves its plan and its row."""
+    """The row of one clip, which is made unless its folder holds one that passed; a failed one leaves what there was."""
     robot, folder, file = planner.robot, out / name, export.default_name(format_name, "simulation")
     said = {"name": name, "target": asdict(task), "robot": robot.hash, "versions": store.versions()}
     row = store.read_json(folder / ROW) if (folder / ROW).is_file() else {}
-    if any(row.get(key) != value for key, value in said.items()):
+    if not row.get("passed") or any(row[key] != value for key, value in said.items()):
         staging = out / STAGING / name
         shutil.rmtree(staging, ignore_errors=True)  # left by a run that was killed
         with made(staging):
