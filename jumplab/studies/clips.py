@@ -1,6 +1,6 @@
 """A library of clips: jumps of one robot to all sides, each planned, audited, landed alike by all engines, exported.
 
-Every clip is a folder, put in its place whole: a library that was stopped goes on with those that are missing or failed.
+Every clip is a folder, put in its place whole: a library that was stopped goes on with those missing or failed.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def make_clips(
 def _clip(
     planner: Planner, name: str, task: JumpTask, out: Path, format_name: str, fps: float | None
 ) -> dict[str, Any]:
-    """The row of one clip, which is made unless its folder holds one that passed; a failed one leaves what there was."""
+    """The row of one clip, which is made unless its folder holds one that passed; a failed one leaves its plan."""
     robot, folder, file = planner.robot, out / name, export.default_name(format_name, "simulation")
     said = {"name": name, "target": asdict(task), "robot": robot.hash, "versions": store.versions()}
     row = store.read_json(folder / ROW) if (folder / ROW).is_file() else {}
