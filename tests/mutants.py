@@ -28,7 +28,7 @@ AUDIT = tuple(f"jumplab.auditing.{part}" for part in ("audit", "contact", "dynam
 JUDGED = {
     "audit": (AUDIT, ("tests/test_audit_amounts.py", "tests/test_audit_words.py"), 0.95),
     "exports": (
-        ("jumplab.io.export", "jumplab.io.motion", "jumplab.io.whole"),
+        ("jumplab.io.export", "jumplab.io.motion"),
         ("tests/test_export_amounts.py", "tests/test_motion.py"),
         0.95,
     ),

@@ -61,9 +61,8 @@ def test_thirty_targets_of_every_kind_grow_with_the_leg(bhr):
         "forward", "back", "height", "platform", "side", "turn"}  # fmt: skip
     assert len(set(found.values())) == 30
     leg = clips.leg_m(bhr)
-    model, data = bhr.sagittal, found["forward-1"]
-    assert leg == pytest.approx(model.length[1] + model.length[2])  # shank and thigh
-    assert data == JumpTask(round(0.2 * leg, 2), round(0.2 * leg, 2))
+    assert clips.leg_m(bhr.with_legs(1.1)) == pytest.approx(1.1 * leg)  # thigh and shank
+    assert found["forward-1"] == JumpTask(round(0.2 * leg, 2), round(0.2 * leg, 2))
     assert found["back-4"].distance_m == -round(0.4 * leg, 2) and found["side-2"].side_m == -round(0.15 * leg, 2)
     assert found["platform-5"].platform_m < 0 < found["platform-1"].platform_m
     assert found["turn-4"].yaw_rad == math.radians(-60)

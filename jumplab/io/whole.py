@@ -62,9 +62,9 @@ class Whole:
         xyz, rpy = (get(key, count=3) if told else [0.0] * 3 for key in ("xyz_m", "rpy_rad"))
         self._offset = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
         try:
-            self.model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
             self._below = _children(self.urdf)
-        except (ValueError, AttributeError, ElementTree.ParseError) as e:
+            self.model = pin.buildModelFromXML(self.urdf, pin.JointModelFreeFlyer())
+        except (ValueError, AttributeError, KeyError, ElementTree.ParseError) as e:
             raise RobotError(f"robot {robot.name}: [published] holds no URDF: {str(e).splitlines()[0]}") from e
         self.model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
         self.joints, self.links = self.ordered()
