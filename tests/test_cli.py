@@ -50,7 +50,8 @@ def here(tmp_path, monkeypatch):
 
 
 NAMES = (
-    "run, plan, audit, simulate, trials, margins, certify, chain, view, export, robot, envelope, atlas, sweep, bench "
+    "run, plan, audit, simulate, trials, margins, certify, chain, clips, view, export, robot, envelope, atlas, sweep, "
+    "bench "
 )
 NAMES += "or completion"
 REFUSALS = [

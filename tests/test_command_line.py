@@ -69,8 +69,6 @@ def test_quiet_says_nothing(capsys, planned):
 
 
 IGNORED = [
-    ("export {} --format csv --fps 30", "--fps is of a motion-clip, not of csv; leave it away"),
-    ("export {} --format npz --order depth-first", "--order is of a motion-clip, not of npz; leave it away"),
     ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it away"),
     ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it away"),
     ("chain --distance-m 0.5 --ranges wide --out x", "--ranges says how perturbed robots differ, and neither --seed "

@@ -86,7 +86,8 @@ def test_times_outside():
 
 def write(folder, **changes):
     arrays = {"schema": np.array("jumplab-simulation-1"), "t": np.arange(3.0), "q": np.zeros((3, 21)),
-              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3)}  # fmt: skip
+              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3),
+              "foot_wrench": np.zeros((3, 2, 6))}  # fmt: skip
     np.savez(folder / "simulation.npz", **(arrays | changes))
 
 

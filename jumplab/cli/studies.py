@@ -12,6 +12,8 @@ from jumplab.cli import common
 from jumplab.cli.common import (
     DISTURB,
     ENGINE,
+    EXPORTED,
+    FPS,
     JOBS,
     JUMP,
     METHODS,
@@ -38,6 +40,7 @@ certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab
 bounds = Late("jumplab.studies.margins")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
 memory = Late("jumplab.studies.atlas")
+libraries = Late("jumplab.studies.clips")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
@@ -172,6 +175,32 @@ def certify(args: Namespace) -> None:
         more = f"; and {len(found.failures) - 1} more" if len(found.failures) > 1 else ""
         raise InfeasibleError(f"not certified: {found.failures[0]}{more}; see certificate.html in {args.dir!r}")
     print(f"certified: all {len(found.audit.checks)} checks of the audit passed, and the engines agree that it lands")
+
+
+@command(
+    ROBOT,
+    opt(
+        "--out DIR", "folder for index.json and the clips; an interrupted library goes on", None, folder, required=True
+    ),
+    opt("--format", "of the clips (default mjlab-npz)", "mjlab-npz", EXPORTED),
+    FPS,
+    opt("--only NAME+", "names of clips, such as forward-1 (default: all thirty)"),
+    JOBS,
+)
+def clips(args: Namespace) -> None:
+    """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
+    start, robot = time.perf_counter(), robots.Robot.load(args.robot)
+    how = dict(fps=args.fps, only=args.only, jobs=args.jobs, say=print)
+    try:
+        found = libraries.make_clips(robot, args.out, args.format, **how)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(KEPT.replace("trials", "clips")) from None
+    args.found |= {"out": args.out} | found.to_json()
+    count = len(found.rows) + len(found.left_out)
+    print(f"{len(found.rows)} of {count} clips passed; index.json in {args.out}")
+    print(f"whole library: {time.perf_counter() - start:.1f} s")
+    if not found.rows:
+        raise InfeasibleError(f"no clip of {robot.name} passed: {found.left_out[0]['reasons'][0]}")
 
 
 @command(

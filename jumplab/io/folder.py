@@ -40,7 +40,17 @@ PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy"
 BUILDS = {"pybullet": "pybullet-arm64"}  # the same sources, built for later Pythons under another name
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
-EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")
+EXPORTS = (
+    "joints.csv",
+    "motion.npz",
+    "replay",
+    "unitree.csv",
+    "gmr.pkl",
+    "mjlab.npz",
+    "beyondmimic.npz",
+    "holosoma.npz",
+)
+EXPORTS += ("mujoco",)
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
 TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")

@@ -16,6 +16,7 @@ from jumplab.robot import Robot
 
 SIMULATION_NAME, SIMULATION_SCHEMA = "simulation.npz", "jumplab-simulation-1"
 MAX_RATE_HZ = 10_000.0  # ten times the rate of the logs; more is a typing error
+CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-off 20 ms late
 END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample in spite of rounding
 
 
@@ -40,13 +41,20 @@ class Motion:
     phase: np.ndarray  # (N,) "launch", "flight" or "landing"
     source: str  # "plan" or "simulation"
     wrench: np.ndarray | None = None  # (N, 2, 6) on the feet: force, moment, world axes, at the foot links' origins
+    contact: np.ndarray | None = None  # (N, 2) whether left and right foot press on the ground; None: but in flight
+
+    def __post_init__(self) -> None:
+        if self.contact is None:
+            both = np.repeat(np.asarray(self.phase)[:, None] != "flight", 2, axis=1)
+            object.__setattr__(self, "contact", both)
 
     @classmethod
     def of(cls, record: Record) -> Motion:
         """The motion of a ``Tape`` (it alone carries accelerations) or of a ``SimulationResult``."""
         source = "plan" if hasattr(record, "a") else "simulation"
         wrench = getattr(record, "f" if source == "plan" else "foot_wrench", None)
-        return cls(record.t, record.q, record.v, record.tau, record.phase, source, wrench)
+        contact = None if source == "plan" else _pressing(wrench)
+        return cls(record.t, record.q, record.v, record.tau, record.phase, source, wrench, contact)
 
     @classmethod
     def of_simulation_file(cls, folder: str | Path, robot: Robot) -> Motion:
@@ -54,7 +62,8 @@ class Motion:
         if not (Path(folder) / SIMULATION_NAME).is_file():
             raise InputError(f"{str(folder)!r} holds no simulation; run 'jumplab simulate {folder}' first")
         data = read_simulation(folder, robot, ("t", "q", "v", "tau", "phase"), ("foot_wrench",))
-        return cls(wrench=data.pop("foot_wrench", None), **data, source="simulation")
+        wrench = data.pop("foot_wrench", None)
+        return cls(wrench=wrench, contact=_pressing(wrench), **data, source="simulation")
 
     @property
     def duration(self) -> float:
@@ -81,16 +90,26 @@ class Motion:
 
         q = between(self.q)
         q[:, 3:7] = _between_attitudes(self.q[row, 3:7], self.q[row + 1, 3:7], share)
-        phase = np.where(share < 1.0, self.phase[row], self.phase[row + 1])
-        wrench = None if self.wrench is None else between(self.wrench)
-        return Motion(times, q, between(self.v), between(self.tau), phase, self.source, wrench)
+        wrench, late = None if self.wrench is None else between(self.wrench), np.where(share < 1.0, row, row + 1)
+        states = (q, between(self.v), between(self.tau), self.phase[late])
+        return Motion(times, *states, self.source, wrench, self.contact[late])
 
-    def every(self, rate_hz: float) -> Motion:
-        """The motion on a grid of ``rate_hz`` samples a second, from its start to the last grid point within it."""
-        if not 0 < rate_hz <= MAX_RATE_HZ:
-            raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
+    def every(self, rate_hz: float, *, end: bool = False) -> Motion:
+        """The motion on a grid of ``rate_hz`` samples a second, from its start to the last grid point within it.
+
+        With ``end`` its last instant follows, where it is none of the grid: touchdown, in a plan.
+        """
+        checked_rate(rate_hz)
         count = int(np.floor((self.duration + END_TOLERANCE) * rate_hz)) + 1
-        return self.at(np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1]))
+        times = np.minimum(self.t[0] + np.arange(count) / rate_hz, self.t[-1])
+        return self.at(np.append(times, self.t[-1]) if end and self.t[-1] - times[-1] > END_TOLERANCE else times)
+
+
+def checked_rate(rate_hz: float) -> float:
+    """A rate [1/s] that a motion can be sampled with; raises :class:`InputError` if it is none."""
+    if not 0 < rate_hz <= MAX_RATE_HZ:
+        raise InputError(f"rate = {rate_hz:g} per second must lie above 0 and not above {MAX_RATE_HZ:g}")
+    return rate_hz
 
 
 def read_simulation(
@@ -120,6 +139,11 @@ def _between_attitudes(first: np.ndarray, second: np.ndarray, share: np.ndarray)
     start = Rotation.from_quat(first)
     arc = (start.inv() * Rotation.from_quat(second)).as_rotvec()
     return steady((start * Rotation.from_rotvec(share[:, None] * arc)).as_quat())
+
+
+def _pressing(wrench: np.ndarray | None) -> np.ndarray | None:
+    """Which feet (N, 2) press on the ground, from the wrenches (N, 2, 6) on them."""
+    return None if wrench is None else wrench[:, :, 2] > CONTACT_FORCE_N
 
 
 def steady(quaternions: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import pinocchio as pin
 from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
-from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
+from jumplab.io.motion import CONTACT_FORCE_N, SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of
@@ -24,7 +24,6 @@ from jumplab.sim.playback import Actuators
 from jumplab.sim.scene import Contacts
 
 STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
-CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-off 20 ms late
 STILL_SPEED = 0.05  # [m/s] a CoM slower than this at the end stands
 LEVEL_TOLERANCE_M = 0.05  # soles this close to the planned height stand on the planned surface
 IMPACT_S = 0.1  # the landing impulse is summed over this time after touchdown
