@@ -345,7 +345,7 @@ def test_browser_shows_launch_flight_and_landing(page, tmp_path):
     seen = {
         "launch": picture(f"{url}#t=0.4", tmp_path),
         "flight": picture(f"{url}#t=1.1", tmp_path),
-        "landing": picture(f"{url}#t=3.5&view=corner", tmp_path),
+        "landing": picture(f"{url}#t=3.5&view=corner&follow=1", tmp_path),
     }
     for phase, image in seen.items():
         others = [count(image, p) for p in PHASE_COLORS if p != phase]
