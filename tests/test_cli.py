@@ -49,8 +49,11 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = "run, plan, audit, simulate, trials, certify, chain, view, export, robot, envelope, atlas, sweep, bench or "
-NAMES += "completion"
+NAMES = (
+    "run, plan, audit, simulate, trials, margins, certify, chain, clips, view, export, robot, envelope, atlas, sweep, "
+    "bench "
+)
+NAMES += "or completion"
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),

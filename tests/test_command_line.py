@@ -35,7 +35,7 @@ def test_every_command_takes_json_and_quiet(capsys, name):
     said = capsys.readouterr().out
     assert "--json" in said and "--quiet" in said
     assert not re.search(r"--(workers|n-jobs|distances-m|heights-m|platforms-m)\b", said)
-    if name in ("trials", "certify", "chain", "envelope", "sweep"):
+    if name in ("trials", "margins", "certify", "chain", "envelope", "sweep"):
         assert "--jobs N" in said
 
 
@@ -69,8 +69,6 @@ def test_quiet_says_nothing(capsys, planned):
 
 
 IGNORED = [
-    ("export {} --format csv --fps 30", "--fps is of a motion-clip, not of csv; leave it away"),
-    ("export {} --format npz --order depth-first", "--order is of a motion-clip, not of npz; leave it away"),
     ("view {} --movie a.gif --out b.html", "--out names the page, and --movie is given instead of it; leave it away"),
     ("chain --distance-m 0.5 --jobs 2 --out x", "--jobs is for several --runs; leave it away"),
     ("chain --distance-m 0.5 --ranges wide --out x", "--ranges says how perturbed robots differ, and neither --seed "

@@ -1,22 +1,27 @@
 """Exports, each read back as its reader would and compared with Pinocchio, MuJoCo or PyBullet."""
 
+import pickle
 import re
 import sys
-from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import jump
+from fixtures_robots import arm_base, held_arms, sideways, waist, write
 from test_cli import one_sentence, run
-from test_robot import with_free_base
 from test_store import names
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, RobotError
 from jumplab.io import export
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion
+from jumplab.io.whole import ORDERS, Whole
+from jumplab.robot import Robot
+from jumplab.robot.description import SHIPPED
+from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +47,11 @@ def test_joint_table(motion, bhr, odd_folder):
     path = export.write("csv", motion, bhr, odd_folder / "joints.csv")
     head = path.read_text().splitlines()[0].split(",")
     table = np.genfromtxt(path, delimiter=",", names=True)
-    assert list(table.dtype.names) == head and len(head) == 2 + 3 * len(bhr.joint_names)
-    assert np.diff(table["time_s"]) == pytest.approx(0.001, abs=1e-9)
-    assert table["time_s"][0] == 0 and table["time_s"][-1] == np.floor(tape.t[-1] * 1000) / 1000
-    rows = np.concatenate([np.arange(tape.takeoff_index - 1), np.arange(tape.takeoff_index, len(tape.t) - 1)])
-    assert len(rows) == len(table)  # take-off once, and the fraction of a millisecond at the end not at all
+    assert list(table.dtype.names) == head and len(head) == 4 + 3 * len(bhr.joint_names)
+    assert np.diff(table["time_s"])[:-1] == pytest.approx(0.001, abs=1e-9)
+    assert table["time_s"][0] == 0 and table["time_s"][-1] == pytest.approx(tape.t[-1], abs=1e-6)  # touchdown is in
+    rows = np.concatenate([np.arange(tape.takeoff_index - 1), np.arange(tape.takeoff_index, len(tape.t))])
+    assert len(rows) == len(table)  # take-off once
     model = bhr.model
     for name in bhr.joint_names:
         i, j = model.idx_qs[model.getJointId(name)], model.idx_vs[model.getJointId(name)]
@@ -62,7 +67,8 @@ def test_plain_arrays(flip, bhr, tmp_path):
     with np.load(export.write("npz", flip, bhr, tmp_path / "motion.npz"), allow_pickle=False) as file:
         x = {k: file[k] for k in file.files}
     model, data = bhr.model, bhr.model.createData()
-    assert tuple(x["joint_names"]) == bhr.joint_names and np.diff(x["time_s"]) == pytest.approx(0.001)
+    assert set(x["joint_names"]) == set(bhr.joint_names) and np.diff(x["time_s"])[:-1] == pytest.approx(0.001)
+    at = [bhr.joint_names.index(name) for name in x["joint_names"]]
     for k in range(0, len(x["time_s"]), 97):
         row = np.searchsorted(flip.t, x["time_s"][k] + 1e-9) - 1
         pin.forwardKinematics(model, data, flip.q[row], flip.v[row])
@@ -72,80 +78,242 @@ def test_plain_arrays(flip, bhr, tmp_path):
         assert turn == pytest.approx(data.oMi[1].rotation, abs=1e-6)
         assert x["base_velocity_world_m_s"][k] == pytest.approx(twist.linear, abs=1e-5)
         assert x["base_angular_velocity_world_rad_s"][k] == pytest.approx(twist.angular, abs=1e-5)
-        assert x["joint_position_rad"][k] == pytest.approx(flip.q[row, 7:], abs=1e-6)
-        assert x["joint_torque_N_m"][k] == pytest.approx(flip.tau[row], abs=1e-4)
+        assert x["joint_position_rad"][k] == pytest.approx(flip.q[row, 7:][at], abs=1e-6)
+        assert x["joint_torque_N_m"][k] == pytest.approx(flip.tau[row][at], abs=1e-4)
 
 
-# motion clip ----------------------------------------------------------------------------------------------------
-def read_clip(motion, robot, folder, **options):
-    path = export.write("motion-clip", motion, robot, folder / "clip.npz", **options)
+# every frame of every format in MuJoCo --------------------------------------------------------------------------
+G1 = pytest.param("g1", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed"))
+
+
+def published(name: str) -> str:
+    """The URDF that a robot comes from, without its meshes."""
+    if name == "bhr":
+        return Robot.load().urdf
+    root = ET.parse(locate(f"{PACKAGE}:g1_description/urdf/g1_29dof_rev_1_0.urdf", SHIPPED["bhr"].parent)).getroot()
+    for link in root.iterfind("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            link.remove(shape)
+    return ET.tostring(root, encoding="unicode")
+
+
+def tumbling(robot, end=0.2105) -> Motion:
+    """A motion in which nothing is at rest, with contacts that change."""
+    rng, t = np.random.default_rng(8), np.append(np.arange(0.0, end, 0.001), end)
+    model, rate = robot.model, rng.normal(0, 2, robot.model.nv)
+    q = np.array([pin.integrate(model, pin.neutral(model), rate * x) for x in t])
+    v = rate + rng.normal(0, 1, (len(t), model.nv))
+    phase = np.where(t < 0.1, "launch", np.where(t < 0.2, "flight", "landing"))
+    contact = rng.uniform(size=(len(t), 2)) < 0.5
+    return Motion(t, q, v, rng.normal(0, 9, (len(t), model.nv - 6)), phase, "simulation", contact=contact)
+
+
+def npz(path) -> dict:
     with np.load(path, allow_pickle=False) as file:
         return {k: file[k] for k in file.files}
 
 
-def test_clip_has_the_layout_that_trackers_index(flip, bhr, tmp_path):
-    clip = read_clip(flip, bhr, tmp_path)
-    frames, joints, bodies = int(np.floor(flip.duration * 50)) + 1, len(bhr.joint_names), len(clip["body_names"])
-    shapes = {"fps": (1,), "joint_pos": (frames, joints), "joint_vel": (frames, joints), "joint_names": (joints,),
-              "body_pos_w": (frames, bodies, 3), "body_quat_w": (frames, bodies, 4), "body_names": (bodies,),
-              "body_lin_vel_w": (frames, bodies, 3), "body_ang_vel_w": (frames, bodies, 3)}  # fmt: skip
-    assert {k: x.shape for k, x in clip.items()} == shapes
-    assert clip["fps"][0] == 50 and clip["body_names"][0] == "trunk"
-    assert all(x.dtype == np.float32 for k, x in clip.items() if k[-1] != "s")
+def states(format_name: str, path) -> dict:
+    """What a format says, under MuJoCo's names where it has them: qpos (F, 7 + J), qvel, and all of its own."""
+    if format_name == "unitree-csv":
+        rows = np.loadtxt(path, delimiter=",")
+        return {"qpos": rows[:, [0, 1, 2, 6, 3, 4, 5, *range(7, rows.shape[1])]]}
+    if format_name == "gmr-pkl":
+        x = pickle.loads(path.read_bytes())
+        return x | {"qpos": np.column_stack([x["root_pos"], x["root_rot"][:, [3, 0, 1, 2]], x["dof_pos"]])}
+    if format_name == "csv":
+        x = np.genfromtxt(path, delimiter=",", names=True)
+        names = [n.removesuffix("_position_rad") for n in x.dtype.names if n.endswith("_position_rad")]
+        return {"joint_names": names} | {
+            own: np.column_stack([x[f"{name}_{kind}"] for name in names])
+            for own, kind in (("angles", "position_rad"), ("rates", "velocity_rad_s"), ("torque", "torque_N_m"))
+        } | {"contact": np.column_stack([x["contact_left"], x["contact_right"]])}  # fmt: skip
+    folder = {"mujoco": "motion.npz", "urdf-replay": "trajectory.npz"}.get(format_name)
+    x = npz(path / folder if folder else path)
+    if format_name in ("npz", "urdf-replay"):
+        turn = x["base_quaternion_xyzw"][:, [3, 0, 1, 2]]
+        spin = np.array([pin.Quaternion(*a).toRotationMatrix().T @ w for a, w in
+                         zip(turn, x["base_angular_velocity_world_rad_s"], strict=True)])  # fmt: skip
+        x["qpos"] = np.column_stack([x["base_position_m"], turn, x["joint_position_rad"]])
+        x["qvel"] = np.column_stack([x["base_velocity_world_m_s"], spin, x["joint_velocity_rad_s"]])
+    if format_name == "holosoma-npz":
+        x |= {"qpos": x["joint_pos"], "qvel": x["joint_vel"]}
+    return x
 
 
-def test_clip_in_mujoco(flip, bhr, tmp_path):
-    """MuJoCo is told base and joints of each frame and must find every body where the clip has it, by number."""
-    clip = read_clip(flip, bhr, tmp_path)
-    model = mujoco.MjModel.from_xml_string(with_free_base(bhr.urdf))
-    data = mujoco.MjData(model)
-    assert [model.body(i).name for i in range(1, model.nbody)] == list(clip["body_names"])
-    assert [model.joint(i).name for i in range(1, model.njnt)] == list(clip["joint_names"])
-    velocity = np.zeros(6)
-    for k in range(len(clip["joint_pos"])):
-        turn = clip["body_quat_w"][k, 0]
-        rotation = pin.Quaternion(*turn.astype(float)).normalized().toRotationMatrix()
-        data.qpos[:] = np.concatenate([clip["body_pos_w"][k, 0], turn, clip["joint_pos"][k]])
-        spin = rotation.T @ clip["body_ang_vel_w"][k, 0]
-        data.qvel[:] = np.concatenate([clip["body_lin_vel_w"][k, 0], spin, clip["joint_vel"][k]])
-        mujoco.mj_forward(model, data)
-        assert clip["body_pos_w"][k] == pytest.approx(data.xpos[1:], abs=2e-6)
-        same = np.abs(np.sum(clip["body_quat_w"][k] * data.xquat[1:], axis=1))
-        assert same == pytest.approx(1.0, abs=1e-6)
-        for i in range(1, model.nbody):
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, i, velocity, 0)
-            assert clip["body_ang_vel_w"][k, i - 1] == pytest.approx(velocity[:3], abs=2e-5)
-            assert clip["body_lin_vel_w"][k, i - 1] == pytest.approx(velocity[3:], abs=2e-5)
+@pytest.mark.parametrize("name", ["bhr", G1])
+def test_every_frame_of_every_format_in_mujoco(name, tmp_path):
+    """MuJoCo has the URDF as its maker published it; where the root and the joints are, is the motion's word."""
+    robot, spec = Robot.load(name), mujoco.MjSpec.from_string(published(name))
+    spec.compiler.fusestatic = True
+    spec.worldbody.first_body().add_freejoint()
+    model = spec.compile()
+    data, motion = mujoco.MjData(model), tumbling(robot)
+    joints = [model.joint(i).name for i in range(1, model.njnt)]
+    bodies = [model.body(i).name for i in range(1, model.nbody)]
+    assert (len(joints), len(bodies)) == {"bhr": (14, 15), "g1": (29, 30)}[name]
+    held = {"left_elbow_joint": 0.9, "right_elbow_joint": 0.9}
+    for format_name, (file, rate) in export.FORMATS.items():
+        x = states(format_name, export.write(format_name, motion, robot, tmp_path / file))
+        frames = motion.every(rate, end=True)
+        at = {n: robot.joint_names.index(n) for n in robot.joint_names}
+        angles = np.column_stack([frames.q[:, 7 + at[n]] if n in at else np.full(len(frames.t), held.get(n, 0.0))
+                                  for n in joints])  # fmt: skip
+        rates = np.column_stack([frames.v[:, 6 + at[n]] if n in at else 0 * frames.t for n in joints])
+        turn = [pin.Quaternion(q[3:7]).toRotationMatrix() for q in frames.q]
+        velocity = np.einsum("fij,fj->fi", turn, frames.v[:, :3])
+        qpos = np.column_stack([frames.q[:, :3], frames.q[:, [6, 3, 4, 5]], angles])
+        qvel = np.column_stack([velocity, frames.v[:, 3:6], rates])
+        check_states(format_name, x, joints, qpos, qvel)
+        if "contact" in x:
+            assert (np.asarray(x["contact"], bool) == frames.contact).all()
+        for k in range(len(qpos)) if "body_pos_w" in x or "local_body_pos" in x else ():
+            data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
+            mujoco.mj_forward(model, data)
+            check_bodies(format_name, x, k, model, data, bodies)
 
 
-def test_clip_against_pinocchio_at_an_odd_rate(flip, bhr, tmp_path):
-    """Interpolated frames: poses of a Pinocchio state, velocities their derivative by finite differences."""
-    clip = read_clip(flip, bhr, tmp_path, fps=240)
-    model, data = bhr.model, bhr.model.createData()
-    ids = [model.getFrameId(str(n)) for n in clip["body_names"]]
-    for k in range(0, len(clip["joint_pos"]), 31):
-        row = min(np.searchsorted(flip.t, k / 240, side="right") - 1, len(flip.t) - 2)
-        share = (k / 240 - flip.t[row]) / (flip.t[row + 1] - flip.t[row])
-        pin.framesForwardKinematics(model, data, pin.interpolate(model, flip.q[row], flip.q[row + 1], share))
-        for i, frame in enumerate(ids):
-            assert clip["body_pos_w"][k, i] == pytest.approx(data.oMf[frame].translation, abs=1e-5)
-    middle = (clip["body_pos_w"][2:].astype(float) - clip["body_pos_w"][:-2]) * 120
-    assert np.abs(middle - clip["body_lin_vel_w"][1:-1]).max() < 0.05
-    steps = np.sum(clip["body_quat_w"][1:] * clip["body_quat_w"][:-1], axis=2)
-    assert steps.min() > 0.99  # neither leaps nor changes of sign
+def check_states(format_name, x, joints, qpos, qvel):
+    if "qpos" in x:
+        assert np.abs(x["qpos"][:, [0, 1, 2]] - qpos[:, :3]).max() < 1e-5, format_name
+        assert np.abs(np.sum(x["qpos"][:, 3:7] * qpos[:, 3:7], axis=1)) == pytest.approx(1.0, abs=1e-6)
+        assert np.abs(x["qpos"][:, 7:] - qpos[:, 7:]).max() < 1e-5
+        assert (np.sum(x["qpos"][1:, 3:7] * x["qpos"][:-1, 3:7], axis=1) > 0).all()
+    if "qvel" in x:
+        assert np.abs(x["qvel"] - qvel).max() < 1e-5
+    if "joint_names" in x and format_name != "beyondmimic-npz":
+        assert list(x["joint_names"]) == joints
+    if format_name == "csv":
+        assert np.abs(x["angles"] - qpos[:, 7:]).max() < 1e-5 and np.abs(x["rates"] - qvel[:, 6:]).max() < 1e-5
+    if format_name in ("mjlab-npz", "beyondmimic-npz"):
+        columns = [joints.index(name) for name in x["joint_names"]]
+        assert np.abs(x["joint_pos"] - qpos[:, 7:][:, columns]).max() < 1e-5
+        assert np.abs(x["joint_vel"] - qvel[:, 6:][:, columns]).max() < 1e-5
 
 
-def test_clip_orders(flip, bhr, tmp_path):
-    deep, broad = (read_clip(flip, bhr, tmp_path, order=o) for o in export.ORDERS)
-    assert list(broad["body_names"][:7]) == [
-        "trunk", "left_hip_yaw_link", "right_hip_yaw_link", "left_arm", "right_arm", "left_hip_roll_link",
-        "right_hip_roll_link"]  # fmt: skip
-    assert broad["joint_names"][0] == "left_hip_yaw" and broad["joint_names"][-1] == "right_ankle_roll"
-    for names_of, arrays in {"body_names": ("body_pos_w", "body_quat_w"), "joint_names": ("joint_pos",)}.items():
-        order = [list(deep[names_of]).index(n) for n in broad[names_of]]
-        assert sorted(order) == list(range(len(order))) and order != sorted(order)
-        for name in arrays:
-            assert np.array_equal(deep[name][:, order], broad[name])
+def check_bodies(format_name, x, k, model, data, bodies):
+    twist = np.zeros(6)
+    if format_name == "gmr-pkl":
+        assert x["link_body_list"] == bodies
+        local = (data.xpos[1:] - data.xpos[1]) @ data.xmat[1].reshape(3, 3)
+        assert np.abs(x["local_body_pos"][k] - local).max() < 1e-5
+        return
+    names, first = list(x["body_names"]), int(format_name == "holosoma-npz")
+    assert names == ["world", *bodies][1 - first :] or format_name == "beyondmimic-npz"
+    assert sorted(names[first:]) == sorted(bodies)
+    of = mujoco.mjtObj.mjOBJ_XBODY if format_name == "mjlab-npz" else mujoco.mjtObj.mjOBJ_BODY  # origin, or CoM
+    for i, name in enumerate(names):
+        body = model.body(name).id
+        mujoco.mj_objectVelocity(model, data, of, body, twist, 0)
+        assert np.abs(x["body_pos_w"][k, i] - data.xpos[body]).max() < 1e-5
+        assert abs(x["body_quat_w"][k, i] @ data.xquat[body]) == pytest.approx(1.0, abs=1e-6)
+        assert np.abs(x["body_ang_vel_w"][k, i] - twist[:3]).max() < 2e-5
+        assert np.abs(x["body_lin_vel_w"][k, i] - twist[3:]).max() < 2e-5
+
+
+@pytest.mark.parametrize("name", ["bhr", G1])
+def test_the_folder_for_mujoco(name, tmp_path):
+    """Its XML is the published robot: bodies, masses, places and motors, in the order of the trajectory."""
+    folder = export.write("mujoco", tumbling(Robot.load(name)), Robot.load(name), tmp_path / "mujoco")
+    model, x = mujoco.MjModel.from_xml_path(str(folder / "robot.xml")), npz(folder / "motion.npz")
+    spec = mujoco.MjSpec.from_string(published(name))
+    spec.compiler.fusestatic = True
+    spec.worldbody.first_body().add_freejoint()
+    there = spec.compile()
+    assert (model.nq, model.nv, model.nu) == (there.nq, there.nv, there.nv - 6) and model.nbody == there.nbody
+    assert x["qpos"].shape[1:] == (model.nq,) and x["qvel"].shape[1:] == (model.nv,) and x["fps"] == 50
+    assert [model.actuator(i).name for i in range(model.nu)] == list(x["joint_names"])
+    assert [model.joint(i).name for i in range(1, model.njnt)] == list(x["joint_names"])
+    for mine, other in ((model.body_mass, there.body_mass), (model.body_inertia, there.body_inertia),
+                        (model.body_ipos, there.body_ipos), (model.body_pos, there.body_pos)):  # fmt: skip
+        assert np.abs(mine - other)[1:].max() < 1e-6
+    data, other = mujoco.MjData(model), mujoco.MjData(there)
+    data.ctrl[:] = x["ctrl"][3]
+    for each, has in ((data, model), (other, there)):
+        each.qpos[:], each.qvel[:] = x["qpos"][3], x["qvel"][3]
+        mujoco.mj_forward(has, each)
+    assert data.qfrc_actuator[6:] == pytest.approx(np.clip(x["ctrl"][3], *model.jnt_actfrcrange[1:].T))  # the effort
+    assert np.abs(data.xpos - other.xpos).max() < 1e-6 and model.opt.gravity[2] == -9.8
+
+
+def test_orders_of_a_g1():
+    """As trackers count them: the left leg first, or level by level."""
+    if not have_published():
+        pytest.skip("the published robots are not installed")
+    whole = Whole(Robot.load("g1"))
+    legs = [f"{side}_{joint}_joint" for side in ("left", "right") for joint in
+            ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")]  # fmt: skip
+    arms = [f"{side}_{joint}_joint" for side in ("left", "right") for joint in
+            ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch",
+             "wrist_yaw")]  # fmt: skip
+    assert list(whole.joints) == [*legs, "waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint", *arms]
+    assert [name.removesuffix("_joint") for name in whole.ordered(ORDERS[1])[0]][:9] == [
+        "left_hip_pitch", "right_hip_pitch", "waist_yaw", "left_hip_roll", "right_hip_roll", "waist_roll",
+        "left_hip_yaw", "right_hip_yaw", "waist_pitch"]  # fmt: skip
+    assert whole.links[0] == "pelvis" and len(whole.links) == 30
+
+
+# the published robot and the one that jumps ---------------------------------------------------------------------
+@pytest.mark.parametrize("variant", [sideways, arm_base, waist, held_arms], ids=lambda v: v.__name__)
+def test_both_robots_are_one(variant, tmp_path):
+    """Wherever the root is: same mass, centre of mass and momenta as the robot that jumps."""
+    robot = Robot.load(write(tmp_path, variant))
+    whole, motion = Whole(robot), tumbling(robot, 0.02)
+    x, here, there = whole.frames(motion, 1000.0), robot.model, whole.model
+    a, b = here.createData(), there.createData()
+    for k, row in enumerate(range(len(motion.t))):
+        pin.ccrba(here, a, motion.q[row], motion.v[row])
+        pin.ccrba(there, b, x.q[k], x.v[k])
+        assert b.com[0] == pytest.approx(a.com[0], abs=1e-9)
+        assert b.hg.vector == pytest.approx(a.hg.vector, abs=1e-8)
+    assert set(robot.joint_names) <= set(whole.joints)
+
+
+def test_held_joints_carry_what_hangs_on_them(tmp_path):
+    """A robot that stands still: its held arms pull at their shoulders by their weight times their lever."""
+    robot = Robot.load(write(tmp_path, held_arms))
+    whole, motion = Whole(robot), tumbling(robot, 0.02)
+    lean = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0)).coeffs()  # face down, so that arms lie level
+    still = Motion(motion.t, np.tile([*motion.q[0, :3], *lean, *motion.q[0, 7:]], (len(motion.t), 1)), 0 * motion.v,
+                   motion.tau, motion.phase, "plan")  # fmt: skip
+    x = whole.frames(still, 100.0)
+    held = [i for i, name in enumerate(whole.joints) if name not in robot.joint_names]
+    assert held
+    for i in held:
+        joint = whole.model.getJointId(whole.joints[i])
+        inertia, rate = whole.model.inertias[joint], np.abs(x.torques[:, i])
+        assert rate == pytest.approx(inertia.mass * robot.gravity * abs(inertia.lever[2]), rel=1e-6)
+
+
+def test_a_robot_that_was_changed_is_not_the_published_one(tmp_path):
+    robot = Robot.load(write(tmp_path, held_arms))
+    name = robot.joints["knee"][0]
+    at = robot.urdf.index(f'<joint name="{name}"')
+    place = re.search(r'xyz="([^"]*)"', robot.urdf[at:])
+    x, y, z = map(float, place[1].split())
+    longer = robot.urdf[:at] + robot.urdf[at:].replace(place[0], f'xyz="{x} {y} {z - 0.05}"', 1)
+    other = Robot.from_text(longer, robot.config_text)
+    with pytest.raises(InputError, match=(
+        rf"^robot {robot.name}: joint '.*' is 50 mm off the published robot's, at most 10; "
+        r"import the changed robot's own URDF$"
+    )):  # fmt: skip
+        Whole(other).frames(tumbling(other, 0.01), 50.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("urdf = '''", "urdf = '''<", r"\[published\] holds no URDF: "),
+        ('trunk = "', 'trunk = "no_', r"\[published\] lacks the link 'no_.*'$"),
+        ("[published.held]", "[published.held]\nelbow = 1.0", r"\[published\] lacks the joint 'elbow'$"),
+    ],
+)
+def test_tables_that_make_no_robot(tmp_path, old, new, sentence):
+    robot = Robot.load(write(tmp_path, held_arms))
+    head, tail = robot.config_text.split("[published]\n")
+    other = Robot.from_text(robot.urdf, f"{head}[published]\n{tail.replace(old, new, 1)}")
+    with pytest.raises(RobotError, match=rf"^robot {robot.name}: {sentence}"):
+        Whole(other)
 
 
 # replay ---------------------------------------------------------------------------------------------------------
@@ -160,7 +328,7 @@ def test_replay_by_the_script_of_its_readme(flip, bhr, odd_folder, monkeypatch):
     space = {}
     try:
         exec(script, space)
-        last = Motion.of(flip).every(100.0).q[-1]
+        last = Motion.of(flip).every(100.0, end=True).q[-1]
         model, data = bhr.model, bhr.model.createData()
         pin.framesForwardKinematics(model, data, last)
         for i in range(pybullet.getNumJoints(space["robot"])):
@@ -182,16 +350,21 @@ def plan(tmp_path_factory):
     n, nv = 30, p.robot.model.nv
     np.savez(folder / "simulation.npz", schema=np.array("jumplab-simulation-1"), t=np.arange(n) / 1000,
              q=np.repeat(p.tape.q[:1], n, axis=0), v=np.zeros((n, nv)), tau=np.ones((n, nv - 6)),
-             phase=np.array(["landing"] * n), joint_names=np.array(p.robot.joint_names))  # fmt: skip
+             phase=np.array(["landing"] * n), foot_wrench=np.ones((n, 2, 6)),
+             joint_names=np.array(p.robot.joint_names))  # fmt: skip
     return folder
 
 
 def test_command(capsys, plan, tmp_path):
     duration = store.read_plan(plan)[0].t[-1]
-    for format_name, name in export.FORMATS.items():
+    for format_name, (name, _) in export.FORMATS.items():
         out = tmp_path / "new" / name
         code, said, err = run(capsys, "export", plan, "--format", format_name, "--out", out)
-        assert (code, err) == (0, "") and said == f"plan, {duration:.3f} s, as {format_name}: {out}\n" and out.exists()
+        assert (
+            (code, err) == (0, "")
+            and said == f"plan to touchdown, {duration:.3f} s, as {format_name}: {out}\n"
+            and out.exists()
+        )
     code, said, err = run(capsys, "export", plan, "--format", "csv", "--simulated")
     assert (code, err) == (0, "") and said.startswith("simulation, 0.029 s, as csv: ")
     table = np.genfromtxt(plan / "simulated_joints.csv", delimiter=",", names=True)
@@ -203,10 +376,10 @@ def test_command(capsys, plan, tmp_path):
     ("arguments", "sentence"),
     [
         (["--format", "csv", "--out", "x.txt"], "--out must name a file that ends in .csv, got 'x.txt'"),
-        (["--format", "motion-clip", "--fps", "many"], "--fps must be a number, got 'many'"),
-        (["--format", "motion-clip", "--fps", "12.5", "--out", "x.npz"],
-         "fps = 12.5: clips carry whole frames per second"),
-        (["--format", "motion-clip", "--fps", "0", "--out", "x.npz"],
+        (["--format", "mjlab-npz", "--fps", "many"], "--fps must be a number, got 'many'"),
+        (["--format", "mujoco", "--out", "mine"],
+         "the folder 'mine' already holds 'thesis.tex'; choose a new or an empty one"),
+        (["--format", "mjlab-npz", "--fps", "0", "--out", "x.npz"],
          "rate = 0 per second must lie above 0 and not above 10000"),
         (["--format", "npz", "--out", "/dev/null/x.npz"],
          "'/dev/null' is a file; choose a folder"),
@@ -223,36 +396,3 @@ def test_refusals(capsys, plan, tmp_path, monkeypatch, arguments, sentence):
     before = names(plan)
     assert one_sentence(*run(capsys, "export", plan, *arguments)) == sentence
     assert names(tmp_path) == ["mine"] and names(tmp_path / "mine") == ["thesis.tex"] and names(plan) == before
-
-
-def test_unknown_format_and_order(motion, bhr, tmp_path):
-    with pytest.raises(InputError, match=r"^format 'bvh': must be one of csv, npz, motion-clip, urdf-replay$"):
-        export.write("bvh", motion, bhr, tmp_path / "x")
-    with pytest.raises(InputError, match=r"^order 'random': must be depth-first or breadth-first$"):
-        export.motion_clip(motion, bhr, order="random")
-
-
-def test_a_failing_write_leaves_the_older_file(motion, bhr, tmp_path, monkeypatch):
-    path = tmp_path / "a" / "joints.csv"
-    path.parent.mkdir()
-    path.write_text("older")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.replace", full)
-    with pytest.raises(InputError, match="No space left on device"):
-        export.write("csv", motion, bhr, path)
-    with pytest.raises(InputError, match="No space left on device"):
-        export.write("csv", motion, bhr, tmp_path / "new" / "joints.csv")
-    assert path.read_text() == "older" and names(path.parent) == ["joints.csv"] and names(tmp_path) == ["a"]
-
-
-def test_a_new_plan_removes_exports_of_the_old_one(bhr, tmp_path):
-    p = jump(1.0, 0.5)
-    store.write_plan(tmp_path, p.tape, p.robot, p.summary)
-    export.write("csv", Motion.of(p.tape), bhr, tmp_path / "joints.csv")
-    export.write("urdf-replay", Motion.of(p.tape), bhr, tmp_path / "replay")
-    Path(tmp_path / "jump.html").write_text("old")
-    store.write_plan(tmp_path, p.tape, p.robot, p.summary)
-    assert names(tmp_path) == ["plan.npz", "robot.toml", "robot.urdf", "summary.json"]

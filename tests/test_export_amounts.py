@@ -7,16 +7,15 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
-from test_robot import with_free_base
 
 from jumplab.errors import InputError
-from jumplab.io import export
+from jumplab.io import export, whole
 from jumplab.io.motion import Motion, read_simulation, steady
+from jumplab.io.whole import ORDERS, Whole
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 
@@ -41,6 +40,8 @@ def short() -> Motion:
 
 
 ROWS = [*range(SWITCH), *range(SWITCH + 1, LAST)]  # on a grid of 1 ms: take-off once, the later sample; no half ones
+WHOLE = Whole(ROBOT)
+AT = [JOINTS.index(name) for name in WHOLE.joints]  # of the joints in the URDF's order, in Pinocchio's
 
 
 def refused(call) -> str:
@@ -49,76 +50,100 @@ def refused(call) -> str:
     return str(e.value)
 
 
+def frames(rate: float, motion: Motion | None = None):
+    return WHOLE.frames(motion or short(), rate)
+
+
 # tables and arrays ----------------------------------------------------------------------------------------------
 def test_every_number_of_the_joint_table():
-    motion, lines = short(), export.joint_table(short(), ROBOT).splitlines()
+    motion, lines = short(), export.joint_table(WHOLE, frames(1000.0)).splitlines()
     kinds = {"position_rad": motion.q[:, 7:], "velocity_rad_s": motion.v[:, 6:], "torque_N_m": motion.tau}
-    head = [f"{name}_{kind}" for kind in kinds for name in JOINTS]
-    assert lines[0].split(",") == ["time_s", "phase_0_launch_1_flight_2_landing", *head]
-    assert len(lines) == 22
-    for k, (line, row) in enumerate(zip(lines[1:], ROWS, strict=True)):
+    head = [f"{name}_{kind}" for kind in kinds for name in WHOLE.joints]
+    assert lines[0].split(",") == [
+        "time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right", *head]  # fmt: skip
+    assert len(lines) == 23  # the last whole millisecond, and the end half a one later
+    for k, (line, row) in enumerate(zip(lines[1:], [*ROWS, LAST], strict=True)):
         said = line.split(",")
-        assert said[0] == f"{k / 1000:.6f}"
+        assert said[0] == ("0.020500" if row == LAST else f"{k / 1000:.6f}")
         assert said[1] == {"launch": "0", "flight": "1", "landing": "2"}[motion.phase[row]]
+        assert said[2:4] == ["0" if motion.phase[row] == "flight" else "1"] * 2
         np.testing.assert_allclose(
-            np.array(said[2:], float), np.concatenate([x[row] for x in kinds.values()]), rtol=6e-9
+            np.array(said[4:], float), np.concatenate([x[row][AT] for x in kinds.values()]), rtol=6e-9
         )
-    assert max(len(x) for x in lines[1].split(",")[2:]) >= 10  # nine digits
+    assert max(len(x) for x in lines[1].split(",")[4:]) >= 10  # nine digits
 
 
 def test_every_plain_array():
     motion = short()
-    for rate, rows in ((1000.0, ROWS), (500.0, ROWS[::2])):
-        x = export.plain_arrays(motion, ROBOT, rate) if rate != 1000.0 else export.plain_arrays(motion, ROBOT)
+    for rate, rows in ((1000.0, [*ROWS, LAST]), (500.0, [*ROWS[::2], LAST])):
+        x = export.plain_arrays(WHOLE, frames(rate))
         turn = Rotation.from_quat(motion.q[rows, 3:7])
         expected = {
-            "time_s": np.arange(len(rows)) / rate, "phase": motion.phase[rows], "joint_names": np.array(JOINTS),
+            "time_s": np.append(np.arange(len(rows) - 1) / rate, 0.0205), "phase": motion.phase[rows],
+            "contact": np.repeat(motion.phase[rows][:, None] != "flight", 2, axis=1),
+            "joint_names": np.array(WHOLE.joints),
             "base_position_m": motion.q[rows, :3], "base_quaternion_xyzw": turn.as_quat(),
             "base_velocity_world_m_s": turn.apply(motion.v[rows, :3]),
             "base_angular_velocity_world_rad_s": turn.apply(motion.v[rows, 3:6]),
-            "joint_position_rad": motion.q[rows, 7:], "joint_velocity_rad_s": motion.v[rows, 6:],
-            "joint_torque_N_m": motion.tau[rows]}  # fmt: skip
+            "joint_position_rad": motion.q[rows, 7:][:, AT], "joint_velocity_rad_s": motion.v[rows, 6:][:, AT],
+            "joint_torque_N_m": motion.tau[rows][:, AT]}  # fmt: skip
         assert list(x) == list(expected)
         for name, values in expected.items():
             if name == "base_quaternion_xyzw":
                 np.testing.assert_allclose(Rotation.from_quat(x[name]).as_matrix(), turn.as_matrix(), atol=1e-9)
                 assert (np.sum(x[name][1:] * x[name][:-1], axis=1) > 0).all()
-            elif values.dtype.kind == "U":
-                assert list(x[name]) == list(values), name
+            elif values.dtype.kind in "Ub":
+                assert x[name].tolist() == values.tolist(), name
             else:
                 np.testing.assert_allclose(x[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 # clips ----------------------------------------------------------------------------------------------------------
-def test_a_clip_is_what_mujoco_finds():
-    motion, clip = short(), export.motion_clip(short(), ROBOT, fps=500)
-    assert list(clip) == ["fps", "joint_pos", "joint_vel", "body_pos_w", "body_quat_w", "body_lin_vel_w",
-                          "body_ang_vel_w", "joint_names", "body_names"]  # fmt: skip
-    assert clip["fps"].dtype == np.int64 and list(clip["fps"]) == [500]
-    assert {clip[k].dtype for k in list(clip)[1:7]} == {np.dtype(np.float32)}
-    model = mujoco.MjModel.from_xml_string(with_free_base(ROBOT.urdf))
-    data, twist = mujoco.MjData(model), np.zeros(6)
-    assert [model.body(i).name for i in range(1, model.nbody)] == list(clip["body_names"])
-    joints = [model.joint(i).name for i in range(1, model.njnt)]
-    assert joints == list(clip["joint_names"]) and sorted(joints) == sorted(JOINTS)
-    at = [JOINTS.index(name) for name in joints]
-    assert len(clip["joint_pos"]) == 11
-    for k, row in enumerate(ROWS[::2]):
-        np.testing.assert_allclose(clip["joint_pos"][k], motion.q[row, 7:][at], atol=1e-6)
-        np.testing.assert_allclose(clip["joint_vel"][k], motion.v[row, 6:][at], atol=1e-6)
-        x, y, z, w = motion.q[row, 3:7]
-        turn = Rotation.from_quat([x, y, z, w])
-        data.qpos[:] = np.concatenate([motion.q[row, :3], [w, x, y, z], motion.q[row, 7:][at]])
-        data.qvel[:] = np.concatenate([turn.apply(motion.v[row, :3]), motion.v[row, 3:6], motion.v[row, 6:][at]])
-        mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(clip["body_pos_w"][k], data.xpos[1:], atol=2e-6)
-        for i in range(1, model.nbody):
-            same = clip["body_quat_w"][k, i - 1] @ data.xquat[i]
-            assert abs(same) == pytest.approx(1.0, abs=1e-6)
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, i, twist, 0)
-            np.testing.assert_allclose(clip["body_ang_vel_w"][k, i - 1], twist[:3], atol=2e-5)
-            np.testing.assert_allclose(clip["body_lin_vel_w"][k, i - 1], twist[3:], atol=2e-5)
+KEYS = ["fps", "joint_pos", "joint_vel", "joint_torque", "body_pos_w", "body_quat_w", "body_lin_vel_w",
+        "body_ang_vel_w", "contact", "phase", "joint_names", "body_names"]  # fmt: skip
+
+
+def test_names_and_kinds_of_what_trackers_read():
+    motion, clip = short(), export.tracked(WHOLE, frames(500.0), 500.0)
+    assert list(clip) == KEYS and clip["fps"].dtype == np.int64 and list(clip["fps"]) == [500]
+    assert {clip[k].dtype for k in KEYS[1:8]} == {np.dtype(np.float32)} and clip["contact"].dtype == bool
+    assert list(export.tracked(WHOLE, frames(12.5), 12.5)["fps"]) == [12.5]
+    rows = [*ROWS[::2], LAST]
+    for name, values in (("joint_pos", motion.q[:, 7:]), ("joint_vel", motion.v[:, 6:]), ("joint_torque", motion.tau)):
+        np.testing.assert_allclose(clip[name], values[rows][:, AT], rtol=1e-6, atol=1e-5)
+    assert list(clip["phase"]) == list(motion.phase[rows])
+    assert list(clip["joint_names"]) == list(WHOLE.joints) and list(clip["body_names"]) == list(WHOLE.links)
     assert (np.sum(clip["body_quat_w"][1:] * clip["body_quat_w"][:-1], axis=-1) > 0).all()
+
+
+def test_the_world_is_the_first_body():
+    x = frames(500.0)
+    clip, bare = export.with_world(export.tracked(WHOLE, x, 500.0), x), export.tracked(WHOLE, x, 500.0)
+    assert list(clip) == KEYS and list(clip["body_names"]) == ["world", *WHOLE.links]
+    assert not clip["body_pos_w"][:, 0].any() and not clip["body_lin_vel_w"][:, 0].any()
+    assert (clip["body_quat_w"][:, 0] == [1, 0, 0, 0]).all() and not clip["body_ang_vel_w"][:, 0].any()
+    for name in KEYS[4:8]:
+        np.testing.assert_array_equal(clip[name][:, 1:], bare[name])
+    np.testing.assert_allclose(clip["joint_pos"], np.hstack([x.place, x.turn[:, [3, 0, 1, 2]], x.angles]), atol=1e-6)
+    np.testing.assert_allclose(clip["joint_vel"], np.hstack([x.velocity, x.spin, x.rates]), atol=1e-5)
+    assert clip["joint_pos"].dtype == clip["body_pos_w"].dtype == np.float32
+
+
+def test_what_retargeters_keep():
+    x, clip = frames(30.0), export.retargeted(WHOLE, frames(30.0), 30.0)
+    names = ["fps", "root_pos", "root_rot", "dof_pos", "local_body_pos", "link_body_list"]
+    assert list(clip) == [*names, "dof_torque", "contact", "phase", "joint_names"] and clip["fps"] == 30.0
+    assert clip["link_body_list"] == list(WHOLE.links) and clip["joint_names"] == list(WHOLE.joints)
+    for name, values in dict(root_pos=x.place, root_rot=x.turn, dof_pos=x.angles, dof_torque=x.torques).items():
+        np.testing.assert_array_equal(clip[name], values)
+    data = MODEL.createData()
+    still = pin.neutral(MODEL)
+    for k, angles in enumerate(x.angles):
+        still[7:][AT] = angles
+        pin.framesForwardKinematics(MODEL, data, still)
+        for i, link in enumerate(WHOLE.links):
+            expected = data.oMf[MODEL.getFrameId(link)].translation
+            np.testing.assert_allclose(clip["local_body_pos"][k, i], expected, atol=1e-9)
 
 
 TREE = """<robot name="x">
@@ -132,53 +157,53 @@ TREE = """<robot name="x">
 
 
 def test_links_in_both_orders():
-    robot = SimpleNamespace(urdf=TREE)
-    assert export._walk(robot, "depth-first") == [
-        ("root", None), ("b", "jb"), ("b1", "jb1"), ("end", "je"), ("a", "ja"), ("a1", "ja1")]  # fmt: skip
-    assert export._walk(robot, "breadth-first") == [
-        ("root", None), ("b", "jb"), ("a", "ja"), ("b1", "jb1"), ("a1", "ja1"), ("end", "je")]  # fmt: skip
-    assert refused(lambda: export._walk(robot, "random")) == "order 'random': must be depth-first or breadth-first"
-    deep, broad = (export.motion_clip(short(), ROBOT, order=o) for o in ("depth-first", "breadth-first"))
-    assert list(deep["body_names"]) == list(export.motion_clip(short(), ROBOT)["body_names"])
-    for names, array in (("joint_names", "joint_vel"), ("body_names", "body_quat_w")):
-        order = [list(deep[names]).index(n) for n in broad[names]]
+    tree = SimpleNamespace(_below=whole._children(TREE))
+    deep, broad = (Whole.ordered(tree, order) for order in ORDERS)
+    assert deep == (("jb", "jb1", "je", "ja1"), ("root", "b", "b1", "end", "a1"))  # a is fixed to the root
+    assert broad == (("jb", "jb1", "ja1", "je"), ("root", "b", "b1", "a1", "end"))
+    one, other = (export.tracked(WHOLE, frames(50.0), 50.0, order=order) for order in ORDERS)
+    for names, array in (("joint_names", "joint_vel"), ("joint_names", "joint_torque"), ("body_names", "body_quat_w")):
+        order = [list(one[names]).index(n) for n in other[names]]
         assert order != sorted(order)
-        np.testing.assert_array_equal(deep[array][:, order], broad[array])
-    assert len(deep["joint_pos"]) == 2 and list(deep["fps"]) == [50]  # 0 and 20 ms
-    assert refused(lambda: export.motion_clip(short(), ROBOT, fps=12.5)) == (
-        "fps = 12.5: clips carry whole frames per second"
-    )
+        np.testing.assert_array_equal(one[array][:, order], other[array])
+    assert len(one["joint_pos"]) == 3 and list(one["fps"]) == [50]  # 0, 20 and 20.5 ms
 
 
 # files ----------------------------------------------------------------------------------------------------------
-NAMES = {"csv": "joints.csv", "npz": "motion.npz", "motion-clip": "motion_clip.npz", "urdf-replay": "replay"}
+NAMES = {"csv": "joints.csv", "npz": "motion.npz", "urdf-replay": "replay", "unitree-csv": "unitree.csv",
+         "gmr-pkl": "gmr.pkl", "mjlab-npz": "mjlab.npz", "beyondmimic-npz": "beyondmimic.npz",
+         "holosoma-npz": "holosoma.npz", "mujoco": "mujoco"}  # fmt: skip
 
 
 def test_files_and_their_names(tmp_path):
     assert {k: export.default_name(k, "plan") for k in export.FORMATS} == NAMES
     assert {k: export.default_name(k, "simulation") for k in NAMES} == {k: f"simulated_{x}" for k, x in NAMES.items()}
     assert refused(lambda: export.write("bvh", short(), ROBOT, tmp_path / "x")) == (
-        "format 'bvh': must be one of csv, npz, motion-clip, urdf-replay"
+        f"format 'bvh': must be one of {', '.join(NAMES)}"
     )
-    for name, ending in (("csv", ".csv"), ("npz", ".npz"), ("motion-clip", ".npz")):
+    for name, ending in (("csv", ".csv"), ("gmr-pkl", ".pkl"), ("mjlab-npz", ".npz")):
         assert refused(lambda name=name: export.write(name, short(), ROBOT, tmp_path / "x.txt")) == (
             f"--out must name a file that ends in {ending}, got {str(tmp_path / 'x.txt')!r}"
         )
     path = export.write("csv", short(), ROBOT, str(tmp_path / "LOUD.CSV"))
-    assert path == tmp_path / "LOUD.CSV" and path.read_text() == export.joint_table(short(), ROBOT)
-    for name, arrays, options in (
-        ("npz", export.plain_arrays(short(), ROBOT), {}),
-        ("motion-clip", export.motion_clip(short(), ROBOT), {}),
-        ("motion-clip", export.motion_clip(short(), ROBOT, fps=250, order="breadth-first"),
-         {"fps": 250, "order": "breadth-first"}),
-    ):  # fmt: skip
-        path = export.write(name, short(), ROBOT, tmp_path / "x.npz", **options)
+    assert path == tmp_path / "LOUD.CSV" and path.read_text() == export.joint_table(WHOLE, frames(1000.0))
+    for name, arrays, fps in (
+        ("npz", export.plain_arrays(WHOLE, frames(1000.0)), None),
+        ("mjlab-npz", export.tracked(WHOLE, frames(50.0), 50.0), None),
+        ("mjlab-npz", export.tracked(WHOLE, frames(250.0), 250.0), 250),
+        ("beyondmimic-npz", export.tracked(WHOLE, frames(50.0), 50.0, order=ORDERS[1], at_com=True), None),
+        ("holosoma-npz", export.with_world(export.tracked(WHOLE, frames(50), 50, at_com=True), frames(50)), None),
+    ):
+        path = export.write(name, short(), ROBOT, tmp_path / "x.npz", fps=fps)
         raw = sum(x.nbytes for x in arrays.values())
         with np.load(path, allow_pickle=False) as file:
             assert file.files == list(arrays)
             for key, x in arrays.items():
                 np.testing.assert_array_equal(file[key], x)
         assert path.stat().st_size < raw + 300 * len(arrays)  # compressed
+    rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
+    assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
+                     "beyondmimic-npz": 50, "holosoma-npz": 50, "mujoco": 50}  # fmt: skip
 
 
 def test_the_folder_of_a_replay(tmp_path):
@@ -189,7 +214,7 @@ def test_the_folder_of_a_replay(tmp_path):
     readme, script = (folder / "README.md").read_text(), (folder / "replay.py").read_text()
     assert re.search(r"```python\n(.*?)\n```", readme, re.S)[1] == script.strip()
     assert "@@" not in readme and "simulation" in readme and ROBOT.name in readme
-    arrays = export.plain_arrays(replace(short(), source="simulation"), ROBOT, 100.0)
+    arrays = export.plain_arrays(WHOLE, frames(100.0))
     with np.load(folder / "trajectory.npz") as file:
         assert file.files == ["hz", *arrays] and file["hz"] == 100.0
         for key, x in arrays.items():
@@ -223,6 +248,7 @@ def test_between_samples():
         assert abs(same) == pytest.approx(1.0, abs=1e-12)
     assert list(x.phase) == ["launch", "launch", "launch", "flight", "flight", "landing", "landing"]
     assert x.source == "plan" and motion.duration == pytest.approx(0.0205)
+    assert x.contact.tolist() == [[phase != "flight"] * 2 for phase in x.phase]
     assert len(motion.at([]).t) == 0
     assert motion.at([0.5205 + 0.9e-9]).tau[0] == pytest.approx(motion.tau[-1])
     for outside in ([0.4999, 0.51], [0.51, 0.5205 + 2e-9]):
@@ -244,7 +270,8 @@ def test_grids():
     motion = short()
     assert list(motion.every(10_000.0).t) == pytest.approx(0.5 + np.arange(206) / 10_000)
     assert len(motion.every(2000.0).t) == 42  # the last sample lies on it
-    assert list(motion.every(0.5).t) == [0.5]
+    assert list(motion.every(0.5).t) == [0.5] and list(motion.every(0.5, end=True).t) == [0.5, motion.t[-1]]
+    assert len(motion.every(2000.0, end=True).t) == 42  # once
     rounded = replace(motion, t=np.append(motion.t[:-1], 0.5205 - 1e-10))
     assert rounded.every(2000.0).t[-1] == rounded.t[-1]
     for rate in (0.0, -1.0, 10_000.1):
@@ -266,22 +293,29 @@ def test_signs_of_quaternions():
 def test_where_a_motion_comes_from(tmp_path):
     record = SimpleNamespace(**{k: getattr(short(), k) for k in ("t", "q", "v", "tau", "phase")})
     assert Motion.of(record).source == "simulation" and Motion.of(record).tau is short().tau
+    wrench = np.zeros((len(short().t), 2, 6))
+    wrench[3, 0, 2], wrench[4, 1, 2], wrench[5, :, 1] = 5.1, 5.0, 900.0  # a few newtons of what presses
+    record.foot_wrench = wrench
+    assert np.argwhere(Motion.of(record).contact).tolist() == [[3, 0]]
+    del record.foot_wrench
     record.a = short().v
-    assert Motion.of(record).source == "plan"
+    assert Motion.of(record).source == "plan" and Motion.of(record).contact[0].all()
     assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == (
         f"{str(tmp_path)!r} holds no simulation; run 'jumplab simulate {tmp_path}' first"
     )
     good = {k: getattr(short(), k) for k in ("t", "q", "v", "tau", "phase")}
     good |= {"schema": np.array("jumplab-simulation-1"), "joint_names": np.array(JOINTS), "more": np.arange(3)}
+    good |= {"foot_wrench": wrench}
     path = tmp_path / "simulation.npz"
     np.savez(path, **good)
     back = Motion.of_simulation_file(tmp_path, ROBOT)
-    assert back.source == "simulation"
+    assert back.source == "simulation" and np.argwhere(back.contact).tolist() == [[3, 0]]
     for name in ("t", "q", "v", "tau", "phase"):
         np.testing.assert_array_equal(getattr(back, name), good[name])
     assert list(read_simulation(str(tmp_path), ROBOT, ("more", "t", "q", "v", "tau", "phase"))["more"]) == [0, 1, 2]
     foreign = f"{path}: not a simulation of this folder's robot; simulate the plan again"
     wrong = {"q": good["q"][:, 1:], "v": good["v"][1:], "tau": good["tau"][:, 1:], "phase": good["phase"][1:],
+             "foot_wrench": wrench[1:],
              "schema": np.array("x"), "joint_names": good["joint_names"][::-1], "t": good["t"][None]}  # fmt: skip
     for name, value in wrong.items():
         np.savez(path, **(good | {name: value}))

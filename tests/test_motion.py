@@ -56,6 +56,13 @@ def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
     assert Motion.of(tape).source == "plan" and Motion.of(tape).duration == tape.t[-1]
 
 
+def test_forces_on_the_feet_go_along(bhr):
+    tape = jump(1.0, 0.5).tape
+    x = Motion.of(tape).at(tape.t[[100, 700]])
+    assert np.abs(x.wrench - tape.f[[100, 700]]).max() < 1e-6 and np.abs(x.wrench).max() > 100
+    assert spinning([0.0, 0.1]).at([0.05]).wrench is None
+
+
 def test_velocities_are_those_of_the_resampled_motion(bhr):
     """Pinocchio's difference over time agrees with the mean of v, up to a trapezoid's error of second order."""
     motion, worst = Motion.of(jump(1.0, 0.5).tape), []
@@ -79,7 +86,8 @@ def test_times_outside():
 
 def write(folder, **changes):
     arrays = {"schema": np.array("jumplab-simulation-1"), "t": np.arange(3.0), "q": np.zeros((3, 21)),
-              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3)}  # fmt: skip
+              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3),
+              "foot_wrench": np.zeros((3, 2, 6))}  # fmt: skip
     np.savez(folder / "simulation.npz", **(arrays | changes))
 
 

@@ -280,8 +280,9 @@ def test_source_notebook_keeps_the_house_rules(stem):
     assert all(not c.outputs and c.execution_count is None for c in code), "commit notebooks without outputs"
     assert set(notebooks.STANDARD) <= set(notebooks.declared_parameters(path))
     assert any("check_parameters(" in c.source for c in code)
+    most = 10 if stem == "03_joint_space_mapping" else 25  # the lesson: one idea a cell
     for cell in code:
-        assert len(cell.source.splitlines()) <= 25, cell.source
+        assert len([line for line in cell.source.splitlines() if line.strip()]) <= most, cell.source
         plain = "\n".join(line for line in cell.source.splitlines() if not line.startswith(("%", "!")))
         assert not any(isinstance(node, ast.ClassDef) for node in ast.walk(ast.parse(plain))), cell.source
 

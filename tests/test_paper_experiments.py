@@ -165,7 +165,7 @@ def basin_of(grid):
 )
 def test_basin_shows_every_state_in_its_place(grid, panels):
     basin = basin_of(grid)
-    fig = pictures.basin_map(basin)
+    fig = pictures.basin_map(basin.trials)
     assert len(fig.axes) == panels and smallest_font(fig) >= MIN_FONT_PT
     drawn = {LANDING: set(), VERMILION: set()}
     for ax in fig.axes:
@@ -181,7 +181,7 @@ def test_basin_shows_every_state_in_its_place(grid, panels):
 
 
 def test_titles_of_a_whole_basin_keep_apart():
-    fig = pictures.basin_map(basin_of(BasinGrid()))
+    fig = pictures.basin_map(basin_of(BasinGrid()).trials)
     fig.draw_without_rendering()
     boxes = [ax._left_title.get_window_extent() for ax in fig.axes[3:6]]
     assert boxes[0].x1 < boxes[1].x0 and boxes[1].x1 < boxes[2].x0 and boxes[2].x1 <= fig.bbox.x1

@@ -7,20 +7,16 @@ from fixtures_core import pendulum
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from paper import drawings
+from paper.claims import Start
 
 from jumplab import show as plotting
 from jumplab.show.style import MIN_FONT_PT
 from jumplab.stages.joint_qp import JointMapper, map_to_joints
+from jumplab.task import JumpTask
 
-ROWS = [
-    {"target": target, "start": start, "iterations": n, "cost": cost}
-    for target, start, n, cost in (
-        ((1.0, 0.5), "crouch", 30, 1.0),
-        ((1.0, 0.5), "stage 2", 20, 1.0),
-        ((0.5, 0.3), "crouch", 50, 1.02),
-        ((0.5, 0.3), "stage 2", None, None),
-    )
-]
+FAR, NEAR = JumpTask(1.0, 0.5), JumpTask(0.5, 0.3)
+ROWS = [Start(FAR, "crouch", 30, cost=1.0), Start(FAR, "stage 2", 20, cost=1.0)]
+ROWS += [Start(NEAR, "crouch", 50, cost=1.02), Start(NEAR, "stage 2")]
 PANELS = {"iterations": "iterations [1]", "cost": "cost [best]"}
 
 

@@ -17,6 +17,7 @@ import pinocchio as pin
 import pytest
 import umsgpack
 from fixtures_core import jump
+from scipy.spatial import cKDTree
 from test_cli import one_sentence, run
 from test_store import names
 
@@ -24,6 +25,9 @@ from jumplab.errors import InputError
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion
 from jumplab.robot import Robot
+from jumplab.robot.description import files_of
+from jumplab.robot_import.urdf import have_published
+from jumplab.show import shapes
 from jumplab.show import viewer as viewer
 from jumplab.show.style import PHASE_COLORS
 from jumplab.sim import Scene, simulate_jump
@@ -34,6 +38,8 @@ FLAGS = (
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--window-size=1280,720 --virtual-time-budget=4000 --enable-logging=stderr"
 ).split()
+STAGE = slice(64, 555)  # rows of a picture between the header and the curves
+published = pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
 
 
@@ -121,6 +127,101 @@ def test_poses_are_those_of_the_log(page, simulation, bhr):
     assert starts["landing"] == pytest.approx(simulation.metrics.touchdown_s, abs=0.021)
 
 
+def packed(clip, name, *shape):
+    return np.frombuffer(base64.b64decode(clip[name]), "<f4").reshape(clip["frames"], *shape).astype(float)
+
+
+def test_forces_stand_on_the_soles_and_carry_the_jump(page, simulation, bhr):
+    """Their points lie within the soles on the ground, and their sum over time is the impulse of the record."""
+    model, data = bhr.model, bhr.model.createData()
+    for clip, record in zip(facts_of(page)["clips"], (simulation, jump(1.0, 0.5).tape), strict=True):
+        forces, logged = packed(clip, "forces", 2, 6), Motion.of(record).wrench[:, :, :3]
+        touching = ~np.isnan(forces[:, :, 2])
+        phase = Motion.of(record).every(50).phase
+        assert touching[phase == "launch"].mean() > 0.97 and touching[phase == "flight"].mean() < 0.1
+        assert np.abs(forces[:, :, 2][touching]).max() == 0.0  # level ground
+        for k in np.flatnonzero(touching.all(axis=1))[::9]:
+            pin.framesForwardKinematics(model, data, record.q[int(np.argmin(np.abs(record.t - k / 50)))])
+            for foot, frame in enumerate(bhr.foot.frames):
+                place = data.oMf[model.getFrameId(frame)]
+                x, y, _ = place.actInv(np.array([*forces[k, foot, :2], place.act(bhr.foot.center)[2]]))
+                assert bhr.foot.heel - 5e-3 < x < bhr.foot.toe + 5e-3 and abs(y) < bhr.foot.half_width + 5e-3
+        impulse = np.nansum(forces[:, :, 3:], axis=(0, 1)) / 50
+        whole = (logged.sum(axis=1)[1:] * np.diff(record.t)[:, None]).sum(axis=0)
+        assert impulse == pytest.approx(whole, abs=0.02 * whole[2])
+
+
+def test_figures_and_curves_are_those_of_the_simulation(page, simulation, bhr):
+    clip, row = facts_of(page)["clips"][0], 30
+    distance, rise, height, *_ = values = packed(clip, "values", 10).T
+    at = [int(np.argmin(np.abs(simulation.t - k / 50))) for k in range(clip["frames"])]
+    assert height == pytest.approx(simulation.com[at, 2], abs=1e-5)
+    assert rise.max() == pytest.approx(simulation.metrics.com_rise_m, abs=1e-3)
+    assert distance[-1] == pytest.approx(simulation.metrics.foot_distance_m, abs=1e-4)
+    for k, role in enumerate(("hip_pitch", "knee", "ankle_pitch")):
+        name = bhr.joints[role][0]
+        assert values[3 + k] == pytest.approx(np.degrees(simulation.angle[name][at]), abs=1e-3)
+        both = [abs(simulation.torque[n][at[row]]) / bhr.actuators[n]["effort"] for n in bhr.joints[role]]
+        assert values[6 + k, row] == pytest.approx(max(both), abs=1e-5)
+    assert values[9, -1] == pytest.approx(1.0, abs=0.02)  # it stands
+
+
+def test_rounded_body_stands_on_the_soles_between_the_joints(bhr):
+    """The default robot's feet end where its soles do, its legs reach from hip to ankle, a head is above its arms."""
+    parts, said = shapes.parts_of(bhr)
+    model, data = bhr.model, bhr.model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    world = [data.oMi[p.joint].act(pin.SE3.Identity()).homogeneous for p in parts]
+    points = [p.points @ place[:3, :3].T + place[:3, 3] for p, place in zip(parts, world, strict=True)]
+    feet = [model.frames[model.getFrameId(name)].parentJoint for name in bhr.foot.frames]
+    sole = data.oMi[feet[0]].translation[2] + bhr.foot.sole_z
+    assert said == [] and min(x[:, 2].min() for x in points) == pytest.approx(sole, abs=1e-9)
+    hip, ankle = (data.oMi[model.getJointId(bhr.joints[r][0])].translation[2] for r in ("hip_pitch", "ankle_pitch"))
+    legs = [x for x, p in zip(points, parts, strict=True) if p.kind == "limb" and p.joint in (model.supports[feet[0]])]
+    assert min(x[:, 2].min() for x in legs) < ankle and max(x[:, 2].max() for x in legs) > hip
+    assert max(x[:, 2].max() for x in points) == pytest.approx(0.295, abs=1e-6)  # the top of the head's box
+    for part in parts:  # seen from outside: a closed surface whose volume is positive
+        a, b, c = np.moveaxis(part.points[part.triangles] - part.points.mean(axis=0), 1, 0)
+        assert np.einsum("ij,ij->i", a, np.cross(b, c)).min() > -1e-12
+
+
+@published
+@pytest.mark.parametrize("name", ["g1", "alexander", "talos"])
+def test_meshes_of_a_published_robot_lie_where_its_urdf_puts_them(name):
+    """Pinocchio places the same meshes by the published URDF: all fill the same space, but for the coarseness."""
+    robot = Robot.load(name)
+    parts, said = shapes.parts_of(robot)
+    assert said == ["published meshes, made coarser"]
+    assert 10_000 < sum(len(p.triangles) for p in parts) <= shapes.TRIANGLES
+    path, config = files_of(name)
+    share = next(p for p in path.parents if p.name == "example-robot-data").parent
+    model = pin.buildModelFromUrdf(str(path))
+    geometry = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL, package_dirs=str(share))
+    q, data, places = pin.neutral(model), model.createData(), geometry.createData()
+    for joint, angle in Robot.imported(path, config)[0].lumped.held.items():
+        if model.existJointName(joint):
+            q[model.idx_qs[model.getJointId(joint)]] = angle
+    pin.updateGeometryPlacements(model, data, geometry, places, q)
+    corners = [pin.SE3(places.oMg[k]).act(np.array(v)) for k, g in enumerate(geometry.geometryObjects)
+               if hasattr(g.geometry, "vertices") for v in g.geometry.vertices()]  # fmt: skip
+    own, mine = robot.model, robot.model.createData()
+    pin.forwardKinematics(own, mine, pin.neutral(own))
+    drawn = np.concatenate([p.points @ mine.oMi[p.joint].rotation.T + mine.oMi[p.joint].translation for p in parts])
+    source = np.array(corners)
+    source += drawn.min(axis=0) - source.min(axis=0)  # the jumper's origin is another one
+    away = [cKDTree(x).query(y)[0].max() for x, y in ((source, drawn), (drawn, source))]
+    assert max(away) < 0.02, away  # no point is missing, none is elsewhere
+
+
+@published
+def test_without_the_files_a_published_robot_is_drawn_from_boxes_and_the_page_says_so(monkeypatch):
+    robot = Robot.load("g1")
+    monkeypatch.setattr("jumplab.robot_import.urdf.have_published", lambda: False)
+    parts, said = shapes.parts_of(robot)
+    assert said == ["drawn from boxes: its meshes are not known on this machine"]
+    assert {p.kind for p in parts} == {"trunk", "limb", "rest"} and sum(len(p.triangles) for p in parts) < 20_000
+
+
 @pytest.mark.parametrize(
     ("scene", "tops"),
     [
@@ -145,13 +246,14 @@ def test_ground_of_the_scene(bhr, scene, tops):
         assert round(d["place"][14] + d["size"]["depth"] / 2, 6) in heights
 
 
-def test_robot_whose_shapes_are_lost_keeps_its_skeleton(bhr):
-    """A mesh file does not travel with the robot's text."""
+def test_robot_whose_shapes_are_lost_keeps_its_limbs(bhr):
+    """A mesh file does not travel with the robot's text; thighs and shanks stand between the joints all the same."""
     mesh = '<mesh filename="package://elsewhere/thigh.stl"/>'
     robot = Robot.from_text(re.sub(r"<box [^>]*/>", mesh, bhr.urdf), bhr.config_text)
     paths = {c["path"] for c in commands_of(viewer.page(robot, plan=jump(1.0, 0.5).tape)) if c["type"] == "set_object"}
-    moved = {p for p in paths if p.startswith("/meshcat/jump/plan/") and "trail" not in p}
-    assert moved and all("/rest/" in p for p in moved)
+    limbs = {p.split("/")[4] for p in paths if p.startswith("/meshcat/jump/plan/") and "/limb/" in p}
+    legs = [bhr.joints[role] for role in ("hip_pitch", "knee")]
+    assert limbs == {str(bhr.model.getJointId(name)) for pair in legs for name in pair}
 
 
 def test_nothing_to_show(bhr):
@@ -222,15 +324,15 @@ def picture(url, folder):
 
 
 def count(image, phase):
-    """Pixels of the phase's hue, light or dark, above the controls."""
-    hsv = mcolors.rgb_to_hsv(image[80:640])
+    """Pixels of the phase's hue, light or dark, between header and curves."""
+    hsv = mcolors.rgb_to_hsv(image[STAGE])
     hue = mcolors.rgb_to_hsv(mcolors.to_rgb(PHASE_COLORS[phase]))[0]
     return int(((np.abs(hsv[:, :, 0] - hue) < 0.03) & (hsv[:, :, 1] > 0.3) & (hsv[:, :, 2] > 0.3)).sum())
 
 
 def rows_of(image, phase):
     """Mean height of those pixels [pixels from the top]."""
-    hsv = mcolors.rgb_to_hsv(image[80:640])
+    hsv = mcolors.rgb_to_hsv(image[STAGE])
     hue = mcolors.rgb_to_hsv(mcolors.to_rgb(PHASE_COLORS[phase]))[0]
     return float(np.nonzero((np.abs(hsv[:, :, 0] - hue) < 0.03) & (hsv[:, :, 1] > 0.3))[0].mean())
 
@@ -243,7 +345,7 @@ def test_browser_shows_launch_flight_and_landing(page, tmp_path):
     seen = {
         "launch": picture(f"{url}#t=0.4", tmp_path),
         "flight": picture(f"{url}#t=1.1", tmp_path),
-        "landing": picture(f"{url}#t=3.5&view=corner", tmp_path),
+        "landing": picture(f"{url}#t=3.5&view=corner&follow=1", tmp_path),
     }
     for phase, image in seen.items():
         others = [count(image, p) for p in PHASE_COLORS if p != phase]

@@ -18,7 +18,8 @@ from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
-from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise
+from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
+from jumplab.studies import margins
 from jumplab.studies import trials as monte_carlo
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, run_trials, trial_log, wilson
 
@@ -291,6 +292,76 @@ def test_damaged_plans_are_refused_in_one_sentence(folder, damage):
     with pytest.raises(InputError) as e:
         run_trials(folder, 2, jobs=1)
     assert "\n" not in str(e.value) and str(folder) in str(e.value) and names(folder) == before
+
+
+# ------------------------------------------------------------------------------------------ causes, falls, margins
+
+
+def test_failures_are_counted_by_their_first_sign(folder, monkeypatch):
+    def failing(tape, robot, scene, settings, key):
+        found = (Sign("slip", 0.1), Sign("tip", 0.2)) if key.index < 3 else ()
+        return replace(play(tape, robot, scene, settings, key), landed=key.index == 4, signs=found).as_kept()
+
+    monkeypatch.setattr(monte_carlo, "run_trial", failing)
+    monkeypatch.setattr(monte_carlo.TrialReport, "values", lambda self, name: np.zeros(0))
+    report = run_trials(folder, 5, jobs=1)
+    assert report.causes == {"slip": 3, "other": 1} == store.read_json(folder / "trials.json")["causes"]
+    assert run_trials(folder, 5, jobs=1).trials == report.trials and "began with: slip" in report._repr_html_()
+
+
+def test_falls_are_kept_whole(folder, monkeypatch):
+    """The very run of the trial, in a folder that everything else can read, on the ground that it had."""
+    settings = TrialSettings(ranges=Ranges.none(shove_launch_n_s=(25, 25), ground_m=0.02))
+    report = run_trials(folder, 1, 2, settings, jobs=1, keep_falls=1)
+    (trial,) = report.trials
+    assert not trial.landed and trial.signs and trial.reason == trial.metrics.reason
+    own = folder / "falls" / "0"
+    _, robot, summary = store.read_plan(own)
+    run = SimulationResult.load(own, robot)
+    assert run.metrics == trial.metrics and signs(replace(run, robot=robot)) == trial.signs
+    ground = Scene.of_run(store.read_json(own / "simulation.json"), summary, robot)
+    assert len(ground.blocks) == 2 and abs(ground.blocks[1].top) == abs(trial.perturbation["ground_m"]) > 0
+
+
+def bears(limits):
+    """Stands in for a trial: lands up to a payload, farther with re-aim."""
+
+    def trial(tape, robot, scene, settings, key):
+        trials.append(key)
+        load, most = settings.ranges.payload_kg[0], limits[settings.reaim]
+        return replace(play(tape, robot, scene, settings, key), landed=load <= most or (load < 4 and key.index == 7))
+
+    trials: list[TrialKey] = []
+    return trial, trials
+
+
+@pytest.mark.parametrize(("most", "shares"), [((2.6, 9.0), (0.5, 1.0)), ((-1.0, 0.3), (0.0, 0.0))])
+def test_margins_are_bisected_and_resumed(folder, monkeypatch, most, shares):
+    trial, tried = bears(most)
+    monkeypatch.setattr(monte_carlo, "run_trial", trial)
+    report = margins.margins(folder, ("payload_kg", "payload_kg+friction"), 20, steps=4, jobs=1)
+    found = {(m.names, m.reaim): m for m in report.margins}
+    assert [found["payload_kg", on].share for on in (False, True)] == list(shares)
+    plain = found["payload_kg", False]
+    assert plain.sizes == {"payload_kg": 5 * shares[0]} and plain.interval == wilson(plain.landed, plain.tried)
+    assert plain.probes[0][0] == 1.0 and plain.probes[0][2] == 2  # two of twenty that fall are too many
+    assert found["payload_kg+friction", True].sizes["friction"] == pytest.approx(0.8 - 0.5 * shares[1])
+    again, count = margins.margins(folder, ("payload_kg", "payload_kg+friction"), 20, steps=4, jobs=1), len(tried)
+    assert again.margins == report.margins and len(tried) == count
+    kept = margins.MarginReport.from_json(store.read_json(folder / "margins.json"))
+    assert kept.margins == report.margins and "margins in bullet" in kept._repr_html_()
+    assert 0.94 < 19 / 20 and margins.enough(19, 20) and not margins.enough(18, 20) and not margins.enough(3, 4)
+
+
+def test_margins_of_what_is_not_there(folder):
+    with pytest.raises(InputError, match=r"^no disturbance is called 'wind'; there are mass, com_m, "):
+        margins.margins(folder, ("wind",), 2, jobs=1)
+    with pytest.raises(InputError) as e:
+        margins.MarginReport.from_json({"margins": [{}]})
+    assert str(e.value) == "not the margins of a plan (KeyError); make them with 'jumplab margins'"
+    whole = {name: margins.ranges_at(name, 1.0) for name in (*margins.SINGLE, *margins.PAIRS)}
+    assert whole["friction"].friction == (0.3, 0.3) and whole["delay_s"].delay_s == (0.0, 0.008)
+    assert all(margins.ranges_at(name, 0.0) == Ranges.none() for name in whole)
 
 
 # ------------------------------------------------------------------------------------------ the real thing

@@ -42,7 +42,7 @@ def test_a_cell_shows_what_is_done_and_leaves_nothing(shell):
     tell("audit")
     shell.events.calls["post_run_cell"](None)
     tell("after it")
-    assert shell.shown == ["done 3 of 7, 0 s", "audit, 0 s", ""]
+    assert shell.shown == ["done 3 of 7, 0 s", "done 3 of 7, audit, 0 s", ""]
 
 
 def test_a_quick_cell_shows_nothing(shell, monkeypatch):

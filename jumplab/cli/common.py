@@ -112,6 +112,21 @@ def values_of(option: str, text: str) -> list[float]:
     return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
 
 
+def disturbances(option: str, pairs: Sequence[str]) -> dict[str, tuple[float, ...]]:
+    """What was given as NAME=SIZE or NAME=FROM:TO, several times."""
+    found: dict[str, tuple[float, ...]] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        numbers = text.split(":")
+        if not (name and equals) or len(numbers) > 2:
+            raise InputError(f"{option} must be NAME=SIZE or NAME=FROM:TO, got {pair!r}")
+        found[name] = tuple(number(f"{option} {name}", part) for part in numbers)
+    return found
+
+
+DISTURB = opt(
+    "--disturb NAME=SIZE...", "payload_kg=5, friction=0.3:1.0 ...; a wrong name shows all; may be repeated", []
+)
 VALUES, MOST_VALUES = "FROM:TO:COUNT or A,B,...", 10_000
 folder = needing("name a folder", str.strip)
 # without defaults, which would undo them where they stand before COMMAND
@@ -123,6 +138,9 @@ SEED = opt("--seed S", "seed of the first robot (default 0)", None, whole(0, 2**
 PLAN = opt("DIR", "folder of a plan")
 MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
 ENGINE = opt("--engine", "physics engine of the simulation", DEFAULT_ENGINE, tuple(ENGINES))
+TRACKERS = ("unitree-csv", "gmr-pkl", "mjlab-npz", "beyondmimic-npz", "holosoma-npz", "mujoco")
+EXPORTED = ("csv", "npz", "urdf-replay", *TRACKERS)  # of jumplab.io.export
+FPS = opt("--fps N", "frames per second (default: 1000, 100 or, for trackers, 50 or 30)", None, number)
 METHODS = ("three-step", "direct")
 ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
 JUMP = (

@@ -9,7 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.cli import common
-from jumplab.cli.common import ENGINE, JUMP, METHODS, MODE, PLAN, Late, command, folder, needing, number, opt
+from jumplab.cli.common import (
+    DISTURB,
+    ENGINE,
+    EXPORTED,
+    FPS,
+    JUMP,
+    METHODS,
+    MODE,
+    PLAN,
+    SEED,
+    Late,
+    command,
+    folder,
+    needing,
+    number,
+    opt,
+)
 from jumplab.errors import InputError
 from jumplab.sim import ENGINES
 from jumplab.task import JumpTask
@@ -20,10 +36,8 @@ sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("
 advice, memory = Late("jumplab.studies.advice"), Late("jumplab.studies.atlas")
 movies = Late("jumplab.show.movies")
 
-FORMATS = ("csv", "npz", "motion-clip", "urdf-replay")  # of jumplab.io.export
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
 MOVIE = needing("name a file that ends in .gif or .mp4", lambda text: text.lower().endswith((".gif", ".mp4")))
-ORDERS = ("depth-first", "breadth-first")
 
 
 @command(
@@ -108,13 +122,19 @@ def _audited(report: Any) -> dict[str, Any]:
     return json.loads(report.to_json())
 
 
-@command(PLAN, MODE, ENGINE)
+@command(PLAN, MODE, ENGINE, DISTURB, SEED)
 def simulate(args: Namespace) -> None:
     """Simulate a plan in PyBullet or MuJoCo."""
+    fixed = {k: (x * 2 if len(x) == 1 and sim.is_pair(k) else x)
+             for k, x in common.disturbances("--disturb", args.disturb).items()}  # fmt: skip
+    ranges = sim.ranges_of(fixed)
+    if not fixed:
+        common.without(args, "says where --disturb acts, which is not given", seed=None)
     tape, robot, summary = store.read_plan(args.dir)
     store.ensure_writable(args.dir)
     scene = sim.Scene.of_plan(summary, robot)
-    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine)
+    drawn = sim.Perturbation.draw(robot, args.seed or 0, ranges) if fixed else None
+    result = sim.simulate_jump(tape, robot, mode=args.mode, scene=scene, engine=args.engine, perturbation=drawn)
     store.write_simulation(args.dir, result, summary)
     args.found |= result.to_json()
     common.print_simulation(result.to_json())
@@ -134,7 +154,8 @@ def view(args: Namespace) -> None:
     store.ensure_writable(path.parent)
     simulated = Path(args.dir, motions.SIMULATION_NAME).is_file()
     simulation = motions.Motion.of_simulation_file(args.dir, robot) if simulated else None
-    task, scene = JumpTask(**summary["target"]), sim.Scene.of_plan(summary, robot)
+    told = store.read_json(Path(args.dir, "simulation.json")) if simulated else {}
+    task, scene = JumpTask(**summary["target"]), sim.Scene.of_run(told, summary, robot)
     if args.movie:
         made = movies.write_movie(path, robot, simulation or tape, scene)
         size = path.stat().st_size
@@ -149,28 +170,17 @@ def view(args: Namespace) -> None:
 
 @command(
     PLAN,
-    opt(
-        "--format",
-        "joint table at 1 kHz, arrays, clip for motion trackers, folder to replay",
-        None,
-        FORMATS,
-        required=True,
-    ),
-    opt("--out PATH", "file, or folder of a urdf-replay (default: in DIR)", None, folder),
-    opt("--simulated", "the simulated jump instead of the planned one"),
-    opt("--fps N", "frames per second of a motion-clip (default 50)", None, number),
-    opt(
-        "--order", "of a motion-clip's joints and bodies: MuJoCo's depth-first (default), or Isaac Lab's", None, ORDERS
-    ),
+    opt("--format", "joint table, arrays, folder to replay; what trackers read", None, EXPORTED, required=True),
+    opt("--out PATH", "file, or folder of urdf-replay and mujoco (default: in DIR)", None, folder),
+    opt("--simulated", "the simulated jump, to its standing end, instead of the planned one, to touchdown"),
+    FPS,
 )
 def export(args: Namespace) -> None:
-    """A jump for other programs."""
-    if args.format != "motion-clip":
-        common.without(args, f"is of a motion-clip, not of {args.format}", fps=None, order=None)
-    clip = {"fps": 50.0 if args.fps is None else args.fps, "order": args.order or ORDERS[0]}
+    """A jump of the whole robot for other programs."""
     tape, robot, _ = store.read_plan(args.dir)
     motion = motions.Motion.of_simulation_file(args.dir, robot) if args.simulated else motions.Motion.of(tape)
     path = Path(args.out or Path(args.dir, exports.default_name(args.format, motion.source)))
-    exports.write(args.format, motion, robot, path, **clip)
+    exports.write(args.format, motion, robot, path, fps=args.fps)
     args.found |= {"file": path, "format": args.format, "source": motion.source, "duration_s": motion.duration}
-    print(f"{motion.source}, {motion.duration:.3f} s, as {args.format}: {path}")
+    said = f"{motion.source}{'' if args.simulated else ' to touchdown'}, {motion.duration:.3f} s"
+    print(f"{said}, as {args.format}: {path}")

@@ -19,7 +19,7 @@ from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import robot
 from jumplab.cli.status import Status
-from jumplab.cli.studies import atlas, bench, certify, chain, envelope, sweep, trials
+from jumplab.cli.studies import atlas, bench, certify, chain, clips, envelope, margins, sweep, trials
 from jumplab.errors import InputError, JumplabError
 
 INTERNAL = 4
@@ -34,7 +34,7 @@ def completion(args: argparse.Namespace) -> None:
     print(args.found["script"])
 
 
-COMMANDS = (run, plan, audit, simulate, trials, certify, chain, view, export)
+COMMANDS = (run, plan, audit, simulate, trials, margins, certify, chain, clips, view, export)
 COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
 
 

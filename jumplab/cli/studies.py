@@ -10,7 +10,10 @@ from pathlib import Path
 
 from jumplab.cli import common
 from jumplab.cli.common import (
+    DISTURB,
     ENGINE,
+    EXPORTED,
+    FPS,
     JOBS,
     JUMP,
     METHODS,
@@ -34,8 +37,10 @@ from jumplab.task import JumpTask
 
 store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jumplab.sim")
 certificates, certificate_pages = Late("jumplab.studies.certify"), Late("jumplab.show.certificate")
+bounds = Late("jumplab.studies.margins")
 many, basins, chains = Late("jumplab.studies.trials"), Late("jumplab.studies.basin"), Late("jumplab.studies.chain")
 memory = Late("jumplab.studies.atlas")
+libraries = Late("jumplab.studies.clips")
 maps, sweeps, benchmark = Late("jumplab.studies.envelope"), Late("jumplab.studies.sweep"), Late("jumplab.studies.bench")
 pages, pictures = Late("jumplab.show.viewer"), Late("jumplab.show.jumps")
 tables, style = Late("jumplab.show.tables"), Late("jumplab.show.style")
@@ -63,6 +68,8 @@ def bars(args: Namespace) -> bool | None:
     ENGINE,
     opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
     opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
+    DISTURB,
+    opt("--keep-falls N", "run the first N failures again, each into falls/NUMBER, for 'view'", "0", whole(0, 100)),
     JOBS,
 )
 def trials(args: Namespace) -> None:
@@ -70,15 +77,19 @@ def trials(args: Namespace) -> None:
     start = time.perf_counter()
     if args.basin and args.seed is not None:
         raise InputError("--seed says which robots are drawn, and --basin draws none; leave one of them away")
+    if args.basin:
+        without(args, "is for robots that are drawn, and --basin draws none", disturb=[], keep_falls=0)
+    ranges = sim.ranges_of(common.disturbances("--disturb", args.disturb), sim.Ranges())
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = many.TrialSettings(args.mode, args.reaim, noise, engine=args.engine)
+    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine)
     try:
         how = {"jobs": args.jobs, "progress": bars(args)}
         if args.basin:
             report = basins.landing_basin(args.dir, args.n, settings, **how)
         else:  # 200: a success rate near 95 % is then known to 3 % on either side
+            how["keep_falls"] = args.keep_falls
             report = many.run_trials(args.dir, args.n or 200, args.seed or 0, settings, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(KEPT) from None
@@ -89,6 +100,8 @@ def trials(args: Namespace) -> None:
     print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
     for reason, count in report.reasons.items():
         print(f"{count:>5} failed: {reason}")
+    if report.causes:
+        print("first signs of the failures: " + ", ".join(f"{count} {name}" for name, count in report.causes.items()))
     for name, unit in (("distance", "foot_distance_m"), ("rise", "com_rise_m")):
         values = report.values(unit)
         if len(values) and not args.basin:  # they would count from the apex
@@ -97,6 +110,32 @@ def trials(args: Namespace) -> None:
         print(f"errors of those that landed: {common.misses(report.target, report.values)}")
     kept = f"{'basin' if args.basin else 'trials'}.json in {args.dir}, {report.resumed} trials from an earlier run"
     print(f"{kept}, whole run: {time.perf_counter() - start:.1f} s")
+
+
+@command(
+    opt("DIR", "folder of a plan; trials.jsonl and margins.json are written there"),
+    opt("--disturb NAME...", "only these; A+B for two together; a wrong name shows all; may be repeated", []),
+    opt("--n N", "number of robots at each size (default 20)", "20", whole(1, MOST)),
+    opt("--steps N", "of the bisection (default 4, to a sixteenth of the limit)", "4", whole(0, 20)),
+    SEED,
+    MODE,
+    ENGINE,
+    JOBS,
+)
+def margins(args: Namespace) -> None:
+    """How much of each disturbance a plan bears."""
+    start = time.perf_counter()
+    store.read_plan(args.dir)  # refuses a damaged folder
+    store.ensure_writable(args.dir)
+    settings, names = many.TrialSettings(args.mode, engine=args.engine), args.disturb or (*bounds.SINGLE, *bounds.PAIRS)
+    try:
+        how = {"steps": args.steps, "jobs": args.jobs, "progress": bars(args)}
+        report = bounds.margins(args.dir, names, args.n, args.seed or 0, settings, **how)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(KEPT) from None
+    args.found |= report.to_json()
+    print(tables.table([margin.row() for margin in report.margins], digits=3))
+    print(f"{report.line()}; margins.json in {args.dir}, whole run: {time.perf_counter() - start:.1f} s")
 
 
 @command(
@@ -136,6 +175,32 @@ def certify(args: Namespace) -> None:
         more = f"; and {len(found.failures) - 1} more" if len(found.failures) > 1 else ""
         raise InfeasibleError(f"not certified: {found.failures[0]}{more}; see certificate.html in {args.dir!r}")
     print(f"certified: all {len(found.audit.checks)} checks of the audit passed, and the engines agree that it lands")
+
+
+@command(
+    ROBOT,
+    opt(
+        "--out DIR", "folder for index.json and the clips; an interrupted library goes on", None, folder, required=True
+    ),
+    opt("--format", "of the clips (default mjlab-npz)", "mjlab-npz", EXPORTED),
+    FPS,
+    opt("--only NAME+", "names of clips, such as forward-1 (default: all thirty)"),
+    JOBS,
+)
+def clips(args: Namespace) -> None:
+    """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
+    start, robot = time.perf_counter(), robots.Robot.load(args.robot)
+    how = dict(fps=args.fps, only=args.only, jobs=args.jobs, say=print)
+    try:
+        found = libraries.make_clips(robot, args.out, args.format, **how)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(KEPT.replace("trials", "clips")) from None
+    args.found |= {"out": args.out} | found.to_json()
+    count = len(found.rows) + len(found.left_out)
+    print(f"{len(found.rows)} of {count} clips passed; index.json in {args.out}")
+    print(f"whole library: {time.perf_counter() - start:.1f} s")
+    if not found.rows:
+        raise InfeasibleError(f"no clip of {robot.name} passed: {found.left_out[0]['reasons'][0]}")
 
 
 @command(

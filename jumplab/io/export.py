@@ -3,53 +3,64 @@
 from __future__ import annotations
 
 import io
+import pickle
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.errors import InputError
 from jumplab.io.folder import EXPORTS, transaction, write_file
-from jumplab.io.motion import Motion, steady
-from jumplab.io.tape import RATE_HZ
+from jumplab.io.motion import Motion, checked_rate
+from jumplab.io.whole import ORDERS, Frames, Whole
 from jumplab.robot import Robot
 
-CLIP_FPS = 50.0  # what motion trackers run at
-REPLAY_HZ = 100.0  # smoother than any screen, and a small file
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
-ORDERS = ("depth-first", "breadth-first")  # of links and joints: MuJoCo's and Isaac Lab's
-FORMATS = dict(zip(("csv", "npz", "motion-clip", "urdf-replay"), EXPORTS, strict=True))
+_RATES = (1000.0, 1000.0, 100.0, 30.0, 30.0, 50.0, 50.0, 50.0, 50.0)  # what the formats' usual readers expect
+_NAMES = ("csv", "npz", "urdf-replay", "unitree-csv", "gmr-pkl", "mjlab-npz", "beyondmimic-npz", "holosoma-npz")
+FORMATS = dict(zip((*_NAMES, "mujoco"), zip(EXPORTS, _RATES, strict=True), strict=True))  # -> file, frames a second
+WXYZ = [3, 0, 1, 2]  # of x y z w
 
 
 def default_name(format_name: str, source: str) -> str:
     """Name of an export in a result folder; what comes from a simulation says so."""
-    return FORMATS[format_name] if source == "plan" else f"simulated_{FORMATS[format_name]}"
+    name = FORMATS[format_name][0]
+    return name if source == "plan" else f"simulated_{name}"
 
 
-def write(
-    format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float = CLIP_FPS, order: str = ORDERS[0]
-) -> Path:
-    """Write a motion in one of :data:`FORMATS` to a file, or to a folder with "urdf-replay".
-
-    ``fps`` and ``order`` are those of a :func:`motion_clip`. Raises :class:`InputError`, and leaves nothing behind, if
-    the format is unknown, an option cannot be meant, or the path cannot be written.
-    """
-    path = Path(path)
+def rate_of(format_name: str, fps: float | None = None) -> float:
+    """Frames a second of a format, ``fps`` where given; raises :class:`InputError` if either cannot be meant."""
     if format_name not in FORMATS:
         raise InputError(f"format {format_name!r}: must be one of {', '.join(FORMATS)}")
-    if format_name == "urdf-replay":
-        return _write_replay(motion, robot, path)
-    ending = Path(FORMATS[format_name]).suffix
-    if path.suffix.lower() != ending:
+    return checked_rate(FORMATS[format_name][1] if fps is None else fps)
+
+
+def write(format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float | None = None) -> Path:
+    """Write a motion of the whole robot in one of :data:`FORMATS` to a file, or to a folder.
+
+    ``fps`` are frames a second, by default those of the format; the motion's end follows, where it is none of them.
+    Raises :class:`InputError`, and leaves nothing behind, if the format is unknown, the rate cannot be meant, or the
+    path cannot be written.
+    """
+    path, rate = Path(path), rate_of(format_name, fps)
+    ending = Path(FORMATS[format_name][0]).suffix
+    if ending and path.suffix.lower() != ending:
         raise InputError(f"--out must name a file that ends in {ending}, got {str(path)!r}")
-    if format_name == "csv":
-        return write_file(path, joint_table(motion, robot).encode())
-    clip = format_name == "motion-clip"
-    arrays = motion_clip(motion, robot, fps=fps, order=order) if clip else plain_arrays(motion, robot)
-    return write_file(path, _npz(arrays))
+    whole = Whole(robot)
+    frames = whole.frames(motion, rate)
+    if not ending:
+        return _write_folder(_replay if format_name == "urdf-replay" else _mujoco, whole, frames, rate, path)
+    makers = {
+        "csv": lambda: joint_table(whole, frames).encode(),
+        "npz": lambda: _npz(plain_arrays(whole, frames)),
+        "unitree-csv": lambda: _rows(_state(frames)),
+        "gmr-pkl": lambda: pickle.dumps(retargeted(whole, frames, rate), protocol=4),
+        "mjlab-npz": lambda: _npz(tracked(whole, frames, rate)),
+        "beyondmimic-npz": lambda: _npz(tracked(whole, frames, rate, order=ORDERS[1], at_com=True)),
+        "holosoma-npz": lambda: _npz(with_world(tracked(whole, frames, rate, at_com=True), frames)),
+    }
+    return write_file(path, makers[format_name]())
 
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -58,124 +69,153 @@ def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def joint_table(motion: Motion, robot: Robot) -> str:
-    """Time, phase, position, velocity and torque of every joint as comma-separated text, one header line with units.
+def _rows(table: np.ndarray, head: str = "", digits: str | list[str] = "%.9g") -> bytes:
+    buffer = io.StringIO()
+    np.savetxt(buffer, table, fmt=digits, delimiter=",", header=head, comments="")
+    return buffer.getvalue().encode()
 
-    One line per millisecond; take-off, which a tape holds twice, stands once. The last line is the last whole
-    millisecond within the motion.
+
+def _state(x: Frames) -> np.ndarray:
+    """(F, 7 + J): x y z, quaternion x y z w, joints in the maker's order."""
+    return np.column_stack([x.place, x.turn, x.angles])
+
+
+# tables and arrays ----------------------------------------------------------------------------------------------
+def joint_table(whole: Whole, x: Frames) -> str:
+    """Time, phase, contacts, position, velocity and torque of every joint as comma-separated text.
+
+    One header line with units, one line per frame; take-off, which a tape holds twice, stands once.
     """
-    x = motion.every(RATE_HZ)
-    kinds = {"position_rad": x.q[:, 7:], "velocity_rad_s": x.v[:, 6:], "torque_N_m": x.tau}
-    head = ["time_s", "phase_0_launch_1_flight_2_landing"]
-    head += [f"{name}_{kind}" for kind in kinds for name in robot.joint_names]
-    code = [PHASE_CODES[str(p)] for p in x.phase]
-    table, buffer = np.column_stack([x.t - x.t[0], code, *kinds.values()]), io.StringIO()
-    digits = ["%.6f", "%d", *["%.9g"] * (table.shape[1] - 2)]
-    np.savetxt(buffer, table, fmt=digits, delimiter=",", header=",".join(head), comments="")
-    return buffer.getvalue()
+    kinds = {"position_rad": x.angles, "velocity_rad_s": x.rates, "torque_N_m": x.torques}
+    head = ["time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right"]
+    head += [f"{name}_{kind}" for kind in kinds for name in whole.joints]
+    table = np.column_stack([x.t, [PHASE_CODES[str(p)] for p in x.phase], x.contact, *kinds.values()])
+    return _rows(table, ",".join(head), ["%.6f", *["%d"] * 3, *["%.9g"] * (table.shape[1] - 4)]).decode()
 
 
-def plain_arrays(motion: Motion, robot: Robot, rate_hz: float = RATE_HZ) -> dict[str, np.ndarray]:
-    """The motion on an even grid under names that need no manual: units in them, velocities in world axes."""
-    x = motion.every(rate_hz)
-    turn = [pin.Quaternion(q[3:7]).toRotationMatrix() for q in x.q]
+def plain_arrays(whole: Whole, x: Frames) -> dict[str, np.ndarray]:
+    """The motion under names that need no manual: units in them, velocities in world axes."""
     return {
-        "time_s": x.t - x.t[0],
+        "time_s": x.t,
         "phase": x.phase,
-        "joint_names": np.array(robot.joint_names),
-        "base_position_m": x.q[:, :3],
-        "base_quaternion_xyzw": x.q[:, 3:7],
-        "base_velocity_world_m_s": np.einsum("nij,nj->ni", turn, x.v[:, :3]),
-        "base_angular_velocity_world_rad_s": np.einsum("nij,nj->ni", turn, x.v[:, 3:6]),
-        "joint_position_rad": x.q[:, 7:],
-        "joint_velocity_rad_s": x.v[:, 6:],
-        "joint_torque_N_m": x.tau,
+        "contact": x.contact,
+        "joint_names": np.array(whole.joints),
+        "base_position_m": x.place,
+        "base_quaternion_xyzw": x.turn,
+        "base_velocity_world_m_s": x.velocity,
+        "base_angular_velocity_world_rad_s": x.spin_world,
+        "joint_position_rad": x.angles,
+        "joint_velocity_rad_s": x.rates,
+        "joint_torque_N_m": x.torques,
     }
 
 
-def motion_clip(
-    motion: Motion, robot: Robot, *, fps: float = CLIP_FPS, order: str = ORDERS[0]
+# what trackers and retargeters read -----------------------------------------------------------------------------
+def tracked(
+    whole: Whole, x: Frames, fps: float, *, order: str = ORDERS[0], at_com: bool = False
 ) -> dict[str, np.ndarray]:
-    """F frames under the names that motion trackers read: J joints and B links, 32-bit floats, all in world axes.
-
-    Base and joints are interpolated, links follow from them by Pinocchio, so that every frame is a state that the robot
-    can have. ``fps`` are whole frames a second, ``order`` of joints and links is one of :data:`ORDERS`; raises
-    :class:`InputError` if they cannot be meant.
+    """F frames under the names that motion trackers read: J joints and B links in ``order``, 32-bit floats.
 
     Returns
     -------
-    ``fps`` (1,); ``joint_pos``, ``joint_vel`` (F, J) [rad, rad/s]; ``body_pos_w`` (F, B, 3) origins of the links [m];
-    ``body_quat_w`` (F, B, 4) w x y z, free of jumps in sign; ``body_lin_vel_w`` (F, B, 3) of those origins [m/s];
-    ``body_ang_vel_w`` (F, B, 3) [rad/s]; ``joint_names`` (J,); ``body_names`` (B,), the base link first.
+    ``fps`` (1,); ``joint_pos``, ``joint_vel``, ``joint_torque`` (F, J) [rad, rad/s, N m]; ``body_pos_w`` (F, B, 3)
+    origins of the links [m]; ``body_quat_w`` (F, B, 4) w x y z, free of jumps in sign; ``body_lin_vel_w`` (F, B, 3) of
+    those origins, or of the centres of mass, ``at_com`` [m/s]; ``body_ang_vel_w`` (F, B, 3) [rad/s], all in world
+    axes; ``contact`` (F, 2); ``phase`` (F,); ``joint_names`` (J,); ``body_names`` (B,), the root link first.
     """
-    if fps != round(fps):
-        raise InputError(f"fps = {fps:g}: clips carry whole frames per second")
-    frames, walk = motion.every(fps), _walk(robot, order)
-    joints = [joint for _, joint in walk if joint in robot.joint_names]
-    columns = [robot.joint_names.index(name) for name in joints]
-    place, turn, speed, spin = _links(frames, robot, [link for link, _ in walk])
-    arrays = {
-        "joint_pos": frames.q[:, 7:][:, columns],
-        "joint_vel": frames.v[:, 6:][:, columns],
-        "body_pos_w": place,
-        "body_quat_w": steady(turn),
-        "body_lin_vel_w": speed,
-        "body_ang_vel_w": spin,
+    joints, links = whole.ordered(order)
+    columns = [whole.joints.index(name) for name in joints]
+    joined = {"joint_pos": x.angles, "joint_vel": x.rates, "joint_torque": x.torques}
+    arrays = {name: values[:, columns] for name, values in joined.items()} | whole.bodies(x, links, at_com=at_com)
+    numbers = {name: values.astype(np.float32) for name, values in arrays.items()}
+    names = {"joint_names": np.array(joints), "body_names": np.array(links)}
+    rate = np.array([fps]) if fps % 1 else np.array([fps], np.int64)
+    return {"fps": rate, **numbers, "contact": x.contact, "phase": x.phase, **names}
+
+
+def with_world(arrays: Mapping[str, np.ndarray], x: Frames) -> dict[str, np.ndarray]:
+    """The arrays of :func:`tracked` with the world as first body and the root's state before the joints', as MuJoCo's.
+
+    ``joint_pos`` (F, 7 + J) begins with x y z, quaternion w x y z, ``joint_vel`` (F, 6 + J) with the velocity in world
+    axes and the angular velocity in the root's own.
+    """
+    out = dict(arrays)
+    for name in ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w"):
+        still = np.zeros_like(arrays[name][:, :1])
+        still[..., 0] = name == "body_quat_w"
+        out[name] = np.concatenate([still, arrays[name]], axis=1)
+    for name, state in (("joint_pos", _qpos(x)[:, :7]), ("joint_vel", _qvel(x)[:, :6])):
+        out[name] = np.hstack([state.astype(np.float32), arrays[name]])
+    return out | {"body_names": np.array(["world", *arrays["body_names"]])}
+
+
+def retargeted(whole: Whole, x: Frames, fps: float) -> dict[str, object]:
+    """What motion retargeters keep in a pickle: rotations x y z w, ``local_body_pos`` (F, B, 3) in the root's axes."""
+    here = whole.bodies(x, whole.links, at_com=False)["body_pos_w"] - x.place[:, None]
+    return {
+        "fps": fps,
+        "root_pos": x.place,
+        "root_rot": x.turn,
+        "dof_pos": x.angles,
+        "local_body_pos": np.einsum("fji,fbj->fbi", x.rotation, here),
+        "link_body_list": list(whole.links),
+        "dof_torque": x.torques,
+        "contact": x.contact,
+        "phase": [str(name) for name in x.phase],
+        "joint_names": list(whole.joints),
     }
-    names = {"joint_names": np.array(joints), "body_names": np.array([link for link, _ in walk])}
-    numbers = {name: x.astype(np.float32) for name, x in arrays.items()}
-    return {"fps": np.array([round(fps)], np.int64), **numbers, **names}
 
 
-def _links(frames: Motion, robot: Robot, links: list[str]) -> tuple[np.ndarray, ...]:
-    """Origins, attitudes (w x y z), velocities and angular velocities of the links, (F, B, 3 or 4) in world axes."""
-    model, data = robot.model, robot.model.createData()
-    ids = [model.getFrameId(name, pin.FrameType.BODY) for name in links]
-    place, turn, speed, spin = (np.empty((len(frames.t), len(ids), k)) for k in (3, 4, 3, 3))
-    for k, (q, v) in enumerate(zip(frames.q, frames.v, strict=True)):
-        pin.forwardKinematics(model, data, q, v)
-        pin.updateFramePlacements(model, data)
-        for i, frame in enumerate(ids):
-            place[k, i] = data.oMf[frame].translation
-            turn[k, i] = pin.Quaternion(data.oMf[frame].rotation).coeffs()[[3, 0, 1, 2]]
-            twist = pin.getFrameVelocity(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-            speed[k, i], spin[k, i] = twist.linear, twist.angular
-    return place, turn, speed, spin
-
-
-def _walk(robot: Robot, order: str) -> list[tuple[str, str | None]]:
-    """Every link with the joint above it. Siblings come as the URDF lists them; Pinocchio sorts them by name."""
-    if order not in ORDERS:
-        raise InputError(f"order {order!r}: must be {' or '.join(ORDERS)}")
-    tree = ElementTree.fromstring(robot.urdf)
-    below: dict[str, list[tuple[str, str | None]]] = {}
-    for joint in tree.iterfind("joint"):
-        parent, child = joint.find("parent").get("link"), joint.find("child").get("link")
-        below.setdefault(parent, []).append((child, joint.get("name")))
-    children = {link for pairs in below.values() for link, _ in pairs}
-    out, waiting = [], [(link.get("name"), None) for link in tree.iterfind("link") if link.get("name") not in children]
-    while waiting:
-        out.append(waiting.pop(0))
-        found = below.get(out[-1][0], [])
-        waiting = found + waiting if order == "depth-first" else waiting + found
-    return out
-
-
-def _write_replay(motion: Motion, robot: Robot, path: Path) -> Path:
-    """A folder with the URDF, the trajectory, and a script of ten lines that shows it."""
-    # the last two are left by a writer that was killed
-    known = ("README.md", "replay.py", "robot.urdf", "trajectory.npz", ".staging", ".commit")
+# folders --------------------------------------------------------------------------------------------------------
+def _write_folder(fill, whole: Whole, x: Frames, fps: float, path: Path) -> Path:
+    """A folder with what ``fill`` makes, bytes by file name."""
+    files = fill(whole, x, fps)
+    known = (*files, ".staging", ".commit")  # the last two are left by a writer that was killed
     strangers = sorted(p.name for p in path.iterdir() if p.name not in known) if path.is_dir() else []
     if strangers:
         raise InputError(f"the folder {str(path)!r} already holds {strangers[0]!r}; choose a new or an empty one")
+    with transaction(path) as staging:
+        for name, content in files.items():
+            (staging / name).write_bytes(content)
+    return path
+
+
+def _replay(whole: Whole, x: Frames, fps: float) -> dict[str, bytes]:
+    """The URDF, the trajectory, and a script of ten lines that shows it."""
     files = resources.files("jumplab.io")
     script, readme = ((files / name).read_text(encoding="utf-8") for name in ("replay.py.txt", "replay.md"))
-    for mark, said in (("@@SCRIPT@@", script.strip()), ("@@SOURCE@@", motion.source), ("@@ROBOT@@", robot.name)):
+    for mark, said in (("@@SCRIPT@@", script.strip()), ("@@SOURCE@@", x.source), ("@@ROBOT@@", whole.robot.name)):
         readme = readme.replace(mark, said)
-    arrays = {"hz": np.array(REPLAY_HZ), **plain_arrays(motion, robot, REPLAY_HZ)}
-    with transaction(path) as staging:
-        (staging / "robot.urdf").write_bytes(robot.urdf.encode())
-        (staging / "trajectory.npz").write_bytes(_npz(arrays))
-        (staging / "replay.py").write_text(script, encoding="utf-8")
-        (staging / "README.md").write_text(readme, encoding="utf-8")
-    return path
+    return {
+        "robot.urdf": whole.urdf.encode(),
+        "trajectory.npz": _npz({"hz": np.array(fps), **plain_arrays(whole, x)}),
+        "replay.py": script.encode(),
+        "README.md": readme.encode(),
+    }
+
+
+def _qpos(x: Frames) -> np.ndarray:
+    """(F, 7 + J): x y z, quaternion w x y z, joints."""
+    return np.column_stack([x.place, x.turn[:, WXYZ], x.angles])
+
+
+def _qvel(x: Frames) -> np.ndarray:
+    """(F, 6 + J): velocity in world axes, angular velocity in the root's own, joints."""
+    return np.column_stack([x.velocity, x.spin, x.rates])
+
+
+def _mujoco(whole: Whole, x: Frames, fps: float) -> dict[str, bytes]:
+    """The robot on level ground as MuJoCo's XML, a motor on every joint, and ``qpos``, ``qvel``, ``ctrl`` (torques)."""
+    import mujoco
+
+    spec = mujoco.MjSpec.from_string(whole.urdf)
+    spec.compiler.discardvisual, spec.compiler.fusestatic = False, True
+    spec.worldbody.first_body().add_freejoint()
+    spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    for name in whole.joints:
+        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    spec.compile()
+    names = {"joint_names": np.array(whole.joints), "contact": x.contact, "phase": x.phase, "fps": np.array(fps)}
+    states = {"time": x.t, "qpos": _qpos(x), "qvel": _qvel(x), "ctrl": x.torques}
+    return {"robot.xml": spec.to_xml().encode(), "motion.npz": _npz(states | names)}

@@ -40,10 +40,21 @@ PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy"
 BUILDS = {"pybullet": "pybullet-arm64"}  # the same sources, built for later Pythons under another name
 PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
-EXPORTS = ("joints.csv", "motion.npz", "motion_clip.npz", "replay")
+EXPORTS = (
+    "joints.csv",
+    "motion.npz",
+    "replay",
+    "unitree.csv",
+    "gmr.pkl",
+    "mjlab.npz",
+    "beyondmimic.npz",
+    "holosoma.npz",
+)
+EXPORTS += ("mujoco",)
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
-RESULTS = ("passport.json", "simulation.npz", "simulation.json", "trials.jsonl", "trials.json", "basin.json")
+TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")
+RESULTS = ("passport.json", "simulation.npz", "simulation.json", *TRIALS)
 CERTIFICATE = ("certificate.json", "certificate.html")
 OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *CERTIFICATE, *EXPORTS, *OF_SIMULATION)
 _STAGING, _COMMIT = ".staging", ".commit"

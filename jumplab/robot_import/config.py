@@ -13,6 +13,7 @@ import numpy as np
 from jumplab.errors import RobotError
 
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+LEG = ROLES[:3]
 _REQUIRED = object()
 
 

@@ -19,7 +19,7 @@ from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
 from jumplab.robot_import.roles import LEG
-from jumplab.robot_import.urdf import Tree, parse
+from jumplab.robot_import.urdf import MOVING, Tree, parse
 
 REPAIRS = ("inertia", "massless")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
@@ -32,6 +32,7 @@ ARM_REACH = 1.86  # length of an arm's box, in distances from the shoulder to th
 DIAGONAL = 1e-9  # [kg m^2] below, a product of inertia is rounding
 STEP_RAD = 0.02  # of the sweep for collisions; the range is cut one step early
 FREE_M = 0.008  # distance kept between thigh and trunk
+ANY = {"lower": -np.pi, "upper": np.pi, "effort": 0.0, "velocity": 0.0}  # of a joint whose limits are not told
 Boxes = list[tuple[np.ndarray, np.ndarray]]  # (centre, size) in the frame of a body [m]
 
 
@@ -61,7 +62,10 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     sole = _sole(config, lumped, where)
     lumped = _cut_hips(lumped, roles, _urdf(config, roles, lumped, sole))
     text = _urdf(config, roles, lumped, sole)
-    return Jumper(text, _toml(config, roles, feet, sole, urdf, lumped), lumped, tree)
+    told = _toml(config, roles, feet, sole, urdf, lumped) + _published(
+        tree, lumped, _boxes(config, roles, lumped, sole)
+    )
+    return Jumper(text, told, lumped, tree)
 
 
 def _source(config: dict) -> dict:
@@ -144,6 +148,48 @@ def _urdf(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float
     return f'<?xml version="1.0"?>\n{ET.tostring(robot, encoding="unicode")}\n'
 
 
+def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
+    """The table [published]: the robot with all its joints, links that are fixed to each other as one, as a URDF."""
+
+    def carrier(link: str) -> str:
+        while link in tree.above and tree.above[link].kind == "fixed":
+            link = tree.above[link].parent
+        return link
+
+    trunk, robot, shapes = lumped.bodies[0], ET.Element("robot", name="published"), {}
+    for body in lumped.bodies:
+        axes = lumped.placed[carrier(body.name)].inverse() * pin.SE3(np.eye(3), body.place)
+        shapes[carrier(body.name)] = (boxes.get(body.name, []), None, axes)
+    todo = [trunk.name]
+    while (above := tree.above.get(todo[0])) and above.kind in (*MOVING, "fixed"):
+        todo = [above.parent]
+    for link in todo:
+        parts, total = {link: pin.SE3.Identity()}, pin.Inertia.Zero()
+        for name in tree.fixed_to(link):
+            if tree.links[name].inertia.mass > 0:
+                total += parts[name].act(tree.links[name].inertia)
+            for below in tree.below[name]:
+                parts[below.child] = parts[name] * below.place
+                if below.kind in MOVING:
+                    joint = _joint(robot, below.name, below.kind.replace("continuous", "revolute"), link, below.child)
+                    place = parts[below.child]
+                    _add(joint, "origin", xyz=place.translation, rpy=pin.rpy.matrixToRpy(place.rotation))
+                    _add(joint, "axis", xyz=below.axis)
+                    _add(joint, "limit", **ANY | below.limits)
+                    todo.append(below.child)
+        _link(robot, link, total, *shapes.get(link, ([],)))
+    ET.indent(robot)
+    place = pin.SE3(np.eye(3), -trunk.place) * lumped.placed[carrier(trunk.name)]
+    return filled(
+        "published.toml.in",
+        trunk=texts([carrier(trunk.name)])[1:-1],
+        xyz=", ".join(f"{x:.12g}" for x in 0.0 + place.translation),
+        rpy=", ".join(f"{x:.12g}" for x in 0.0 + pin.rpy.matrixToRpy(place.rotation)),
+        urdf=ET.tostring(robot, encoding="unicode"),
+        held="\n".join(f"{texts([name])[1:-1]} = {angle:.12g}" for name, angle in sorted(lumped.held.items())),
+    )
+
+
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
     joint = _add(robot, "joint", name=name, type=kind)
     _add(joint, "parent", link=parent)
@@ -151,8 +197,16 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> 
     return joint
 
 
-def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes: Boxes, seen: Boxes | None = None) -> None:
-    """A link with boxes that collide and are seen, and boxes that are only ``seen``."""
+def _link(
+    robot: ET.Element,
+    name: str,
+    inertia: pin.Inertia,
+    boxes: Boxes,
+    seen: Boxes | None = None,
+    axes: pin.SE3 | None = None,
+) -> None:
+    """A link with boxes that collide and are seen, and boxes that are only ``seen``; they lie along ``axes`` in it."""
+    axes = axes or pin.SE3.Identity()
     link = _add(robot, "link", name=name)
     inertial = _add(link, "inertial")
     _add(inertial, "origin", xyz=inertia.lever, rpy="0 0 0")
@@ -162,7 +216,7 @@ def _link(robot: ET.Element, name: str, inertia: pin.Inertia, boxes: Boxes, seen
     for kind, shapes in (("visual", [*boxes, *(seen or [])]), ("collision", boxes)):
         for centre, size in shapes:
             shape = _add(link, kind)
-            _add(shape, "origin", xyz=centre, rpy="0 0 0")
+            _add(shape, "origin", xyz=axes.act(centre), rpy=pin.rpy.matrixToRpy(axes.rotation))
             _add(_add(shape, "geometry"), "box", size=size)
 
 

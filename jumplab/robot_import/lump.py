@@ -52,6 +52,8 @@ class Lumped:
     foot_offset: np.ndarray  # (3,) from the foot body's origin to the origin of the told foot link [m]
     changed: dict[str, tuple[float, str]]  # what evening out and repairs changed: name -> (amount, unit)
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
+    links: dict[str, tuple[str, pin.SE3]]  # link of the URDF -> body it belongs to, and its place there
+    placed: dict[str, pin.SE3]  # link -> its place in the robot's axes, those joints held and all others at 0
 
     def body(self, joint: str) -> Body:
         """The body that a joint moves."""
@@ -81,7 +83,11 @@ def lump(tree: Tree, config: dict, roles: RoleJoints, source: dict, feet: tuple[
         bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     offset = placed[feet[0]].translation - next(b for b in bodies if b.name == feet[0]).place
-    return Lumped(tuple(bodies), offset, changed, held)
+    links, group = {}, _groups(tree, moving)
+    for body in bodies:
+        here = {n: pin.SE3(placed[n].rotation, placed[n].translation - body.place) for n in group[body.name]}
+        links |= {name: (body.name, place) for name, place in here.items()}
+    return Lumped(tuple(bodies), offset, changed, held, links, placed)
 
 
 # what moves, and how far ----------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.checks import PLAUSIBLE
-from jumplab.robot_import.config import ROLES, filled, texts
+from jumplab.robot_import.config import LEG, ROLES, filled, texts
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, parse, read_urdf
 
 # None of these numbers is printed by the paper.
@@ -37,7 +37,6 @@ GUESS_X, GUESS_Y, GUESS_Z = (-0.143, 0.2), (-0.071, 0.071), -0.107
 STANCE_KNEE_RAD, STANCE_TRUNK_RAD = 0.5, 0.05  # as the default robot stands
 STANCE_ROOM_RAD = 0.15  # from the joint stops
 AXES = dict(zip("xyz", np.eye(3), strict=True))
-LEG = ROLES[:3]
 
 
 @dataclass(frozen=True)

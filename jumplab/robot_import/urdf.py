@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib import metadata
 from itertools import product
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -142,6 +143,7 @@ class Link:
     weighed: bool  # the URDF says something of its mass
     inertia: pin.Inertia  # in its own frame; zero without mass
     shapes: list[tuple[ET.Element, ET.Element]] = field(repr=False)  # (<collision>, the shape in it)
+    seen: list[tuple[ET.Element, ET.Element]] = field(repr=False)  # (<visual>, the mesh in it)
 
 
 @dataclass(frozen=True)
@@ -197,7 +199,8 @@ def _link(e: ET.Element, most: float) -> Link:
             matrix = repaired(matrix)
         total = pin.Inertia(mass, place.translation, place.rotation @ matrix @ place.rotation.T)
     shapes = [(c, s) for c in e.findall("collision") for s in c.findall("geometry/*") if s.tag in KNOWN]
-    return Link(e.get("name"), inertial is not None, total, shapes)
+    seen = [(v, s) for v in e.findall("visual") for s in v.findall("geometry/mesh")]
+    return Link(e.get("name"), inertial is not None, total, shapes, seen)
 
 
 def unsolid(matrix: np.ndarray) -> float:
@@ -302,7 +305,7 @@ class Tree:
         """(n, 3) points in a link's frame whose hull holds its collision shapes; meshes count where they are found."""
         found = [np.zeros((0, 3))]
         for collision, shape in self.links[link].shapes:
-            place, local = _place(collision), self._mesh(shape) if shape.tag == "mesh" else _corners(shape)
+            place, local = _place(collision), self._mesh(shape)[0] if shape.tag == "mesh" else _corners(shape)
             found.append(local @ place.rotation.T + place.translation)
         return np.concatenate(found)
 
@@ -315,22 +318,29 @@ class Tree:
         points = np.concatenate(found)
         return points[points[:, 2] < points[:, 2].min(initial=np.inf) + SOLE_M]
 
-    def _mesh(self, shape: ET.Element) -> np.ndarray:
-        """(n, 3) vertices of a mesh: from beside the URDF, or from a folder above it; none if it is not there."""
+    def meshes(self, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Points (n, 3) in a link's frame and triangles (m, 3) of the meshes seen of it, where they are found."""
+        found = [(_place(visual), *self._mesh(shape)) for visual, shape in self.links[link].seen]
+        corners = [[[m.tri_indices(k)[i] for i in range(3)] for k in range(m.num_tris)] if m else [] for *_, m in found]
+        moved = [points @ place.rotation.T + place.translation for place, points, _ in found]
+        return [(x, np.array(f)) for x, f in zip(moved, corners, strict=True) if f]
+
+    def _mesh(self, shape: ET.Element) -> tuple[np.ndarray, Any]:
+        """(n, 3) vertices of a mesh, and the mesh, from beside the URDF or above it; None if it is not there."""
         inside = shape.get("filename").split("://", 1)[-1].lstrip("/")
         told = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
         folders = [*(self.path.resolve().parents if self.path else ()), *map(Path, told)]
         places = (folder / part for folder in folders for part in (inside, inside.split("/", 1)[-1]))
         file = next((place for place in places if place.is_file()), None)
         if file is None:
-            return np.zeros((0, 3))
+            return np.zeros((0, 3)), None
         import coal
 
         try:
             mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), np.ones(3))
         except (RuntimeError, ValueError):  # a pointer to a mesh that was not downloaded, or a format of its own
-            return np.zeros((0, 3))
-        return np.array(mesh.vertices()) * numbers(shape.get("scale", "1 1 1"), 3)
+            return np.zeros((0, 3)), None
+        return np.array(mesh.vertices()) * numbers(shape.get("scale", "1 1 1"), 3), mesh
 
 
 def _corners(shape: ET.Element) -> np.ndarray:

@@ -17,7 +17,8 @@ import lazy_loader as lazy
 
 _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
-    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum envelope_map",
+    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum envelope_map "
+    "margin_radar",
     # the jump in 3-D, the page of a certificate, tables
     "viewer": "Page page",
     "certificate": "certificate_page",

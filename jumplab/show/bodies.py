@@ -7,7 +7,6 @@ Angles are positive about +y, x forward, z up; all lengths in metres. Axes that 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
@@ -25,8 +24,7 @@ from jumplab.show.style import FLIGHT, GROUND, INK, LANDING, LAUNCH, PURPLE, VER
 ROUNDING_M = 0.018  # radius by which drawn boxes are rounded
 CIRCLE = np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 12, endpoint=False)), np.sin(a)], -1)  # (12, 2)
 VIEWS = {"side": [0, 2], "front": [1, 2]}
-JOINT_RADIUS_M, ROD_RADIUS_M = 0.038, 0.018  # balls and rods of the skeleton in rendered pictures and on the page
-LIMB_SHARE = 0.5  # strength of a colour there on limbs, whose trunk has all of it
+LIMB_SHARE = 0.5  # strength of a colour on limbs, whose trunk has all of it, in rendered pictures and on the page
 ABOVE_M = 0.36  # seen there above the highest base: a head is 0.3 m above the shoulders
 SHADES = {"trunk": 1.0, "limb": 0.78, "far": 0.45}  # strength of the colour per part
 BODY = "#5B6B7F"  # a robot outside of any phase
@@ -180,19 +178,6 @@ def equal_scales(ax: Axes) -> None:
     """Equal scales on both axes, everything in view."""
     ax.set_aspect("equal", adjustable="box")
     ax.autoscale_view()
-
-
-def skeleton(robot: Robot, axis: ArrayLike) -> Iterator[tuple[int, tuple[int, float, pin.SE3] | None]]:
-    """Each pitch joint with the rod from it to the next one above it in its limb, if there is one.
-
-    A rod is the joint above, its length [m] and its place there; its shape lies along ``axis`` (3,).
-    """
-    model = robot.model
-    joints = [model.getJointId(name) for pair in robot.joints.values() for name in pair]
-    for joint in joints:
-        above, way = model.parents[joint], np.array(model.jointPlacements[joint].translation)
-        turn = pin.Quaternion.FromTwoVectors(np.asarray(axis, float), way).toRotationMatrix()
-        yield joint, (above, float(np.linalg.norm(way)), pin.SE3(turn, way / 2)) if above in joints else None
 
 
 # the sheet of a robot -------------------------------------------------------------------------------------------

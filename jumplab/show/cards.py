@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.auditing import AuditReport
     from jumplab.robot import Robot
     from jumplab.sim import SimulationResult
+    from jumplab.studies.margins import MarginReport
     from jumplab.studies.trials import TrialReport
 
 Card = tuple[Table, style.Picture | None]
@@ -108,7 +109,12 @@ def _of_trials(report: TrialReport) -> Card:
     low, high = report.interval
     rows = [{"": "landed", "robots": report.landed, "share": f"{report.success_rate:.1%} ({low:.1%} ... {high:.1%})"}]
     rows += [{"": reason, "robots": count} for reason, count in report.reasons.items()]
+    rows += [{"": f"of the failures, began with: {cause}", "robots": count} for cause, count in report.causes.items()]
     return table(rows, ["", "robots", "share"]), _scatter(report)
+
+
+def _of_margins(report: MarginReport) -> Card:
+    return table([margin.row() for margin in report.margins], digits=3), jumps.margin_radar(report)
 
 
 @style.styled
@@ -130,6 +136,7 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "Robot": _of_robot,
     "AuditReport": _of_audit,
     "TrialReport": _of_trials,
+    "MarginReport": _of_margins,
 }
 
 

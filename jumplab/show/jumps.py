@@ -22,6 +22,7 @@ from jumplab.task import GRAVITY
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
+    from jumplab.studies.margins import MarginReport
 
 REFUSED = {
     OPEN: ("#9A9A9A", "no plan found"),
@@ -200,6 +201,26 @@ def envelope_map(envelope: Envelope) -> Figure:
     handles = [Patch(color=color, label=name) for name, color in colors.items()]
     handles += [Patch(color=color, label=text) for kind, (color, text) in REFUSED.items() if kind in seen]
     ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=7, frameon=False)
+    return fig
+
+
+@style.styled
+def margin_radar(report: MarginReport) -> Figure:
+    """How much of each disturbance a plan bears, as a share of the largest that is tried; dashed without re-aim."""
+    names = list(dict.fromkeys(m.names for m in report.margins))
+    angles = 2 * np.pi * np.arange(len(names)) / len(names)
+    fig = style.new_figure(style.PAGE_IN, 4.2)
+    ax = fig.add_subplot(projection="polar")
+    for reaim, word, look in ((False, "plain", "--"), (True, "re-aimed", "-")):
+        shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
+        values = [shares.get(name, np.nan) for name in (*names, names[0])]
+        color = style.LANDING if reaim else style.LAUNCH
+        ax.plot([*angles, angles[0]], values, look, color=color, marker="o", markersize=3, label=word)
+    words = [name.replace("+", " +\n") for name in names]
+    ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
+    ax.set_xticks(angles, words, fontsize=6.5)
+    ax.set_yticks([25, 50, 75, 100], ["25 %", "", "75 %", "100 % of what is tried"], fontsize=6)
+    ax.legend(loc="lower left", bbox_to_anchor=(1.05, 0.0), frameon=False)
     return fig
 
 

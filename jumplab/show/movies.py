@@ -31,6 +31,7 @@ SPEED, AFTER_TOUCHDOWN_S = 0.5, 0.8  # how fast it is shown, and how much of the
 VIEW_M, FIELD_DEG, AZIMUTH_DEG, TILT_DEG = 3.5, 36.0, 115.0, -9.0  # the camera: distance, opening, direction
 GLIDE_S = 0.25  # the camera follows the trunk, smoothed over this time
 SKY, FLOOR, FLOOR_TOO = (0.93, 0.95, 0.97), (0.86, 0.88, 0.91), (0.80, 0.83, 0.87)
+SHOWN_M = -6.0, 8.0  # of the ground
 BONE, BONE_M, BONE_COLOR = "bone", 0.03, "#42474F"
 COLORS = 64  # of a GIF: more is larger, and looks the same
 
@@ -189,12 +190,9 @@ def _model(robot: Robot, scene: Scene):
     spec.worldbody.add_light(pos=[0.0, -1.0, 6.0], dir=[0.15, 0.3, -1.0], **sun)
     for body in list(spec.bodies)[1:]:
         _add_bones(body)
-    for block in scene.blocks:
-        left, right = max(block.x_from, -6.0), min(block.x_to, 8.0)
-        if left < right:
-            half = [(right - left) / 2, 4.0, block.thickness / 2]
-            middle = [(left + right) / 2, 0.0, block.top - block.thickness / 2]
-            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=middle, material="floor")
+    for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
+        place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **place, material="floor")
     model = spec.compile()
     return model, np.array([model.joint(name).qposadr[0] for name in robot.joint_names])
 
@@ -220,13 +218,9 @@ def _bullet(robot: Robot, scene: Scene, size: tuple[int, int]) -> tuple[Draw, Ca
         Path(folder, "robot.urdf").write_text(robot.urdf)
         body = client.loadURDF(str(Path(folder, "robot.urdf")))
     joints = {client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))}
-    for block in scene.blocks:
-        left, right = max(block.x_from, -6.0), min(block.x_to, 8.0)
-        if left < right:
-            half = [(right - left) / 2, 1.2, block.thickness / 2]
-            shape = client.createVisualShape(p.GEOM_BOX, halfExtents=half, rgbaColor=[*FLOOR, 1])
-            middle = [(left + right) / 2, 0.0, block.top - block.thickness / 2]
-            client.createMultiBody(0, -1, shape, middle)
+    for half, middle, turn in scene.within(*SHOWN_M, 1.2).boxes():
+        shape = client.createVisualShape(p.GEOM_BOX, halfExtents=half, rgbaColor=[*FLOOR, 1])
+        client.createMultiBody(0, -1, shape, middle, turn)
     lens = client.computeProjectionMatrixFOV(FIELD_DEG, size[0] / size[1], 0.1, 30.0)
     base = np.array(client.getDynamicsInfo(body, -1)[3])  # the engine's base is the link's centre of mass
 

@@ -2,23 +2,27 @@
 "use strict";
 const byId = (name) => document.getElementById(name);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-const viewer = new MeshCat.Viewer(byId("pane"));
+const stage = byId("stage"), viewer = new MeshCat.Viewer(byId("pane"));
+const fill = viewer.set_3d_pane_size.bind(viewer); // the engine would fill the window
+viewer.set_3d_pane_size = () => stage.clientHeight && fill(stage.clientWidth, stage.clientHeight);
 for (const text of commands) viewer.handle_command_bytearray(bytes(text));
 const tell = (type, path, rest) => viewer.handle_command({ type, path, ...rest });
 
 tell("set_property", "/Lights/SpotLight/<object>", { property: "castShadow", value: true }); // Python's client knows no capitals
 viewer.scene_tree.find(["Lights", "SpotLight", "<object>"]).object.shadow.mapSize.set(2048, 2048);
 
+const { Color, ConeGeometry, CylinderGeometry, Group, Matrix4, Mesh, MeshPhongMaterial, Quaternion, Vector3 } = MeshCat.THREE;
+const floats = (text) => text && new Float32Array(bytes(text).buffer);
 const clips = facts.clips.map((clip) => ({
   ...clip,
-  poses: new Float32Array(bytes(clip.poses).buffer),
+  ...Object.fromEntries(["poses", "forces", "values"].map((name) => [name, floats(clip[name])])),
+  aside: 0,
   duration: (clip.frames - 1) / facts.fps,
   painted: null,
 }));
 let duration = 0, now = 0, playing = false, before = 0, lead = clips[0];
 
 // Column-major matrix of the pose between two frames; `u` is the share of the way.
-const { Matrix4, Quaternion, Vector3 } = MeshCat.THREE;
 const point = (poses, k) => new Vector3().fromArray(poses, k);
 const turn = (poses, k) => new Quaternion().fromArray(poses, k + 3);
 function between(poses, a, b, u) {
@@ -28,14 +32,28 @@ function between(poses, a, b, u) {
 
 const phaseAt = (clip, time) => clip.phases.filter(([start]) => start <= time + 1e-9).at(-1)[1];
 
+// The frames before and after an instant, and the share of the way between them.
+function frames(clip, time) {
+  const at = Math.min(time, clip.duration) * facts.fps, low = Math.min(Math.floor(at + 1e-9), clip.frames - 1);
+  return [low, Math.min(low + 1, clip.frames - 1), Math.max(0, at - low)];
+}
+const columns = 2 + facts.curves.reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
+function value(clip, column, time) {
+  const [low, high, u] = frames(clip, time), at = (k) => clip.values[columns * k + column];
+  return at(low) + u * (at(high) - at(low));
+}
+function base(clip, time) { // and how far the clip is moved aside
+  const [low, high, u] = frames(clip, time), width = 7 * clip.bodies;
+  return point(clip.poses, width * low).lerp(point(clip.poses, width * high), u).add(new Vector3(0, clip.aside, 0));
+}
+
 function pose(clip, time) {
-  const at = Math.min(time, clip.duration) * facts.fps;
-  const low = Math.min(Math.floor(at + 1e-9), clip.frames - 1), high = Math.min(low + 1, clip.frames - 1);
-  const width = 7 * clip.bodies;
+  const [low, high, u] = frames(clip, time), width = 7 * clip.bodies;
   for (let j = 0; j < clip.bodies; j++) {
-    const matrix = between(clip.poses, low * width + 7 * j, high * width + 7 * j, Math.max(0, at - low));
+    const matrix = between(clip.poses, low * width + 7 * j, high * width + 7 * j, u);
     tell("set_transform", `/meshcat/jump/${clip.name}/${j + 1}`, { matrix });
   }
+  press(clip, u < 0.5 ? low : high);
   const phase = phaseAt(clip, time), alpha = ghosted(clip) ? facts.ghost : 1;
   if (clip.painted !== phase + alpha) {
     clip.painted = phase + alpha;
@@ -43,6 +61,40 @@ function pose(clip, time) {
       for (const path of clip[kind])
         tell("set_property", path, { property: "color", value: [...facts.colors[phase][kind], alpha] });
   }
+}
+
+// forces of the ground, and where they act: an arrow for each foot, a dot for both, seen through the legs
+const solid = (shape) => new Mesh(shape, new MeshPhongMaterial({ color: facts.arrow, transparent: true, depthTest: false }));
+const ARROW_M = 0.4, HEAD_M = 0.07, LONGEST_M = 1.2; // length for the robot's weight, of the head, and at most
+for (const clip of clips.filter(({ forces }) => forces)) {
+  clip.arrows = [0, 1].map(() => {
+    const [shaft, head, arrow] = [solid(new CylinderGeometry(0.011, 0.011, 1, 12)), solid(new ConeGeometry(0.028, HEAD_M, 16)), new Group()];
+    return arrow.add(shaft, head);
+  });
+  clip.dot = solid(new CylinderGeometry(0.035, 0.035, 0.008, 24).rotateX(Math.PI / 2));
+  viewer.scene_tree.find(["meshcat", "jump", clip.name]).object.add(...clip.arrows, clip.dot);
+}
+function press(clip, frame) {
+  if (!clip.forces) return;
+  const middle = new Vector3(), up = new Vector3(0, 1, 0);
+  let total = 0;
+  for (const [foot, arrow] of clip.arrows.entries()) {
+    const [x, y, z, ...force] = clip.forces.subarray(12 * frame + 6 * foot, 12 * frame + 6 * foot + 6);
+    arrow.visible = !isNaN(z);
+    if (!arrow.visible) continue;
+    const way = new Vector3(...force), size = way.length(), length = Math.min(LONGEST_M, (ARROW_M * size) / facts.weight);
+    const [shaft, head] = arrow.children;
+    arrow.position.set(x, y, z);
+    arrow.quaternion.setFromUnitVectors(up, way.normalize());
+    shaft.scale.y = Math.max(0.001, length - HEAD_M);
+    shaft.position.y = shaft.scale.y / 2;
+    head.position.y = Math.max(HEAD_M, length) - HEAD_M / 2;
+    middle.add(new Vector3(x, y, z + 0.008).multiplyScalar(force[2]));
+    total += force[2];
+  }
+  clip.dot.visible = total > 0;
+  if (total > 0) clip.dot.position.copy(middle.divideScalar(total));
+  for (const mesh of [clip.dot, ...clip.arrows.flatMap(({ children }) => children)]) mesh.material.opacity = ghosted(clip) ? 0.5 : 1;
 }
 
 function seek(time) {
@@ -53,7 +105,35 @@ function seek(time) {
   byId("phase-name").textContent = phase;
   byId("dot").style.background = facts.css[phase];
   byId("clock").textContent = `${now.toFixed(2)} s`;
+  compare();
+  for (const plot of plots) plot.point();
+  if (following) go_along();
+  viewer.set_dirty();
 }
+
+const said = (x, digits) => x.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−"); // never "−0.0"
+
+// plan and simulation in figures, as long as both last
+const ROWS = [["travel of the toes", 0], ["rise of the CoM", 1]];
+function compare() {
+  const [simulation, plan] = ["simulation", "plan"].map((name) => clips.find((clip) => clip.name === name));
+  if (!simulation || !plan) return;
+  const end = Math.min(simulation.duration, plan.duration), at = Math.min(now, end);
+  const away = base(simulation, at).sub(base(plan, at)), mm = (x) => `${said(1000 * x, 1)} mm`;
+  away.y += plan.aside - simulation.aside;
+  const rows = ROWS.map(([name, column]) => {
+    const [a, b] = [simulation, plan].map((clip) => value(clip, column, at));
+    return [name, `${said(a, 3)} m`, `${said(b, 3)} m`, mm(a - b)];
+  });
+  const last = ["base, apart", `x ${mm(away.x)}`, `z ${mm(away.z)}`, mm(away.length())];
+  const table = [[now > end ? `at ${end.toFixed(2)} s, the plan's end` : "now", "simulation", "plan", "apart"], ...rows, last];
+  table.forEach((row, i) => row.forEach((text, k) => { byId("apart").rows[i].cells[k].textContent = text; }));
+}
+if (clips.length > 1)
+  for (let i = 0; i < 4; i++) {
+    const row = byId("apart").insertRow();
+    for (let k = 0; k < 4; k++) row.append(document.createElement(i && k ? "td" : "th"));
+  }
 
 // what is shown
 const shown = (clip) => byId("show").value === "both" || byId("show").value === clip.name;
@@ -67,28 +147,115 @@ function choose() {
     const end = i + 1 < lead.phases.length ? lead.phases[i + 1][0] : lead.duration;
     return [`${facts.css[phase]} ${(100 * start) / duration}% ${(100 * end) / duration}%`];
   });
-  byId("time").style.background = `linear-gradient(to right, ${stops.join(", ")}, #dde1e7 0)`;
+  byId("time").style.backgroundImage = `linear-gradient(to right, ${stops.join(", ")}, #dde1e7 0)`;
+  const gap = byId("show").value === "both" ? Number(byId("offset").value) : 0;
+  byId("offset-m").textContent = `${gap} m`;
+  for (const clip of clips) {
+    clip.aside = gap * (clip.name === "plan" ? 0.5 : -0.5);
+    tell("set_transform", `/meshcat/jump/${clip.name}`, { matrix: new Matrix4().makeTranslation(0, clip.aside, 0).toArray() });
+  }
+  for (const plot of plots) plot.draw();
   seek(now);
 }
+
+// curves, with the phases behind them
+const lines = (curve) => Object.entries(curve.lines);
+const plots = facts.curves.map((curve, i) => {
+  const first = 2 + facts.curves.slice(0, i).reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
+  const [card, title, plot, canvas, cursor] = ["div", "h2", "div", "canvas", "div"].map((tag) => document.createElement(tag));
+  title.append(curve.title + (curve.unit && ` [${curve.unit}]`));
+  const numbers = lines(curve).map(([name, color]) => {
+    const number = document.createElement("b");
+    number.style.color = color;
+    title.append(number, " "); // so that a line can break between them
+    return { name, number, digits: curve.unit === "°" ? 0 : 2 };
+  });
+  plot.className = "plot";
+  cursor.className = "cursor";
+  plot.append(canvas, cursor);
+  card.append(title, plot);
+  byId("curves").append(card);
+  const seen = clips.flatMap((clip) => [...clip.values].filter((_, k) => k % columns >= first && k % columns < first + numbers.length));
+  const finite = seen.filter(isFinite).sort((a, b) => a - b);
+  if (!finite.length) card.style.display = "none";
+  let [low, high] = [finite[0], finite.at(-1)];
+  if (curve.limit) [low, high] = [0, Math.max(high, 1.05 * curve.limit)];
+  [low, high] = [low - 0.04 * (high - low), high + 0.04 * (high - low) + 1e-6];
+  const here = (e) => {
+    const box = plot.getBoundingClientRect();
+    play(false);
+    seek((duration * (e.clientX - box.left)) / box.width);
+  };
+  plot.addEventListener("pointerdown", (e) => { plot.setPointerCapture(e.pointerId); here(e); });
+  plot.addEventListener("pointermove", (e) => { if (e.buttons) here(e); });
+  function draw() {
+    const [w, h] = [plot.clientWidth, plot.clientHeight], pen = canvas.getContext("2d");
+    canvas.width = w * devicePixelRatio;
+    canvas.height = h * devicePixelRatio;
+    pen.scale(devicePixelRatio, devicePixelRatio);
+    const x = (t) => (w * t) / duration, y = (value) => h - (h * (value - low)) / (high - low);
+    lead.phases.forEach(([start, phase], k) => {
+      const end = k + 1 < lead.phases.length ? lead.phases[k + 1][0] : lead.duration;
+      pen.fillStyle = facts.css[phase] + "22";
+      pen.fillRect(x(start), 0, x(end) - x(start), h);
+    });
+    const line = (points) => { pen.beginPath(); points.forEach(([a, b], k) => (k ? pen.lineTo(a, b) : pen.moveTo(a, b))); pen.stroke(); };
+    pen.strokeStyle = "#999";
+    for (const level of [0, curve.limit]) if (level !== null && low < level && level < high) line([[0, y(level)], [w, y(level)]]);
+    for (const clip of clips.filter(shown)) {
+      pen.setLineDash(ghosted(clip) ? [4, 3] : []);
+      pen.lineWidth = 1.5;
+      lines(curve).forEach(([, color], n) => {
+        pen.strokeStyle = color;
+        line(Array.from({ length: clip.frames }, (_, k) => [x(k / facts.fps), y(clip.values[columns * k + first + n])]));
+      });
+    }
+  }
+  function point() {
+    cursor.style.left = `${(100 * now) / duration}%`;
+    for (const [n, { name, number, digits }] of numbers.entries())
+      number.textContent = `${name} ${said(value(lead, first + n, now), digits)}`;
+  }
+  return { draw, point };
+});
 
 // the camera: the whole jump, whatever the shape of the window
 const middle = [(facts.view.x[0] + facts.view.x[1]) / 2, (facts.view.z[0] + facts.view.z[1]) / 2, 0]; // y points up
 const size = [facts.view.x[1] - facts.view.x[0], facts.view.z[1] - facts.view.z[0], facts.view.width];
 const opening = (24 * Math.PI) / 180;
+let following = false, eye = null; // where the camera's middle is, as it follows
+const upright = ({ x, y, z }) => new Vector3(x, z, -y); // the engine's y points up
 function look() {
-  if (!innerWidth || !innerHeight) return; // a frame that is not on the page yet
-  const aspect = innerWidth / innerHeight, free = Math.max(0.3, 1 - 150 / innerHeight); // below the title, above the bar
+  const [w, h] = [stage.clientWidth, stage.clientHeight];
+  if (!w || !h) return; // a frame that is not on the page yet
+  const free = Math.max(0.3, 1 - 50 / h); // below the title
   const [yaw, pitch] = { side: [0, 0.1], corner: [-0.75, 0.3], front: [Math.PI / 2, 0.15] }[byId("view").value];
   const [c, s] = [Math.abs(Math.cos(yaw)), Math.abs(Math.sin(yaw))];
-  const wide = size[0] * c + size[2] * s, deep = size[0] * s + size[2] * c; // of the box around the jump, as seen
+  const long = following ? Math.min(1.5, size[0]) : size[0], across = following ? 1 : size[2];
+  const wide = long * c + across * s, deep = long * s + across * c; // of the box around the jump, as seen
   const tall = size[1] * Math.cos(pitch) + deep * Math.sin(pitch);
-  const far = Math.max(tall / free, wide / aspect) / 2 / Math.tan(opening / 2) + deep / 2;
+  const far = Math.max(tall / free, (wide / w) * h) / 2 / Math.tan(opening / 2) + deep / 2;
   const offset = [Math.sin(yaw) * Math.cos(pitch), Math.sin(pitch), Math.cos(yaw) * Math.cos(pitch)];
-  const place = middle.map((x, i) => x + far * offset[i]);
+  eye = following ? upright(base(lead, now)).setY(middle[1]) : new Vector3(...middle);
+  const raised = (tall / free - tall) / 2.6; // what is free is the lower part
+  const place = eye.toArray().map((x, i) => x + far * offset[i] + (i === 1 ? raised : 0));
   viewer.camera.fov = (opening * 180) / Math.PI;
   viewer.camera.near = 0.1;
   tell("set_property", "/Cameras/default/rotated/<object>", { property: "position", value: place });
-  viewer.controls.target.set(...middle);
+  viewer.controls.target.set(...eye.toArray().map((x, i) => x + (i === 1 ? raised : 0)));
+  viewer.controls.update();
+}
+function go_along() {
+  const next = upright(base(lead, now)).setY(eye.y), way = next.clone().sub(eye);
+  eye = next;
+  viewer.camera.position.add(way);
+  viewer.controls.target.add(way);
+  viewer.controls.update();
+}
+function follow(yes) {
+  following = yes;
+  byId("follow").setAttribute("aria-pressed", yes);
+  look();
 }
 
 // numbers along the ground, drawn by the browser where the camera sees them
@@ -101,13 +268,14 @@ const labels = facts.ruler.map(({ at, text }) => {
 function place_labels() {
   viewer.camera.updateMatrixWorld();
   for (const { at, span } of labels) {
-    const p = new Vector3(at[0], at[2], -at[1]).project(viewer.camera); // the engine's y points up
+    const p = upright(new Vector3(...at)).project(viewer.camera);
     span.style.display = p.z < 1 ? "" : "none"; // not behind the camera
-    span.style.left = `${((p.x + 1) / 2) * innerWidth}px`;
-    span.style.top = `${((1 - p.y) / 2) * innerHeight}px`;
+    span.style.left = `${((p.x + 1) / 2) * stage.clientWidth}px`;
+    span.style.top = `${((1 - p.y) / 2) * stage.clientHeight}px`;
   }
 }
 
+const pressed = (name) => byId(name).getAttribute("aria-pressed") === "true";
 function play(yes) {
   if (yes && now >= duration) now = 0;
   playing = yes;
@@ -119,7 +287,8 @@ function tick(instant) {
   if (playing) {
     seek(now + (Math.max(0, instant - before) / 1000) * Number(byId("speed").value));
     before = instant;
-    if (now >= duration) play(false);
+    if (now >= duration && pressed("loop")) now = 0;
+    else if (now >= duration) play(false);
   }
   place_labels();
   requestAnimationFrame(tick);
@@ -130,20 +299,23 @@ byId("note").textContent = `${clips.map((clip) => clip.name).join(" and ")} · $
 byId("time").addEventListener("input", (e) => { play(false); seek(Number(e.target.value)); });
 byId("play").addEventListener("click", () => play(!playing));
 byId("view").addEventListener("change", look);
+byId("loop").addEventListener("click", () => byId("loop").setAttribute("aria-pressed", !pressed("loop")));
+byId("follow").addEventListener("click", () => follow(!following));
+byId("offset").addEventListener("input", () => { byId("show").value = "both"; choose(); });
 for (const name of [...clips.map((clip) => clip.name), ...(clips.length > 1 ? ["both"] : [])])
   byId("show").append(new Option(name, name));
 byId("show").addEventListener("change", choose);
-if (clips.length < 2) byId("show").style.display = "none";
+if (clips.length < 2) for (const name of ["show", "beside"]) byId(name).style.display = "none";
 addEventListener("keydown", (e) => { if (e.code === "Space" && e.target === document.body) { e.preventDefault(); play(!playing); } });
-addEventListener("resize", () => { viewer.set_3d_pane_size(innerWidth, innerHeight); look(); });
+addEventListener("resize", () => { viewer.set_3d_pane_size(); look(); for (const plot of plots) plot.draw(); });
 
-// jump.html#t=0.95&view=corner&show=both opens still, at that instant
+// jump.html#t=0.95&view=corner&show=both opens still, at that instant; &follow=1 with the robot in the middle
 const asked = new URLSearchParams(location.hash.slice(1));
 for (const name of ["view", "show"])
   if ([...byId(name).options].some((o) => o.value === asked.get(name))) byId(name).value = asked.get(name);
-viewer.set_3d_pane_size(innerWidth, innerHeight);
-look();
+viewer.set_3d_pane_size();
 choose();
 seek(Number(asked.get("t")) || 0);
+follow(asked.has("follow") ? asked.get("follow") === "1" : stage.clientWidth < 0.9 * stage.clientHeight); // as on a phone
 if (!asked.has("t")) play(true);
 requestAnimationFrame(tick);

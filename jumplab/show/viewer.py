@@ -17,36 +17,45 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import matplotlib.colors as mcolors
 import meshcat
 import meshcat.geometry as shapes
 import numpy as np
 import pinocchio as pin
 import umsgpack
-from pinocchio.visualize import MeshcatVisualizer
 
-from jumplab.errors import InputError, RobotError
+from jumplab.errors import InputError
 from jumplab.io.folder import write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.robot import Robot
-from jumplab.show.bodies import ABOVE_M, JOINT_RADIUS_M, LIMB_SHARE, ROD_RADIUS_M, skeleton
-from jumplab.show.style import PHASE_COLORS, VERMILION, describe_task, tint
+from jumplab.robot_import.config import LEG
+from jumplab.show.bodies import ABOVE_M, LIMB_SHARE
+from jumplab.show.shapes import Part, parts_of
+from jumplab.show.style import INK, PHASE_COLORS, VERMILION, describe_task, tint
+from jumplab.sim.result import CONTACT_FORCE_N
 from jumplab.sim.scene import Scene
-from jumplab.task import JumpTask
+from jumplab.task import GRAVITY, JumpTask
 
 FPS = 50.0  # frames a second: every twentieth sample of a log; the page turns smoothly between them
 AHEAD_M = 0.75  # ground that is seen behind the start and beyond the end of the jump
 RULER_M = 0.5  # spacing of the numbers along the ground
-NOTEBOOK_HEIGHT_PX = 520  # height of the frame in a notebook
+NOTEBOOK_HEIGHT_PX = 640  # height of the frame in a notebook
 GHOST_ALPHA = 0.35  # strength of the plan where simulation and plan are shown together
-TRACK_HALF_WIDTH_M, TRACK_DEPTH_M, TOP_M = 0.6, 0.06, 0.004  # the ground as drawn, and the thickness of its surface
+TRACK_HALF_WIDTH_M, TRACK_DEPTH_M, TOP_M = 0.8, 0.06, 0.004  # the ground as drawn, and the thickness of its surface
 LINE_LIFT_M = 0.0015  # lines lie this much above the ground, so that they are not hidden by it
 MARK_M = 0.012  # width of a line across the ground
 BEAD_M, BEAD_RADIUS_M = 0.03, 0.007  # spacing and size of the beads along the path of the CoM
 TRAIL_AFTER_TOUCHDOWN_S = 0.6  # later the CoM hardly moves
 TRACK_COLOR, TRACK_SIDE = "#F4F5F7", "#C9CED6"
 GRIDS = {"fine": (0.1, 1.0, "#DDE1E7"), "coarse": (0.5, 1.3, "#AEB6C2")}  # spacing [m], lift [LINE_LIFT_M], colour
-REST_COLOR = "#42474F"  # feet and skeleton, whose colour stays
+REST_COLOR = "#42474F"  # feet and joints, whose colour stays
+ROLE_COLORS = {"hip": INK, "knee": VERMILION, "ankle": "#9C5480"}  # not those of the phases, which lie behind
+FORCE_COLOR = "#B3125F"
+CURVES = (  # title, unit, limit or None, names and colours of lines, in the order of _values() after its first two
+    ("CoM height", "m", None, {"": INK}),
+    ("left angle", "°", None, ROLE_COLORS),
+    ("torque / limit", "", 1.0, ROLE_COLORS),
+    ("ground force / weight", "", None, {"": INK}),
+)
 ROOT = "jump"
 FILES = {"PAGE": "page.html", "STYLE": "page.css", "PLAYER": "player.js"}
 _UUID = re.compile(rb"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
@@ -94,16 +103,20 @@ def page(
     given = {name: record for name, record in (("simulation", simulation), ("plan", plan)) if record is not None}
     if not given:
         raise InputError("a page needs a plan or a simulation to show")
-    motions = {k: (r if isinstance(r, Motion) else Motion.of(r)).every(fps) for k, r in given.items()}
+    wholes = {k: r if isinstance(r, Motion) else Motion.of(r) for k, r in given.items()}
+    motions = {name: whole.every(fps) for name, whole in wholes.items()}
     scene, commands = scene or Scene.flat(), _Commands()
     vis = meshcat.Visualizer(window=commands)
     _light(vis)
-    clips, places = [], []
+    clips, places, (parts, said) = [], [], parts_of(robot)
     for name, motion in motions.items():
-        painted, (poses, path) = _add_robot(vis, robot, name), _trace(motion, robot)
-        _add_trail(vis[f"{ROOT}/{name}/trail"], motion, path)
-        clips.append({"name": name, **painted, **_clip(motion, poses)})
-        places += list(map(float, path[:, 0]))
+        painted, trace = _add_robot(vis, parts, name), _Trace.of(motion, robot)
+        _add_trail(vis[f"{ROOT}/{name}/trail"], motion, trace.com)
+        forces = _forces(wholes[name], motion.t, trace.feet, scene)
+        values = _values(wholes[name], motion, robot, trace, forces)
+        clips.append({"name": name, **painted, **_clip(motion, trace.poses), "values": _packed(values)})
+        clips[-1]["forces"] = None if forces is None else _packed(forces)
+        places += list(map(float, trace.com[:, 0]))
     toe = robot.foot.toe - float(robot.foot.center[0])
     marks = [toe + goal for goal in (0.0, *([task.distance_m] if task else []), *marks_m)]
     span = min(places + marks) - AHEAD_M, max(places + marks) + AHEAD_M
@@ -111,8 +124,11 @@ def page(
     rest = tint(REST_COLOR, 1.0)
     facts = {  # what player.js reads
         "title": title or (describe_task(task) if task else "A jump"),
-        "note": f"robot {robot.name}, {robot.total_mass:.0f} kg · {fps:g} frames per second",
+        "note": " · ".join([f"robot {robot.name}, {robot.total_mass:.0f} kg", f"{fps:g} frames per second", *said]),
         "fps": fps,
+        "weight": robot.total_mass * GRAVITY,
+        "arrow": FORCE_COLOR,
+        "curves": [dict(title=title, unit=unit, limit=limit, lines=lines) for title, unit, limit, lines in CURVES],
         "clips": clips,
         "ruler": _ruler(scene, span, toe),
         "view": {"x": span, "z": _heights(scene, span, motions), "width": 2 * TRACK_HALF_WIDTH_M},
@@ -130,9 +146,13 @@ def _clip(motion: Motion, poses: np.ndarray) -> dict[str, Any]:
     return {
         "bodies": poses.shape[1],
         "frames": len(poses),
-        "poses": base64.b64encode(poses.astype("<f4").tobytes()).decode("ascii"),
+        "poses": _packed(poses),
         "phases": [[float(motion.t[k] - motion.t[0]), str(motion.phase[k])] for k in cuts],
     }
+
+
+def _packed(values: np.ndarray) -> str:
+    return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
 
 
 def _ruler(scene: Scene, span: tuple[float, float], zero: float) -> list[dict[str, Any]]:
@@ -179,16 +199,6 @@ class _Commands:
         return self._names.setdefault(found[0], b"%08x-0000-4000-8000-000000000000" % len(self._names))
 
 
-class _Loader(MeshcatVisualizer):
-    """Pinocchio's visualizer, whose node names put each shape below the joint that moves it."""
-
-    def getViewerNodeName(self, geometry_object: Any, geometry_type: Any) -> str:
-        return f"{self.viewerRootNodeName}/{geometry_object.parentJoint}/{self.kinds[geometry_object.name]}"
-
-    def _check_meshcat_has_get_image(self) -> None:
-        """Nobody takes pictures of a page that is only written."""
-
-
 def _light(vis: meshcat.Visualizer) -> None:
     """Lights and a bright background."""
     hidden = ("/Axes", "/Grid", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX")
@@ -219,16 +229,18 @@ def _put(node: meshcat.Visualizer, shape: Any, place: pin.SE3 | Sequence[float] 
 # the ground -----------------------------------------------------------------------------------------------------
 def _lay_ground(vis: meshcat.Visualizer, scene: Scene, span: tuple[float, float], marks: Sequence[float]) -> None:
     """Blocks of the scene between ``span`` [m] with a grid on top, and lines across at ``marks`` [m]."""
-    seen = [b for b in scene.blocks if max(b.x_from, span[0]) < min(b.x_to, span[1])]
-    across = 2 * TRACK_HALF_WIDTH_M
+    seen, across = scene.within(*span, TRACK_HALF_WIDTH_M).blocks, 2 * TRACK_HALF_WIDTH_M
     for number, block in enumerate(seen):
-        start, end = max(block.x_from, span[0]), min(block.x_to, span[1])
-        node, size, middle = vis[f"{ROOT}/ground/{number}"], [float(end - start), across], (start + end) / 2
+        node, wide = vis[f"{ROOT}/ground/{number}"], float(block.y_to - block.y_from)
+        size, (x, y) = [float(block.x_to - block.x_from), wide], (block.x_from + block.x_to, block.y_from + block.y_to)
         depth = float(block.top - min(b.top for b in seen) + TRACK_DEPTH_M - TOP_M)
-        _put(node["side"], shapes.Box([*size, depth]), (middle, 0.0, block.top - TOP_M - depth / 2), TRACK_SIDE)
-        _put(node["top"], shapes.Box([*size, TOP_M]), (middle, 0.0, block.top - TOP_M / 2), TRACK_COLOR)
-        for name, (step, lift, color) in GRIDS.items():
-            _grid(node[name], start, end, block.top + LINE_LIFT_M * lift, step, color)
+        _put(node["side"], shapes.Box([*size, depth]), (x / 2, y / 2, block.top - TOP_M - depth / 2), TRACK_SIDE)
+        _put(node["top"], shapes.Box([*size, TOP_M]), (x / 2, y / 2, block.top - TOP_M / 2), TRACK_COLOR)
+        if not block.even:
+            pivot = np.array([block.pivot_m, 0.0, block.top])
+            node.set_transform(pin.SE3(block.turn, pivot - block.turn @ pivot).homogeneous)
+        for name, (step, lift, color) in GRIDS.items() if wide == across else ():
+            _grid(node[name], block.x_from, block.x_to, block.top + LINE_LIFT_M * lift, step, color)
     for number, x in enumerate(marks):
         line = shapes.Box([MARK_M, across, 0.003])
         _put(vis[f"{ROOT}/marks/{number}"], line, (x, 0.0, scene.top_at(x) + 0.0025), VERMILION)
@@ -244,52 +256,86 @@ def _grid(node: meshcat.Visualizer, start: float, end: float, top: float, step: 
 
 
 # the robot ------------------------------------------------------------------------------------------------------
-def _add_robot(vis: meshcat.Visualizer, robot: Robot, name: str) -> dict[str, list[str]]:
-    """Shapes of the URDF and the skeleton between the pitch joints, below one node per joint.
+def _add_robot(vis: meshcat.Visualizer, parts: Sequence[Part], name: str) -> dict[str, list[str]]:
+    """The parts of a robot, below one node per joint.
 
     Returns the paths to paint: "trunk" and "limb", whose colour tells the phase, and the "rest".
     """
-    geometry, root = _visuals(robot), f"{ROOT}/{name}"
-    feet = {robot.model.getFrameId(frame) for frame in robot.foot.frames}
-    kinds, painted = {}, {"trunk": [], "limb": [], "rest": []}
-    for number, shape in enumerate(geometry.geometryObjects):
-        kind = "rest" if shape.parentFrame in feet else "trunk" if shape.parentJoint == 1 else "limb"
-        kinds[shape.name] = f"{kind}/{number}"
-        painted[kind].append(f"/meshcat/{root}/{shape.parentJoint}/{kind}")
-    loader = _Loader(robot.model, None, geometry)
-    loader.kinds, loader.viewerRootNodeName = kinds, root
-    loader.initViewer(viewer=vis)
-    for shape in geometry.geometryObjects:
-        loader.loadViewerGeometryObject(shape, pin.GeometryType.VISUAL, [*mcolors.to_rgb(REST_COLOR), 1.0])
-        node = vis[loader.getViewerNodeName(shape, pin.GeometryType.VISUAL)]
-        node.set_transform(shape.placement.homogeneous @ np.diag([*shape.meshScale, 1.0]))
-    for joint, rod in skeleton(robot, (0, 1, 0)):
-        _put(vis[f"{root}/{joint}/rest/ball"], shapes.Sphere(JOINT_RADIUS_M), None, REST_COLOR)
-        painted["rest"].append(f"/meshcat/{root}/{joint}/rest")
-        if rod:
-            above, length, place = rod
-            _put(vis[f"{root}/{above}/rest/rod{joint}"], shapes.Cylinder(length, ROD_RADIUS_M), place, REST_COLOR)
+    painted = {"trunk": [], "limb": [], "rest": []}
+    for number, part in enumerate(parts):
+        place = f"{ROOT}/{name}/{part.joint}/{part.kind}"
+        look = dict(shininess=12, specular=0x222222, flatShading=part.faceted)
+        surface = shapes.TriangularMeshGeometry(part.points, part.triangles)
+        vis[f"{place}/{number}"].set_object(surface, shapes.MeshPhongMaterial(color=int(REST_COLOR[1:], 16), **look))
+        painted[part.kind].append(f"/meshcat/{place}")
     return {kind: list(dict.fromkeys(paths)) for kind, paths in painted.items()}
 
 
-def _visuals(robot: Robot) -> pin.GeometryModel:
-    """Visual shapes of the URDF; none if they lie in mesh files, which the robot's text does not carry."""
-    try:
-        return pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL)
-    except ValueError as e:
-        if "mesh" not in str(e).lower():
-            raise RobotError(f"robot {robot.name}: Pinocchio cannot read its shapes: {str(e).splitlines()[0]}") from e
-        return pin.GeometryModel()
+@dataclass(frozen=True)
+class _Trace:
+    """Where the robot is at the frames of a motion."""
+
+    poses: np.ndarray  # (N, njoints - 1, 7) of the joints, base first: x y z [m], quaternion x y z w
+    com: np.ndarray  # (N, 3) [m]
+    feet: np.ndarray  # (N, 2, 3) origins of the foot links [m]
+    toes: np.ndarray  # (N,) mean x of the two toes [m]
+
+    @classmethod
+    def of(cls, motion: Motion, robot: Robot) -> _Trace:
+        model, data = robot.model, robot.model.createData()
+        frames, toe = [model.getFrameId(f) for f in robot.foot.frames], robot.foot.corners[2:].mean(axis=0)
+        poses, com, feet, toes = [], [], [], []
+        for q in motion.q:
+            com.append(pin.centerOfMass(model, data, q).copy())
+            places = [pin.updateFramePlacement(model, data, frame).copy() for frame in frames]
+            poses.append([pin.SE3ToXYZQUAT(data.oMi[j]) for j in range(1, model.njoints)])
+            feet.append([place.translation for place in places])
+            toes.append(np.mean([place.act(toe)[0] for place in places]))
+        return cls(*map(np.array, (poses, com, feet, toes)))
 
 
-def _trace(motion: Motion, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, njoints - 1, 7) of the joints, base first: x y z [m] and quaternion x y z w; path (N, 3) of the CoM."""
-    model, data = robot.model, robot.model.createData()
-    poses, path = [], []
-    for q in motion.q:
-        path.append(pin.centerOfMass(model, data, q).copy())
-        poses.append([pin.SE3ToXYZQUAT(data.oMi[j]) for j in range(1, model.njoints)])
-    return np.array(poses), np.array(path)
+def _forces(motion: Motion, times: np.ndarray, feet: np.ndarray, scene: Scene) -> np.ndarray | None:
+    """Centre of pressure and force (N, 2, 6) [m, N] of each foot (N, 2, 3) at ``times`` (N,), world axes; or None.
+
+    A force is the mean over the time from frame to frame, as that of an impact depends on the engine's step; where
+    nothing presses on a foot, there is nan.
+    """
+    if motion.wrench is None:
+        return None
+    half = (times[1] - times[0]) / 2 if len(times) > 1 else 1.0
+    first, last = np.searchsorted(motion.t, times - half), np.searchsorted(motion.t, times + half, side="right")
+    first = np.minimum(first, last - 1)  # frames may be closer than samples
+    sums = np.concatenate([np.zeros((1, 2, 6)), np.cumsum(motion.wrench, axis=0)])
+    fx, fy, fz, mx, my, _ = np.moveaxis((sums[last] - sums[first]) / (last - first)[:, None, None], -1, 0)
+    fz = np.where(fz > CONTACT_FORCE_N, fz, np.nan)
+    top = np.vectorize(scene.top_at, otypes=[float])(feet[:, :, 0])
+    down = top - feet[:, :, 2]  # the moment about this point of the ground has no horizontal part
+    x, y = feet[:, :, 0] + (down * fx - my) / fz, feet[:, :, 1] + (down * fy + mx) / fz
+    forces = np.stack([x, y, top, fx, fy, fz], -1)
+    forces[np.isnan(fz)] = np.nan
+    return forces
+
+
+def _values(whole: Motion, motion: Motion, robot: Robot, trace: _Trace, forces: np.ndarray | None) -> np.ndarray:
+    """What the page's table and curves show (N, 10): travel of the toes, rise of the CoM since take-off [m], then the
+    columns of :data:`CURVES`.
+    """
+    air = np.flatnonzero(whole.phase == "flight")
+    start = pin.centerOfMass(robot.model, robot.model.createData(), whole.q[air[0] if len(air) else 0])[2]
+    names = robot.joint_names
+    pairs = [[names.index(name) for name in robot.joints[role]] for role in LEG]
+    angles = [np.degrees(motion.q[:, 7 + pair[0]]) for pair in pairs]
+    shares = np.abs(motion.tau) / [robot.actuators[name]["effort"] for name in names]
+    pressed = np.full(len(motion.t), np.nan) if forces is None else np.nansum(forces[:, :, 5], axis=1)
+    height = trace.com[:, 2]
+    columns = [
+        trace.toes - trace.toes[0],
+        height - start,
+        height,
+        *angles,
+        *(shares[:, pair].max(axis=1) for pair in pairs),
+    ]
+    return np.stack([*columns, pressed / (robot.total_mass * GRAVITY)], -1)
 
 
 def _add_trail(node: meshcat.Visualizer, motion: Motion, path: np.ndarray) -> None:

@@ -18,12 +18,13 @@ class Waiting:
 
     def __init__(self, shell: Any):
         self._began, self._drawn_s, self._bar, self._listening = 0.0, 0.0, None, None
+        self._counted: tuple[str, int, int] | None = None
         shell.events.register("pre_run_cell", self._begin)
         shell.events.register("post_run_cell", self._end)
 
     def _begin(self, *_: Any) -> None:
         self._end()
-        self._began, self._drawn_s = time.monotonic(), 0.0
+        self._began, self._drawn_s, self._counted = time.monotonic(), 0.0, None
         self._listening = told_to(self._hear)
         self._listening.__enter__()
 
@@ -35,14 +36,19 @@ class Waiting:
         self._listening = self._bar = None
 
     def _hear(self, what: str, done: int, of: int) -> None:
+        if of:
+            self._counted = (what, done, of)
         passed = time.monotonic() - self._began
         if passed < FIRST_S or passed - self._drawn_s < REDRAW_S:
             return
         from IPython.display import DisplayHandle
 
         self._drawn_s = passed
-        amount = f' value="{done}" max="{of}"' if of else ""
-        text = f"{what} {done} of {of}" if of else what
+        amount, told = "", [] if of else [what]
+        if self._counted is not None:  # what is done just now may be a part of it
+            name, done, of = self._counted
+            amount, told = f' value="{done}" max="{of}"', [f"{name} {done} of {of}", *told]
+        text = ", ".join(told)
         bar = f"<progress{amount}></progress> {html.escape(text)}, {passed:.0f} s"
         shown = {"text/html": bar, "text/plain": f"{text}, {passed:.0f} s"}
         if self._bar is None:

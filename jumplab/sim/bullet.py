@@ -111,7 +111,8 @@ class BulletEngine(Engine):
         self._client = bullet.connect(bullet.DIRECT)
         self._bullet = _Client(self._client)
         self._set_engine()
-        self._ground = [self._add_block(*box) for box in self.scene.boxes()]
+        pairs = zip(self.scene.boxes(), self.scene.blocks, strict=True)
+        self._ground = [self._add_block(*box, block.soft_m) for box, block in pairs]
         self._body = load_urdf(self.robot.urdf, self.robot.name, self._client, bullet.URDF_USE_SELF_COLLISION)
         self._index_links()
         self._set_dynamics(friction)
@@ -131,11 +132,14 @@ class BulletEngine(Engine):
         self._bullet.setGravity(0, 0, -self.robot.gravity)
         self._bullet.setPhysicsEngineParameter(**steps, **contact)
 
-    def _add_block(self, half: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> int:
+    def _add_block(self, half: np.ndarray, centre: np.ndarray, turn: np.ndarray, soft_m: float) -> int:
         box = self._bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half)
         body = self._bullet.createMultiBody(0, box, basePosition=centre, baseOrientation=turn)
         self._bullet.changeDynamics(body, -1, lateralFriction=SETTINGS.ground_friction)
         self._bullet.changeDynamics(body, -1, restitution=0.0)
+        if soft_m:
+            stiffness, damping = self.spring(soft_m)
+            self._bullet.changeDynamics(body, -1, contactStiffness=stiffness, contactDamping=damping)
         return body
 
     def _index_links(self) -> None:
@@ -212,6 +216,12 @@ class BulletEngine(Engine):
         """Torque of every joint for the next step [N m]."""
         self._torque = np.array(tau, float)
         self._bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=self._torque)
+
+    def push(self, force: np.ndarray, place: np.ndarray) -> None:
+        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
+        origin, turn = self._bullet.getBasePositionAndOrientation(self._body)
+        point = np.array(origin) + rotation(turn) @ (place - self._lever)
+        self._bullet.applyExternalForce(self._body, -1, force, point, bullet.WORLD_FRAME)
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""

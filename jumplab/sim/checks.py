@@ -6,6 +6,8 @@ They leave no room for a hand that holds the base, a motor that gives more than 
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 
@@ -15,6 +17,7 @@ from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import STAND_S, Finding, SimulationResult
+from jumplab.sim.scene import Scene
 
 WINDOW = 100  # [steps] 0.1 s; a push shorter than that counts by its mean
 # Sound jumps and flips leave 1e-10 N, 0.02 N m, and in the joints up to 1 N m at an impact.
@@ -29,6 +32,7 @@ SWING = 3.0  # [1] where a contact begins or ends, velocities swing within a ste
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
 LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
 SOLE_M = 0.001  # contact points of sound feet lie within the sole to 1e-7 m
+FACING = 0.7  # [1] a sole that is turned by less than 45 degrees is what touches the ground of a foot
 FRICTION_USE = 1.01  # 1.0001 was seen where feet slide
 
 
@@ -85,6 +89,18 @@ def _kick(result: SimulationResult, robot: Robot, row: int) -> np.ndarray:
     return kick
 
 
+def _pushes(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Stated external forces (N, 3) in every step [N], and the place (3,) in the base link's frame on which they act.
+
+    The place is the centre of mass of the planned trunk, and not that of the real one with its payload.
+    """
+    force = np.zeros((len(result.t), 3))
+    for told in result.settings.get("pushes", ()):
+        begin = max(0, told["step"])
+        force[begin : max(0, told["step"] + told["steps"])] += told["force_n"]
+    return force, np.array(result.settings.get("push_place_m", (0.0, 0.0, 0.0)))
+
+
 def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Generalised forces that neither torques nor foot forces explain: on the base (N - 1, 6), in the joints.
 
@@ -94,7 +110,7 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
     model, data = robot.model, robot.model.createData()
     frames, axes = [model.getFrameId(n) for n in robot.foot.frames], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     states = _steps(result, robot)
-    left = np.empty_like(states[2])
+    left, (pushes, place) = np.empty_like(states[2]), _pushes(result, robot)
     for k, (q, v, a) in enumerate(zip(*states, strict=True)):
         pin.computeJointJacobians(model, data, q)
         left[k] = pin.rnea(model, data, q, v, a)
@@ -102,6 +118,9 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
             if wrench.any():
                 pin.updateFramePlacement(model, data, frame)
                 left[k] -= pin.getFrameJacobian(model, data, frame, axes).T @ wrench
+        if pushes[k].any():
+            force = rotation(q[3:7]).T @ pushes[k]
+            left[k, :6] -= [*force, *np.cross(place, force)]
     if result.settings["engine"]["substeps"] > 1:
         left[:, :6] = _momentum_unexplained(result, robot)
     left[:, 6:] -= result.tau[:-1]
@@ -125,7 +144,10 @@ def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:
     linear, spin, com, *feet = (np.array(column) for column in zip(*rows, strict=True))
     angular, gravity = spin + np.cross(com, linear), np.cross(com, weight)
     force, moment = weight + result.foot_wrench[:, :, :3].sum(axis=1), result.foot_wrench[:, :, 3:].sum(axis=1)
-    for place, push in zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True):
+    pushes, arm = _pushes(result, robot)
+    points = result.q[:, :3] + [rotation(q[3:7]) @ arm for q in result.q]
+    force = force + pushes
+    for place, push in ((points, pushes), *zip(feet, np.moveaxis(result.foot_wrench[:, :, :3], 1, 0), strict=True)):
         moment = moment + np.cross(place, push)
     moment[:-1] += (gravity[:-1] + gravity[1:]) / 2
     return np.hstack([np.diff(linear, axis=0), np.diff(angular, axis=0)]) / STEP_S - np.hstack([force, moment])[:-1]
@@ -176,7 +198,8 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     """Friction and CoP of each foot, from its measured wrench."""
     model, data, foot = robot.model, robot.model.createData(), robot.foot
     frames = [model.getFrameId(name) for name in foot.frames]
-    slip, outside = 0.0, 0.0
+    slip, outside, told = 0.0, 0.0, result.settings.get("ground")
+    ground = None if told is None else Scene.told(told)
     for k in np.flatnonzero((result.foot_wrench[:-1, :, 2] > LOADED_N).any(axis=1)):
         places = []  # a foot may move within a step: where it is at both ends of it
         for q in result.q[k : k + 2]:
@@ -184,8 +207,13 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
             places.append([data.oMf[frame].copy() for frame in frames])
         for wrench, before, after in zip(result.foot_wrench[k], *places, strict=True):
             if wrench[2] > LOADED_N:
-                slip = max(slip, np.hypot(*wrench[:2]) / wrench[2])
-                outside = max(outside, min(_outside(foot, before, place, wrench) for place in (before, after)))
+                slip = max(slip, _slip(wrench[:3], before, ground))
+                if before.rotation[2, 2] < FACING:
+                    continue  # a foot that lies on its side presses with that
+                corners = np.array([before.act(corner) for corner in foot.corners])
+                sunk = (0.0,) if ground is None else (0.0, ground.depth_of(corners))
+                pairs = product((before, after), sunk)
+                outside = max(outside, min(_outside(foot, before, place, wrench, deep) for place, deep in pairs))
     stated = result.settings["perturbation"]["friction"]
     return (
         Finding("friction used, of the stated coefficient", slip / stated, FRICTION_USE, "", "sticky feet"),
@@ -193,11 +221,22 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     )
 
 
-def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray) -> float:
-    """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m]."""
+def _slip(force: np.ndarray, place: pin.SE3, ground: Scene | None) -> float:
+    """Friction that a force (3,) on a foot at ``place`` uses, along the ground there over across it [1]."""
+    if ground is None:
+        return float(np.hypot(*force[:2]) / force[2])
+    up = ground.normal_at(place.translation[:2])
+    return float(np.linalg.norm(force - up @ force * up) / (up @ force))
+
+
+def _outside(foot: Foot, origin: pin.SE3, place: pin.SE3, wrench: np.ndarray, deep: float) -> float:
+    """How far the CoP of a ``wrench`` (6,) about ``origin`` lies outside the sole of a foot at ``place`` [m].
+
+    The CoP is in the plane of the sole, or ``deep`` [m] above: ground that has given way presses on its sides as well.
+    """
     moment = wrench[3:] + pin.skew(origin.translation - place.translation) @ wrench[:3]
     force, moment = place.rotation.T @ wrench[:3], place.rotation.T @ moment
-    x, y = (foot.sole_z * force[:2] + [-moment[1], moment[0]]) / force[2]
+    x, y = ((foot.sole_z + deep) * force[:2] + [-moment[1], moment[0]]) / force[2]
     return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)
 
 

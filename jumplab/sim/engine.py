@@ -20,6 +20,7 @@ from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import Contacts, Scene
 
 MASS_KG, ROUNDING = 1e-6, 1e-9  # by how much an engine's mass, and its friction, may differ from what was asked for
+SOLE_POINTS = 8  # contact points of two flat rectangular soles
 TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 
 
@@ -128,12 +129,22 @@ class Engine(ABC):
         """Torque (nv - 6,) that the engine gave to the joints in the last step [N m]."""
 
     @abstractmethod
+    def push(self, force: np.ndarray, place: np.ndarray) -> None:
+        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
+
+    @abstractmethod
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""
 
     @abstractmethod
     def contacts(self) -> Contacts:
         """What touched, and how hard, in the last step."""
+
+    def spring(self, soft_m: float) -> tuple[float, float]:
+        """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles, four points each,
+        sink by ``soft_m`` under the weight; the whole robot on it is critically damped."""
+        mass, gravity = self.robot.total_mass / SOLE_POINTS, self.robot.gravity
+        return mass * gravity / soft_m, 2 * mass * np.sqrt(gravity / soft_m)
 
     @property
     def mass_kg(self) -> float:

@@ -50,18 +50,21 @@ class Run:
         perturbation: Perturbation | None = None,
         scene: Scene | None = None,
         engine: str = DEFAULT_ENGINE,
+        tape: Tape | None = None,
     ):
         self._open = engine_class(engine)
         self.robot, self.perturbation = robot, perturbation or Perturbation()
         self.scene, self.real = scene or Scene.flat(), self.perturbation.robot(robot)
+        self.ground, self.pushes = self.perturbation.ground(self.scene, robot, tape), self.perturbation.pushes(tape)
 
     def play(self, pilot: Commander, q: np.ndarray, v: np.ndarray, step: int = 0) -> None:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
         perceive = Perception(self.robot, q, v, how.noise, how.seed)
-        motors, delay = Motors(self.robot, how.motor_gain), Delay(round(how.delay_s / STEP_S))
+        motors, delay = Motors(self.real, how.motor_gain, how.sag_per_kw), Delay(round(how.delay_s / STEP_S))
         self.recorders: list[Recorder] = []
-        with self._open(self.real, q, v, scene=self.scene, friction=how.friction) as engine:
+        self.push_place, self._begun = self.robot.model.inertias[1].lever.copy(), step
+        with self._open(self.real, q, v, scene=self.ground, friction=how.friction) as engine:
             servo = Servo(self.robot, late_s=how.known_delay_s, substeps=engine.substeps)
             contacts, fallen_s = engine.contacts(), 0.0
             while not pilot.over(step, fallen_s):
@@ -71,8 +74,12 @@ class Run:
                 seen = perceive(q, v, contacts.wrench)
                 command = pilot.command(step, *seen)
                 if pilot.part == len(self.recorders):
-                    self.recorders.append(Recorder(self.real, pilot.goal, engine.links))
+                    higher_m = self.ground.height_of(pilot.goal, self.robot, self.scene)
+                    self.recorders.append(Recorder(self.real, pilot.goal, engine.links, higher_m))
                 engine.set_torque(motors.deliver(delay(servo.torque(command, *(command.state or seen[:2]))), v[6:]))
+                for push in self.pushes:
+                    if push.at(step):
+                        engine.push(np.array(push.force_n), self.push_place)
                 engine.step()
                 contacts = engine.contacts()
                 self.recorders[-1].add(q, v, engine.applied(), contacts)
@@ -84,6 +91,11 @@ class Run:
         """The checked record of one part of the run; ``solves`` are the QPs posed and failed in it."""
         settings |= dict(scene=self.scene.name, robot=self.robot.name, robot_hash=self.robot.hash, step_s=STEP_S)
         settings |= dict(perturbation=self.perturbation.to_json(), perception=self.perception)
+        if self.ground is not self.scene or not self.ground.plain:
+            settings["ground"] = asdict(self.ground)
+        if self.pushes:  # what the checks know of them
+            told = [asdict(replace(push, step=push.step - self._begun)) for push in self.pushes]
+            settings |= dict(pushes=told, push_place_m=self.push_place.tolist())
         settings |= dict(engine=self.engine, friction_read_back=min(self.engine["friction"]))
         result = self.recorders[part].result(solves, settings)
         return replace(result, checks=check(result, self.real))
@@ -160,13 +172,17 @@ def simulate_jump(
     Raises
     ------
     InputError
-        If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, or the engine is unknown or not there.
+        If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, the engine is unknown or not there, or
+        the robot cannot stand on the ground at the start.
     """
     _check(tape, robot, perturbation, scene, reference, stand_s)
-    run = Run(robot, perturbation, scene, engine)
+    run = Run(robot, perturbation, scene, engine, tape)
     known_delay_s = run.perturbation.known_delay_s
     pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s)
-    step, q, v = (0, tape.q[0], tape.v[0]) if disturbance is None else disturbance.apex(tape, robot)
+    if disturbance is None:
+        step, q, v = 0, run.ground.seated(robot, run.perturbation.start(robot, tape.q[0])), tape.v[0]
+    else:
+        step, q, v = disturbance.apex(tape, robot)
     run.play(pilot, q, v, step)
     said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
     return run.result(0, pilot.solves, landing=pilot.landing_said(), **said)

@@ -29,10 +29,12 @@ class Softness:
 
 SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm
 SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
+SOFT_CONE_RATIO = 1000.0  # the same on soft ground, whose pressure gives way by far more
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
 THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
 FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
+SOFT_FIRST, SOFT_SHARE = 2, 0.1  # geoms of soft ground have it; small shares of acceleration make a plain spring
 
 
 class MujocoEngine(Engine):
@@ -62,6 +64,23 @@ class MujocoEngine(Engine):
             own[:] = 0.0
         self._model.jnt_solref[:] = [self.softness.time_s, self.softness.damping_ratio]
         self._index_links()
+        self._soften(friction)
+
+    def _soften(self, friction: float) -> None:
+        """Make springs of soft blocks, which then decide their contacts, friction included.
+
+        A contact's force is share / (1 - share) / inverse mass times its reference acceleration, -b v - k r. The
+        inverse mass is the engine's own of a foot: under other links the ground is as much harder as they are heavier.
+        """
+        model = self._model
+        inverse = float(np.mean([model.body_invweight0[body, 0] for body in self._feet]))
+        for geom, block in zip(np.flatnonzero(model.geom_bodyid == 0), self.scene.blocks, strict=True):
+            if block.soft_m:
+                k, b = np.array(self.spring(block.soft_m)) * inverse * (1 - SOFT_SHARE) / SOFT_SHARE
+                model.geom_solref[geom] = [-k * SOFT_SHARE, -b * SOFT_SHARE]  # by which the engine divides
+                model.geom_solimp[geom, :2] = SOFT_SHARE
+                model.geom_priority[geom], model.geom_friction[geom, 0] = SOFT_FIRST, friction
+                model.opt.impratio = SOFT_CONE_RATIO
 
     def _read(self) -> mujoco.MjSpec:
         """The robot's URDF, its base free, every link kept, none of its pictures."""
@@ -118,18 +137,22 @@ class MujocoEngine(Engine):
     @property
     def friction(self) -> dict[str, float]:
         """Friction coefficient between every link that can touch, and the ground, as the engine has it."""
-        model = self._model
-        robot = np.flatnonzero(model.geom_bodyid)
-        ground = np.flatnonzero(model.geom_bodyid == 0)
-        wins = model.geom_priority[robot] > model.geom_priority[ground].max()
-        both = np.maximum(model.geom_friction[robot, 0], model.geom_friction[ground, 0].max())
-        used = np.where(wins, model.geom_friction[robot, 0], both)
-        return {self.links[model.geom_bodyid[g] - 1]: float(mu) for g, mu in zip(robot, used, strict=True)}
+        robot = np.flatnonzero(self._model.geom_bodyid)
+        links = (self.links[self._model.geom_bodyid[geom] - 1] for geom in robot)
+        return {link: float(max(self._between(geom))) for link, geom in zip(links, robot, strict=True)}
+
+    def _between(self, geom: int) -> np.ndarray:
+        """Friction coefficients between a geom of the robot and every block of the scene: the higher rank decides."""
+        rank, own = self._model.geom_priority, self._model.geom_friction[:, 0]
+        ground = np.flatnonzero(self._model.geom_bodyid == 0)
+        ours = np.where(rank[ground] > rank[geom], own[ground], own[geom])
+        return np.where(rank[ground] == rank[geom], np.maximum(own[ground], own[geom]), ours)
 
     @property
     def ground_friction(self) -> list[float]:
-        """Friction coefficient of every block of the scene as the engine has it."""
-        return self._model.geom_friction[self._model.geom_bodyid == 0, 0].tolist()
+        """What every block of the scene makes of a foot's friction coefficient, as the engine has it [1]."""
+        foot = int(np.flatnonzero(np.isin(self._model.geom_bodyid, list(self._feet)))[0])
+        return (self._between(foot) / self._model.geom_friction[foot, 0]).tolist()
 
     @property
     def damping(self) -> float:
@@ -150,6 +173,12 @@ class MujocoEngine(Engine):
         """Torque of every joint for the next step [N m]."""
         self._data.qfrc_applied[self._rates] = tau
 
+    def push(self, force: np.ndarray, place: np.ndarray) -> None:
+        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
+        mujoco.mj_kinematics(self._model, self._data)
+        arm = self._data.xpos[1] + self._data.xmat[1].reshape(3, 3) @ place - self._data.xipos[1]
+        self._data.xfrc_applied[1] = [*force, *np.cross(arm, force)]
+
     def applied(self) -> np.ndarray:
         """Torque (nv - 6,) that acted in the last step [N m]."""
         return self._torque
@@ -163,6 +192,7 @@ class MujocoEngine(Engine):
             mujoco.mj_step(self._model, self._data)
             self._feel(origins)
         self._torque = self._data.qfrc_applied[self._rates].copy()
+        self._data.xfrc_applied[1] = 0.0
 
     def contacts(self) -> Contacts:
         """Mean forces of the ground on the feet, and all that touched, in the last step."""
@@ -177,7 +207,7 @@ class MujocoEngine(Engine):
         force = data.efc_force[contact.efc_address[acting, None] + THREE]  # along the axes of the contact's frame
         pairs, places = self._model.geom_bodyid[contact.geom[acting]], contact.pos[acting]
         pushes = np.einsum("ki,kij->kj", force, contact.frame[acting].reshape(-1, 3, 3))
-        points = ([], [])
+        points, depths = ([], []), contact.dist[acting, None] / 2 * contact.frame[acting].reshape(-1, 3, 3)[:, 0]
         for k, (one, other) in enumerate(pairs.tolist()):
             if force[k, 0] <= 0:
                 continue
@@ -191,7 +221,7 @@ class MujocoEngine(Engine):
                 push, place = (pushes[k] if other else -pushes[k]), places[k]
                 self._wrench[side, :3] += push
                 self._wrench[side, 3:] += pin.skew(place - origins[body]) @ push
-                points[side].append(place)
+                points[side].append(place + depths[k] if other else place - depths[k])  # on the robot's own surface
         for body, side in self._feet.items():
             if points[side]:
                 self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))

@@ -21,6 +21,7 @@ from jumplab.sim.kinematics import rotation, solved
 MODES = ("position", "pd")
 FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
 HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
+LEAST_VOLTAGE = 0.5  # share that a battery holds, whatever is drawn
 ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
 
 
@@ -76,15 +77,22 @@ class Delay:
 
 
 class Motors:
-    """Turns commanded into delivered torques; ``gain`` is joint -> torque delivered per torque commanded."""
+    """Turns commanded into delivered torques; ``gain`` is joint -> torque delivered per torque commanded.
 
-    def __init__(self, robot: Robot, gain: dict[str, float]):
-        self.actuators = Actuators(robot)
+    A battery sags by ``sag_per_kw``: speed limits and corner speeds fall by that share per power [kW] that all joints
+    drew in the step before; what brakes gives nothing back.
+    """
+
+    def __init__(self, robot: Robot, gain: dict[str, float], sag_per_kw: float = 0.0):
+        self.actuators, self._sag_per_w, self._drawn_w = Actuators(robot), sag_per_kw / 1e3, 0.0
         self._gain = np.array([gain.get(name, 1.0) for name in robot.joint_names])
 
     def deliver(self, tau: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """What becomes of ``tau`` (nv - 6,) [N m] at true joint rates ``rate``."""
-        return np.clip(self._gain * tau, *self.actuators.range(rate))
+        left = max(1 - self._sag_per_w * self._drawn_w, LEAST_VOLTAGE)
+        found = np.clip(self._gain * tau, *self.actuators.range(rate / left))
+        self._drawn_w = float(np.maximum(found * rate, 0.0).sum())
+        return found
 
 
 @dataclass(frozen=True)

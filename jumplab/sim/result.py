@@ -16,7 +16,7 @@ import pinocchio as pin
 from jumplab.errors import InputError, Shown, SolverError
 from jumplab.io.columns import Named
 from jumplab.io.folder import read_json, write_file
-from jumplab.io.motion import SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
+from jumplab.io.motion import CONTACT_FORCE_N, SIMULATION_NAME, SIMULATION_SCHEMA, read_simulation
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of
@@ -24,7 +24,6 @@ from jumplab.sim.playback import Actuators
 from jumplab.sim.scene import Contacts
 
 STAND_S = 3.0  # standing this long after touchdown, and not a moment less, is a landing
-CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-off 20 ms late
 STILL_SPEED = 0.05  # [m/s] a CoM slower than this at the end stands
 LEVEL_TOLERANCE_M = 0.05  # soles this close to the planned height stand on the planned surface
 IMPACT_S = 0.1  # the landing impulse is summed over this time after touchdown
@@ -61,8 +60,8 @@ class Finding:
 class Metrics:
     """Numbers of one jump, all measured in the simulation; None where the jump did not get so far.
 
-    Loads are ratios |value| / limit, largest over the run; vectors are (x, z), those of the landing along the heading
-    in which the robot was meant to land, those of the launch along the one in which it began.
+    Loads are ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the landing along the
+    heading in which the robot was meant to land, those of the launch along the one in which it began.
     """
 
     foot_distance_m: float | None = None  # travel of the toes from the start to where they stand at the end
@@ -201,13 +200,13 @@ class Recorder:
     """Raw log of one run; :meth:`result` derives everything else.
 
     ``robot`` is the simulated one, perturbed as it is; ``planned_end`` (nq,), the last configuration of the tape, tells
-    the height to land on; ``links`` are the names of all links.
+    the height to land on, where the ground really is ``higher_m`` higher; ``links`` are the names of all links.
     """
 
-    def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...]):
+    def __init__(self, robot: Robot, planned_end: np.ndarray, links: tuple[str, ...], higher_m: float = 0.0):
         self._robot, self._links, self._feet = robot, links, frozenset(robot.foot.frames)
         self._planned_end, self._rows, self._gauge = planned_end, [], Gauge(robot)
-        self.fallen_steps = 0
+        self.fallen_steps, self._higher_m = 0, higher_m
 
     def add(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray, contacts: Contacts) -> None:
         """Log one step: the state before it, and what acted during it."""
@@ -308,7 +307,7 @@ class Recorder:
             return standing, False, f"still moving at {speed:.2f} m/s at the end"
         if not (log["foot_wrench"][-1, :, 2] > CONTACT_FORCE_N).all():
             return standing, False, "a foot was in the air at the end"
-        miss = self._gauge.soles(log["q"][-1])[2] - self._gauge.soles(self._planned_end)[2]
+        miss = self._gauge.soles(log["q"][-1])[2] - self._gauge.soles(self._planned_end)[2] - self._higher_m
         if abs(miss) > LEVEL_TOLERANCE_M:
             return standing, False, f"stands {miss:+.2f} m from the height it was meant to land on"
         return standing, True, f"stood for {standing:.2f} s on its feet alone"

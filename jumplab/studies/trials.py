@@ -40,7 +40,9 @@ from jumplab.sim import (
     Ranges,
     Scene,
     SensorNoise,
+    Sign,
     SimulationResult,
+    signs,
     simulate_jump,
 )
 from jumplab.sim.engine import engine_class
@@ -136,6 +138,12 @@ class Trial:
     landed: bool  # the verdict; a run that fails a check of its honesty has not landed
     reason: str  # and why
     metrics: Metrics | None  # all numbers of the jump; None if the engine lost the robot
+    signs: tuple[Sign, ...] = ()  # of a failure, the earliest of each cause, in order of time
+
+    @property
+    def cause(self) -> str:
+        """What a failure is counted as: the cause whose sign came first."""
+        return self.signs[0].cause if self.signs else "other"
 
     def to_json(self) -> dict[str, Any]:
         """The trial as the log keeps it."""
@@ -150,7 +158,8 @@ class Trial:
         metrics = data.pop("metrics")
         if metrics is not None:
             metrics = Metrics(**{k: tuple(v) if isinstance(v, list) else v for k, v in metrics.items()})
-        return cls(key=TrialKey(**data.pop("key")), metrics=metrics, **data)
+        signs = tuple(Sign(**sign) for sign in data.pop("signs", ()))
+        return cls(key=TrialKey(**data.pop("key")), metrics=metrics, signs=signs, **data)
 
     def as_kept(self) -> Trial:
         """The very trial that a resumed run reads."""
@@ -159,22 +168,29 @@ class Trial:
 
 def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: TrialKey) -> Trial:
     """Draw the robot of ``key`` and let it jump; raises :class:`InputError` if the tape is not this robot's."""
-    drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=drawn, scene=scene)
-    verdict = judged(lambda: simulate_jump(tape, robot, **how))
+    how = _how(robot, settings, key)
+    drawn, verdict = how["perturbation"], judged(lambda: simulate_jump(tape, robot, scene=scene, **how))
     return Trial(key, drawn.to_json(), features(drawn, robot), *verdict).as_kept()
 
 
-def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None]:
-    """Whether a jump counts as landed, why (not), and its metrics: a run that fails a check of its honesty does not."""
+def _how(robot: Robot, settings: TrialSettings, key: TrialKey) -> dict[str, Any]:
+    drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
+    return dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=drawn)
+
+
+def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None, tuple[Sign, ...]]:
+    """Whether a jump counts as landed, why (not), its metrics and the signs of its failure.
+
+    A run that fails a check of its honesty has not landed.
+    """
     try:
         result = simulate()
     except SolverError as e:  # the engine lost the robot: a failure like any other, and counted as one
-        return False, str(e), None
+        return False, str(e), None, ()
     if result.checks_passed:
-        return result.landed, result.reason, result.metrics
+        return result.landed, result.reason, result.metrics, signs(result)
     doubts = "; ".join(str(finding) for finding in result.checks if not finding.passed) or "nothing was checked"
-    return False, f"not honest: {doubts}; the run's own verdict: {result.reason}", result.metrics
+    return False, f"not honest: {doubts}; the run's own verdict: {result.reason}", result.metrics, ()
 
 
 def features(drawn: Perturbation, robot: Robot) -> dict[str, float]:
@@ -245,6 +261,11 @@ class TrialReport(Shown):
         kinds = (re.sub(sides, "", re.sub(numbers, "...", t.reason)) for t in self.trials if not t.landed)
         return dict(Counter(kinds).most_common())
 
+    @property
+    def causes(self) -> dict[str, int]:
+        """How many failures each cause explains, see :func:`jumplab.sim.signs`, the most frequent first."""
+        return dict(Counter(t.cause for t in self.trials if not t.landed).most_common())
+
     def values(self, name: str) -> np.ndarray:
         """One metric (M,) of the trials that landed."""
         return np.array([getattr(t.metrics, name) for t in self.trials if t.landed])
@@ -269,6 +290,7 @@ class TrialReport(Shown):
             "method": "wilson",
             "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed},
             "reasons": self.reasons,
+            "causes": self.causes,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
             "landed_metrics": measured,
             "target": self.target,
@@ -294,12 +316,14 @@ def run_trials(
     *,
     jobs: int | None = None,
     progress: bool | None = None,
+    keep_falls: int = 0,
 ) -> TrialReport:
     """Let ``n`` perturbed robots jump the plan in ``folder``; write ``trials.jsonl`` and ``trials.json`` there.
 
-    Trials that the folder already has are not run again; the first ones of a larger ``n`` are the same. ``jobs`` are
-    processes, one per core if None; ``progress`` is a bar on stderr, only on a terminal if None. Raises
-    :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
+    The first ``keep_falls`` that failed are run once more, each into a result folder of its own, ``falls/NUMBER``, for
+    pictures and films. Trials that the folder already has are not run again; the first ones of a larger ``n`` are the
+    same. ``jobs`` are processes, one per core if None; ``progress`` is a bar on stderr, only on a terminal if None.
+    Raises :class:`InputError` for numbers that cannot be meant, or a folder without a whole plan, or one to read only.
     """
     check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)
@@ -309,6 +333,11 @@ def run_trials(
     trials, resumed = run_series(folder, work, jobs, progress)
     report = TrialReport(trials, seed, settings, plan, dict(summary["target"]), resumed)
     store.write_trials(folder, report.to_json(), summary, "trials.json")
+    for trial in [t for t in trials if not t.landed and t.metrics is not None][:keep_falls]:
+        own = Path(folder, "falls", str(trial.key.index))
+        store.write_plan(own, tape, robot, summary)
+        fall = simulate_jump(tape, robot, scene=scene, **_how(robot, settings, trial.key))
+        store.write_simulation(own, fall, store.read_plan(own)[2])
     return report
 
 
@@ -354,6 +383,7 @@ def in_parallel(work: Sequence[Task], jobs: int | None, order: str = "generator_
     jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
     options = {} if jobs == 1 else {"backend": "loky", **served()}
     results = joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+    tell("done", 0, len(work))
     for number, result in enumerate(results, 1):
         yield result
         tell("done", number, len(work))

@@ -3,7 +3,11 @@
 After ``jumplab run``, in the clone's root: ``python -m sphinx -b html -c notebooks/book notebooks site``.
 """
 
+import re
 from pathlib import Path
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 from jumplab.io.folder import versions
 
@@ -15,6 +19,7 @@ release = version = versions()["jumplab"]
 root_doc = "book/index"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["paper", ".ipynb_checkpoints"]
+html_math_renderer = "mathml"  # browsers draw it themselves: the site asks for nothing outside itself
 html_theme, html_title = "furo", f"jumplab {release}"
 html_extra_path = ["../../executed/jump.html"] if (EXECUTED.parent / "jump.html").is_file() else []
 nb_execution_mode = "off"  # `jumplab run` has executed them; what it has not is shown without outputs
@@ -38,7 +43,18 @@ def front_page(app, exception):
     (Path(app.outdir) / "index.html").write_text(f"{page}<title>jumplab</title>\n", encoding="utf-8")
 
 
+def formula(translator, node):
+    """A formula as MathML; what only makes brackets larger is left out, as MathML does that by itself."""
+    tex = re.sub(r"\\[bB]ig+[lrm]?(?![a-zA-Z])", "", node.astext())
+    block = isinstance(node, nodes.math_block)
+    text = tex2mathml(f"{{}}{tex}" if tex.startswith("^") else tex, as_block=block)
+    translator.body.append(f'<div class="math">{text}</div>' if block else text)
+    raise nodes.SkipNode
+
+
 def setup(app):
     """Called by Sphinx."""
+    app.add_generic_role("mpltype", nodes.literal)  # of matplotlib's own docstrings, which figures inherit
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("source-read", with_outputs)
     app.connect("build-finished", front_page)

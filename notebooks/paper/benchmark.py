@@ -1,7 +1,7 @@
 """What a benchmark's numbers should reach, in words and limits; plans from ever denser atlases; ever larger sweeps.
 
-``python -m paper.benchmark`` in the folder of the notebooks measures the sweeps anew, in an hour of two idle cores, and
-writes :data:`SWEEPS`; notebook 10 draws that file.
+``python -m paper.benchmark`` in the folder of the notebooks measures the sweeps anew, in half an hour of two idle
+cores, and writes :data:`SWEEPS`; notebook 10 draws that file.
 """
 
 from __future__ import annotations

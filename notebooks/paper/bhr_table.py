@@ -148,12 +148,7 @@ def _joint(root, name, parent, child, origin, axis, lower, upper, effort, speed)
     ET.SubElement(joint, "origin", xyz=_numbers(*origin), rpy="0 0 0")
     ET.SubElement(joint, "axis", xyz=_numbers(*axis))
     ET.SubElement(
-        joint,
-        "limit",
-        lower=_numbers(lower),
-        upper=_numbers(upper),
-        effort=_numbers(effort),
-        velocity=_numbers(speed),
+        joint, "limit", lower=_numbers(lower), upper=_numbers(upper), effort=_numbers(effort), velocity=_numbers(speed)
     )
 
 
@@ -178,19 +173,9 @@ def _arm(root, side, sign):
     box = ((0, 0, -length / 2), (thick, thick, length), True)
     inertia = _box_inertia(v("arm_mass"), thick, thick, length)
     _link(root, f"{side}_arm", v("arm_mass"), (0, 0, -v("arm_com_below_shoulder")), inertia, [box], "0.80 0.55 0.25 1")
-    lower, upper = v("shoulder_pitch_lower"), v("shoulder_pitch_upper")
-    _joint(
-        root,
-        f"{side}_shoulder_pitch",
-        "trunk",
-        f"{side}_arm",
-        (0, sign * v("shoulder_offset_y"), 0),
-        (0, 1, 0),
-        lower,
-        upper,
-        v("shoulder_pitch_effort"),
-        v("shoulder_pitch_speed"),
-    )
+    links = "trunk", f"{side}_arm", (0, sign * v("shoulder_offset_y"), 0), (0, 1, 0)
+    limits = (v(f"shoulder_pitch_{limit}") for limit in ("lower", "upper", "effort", "speed"))
+    _joint(root, f"{side}_shoulder_pitch", *links, *limits)
 
 
 def _dummy(root, name):

@@ -7,12 +7,14 @@ import json
 import re
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import coal  # noqa: F401  (its shapes are what Pinocchio's geometry objects hold)
 import numpy as np
 import pinocchio as pin
+from scipy.stats import qmc
 
 from jumplab.errors import InputError, JumplabError, SolverError, as_path, quoted, require_type
 from jumplab.io.tape import Tape
@@ -30,6 +32,7 @@ from jumplab.task import GRAVITY, JumpTask
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
+MESHES = {"fine mesh": {"refine": False}, "coarse first": {"approach": False}, "steps first": {}}  # of stage 3
 LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 SAME_COST = 1.01  # more than this times the least cost known is another jump
@@ -67,6 +70,14 @@ def judge(claim: str, ok: bool | None, measured: str, where: str, change: str = 
     return {"claim": claim, "verdict": verdict, "measured": measured, "change": change, "where": where}
 
 
+class Verdicts(list):
+    """Lines of the table of claims, in their order."""
+
+    def add(self, *claim: Any, **change: str) -> None:
+        """One more, see :func:`judge`."""
+        self.append(judge(*claim, **change))
+
+
 # ---------------------------------------------------------------------------------------------- measurements
 
 
@@ -98,16 +109,9 @@ def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[st
     angles = random.uniform([0.0, -0.2, -1.2, -0.2, -2.0], [0.6, 1.2, 0.6, 0.9, 1.0], (samples, 5))
     rates, accels = random.normal(0, 4, (samples, 5)), random.normal(0, 40, (samples, 5))
     rest = np.zeros((samples, 2))
-    motion = dict(
-        t=np.arange(samples) / 1000,
-        angles=angles,
-        rates=rates,
-        accels=accels,
-        toe=rest,
-        toe_velocity=rest,
-        toe_acceleration=rest,
-        flying=np.zeros(samples, bool),
-    )
+    motion = dict.fromkeys(("toe", "toe_velocity", "toe_acceleration"), rest)
+    motion |= dict(t=np.arange(samples) / 1000, angles=angles, rates=rates, accels=accels)
+    motion["flying"] = np.zeros(samples, bool)
     tape = expand(motion, robot, GRAVITY)
     five = planar_quantities(robot, angles, rates, accels, rest, GRAVITY)
     body = FullBody(robot)
@@ -128,45 +132,59 @@ class Start:
     Attributes
     ----------
     task, start : the target, and one of :data:`STARTS`.
-    iterations : of stage 3, coarse and fine mesh together; None if it failed.
+    iterations : of stage 3, those on the coarse mesh, of half as many intervals, counted half; None if it failed.
     alone_s, total_s : processor time of stage 3, and with that of making the guess [s]; None if it failed.
     cost : of the jump it ends in [1]; None if it failed.
+    mesh : one of :data:`MESHES`: the fine mesh at once, the coarse one first, or that by Gauss-Newton steps.
+    fine : iterations on the fine mesh; None if it failed.
     """
 
     task: JumpTask
     start: str
-    iterations: int | None = None
+    iterations: float | None = None
     alone_s: float | None = None
     total_s: float | None = None
     cost: float | None = None
+    mesh: str = "steps first"
+    fine: int | None = None
 
 
-def compare_starts(tasks: Iterable[JumpTask], robot: Robot) -> list[Start]:
-    """Stage 3, as it plans, from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
+def spread_targets(number: int) -> list[JumpTask]:
+    """Targets spread evenly over distances of 0.1 to 1 m and rises of 0.2 to 0.5 m, to a millimetre."""
+    spread = [0.1, 0.2] + qmc.Halton(2, scramble=False).random(number + 1)[1:] * [0.9, 0.3]
+    return [JumpTask(round(x, 3), round(z, 3)) for x, z in spread]
+
+
+def compare_starts(
+    tasks: Iterable[JumpTask], robot: Robot, starts: Sequence[str] = STARTS, meshes: Sequence[str] = ("steps first",)
+) -> list[Start]:
+    """Stage 3 from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
 
     Returns
     -------
-    Three rows per target, in the order of :data:`STARTS`. Stages 1 to 3 are built once, and not counted.
+    Per target one row for each of ``meshes`` and ``starts``. Stages 1 to 3 are built once, and not counted.
 
     Raises
     ------
     InputError, InfeasibleError, SolverError
         If stage 1 refuses a target; what fails later is a row without numbers.
     """
-    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot)
-    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE)
+    stage1, whole = SrmpPlanner(robot), {mesh: WholeBodyPlanner(robot, **MESHES[mesh]) for mesh in meshes}
+    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE) if STARTS[2] in starts else None
     rows = []
     for task in tasks:
         first = stage1.plan(task)
-        for name in STARTS:
+        for mesh, name in itertools.product(meshes, starts):
             try:
-                rows.append(_from_start(name, task, first, whole, loose))
+                rows.append(replace(_from_start(name, task, first, whole[mesh], loose), mesh=mesh))
             except JumplabError:
-                rows.append(Start(task, name))
+                rows.append(Start(task, name, mesh=mesh))
     return rows
 
 
-def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner) -> Start:
+def _from_start(
+    name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner | None
+) -> Start:
     began = time.process_time()
     guess = None  # the planner's own: four postures joined by straight lines
     if name == "stage 2":
@@ -176,39 +194,53 @@ def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlan
         except SolverError:
             motion = map_to_joints(first, there, method="direct")
         guess = guess_from_joints(motion, whole, task, first.toe_s)
-    elif name == "looser stage 3":
+    elif loose and name == "looser stage 3":
         guess = loose.plan(task, first).solution.guess(asdict(whole.mesh))
     ready = time.process_time()
     plan = whole.plan(task, first, guess=guess)
     end = time.process_time()
-    fine, coarse = plan.solution.statistics, plan.coarse
-    iterations = fine.iterations + (coarse.iterations if coarse else 0)
-    return Start(task, name, iterations, end - ready, end - began, fine.objective)
+    s, coarse = plan.solution.statistics, plan.coarse.iterations if plan.coarse else 0
+    spent = s.iterations + coarse / 2, end - ready, end - began
+    return Start(task, name, *spent, s.objective, fine=s.iterations)
 
 
 def against_crouch(rows: Sequence[Start]) -> list[dict]:
-    """One row per start: solved targets, and medians of iterations and time as shares of the crouch's.
+    """One row per mesh and start: solved targets, and medians of iterations and time as shares of the crouch's.
 
-    Only targets count that the crouch has solved too; shares are None where there is none. ``costlier`` counts the
-    jumps that cost more than :data:`SAME_COST` times the cheapest one found for their target, from whatever start.
+    The crouch is that on the mesh of the first row. Only targets count that it has solved too; shares are None where
+    there is none. ``costlier`` counts the jumps that cost more than :data:`SAME_COST` times the cheapest one found for
+    their target, from whatever start; ``by at most [%]`` is how much more.
     """
-    crouch = {r.task: r for r in rows if r.start == STARTS[0] and r.iterations is not None}
+    crouch = {r.task: r for r in rows if (r.start, r.mesh) == (STARTS[0], rows[0].mesh) and r.iterations is not None}
     least = {t: min((r.cost for r in rows if r.task == t and r.cost is not None), default=0.0) for t in crouch}
     out = []
-    for name in dict.fromkeys(r.start for r in rows):
-        here = [r for r in rows if r.start == name]
+    for name, mesh in dict.fromkeys((r.start, r.mesh) for r in rows):
+        here = [r for r in rows if (r.start, r.mesh) == (name, mesh)]
         both = [(r, crouch[r.task]) for r in here if r.iterations is not None and r.task in crouch]
         shares = {
             "iterations, share": [r.iterations / c.iterations for r, c in both],
             "stage 3 alone, share": [r.alone_s / c.alone_s for r, c in both],
             "with the guess, share": [r.total_s / c.total_s for r, c in both],
         }
+        above = [r.cost / least[r.task] for r, _ in both]
         out.append(
-            {"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
-            | {"costlier": sum(r.cost > SAME_COST * least[r.task] for r, _ in both)}
+            {"start": name, "mesh": mesh, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
             | {key: float(np.median(x)) if x else None for key, x in shares.items()}
+            | {"costlier": sum(x > SAME_COST for x in above), "by at most [%]": 100 * (max(above, default=1.0) - 1)}
         )
     return out
+
+
+def spared(rows: Sequence[Start]) -> str:
+    """What stage 2's motion spares against a crouch on the same mesh, in words."""
+    told = []
+    for mesh in dict.fromkeys(r.mesh for r in rows):
+        crouch, guess = against_crouch([r for r in rows if r.mesh == mesh and r.start in STARTS[:2]])
+        shares = (guess[key] for key in ("iterations, share", "with the guess, share"))
+        gain = ["?" if share is None else f"{1 - share:.0%}" for share in shares]
+        worse = f"costlier jumps: {guess['costlier']}, from the crouch {crouch['costlier']}"
+        told.append(f"{mesh}, {gain[0]} of iterations and {gain[1]} of time ({worse})")
+    return "; ".join(told)
 
 
 def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:

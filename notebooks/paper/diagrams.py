@@ -33,6 +33,9 @@ from paper.render import Camera, Renderer
 ARROW = dict(arrowstyle="-|>", mutation_scale=7, linewidth=0.9, shrinkA=0, shrinkB=0)
 
 
+CENTRED = {"ha": "center", "va": "center"}
+
+
 def arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], color: str = INK, **kwargs) -> None:
     """A straight arrow in data coordinates."""
     ax.add_patch(FancyArrowPatch(start, end, **(ARROW | {"color": color, "zorder": 5} | kwargs)))
@@ -40,29 +43,10 @@ def arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float], color:
 
 # Fig. 2 ---------------------------------------------------------------------------------------------------------
 def _box(ax, x, y, width, height, text, color, *, strength=0.18, fontsize=7.0, weight="normal"):
-    ax.add_patch(
-        FancyBboxPatch(
-            (x, y),
-            width,
-            height,
-            boxstyle="round,pad=0,rounding_size=0.08",
-            linewidth=0.8,
-            facecolor=tint(color, strength),
-            edgecolor=shade(color, 0.8),
-            zorder=2,
-        )
-    )
-    ax.text(
-        x + width / 2,
-        y + height / 2,
-        text,
-        ha="center",
-        va="center",
-        fontsize=fontsize,
-        fontweight=weight,
-        linespacing=1.25,
-        zorder=3,
-    )
+    look = dict(linewidth=0.8, facecolor=tint(color, strength), edgecolor=shade(color, 0.8), zorder=2)
+    ax.add_patch(FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.08", **look))
+    look = dict(**CENTRED, fontsize=fontsize, fontweight=weight, linespacing=1.25, zorder=3)
+    ax.text(x + width / 2, y + height / 2, text, **look)
 
 
 @styled
@@ -81,17 +65,8 @@ def framework() -> Figure:
     first, width, gap = 2.35, 2.45, 0.85
     for k, (name, section, launch, flight) in enumerate(stages):
         x = first + k * (width + gap)
-        ax.add_patch(
-            FancyBboxPatch(
-                (x, 0.75),
-                width,
-                3.4,
-                boxstyle="round,pad=0,rounding_size=0.12",
-                linewidth=0.8,
-                facecolor="#F7F7F7",
-                edgecolor=LIMIT,
-            )
-        )
+        look = dict(boxstyle="round,pad=0,rounding_size=0.12", linewidth=0.8, facecolor="#F7F7F7", edgecolor=LIMIT)
+        ax.add_patch(FancyBboxPatch((x, 0.75), width, 3.4, **look))
         ax.text(x + 0.14, 3.88, name, ha="left", va="center", fontweight="bold", fontsize=8)
         ax.text(x + width / 2, 4.25, section, ha="center", va="bottom", fontsize=7, color="#555555")
         _box(ax, x + 0.12, 2.3, width - 0.24, 1.3, launch, LAUNCH)
@@ -106,22 +81,10 @@ def framework() -> Figure:
     x = first + 3 * (width + gap)
     _box(ax, x, 2.6, 14.27 - x, 1.55, "audit\nsecond\ncode path", INK, strength=0.06)
     _box(ax, x, 0.75, 14.27 - x, 1.55, "simulation\nplayback,\nlanding", LANDING)
-    arrow(
-        ax,
-        (first + width / 2, 0.75),
-        (first + 2 * (width + gap) + width / 2, 0.75),
-        connectionstyle="arc3,rad=0.16",
-        color="#555555",
-    )
-    ax.text(
-        first + 1.5 * width + gap,
-        0.50,
-        "references $\\rho,\\, \\dot{\\rho},\\, \\mathbf{v},\\, L$",
-        ha="center",
-        va="center",
-        fontsize=7,
-        color="#333333",
-    )
+    start, end = (first + width / 2, 0.75), (first + 2 * (width + gap) + width / 2, 0.75)
+    arrow(ax, start, end, connectionstyle="arc3,rad=0.16", color="#555555")
+    text = "references $\\rho,\\, \\dot{\\rho},\\, \\mathbf{v},\\, L$"
+    ax.text(first + 1.5 * width + gap, 0.50, text, **CENTRED, fontsize=7, color="#333333")
     for k, (text, color) in enumerate(PHASE_COLORS.items()):
         ax.add_patch(Circle((0.2, 1.15 - 0.36 * k), 0.09, color=color))
         ax.text(0.38, 1.15 - 0.36 * k, text, va="center", fontsize=7)
@@ -196,13 +159,8 @@ def _five_links(ax, robot):
     for point, offset in zip(points, offsets, strict=True):
         align = "left" if offset[0] > 0 else "right"
         ax.text(*np.add(p[point], offset), f"$q_\\mathrm{{{point}}}$", ha=align, va="center")
-    middles = (
-        ("foot", "heel", "toe"),
-        ("shank", "ankle", "knee"),
-        ("thigh", "knee", "hip"),
-        ("trunk", "hip", "shoulder"),
-        ("arm", "shoulder", "hand"),
-    )
+    middles = [("foot", "heel", "toe"), ("shank", "ankle", "knee"), ("thigh", "knee", "hip")]
+    middles += [("trunk", "hip", "shoulder"), ("arm", "shoulder", "hand")]
     for k, (name, a, b) in enumerate(middles):
         middle = (p[a] + p[b]) / 2
         side, align = (-1, "right") if name == "trunk" else (1, "left")
@@ -273,18 +231,8 @@ def _pendulum(ax, centre, along, radius, tilt):
 
 def _turning(ax, at, radius, start, end, color, label, where):
     """Arc from angle ``start`` to ``end`` (from vertical, positive about +y, i.e. clockwise here) with a head."""
-    ax.add_patch(
-        Arc(
-            at,
-            2 * radius,
-            2 * radius,
-            theta1=90 - np.degrees(max(start, end)),
-            theta2=90 - np.degrees(min(start, end)),
-            color=color,
-            linewidth=1.0,
-            zorder=5,
-        )
-    )
+    angles = {"theta1": 90 - np.degrees(max(start, end)), "theta2": 90 - np.degrees(min(start, end))}
+    ax.add_patch(Arc(at, 2 * radius, 2 * radius, **angles, color=color, linewidth=1.0, zorder=5))
     tip = np.asarray(at) + radius * np.array([np.sin(end), np.cos(end)])
     tangent = np.sign(end - start) * np.array([np.cos(end), -np.sin(end)])
     arrow(ax, tip - 0.02 * tangent, tip + 0.035 * tangent, color=color)
@@ -318,14 +266,8 @@ def _dynamics(ax, centre, along, radius, lean):
     for sign in (1, -1):
         end = centre + sign * radius * along
         arrow(ax, end + sign * 0.07 * along, end + sign * 0.25 * along, color=VERMILION, linewidth=1.3)
-    ax.text(
-        *(centre + (radius + 0.17) * along + [-0.11, 0.09]),
-        r"$F_\varphi$",
-        color=VERMILION,
-        ha="center",
-        va="center",
-        fontsize=9,
-    )
+    place = centre + (radius + 0.17) * along + [-0.11, 0.09]
+    ax.text(*place, r"$F_\varphi$", color=VERMILION, **CENTRED, fontsize=9)
     _turning(ax, centre, 0.19, lean + 2.0, lean + 5.0, VERMILION, r"$\tau_{pl}$", np.add(centre, [-0.28, 0.14]))
     _turning(ax, (0, 0), 0.17, -1.3, 1.1, LAUNCH, r"$\tau_l$", (-0.21, 0.14))
     arrow(ax, centre, centre - [0, 0.36], color="#555555", linewidth=1.3)

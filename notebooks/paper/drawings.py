@@ -51,6 +51,7 @@ from paper.experiments import trunk_pitch as trunk_angle  # of a flip: whole tur
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
+    from paper.claims import Start
 
 # stage1 ------------------------------------------------------------------------------------------
 SPEED_SCALE_S = 0.10  # length of a drawn velocity, metres per m/s
@@ -119,14 +120,8 @@ def _lean(ax: Axes, pivot, lean, color):
     a = np.linspace(0, lean, 20)
     ax.plot(*(pivot[:, None] + 0.36 * np.array([np.sin(a), np.cos(a)])), color=color, linewidth=1.0)
     side = np.sign(lean) or 1.0
-    ax.text(
-        *np.add(pivot, [-0.03 * side, 0.40]),
-        _degrees(lean),
-        color=color,
-        fontsize=7,
-        ha="right" if side > 0 else "left",
-        va="center",
-    )
+    place, ha = np.add(pivot, [-0.03 * side, 0.40]), "right" if side > 0 else "left"
+    ax.text(*place, _degrees(lean), color=color, fontsize=7, ha=ha, va="center")
 
 
 def _lengths(ax: Axes, ground, touchdown, foot, floor):
@@ -206,15 +201,8 @@ def launch_strobe(plan: SrmpPlan) -> Figure:
         ax.plot(launch.t[rows], y[rows], linestyle="none", marker="o", markersize=2.5, color=LAUNCH)
         ax.set(xlabel="time [s]", ylabel=label)
         mark_time(ax, [heel_up])
-    lower[0].annotate(
-        "heel up",
-        (heel_up, lower[0].get_ylim()[0]),
-        (-3, 3),
-        textcoords="offset points",
-        fontsize=7,
-        ha="right",
-        color="#555555",
-    )
+    place, look = (heel_up, lower[0].get_ylim()[0]), {"fontsize": 7, "ha": "right", "color": "#555555"}
+    lower[0].annotate("heel up", place, (-3, 3), textcoords="offset points", **look)
     return fig
 
 
@@ -252,15 +240,8 @@ def _end_angles(ax: Axes, t: np.ndarray, angle: np.ndarray, away_from: float | N
     last = up if away_from is None else int(np.sign(angle[-1] - away_from)) or up
     for row, side, ha in ((0, -up, "left"), (-1, last, "right")):
         gap = 3 if row == 0 or last == up else 11  # points; beside a slope more room is needed
-        ax.annotate(
-            _degrees(angle[row]),
-            (t[row], np.degrees(angle[row])),
-            (0, gap * side),
-            fontsize=7,
-            ha=ha,
-            textcoords="offset points",
-            va="bottom" if side > 0 else "top",
-        )
+        look = {"fontsize": 7, "ha": ha, "va": "bottom" if side > 0 else "top", "textcoords": "offset points"}
+        ax.annotate(_degrees(angle[row]), (t[row], np.degrees(angle[row])), (0, gap * side), **look)
 
 
 @styled
@@ -297,17 +278,8 @@ def reach_envelope(reach: Reach, plan: SrmpPlan | None = None, *, samples: dict 
     fig = new_figure(COLUMN_IN, 2.7)
     ax = fig.subplots()
     if samples is not None:
-        ax.plot(
-            np.linalg.norm(samples["com"], axis=1),
-            samples["rho"],
-            linestyle="none",
-            marker=".",
-            markersize=1.2,
-            color="#C8C8C8",
-            zorder=1,
-            rasterized=True,
-            label="sampled postures",
-        )
+        look = dict(markersize=1.2, color="#C8C8C8", zorder=1, rasterized=True, label="sampled postures")
+        ax.plot(np.linalg.norm(samples["com"], axis=1), samples["rho"], ".", **look)
     phi = np.linspace(*reach.length, 100)
     low, high = np.polyval(reach.inertia_low_fit, phi), np.polyval(reach.inertia_high_fit, phi)
     ax.fill_between(phi, low, high, color=tint(SKY, 0.25), zorder=0.5, label="envelope used in launch")
@@ -410,21 +382,21 @@ def _tracked(plan: JointPlan):
 
 # starts of stage 3 ----------------------------------------------------------------------------------------------
 @styled
-def guess_comparison(rows: Iterable[Mapping], quantities: Mapping[str, str]) -> Figure:
-    """One panel per quantity, one column of dots per start, a thin line per target, a bar at the median.
+def guess_comparison(rows: Iterable[Start], quantities: Mapping[str, str]) -> Figure:
+    """One panel per quantity, one column of dots per start and mesh, a thin line per target, a bar at the median.
 
     Parameters
     ----------
-    rows : one mapping per target and start: "target", "start", the quantities (NaN or None without a solution).
-    quantities : key -> axis label with unit.
+    rows : one per target, start and mesh.
+    quantities : attribute of a row -> axis label with unit.
     """
-    rows = list(rows)
-    starts, targets = (list(dict.fromkeys(r[k] for r in rows)) for k in ("start", "target"))
+    by = {(r.task, f"{r.start},\n" + r.mesh.replace(" ", "\n")): r for r in rows}
+    targets, starts = (list(dict.fromkeys(keys)) for keys in zip(*by, strict=True))
     fig = new_figure(PAGE_IN, 2.5)
     axes = fig.subplots(1, len(quantities), squeeze=False)[0]
     for ax, (key, label) in zip(axes, quantities.items(), strict=True):
-        found = {(r["target"], r["start"]): np.nan if r[key] is None else float(r[key]) for r in rows}
-        table = np.array([[found.get((target, start), np.nan) for start in starts] for target in targets])
+        found = [[getattr(by.get((target, start)), key, None) for start in starts] for target in targets]
+        table = np.array(found, float)  # None becomes nan
         _dots(ax, table)
         ax.set_ylabel(label)
         ax.set_xticks(range(len(starts)), starts)
@@ -451,17 +423,8 @@ def _dots(ax: Axes, table: np.ndarray) -> None:
         ax.plot(line, color="#BBBBBB", linewidth=0.6, zorder=1)
     for k, values in enumerate(table.T):
         color = START_COLORS[k % len(START_COLORS)]
-        ax.plot(
-            np.full(len(values), k),
-            values,
-            linestyle="none",
-            marker="o",
-            markersize=4,
-            color=color,
-            markerfacecolor=tint(color, 0.5),
-            zorder=2,
-            clip_on=False,
-        )
+        look = dict(markersize=4, color=color, markerfacecolor=tint(color, 0.5), zorder=2, clip_on=False)
+        ax.plot(np.full(len(values), k), values, "o", **look)
         if np.isfinite(values).any():
             middle = np.nanmedian(values)
             ax.plot([k - 0.25, k + 0.25], [middle, middle], color=INK, linewidth=2.0, zorder=3)

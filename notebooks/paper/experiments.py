@@ -48,7 +48,6 @@ from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Metrics, Scene, SimulationResult
-    from jumplab.studies.basin import BasinReport
     from jumplab.studies.chain import ChainResult, ChainTrial
     from jumplab.studies.trials import Trial
     from jumplab.task import JumpTask
@@ -313,23 +312,11 @@ def trial_map(trials: Sequence[Trial]) -> Figure:
         values = factor * np.array([t.features[name] for t in trials])
         _rates(ax, values, landed)
         for mask, height, marker, color in ((landed, 1.2, "o", LANDING), (~landed, -0.2, "x", VERMILION)):
-            ax.plot(
-                values[mask],
-                np.full(mask.sum(), height),
-                linestyle="none",
-                marker=marker,
-                color=color,
-                markersize=3.0,
-                markeredgewidth=0.8,
-                alpha=0.7,
-            )
+            look = dict(color=color, markersize=3.0, markeredgewidth=0.8, alpha=0.7)
+            ax.plot(values[mask], np.full(mask.sum(), height), marker, **look)
         ax.margins(x=0.04)
-        ax.set(
-            xlabel=label,
-            ylim=(-0.3, 1.3),
-            yticks=[-0.2, 0, 0.5, 1, 1.2],
-            yticklabels=["fell", "0 %", "50 %", "100 %", "landed"],
-        )
+        ax.set(xlabel=label, ylim=(-0.3, 1.3))
+        ax.set_yticks([-0.2, 0, 0.5, 1, 1.2], ["fell", "0 %", "50 %", "100 %", "landed"])
     panel_letters(axes.flat)
     return fig
 
@@ -347,26 +334,27 @@ def _rates(ax: Axes, values: np.ndarray, landed: np.ndarray) -> None:
 
 # Wrong states in flight ------------------------------------------------------------------------------------------
 @styled
-def basin_map(basin: BasinReport) -> Figure:
+def basin_map(states: Sequence[Trial]) -> Figure:
     """The landing basin: which wrong states at the apex land (dots) or fall (crosses).
 
     Across: error of the horizontal speed, up: error of the pitch. One panel for each height (columns) and friction
-    (rows) of the grid; its title counts.
+    (rows) that was tried; its title counts.
     """
-    heights, frictions = sorted(set(basin.grid.height_m)), sorted(set(basin.grid.friction))
+    tried = {name: sorted({t.features[name] for t in states}) for name in states[0].features}
+    heights, frictions = tried["height_m"], tried["friction"]
     shape = len(frictions), len(heights)
     width, height = (COLUMN_IN, BASIN_SINGLE_IN) if shape == (1, 1) else (PAGE_IN, BASIN_ROW_IN * shape[0])
     fig = new_figure(width, height)
     axes = fig.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     for line, friction in zip(axes, frictions, strict=True):
         for ax, rise in zip(line, heights, strict=True):
-            states = [t for t in basin.trials if (t.features["height_m"], t.features["friction"]) == (rise, friction)]
-            _basin_panel(ax, states)
-            ax.set_title(f"{_height_text(rise)}, friction {friction:g}: {sum(t.landed for t in states)}/{len(states)}")
+            here = [t for t in states if (t.features["height_m"], t.features["friction"]) == (rise, friction)]
+            _basin_panel(ax, here)
+            ax.set_title(f"{_height_text(rise)}, friction {friction:g}: {sum(t.landed for t in here)}/{len(here)}")
     for ax in axes[-1]:
-        ax.set(xlabel="horizontal speed [%]", xticks=[100 * (x - 1) for x in sorted(set(basin.grid.speed_factor))])
+        ax.set(xlabel="horizontal speed [%]", xticks=[100 * (x - 1) for x in tried["speed_factor"]])
     for ax in axes[:, 0]:
-        ax.set(ylabel="pitch [deg]", yticks=sorted(set(basin.grid.pitch_deg)))
+        ax.set(ylabel="pitch [deg]", yticks=tried["pitch_deg"])
     marks = ((LANDING, "o", "lands"), (VERMILION, "x", "falls"))
     legend_above(fig, [Line2D([], [], color=c, marker=m, linestyle="none", label=text) for c, m, text in marks])
     return fig
@@ -429,15 +417,7 @@ def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figu
     clock.plot(number, air, color=FLIGHT, marker="o", markersize=4, label="in the air")
     for in_air, face, label in ((True, PURPLE, "planned in the air"), (False, "white", "planned standing")):
         known = [(1 + p.number, p.solve_s) for j in result.jumps for p in j.plans if p.air == in_air]
-        clock.plot(
-            *np.reshape(known, (-1, 2)).T,
-            color=PURPLE,
-            linestyle="",
-            marker="o",
-            markersize=4,
-            markerfacecolor=face,
-            label=label,
-        )
+        clock.plot(*np.reshape(known, (-1, 2)).T, "o", color=PURPLE, markersize=4, markerfacecolor=face, label=label)
     clock.set(xlabel="jump", ylabel="time [s]", ylim=(0.0, None))
     for ax in (error, clock):
         ax.set_xticks(number)
@@ -551,11 +531,12 @@ def draw_scene(ax: Axes, scene: Scene, left: float, right: float, bottom: float)
     fill = dict(facecolor=tint(GROUND, 0.35), edgecolor="none", zorder=1)
     for block in sorted(scene.blocks, key=lambda b: b.top):
         start, end = max(left, block.x_from), min(right, block.x_to)
-        if start >= end or block.top <= bottom:
+        if start >= end or block.top <= bottom or not block.y_from <= 0 <= block.y_to:
             continue
-        ax.add_patch(Rectangle((start, bottom), end - start, block.top - bottom, **fill))
-        ax.plot([start, end], [block.top] * 2, **line)
-        for x in (block.x_from, block.x_to):
+        tops = [block.height_at(x) for x in (start, end)]
+        ax.fill([start, start, end, end], [bottom, *tops, bottom], **fill)
+        ax.plot([start, end], tops, **line)
+        for x, top in zip((start, end), tops, strict=True):
             if left < x < right:
-                below = max((b.top for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to), default=bottom)
-                ax.plot([x, x], [max(below, bottom), block.top], **line)
+                others = (b.height_at(x) for b in scene.blocks if b is not block and b.x_from <= x <= b.x_to)
+                ax.plot([x, x], [max(max(others, default=bottom), bottom), top], **line)

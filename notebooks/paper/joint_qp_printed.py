@@ -1,4 +1,4 @@
-"""Stage 2's QPs by the letter of the paper, one reading at a time: the library's QPs with rows changed afterwards."""
+"""Stage 2's QPs by the letter of the paper, one reading at a time: the library's with rows changed, and their fate."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, JumplabError
+from jumplab.models.full import FullBody
 from jumplab.robot import Robot
-from jumplab.stages.joint_qp import JointMapper, JointPlan
+from jumplab.stages.joint_qp import JointMapper, JointPlan, Limits, Options
 from jumplab.stages.joint_qp.flight import FlightQp
 from jumplab.stages.joint_qp.launch import LaunchQp
 from jumplab.stages.joint_qp.problem import Layout, StepQp
+from jumplab.stages.srmp import SrmpPlan
+from paper.joint_qp_studies import alone
+from paper.joint_violations import joint_violations
 
 CHOICES = {
     "base_rows": (3, 6),
@@ -26,6 +30,7 @@ CHOICES = {
     "inertia": ("row", "term"),
 }
 SIDES = {"A": ("A", "b"), "E": ("E", "e")}
+LOADED_N, HEEL_UP_M = 20.0, 0.0025  # a foot has a CoP, and a heel is up, beyond these
 
 
 @dataclass(frozen=True)
@@ -147,3 +152,67 @@ class PrintedMapper(JointMapper):
 def map_as_read(srmp_plan: Any, robot: Robot, form: Form = PRINTED, method: str = "direct", **how) -> JointPlan:
     """Stage 2's roll-out in some form, see :func:`jumplab.stages.joint_qp.map_to_joints`."""
     return PrintedMapper(srmp_plan, robot, form, **how).run(method)
+
+
+READ = {  # one reading at a time, everything else as the library's; then all of them
+    "ours": Form(),
+    "without the 1/2": Form(half=False),
+    "three base rows": Form(base_rows=3),
+    "hip sum for all axes": Form(hip_rule="sum", pairs="hips"),
+    "inertia as a hard row": Form(inertia="row"),
+    "heel free on a tiptoe": Form(contact="free"),
+    "the same, heel row everywhere": Form(contact="free", heel="always"),
+    "all as printed": PRINTED,
+    "all, heel row near the ground": replace(PRINTED, heel="near"),
+}
+
+
+def readings_tried(srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, JointPlan], dict[str, str], list[dict]]:
+    """Roll-outs of all of :data:`READ`; one that stops is tried again without torque limits.
+
+    Returns
+    -------
+    By name, the roll-outs that come through, and the first refusal of those that stop; the table of both.
+    """
+    tried, said, rows = {}, {}, []
+    for name, form in READ.items():
+        row = {"form": name, "torque limits": "fails with and without"}
+        for torque in (1.0, None):
+            try:
+                tried[name] = map_as_read(srmp, robot, form, options=Options(limits=Limits(torque_share=torque)))
+            except JumplabError as e:
+                said.setdefault(name, str(e).partition("; relax")[0])
+                continue
+            row["torque limits"] = "yes" if torque else "left out"
+            r = {**tried[name].tracking, **joint_violations(tried[name], robot)}
+            row |= {"take-off speed, off by [%]": 100 * r["takeoff_velocity"]}
+            row |= {"L, off by [%]": 100 * r["launch_momentum"], "force from nowhere [N, N m]": r["base_force"]}
+            row |= {"L lost in flight": r["flight_momentum"]}
+            break
+        rows.append(row)
+    return tried, said, rows
+
+
+def cop_behind_toe_mm(plan: JointPlan, robot: Robot) -> float:
+    """How far the CoP of a loaded left foot gets behind its toe while the heel is up [mm]."""
+    body, behind, foot = FullBody(robot), 0.0, robot.foot
+    for k in range(plan.rows("launch").stop - 1):
+        x, following = (body.motion(plan.q[i], plan.v[i]) for i in (k, k + 1))
+        f = plan.f[k, 0]
+        if f[2] > LOADED_N and x.heel[0, 2] - x.toe[0, 2] > HEEL_UP_M:
+            middle = (x.foot_rotation[0] + following.foot_rotation[0]) / 2  # of the step
+            moment = f[3:] - np.cross(middle @ [foot.toe, 0.0, foot.sole_z], f[:3])
+            behind = max(behind, 1000 * moment[1] / f[2])
+    return float(behind)
+
+
+def moment_from_nowhere(mapper: JointMapper, plan: JointPlan, robot: Robot, srmp: SrmpPlan) -> dict[str, float]:
+    """Largest moment about the base without a cause [N m], at single steps of ``plan``: six base rows, and three."""
+    three = PrintedMapper(srmp, robot, Form(base_rows=3)).launch
+    missed = dict.fromkeys(("ours", "three base rows"), 0.0)
+    for k in range(0, len(mapper.launch.steps), 6):
+        for name, qp in zip(missed, (mapper.launch, three), strict=True):
+            x, _, both = alone(mapper, qp, k, plan)
+            moment = x.M[3:6] @ both[12:] + x.H[3:6] - x.J[:, 3:6].T @ both[:12]
+            missed[name] = max(missed[name], float(np.abs(moment).max()))
+    return missed

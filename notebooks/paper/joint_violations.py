@@ -1,4 +1,4 @@
-"""What a roll-out of stage 2 breaks: Pinocchio's inverse dynamics and the robot's limits, not the QPs' matrices."""
+"""What a roll-out of stage 2 breaks, by Pinocchio's inverse dynamics and the robot's limits, not the QPs' matrices."""
 
 from __future__ import annotations
 
@@ -8,19 +8,33 @@ import pinocchio as pin
 from jumplab.models.full import FullBody, FullTerms
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
+from jumplab.stages.planner import to_link_angles
+from jumplab.stages.whole_body import Limits
 
 LOADED_N = 5.0  # a foot that carries less has no meaningful CoP or friction
+MEANING = {  # of what is broken: words and unit
+    "base_force": ("base rows of the inverse dynamics less the wrenches; in flight the drift control", "N, N m"),
+    "toe_drift": ("toes slip", "m"),
+    "penetration": ("sole below the ground", "m"),
+    "pull": ("ground pulls", "N"),
+    "friction": ("friction used", ""),
+    "cop_outside": ("CoP outside the foot", "m"),
+    "torque": ("torque, share of its limit", ""),
+    "torque_excess": ("torque beyond the motor's line", "N m"),
+    "speed": ("joint speed, share of its limit", ""),
+    "range": ("beyond a joint stop", "rad"),
+    "asymmetry": ("left and right differ", "rad, rad/s"),
+    "flight_com": ("CoM off its parabola", "m"),
+    "flight_momentum": ("angular momentum lost in flight", "kg m^2/s"),
+}
+ALIKE = {"deg": 0.5, "mm": 2.0, "rad/s": 0.1}  # what still counts as the same, by unit
 
 
 def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None) -> dict[str, float]:
-    """Largest violations of a roll-out, by name.
+    """Largest violations of a roll-out, by the names of :data:`MEANING`.
 
-    Keys: ``base_force`` (base rows of the inverse dynamics less the wrenches [N, N m]; in flight it shows the drift
-    control), ``toe_drift``, ``penetration``, ``cop_outside`` [m] (of the sole; of the toe edge once the heel is up),
-    ``pull`` [N] (negative F_z), ``friction`` (largest F_xy / F_z), ``torque``, ``speed`` (largest share of the limit),
-    ``torque_excess`` [N m] (beyond the actuator's torque-speed line), ``range`` [rad] (beyond a joint stop),
-    ``asymmetry`` [rad, rad/s] (of mirrored joints), ``flight_com`` [m] and ``flight_momentum`` [kg m^2/s] (off the
-    parabola, and lost).
+    ``cop_outside`` is of the sole, of the toe edge once the heel is up; ``pull`` is a negative F_z; ``friction`` the
+    largest F_xy / F_z; ``torque_excess`` counts from the motor's line; ``asymmetry`` is of mirrored joints.
     """
     body, launch, flight = FullBody(robot, gravity), plan.rows("launch"), plan.rows("flight")
     nodes = [body.motion(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
@@ -43,6 +57,27 @@ def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None
     out["flight_com"] = float(np.linalg.norm(np.array([x.com for x in flying]) - parabola, axis=1).max())
     out["flight_momentum"] = float(max(abs(x.momentum[4] - start.momentum[4]) for x in flying))
     return out
+
+
+def touchdown_rows(plan: JointPlan, robot: Robot) -> list[dict]:
+    """The last posture of a roll-out beside the bounds that stage 3 sets to its own."""
+    aims, deg, x = Limits(), np.degrees, FullBody(robot).motion(plan.q[-1], plan.v[-1])
+    angles = to_link_angles(robot, plan.q, plan.v, plan.a)[0][-1]
+    _, knee, _, _ = robot.sagittal.joint_angles(angles)  # hip, knee, ankle, shoulder
+    ground = FullBody(robot).motion(plan.q[0], plan.v[0]).toe[0, 2]
+    found = {
+        ("trunk pitch", "deg"): (deg(angles[3]), *deg(aims.touchdown_trunk)),
+        ("knee", "deg"): (deg(knee), *deg(aims.touchdown_knee)),
+        ("foot pitch", "deg"): (deg(x.foot_pitch[0]), 0.0, 0.0),
+        ("toe above the ground", "mm"): (1000 * (x.toe[0, 2] - ground), 0.0, 0.0),
+        ("heel above the ground", "mm"): (1000 * (x.heel[0, 2] - ground), 0.0, 0.0),
+        ("fastest joint", "rad/s"): (np.abs(plan.v[-1, 6:]).max(), 0.0, aims.touchdown_joint_rate),
+    }
+    rows = []
+    for (what, unit), (value, low, high) in found.items():
+        row = {"at touchdown": what, "stage 2": value, "stage 3, from": low, "to": high, "unit": unit}
+        rows.append({**row, "outside": not low - ALIKE[unit] <= value <= high + ALIKE[unit]})
+    return rows
 
 
 def _middle(plan: JointPlan, body: FullBody, k: int) -> FullTerms:

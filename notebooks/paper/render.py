@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 from jumplab.robot import Robot
-from jumplab.show.bodies import ABOVE_M, JOINT_RADIUS_M, LIMB_SHARE, ROD_RADIUS_M, skeleton
+from jumplab.show.bodies import ABOVE_M, LIMB_SHARE
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
 from jumplab.sim.scene import Scene
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jumplab.sim import SimulationResult
 
 OVERSAMPLING = 2  # pictures are drawn larger and averaged, which smooths edges
+JOINT_RADIUS_M, ROD_RADIUS_M = 0.038, 0.018  # balls and rods of the skeleton
 STRIPE_M = 0.25  # the ground is striped, so that distances can be counted
 SEEN_M, HALF_WIDTH_M = (-4.5, 4.5), 0.45  # what is built of the ground; the longest jump allowed is 3 m
 GREYS, JOINT_GREY = (0.87, 0.76), 0.35
@@ -160,7 +161,11 @@ def _ground(scene: Scene, marks: Sequence[float]) -> list[Shape]:
         for a, b in itertools.pairwise(cuts):
             if b - a > 1e-9:
                 grey = GREYS[int(np.floor((a + b) / 2 / STRIPE_M)) % 2]
-                slab = _box((a, -HALF_WIDTH_M, block.top - depth), (b, HALF_WIDTH_M, block.top))
+                sides = np.clip((block.y_from, block.y_to), -HALF_WIDTH_M, HALF_WIDTH_M)
+                slab = _box((a, sides[0], block.top - depth), (b, sides[1], block.top))
+                if not block.even:
+                    pivot = np.array([block.pivot_m, 0.0, block.top])
+                    slab = pivot + (slab - pivot) @ block.turn.T
                 out.append(Shape(0, slab, (grey,) * 3))
     for x in marks:
         low = (x - MARK_M / 2, -HALF_WIDTH_M, scene.top_at(x) - 0.002)
@@ -181,13 +186,17 @@ def _links(robot: Robot) -> list[Shape]:
 
 
 def _skeleton(robot: Robot) -> list[Shape]:
-    out, grey = [], (JOINT_GREY,) * 3
-    for joint, rod in skeleton(robot, (0, 0, 1)):
+    """A ball at each pitch joint, and a rod from it to the next one above it in its limb, if there is one."""
+    out, grey, model = [], (JOINT_GREY,) * 3, robot.model
+    joints = [model.getJointId(name) for pair in robot.joints.values() for name in pair]
+    for joint in joints:
         out.append(Shape(joint, JOINT_RADIUS_M * GLOBE, grey))
-        if rod:
-            above, length, at = rod
-            ends = [ROD_RADIUS_M * RING + [0.0, 0.0, end] for end in (-length / 2, length / 2)]
-            out.append(Shape(above, np.vstack(ends) @ at.rotation.T + at.translation, grey))
+        above, way = model.parents[joint], np.array(model.jointPlacements[joint].translation)
+        if above in joints:
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), way).toRotationMatrix()
+            half = float(np.linalg.norm(way)) / 2
+            ends = [ROD_RADIUS_M * RING + [0.0, 0.0, end] for end in (-half, half)]
+            out.append(Shape(above, np.vstack(ends) @ turn.T + way / 2, grey))
     return out
 
 

@@ -1,22 +1,27 @@
-"""The simulated experiments of Sec. VI: several jumps at once, their table, and how far a landing basin has come."""
+"""The simulated experiments of Sec. VI: several jumps at once, their table; and many trials that ran beforehand."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import joblib
 
-from jumplab.io import folder as store
+from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import SimulationResult, simulate_jump
+from jumplab.sim import ENGINES, SimulationResult, simulate_jump
 from jumplab.sim.result import STAND_S
-from jumplab.studies.basin import BasinGrid, state_keys
-from jumplab.studies.trials import TrialSettings, in_parallel, plan_hash, trial_log
+from jumplab.studies.basin import landing_basin
+from jumplab.studies.trials import Trial, TrialSettings, in_parallel, run_trials, wilson
 from jumplab.task import JumpTask
+
+LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 200  # drawn in each engine
 
 
 def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]:
@@ -50,7 +55,7 @@ def simulate_many(jumps: Mapping[str, Mapping[str, Any]], *, jobs: int | None = 
     Results by the same names, as that function gives them one by one.
     """
     work = [joblib.delayed(simulate_jump)(**arguments) for arguments in jumps.values()]
-    return dict(zip(jumps, in_parallel(work, jobs, "list"), strict=True))
+    return dict(zip(jumps, in_parallel(work, jobs, "generator"), strict=True))
 
 
 def on_softer_ground(
@@ -58,7 +63,7 @@ def on_softer_ground(
 ) -> dict[float, SimulationResult]:
     """Simulate ``tape`` in MuJoCo, on grounds in which a penetration fades in each of ``times_s`` [s]."""
     work = [joblib.delayed(_on_ground)(tape, robot, time_s) for time_s in times_s]
-    return dict(zip(times_s, in_parallel(work, jobs, "list"), strict=True))
+    return dict(zip(times_s, in_parallel(work, jobs, "generator"), strict=True))
 
 
 def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
@@ -71,14 +76,52 @@ def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
         MujocoEngine.softness = SOFTNESS
 
 
-def states_kept(folder: str | Path, settings: TrialSettings = TrialSettings(), grid: BasinGrid | None = None) -> int:
-    """How many states of ``grid`` (by default the usual one) the plan in ``folder`` has been dropped from.
+def study(folder: str | Path, path: Path = LOG) -> None:
+    """Many robots and the whole landing basin for the plan in ``folder``, in every engine, kept as one row each.
 
-    Raises
-    ------
-    InputError
-        If the folder holds no whole plan, or its log cannot be read.
+    What the folder's log has is not simulated again. ``python -m paper.runs DIR`` calls it.
     """
-    plan = plan_hash(store.read_plan(folder)[2])
-    with trial_log(folder) as log:
-        return sum(key in log.done for key in state_keys((grid or BasinGrid()).states, settings, plan))
+    rows = []
+    for engine in ENGINES:
+        settings = TrialSettings(engine=engine)
+        done = *run_trials(folder, ROBOTS, settings=settings).trials, *landing_basin(folder, None, settings).trials
+        rows += [row(engine, trial) for trial in done]
+    write_file(path, "".join(json.dumps(r) + "\n" for r in rows).encode())
+
+
+def row(engine: str, trial: Trial) -> dict[str, Any]:
+    """What is kept of a trial: its draw in a few numbers, the verdict, the travel and rise of one that landed."""
+    m, seen = trial.metrics, {name: float(f"{x:.4g}") for name, x in trial.features.items()}
+    kept = {"engine": engine, "number": trial.key.index, "features": seen, "landed": trial.landed}
+    if not trial.landed or m is None:
+        return {**kept, "reason": trial.reason}
+    return {**kept, "foot_distance_m": round(m.foot_distance_m, 5), "com_rise_m": round(m.com_rise_m, 5)}
+
+
+def stored(engine: str, feature: str, path: Path = LOG) -> list[SimpleNamespace]:
+    """Kept trials of one engine, in the order of their numbers: those whose draw has ``feature``.
+
+    "delay_s" is of the robots, "speed_factor" of the basin's states.
+    """
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    here = (
+        SimpleNamespace(**{"foot_distance_m": None, **r})
+        for r in rows
+        if r["engine"] == engine and feature in r["features"]
+    )
+    return sorted(here, key=lambda r: r.number)
+
+
+def shares(trials: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """How many land, by name, with Wilson's 95 % interval [%], and the reasons of those that do not."""
+    rows = []
+    for name, here in trials.items():
+        landed, count = sum(t.landed for t in here), len(here)
+        low, high = (100 * x for x in wilson(landed, count))
+        row = {"engine": name, "tried": count, "land": landed, "share [%]": 100 * landed / count}
+        rows.append(row | {"from [%]": low, "to [%]": high})
+    return rows
+
+
+if __name__ == "__main__":
+    study(sys.argv[1])

@@ -1,7 +1,7 @@
-"""Jumps in three dimensions, by the dozen: which start pays, and which targets are planned.
+"""Jumps in three dimensions, by the dozen: which start pays, which targets are planned, and how they land.
 
-``python -m paper.three_dimensions`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve,
-and can be stopped and started again; it takes some minutes. Notebook 13 draws the file.
+``python -m paper.three_dimensions`` in the folder of the notebooks does what :data:`LOG` lacks, one line per target,
+and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,18 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.integrate import cumulative_trapezoid
 
+from jumplab import sim
 from jumplab.auditing import audit
 from jumplab.errors import JumplabError
 from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show.style import FLIGHT, LANDING, LAUNCH, LIMIT, PAGE_IN, REFERENCE_STYLE, VERMILION, new_figure, tint
-from jumplab.stages.planner import METHODS, Planner
+from jumplab.sim.playback import MODES
+from jumplab.stages.planner import METHODS, JumpPlan, Planner
 from jumplab.stages.srmp.spatial import SpatialSrmpPlan
 from jumplab.studies.envelope import most_used
+from jumplab.studies.trials import TrialKey, TrialSettings, run_trial, wilson
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("three_dimensions.jsonl")
@@ -36,16 +40,40 @@ STARTS = (  # ahead [m], to the left [m], rise [m], turn [deg]: a fair share of 
     *((0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.4, -45), (0.0, 0.0, 0.5, 150), (0.0, 0.0, 0.5, 180), (0.3, 0.3, 0.4, 0)),
     *((0.8, 0.3, 0.5, 0), (0.5, 0.3, 0.4, 45), (0.6, 0.0, 0.4, 45), (0.3, 0.3, 0.4, 90)),
 )
+LANDED = {  # the same four numbers
+    "side": (
+        *((0.0, y, 0.4, 0) for y in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.3)),
+        *((0.0, -0.6, 0.5, 0), (0.0, 0.2, 0.3, 0), (0.0, 0.4, 0.5, 0), (0.0, 0.3, 0.3, 0), (0.0, 0.6, 0.5, 0)),
+    ),
+    "turn": (
+        *((0.0, 0.0, 0.4, yaw) for yaw in (30, 45, 60, 90, 120, -45, -90)),
+        *((0.0, 0.0, 0.5, yaw) for yaw in (150, 180, -135, -180, 90)),
+        *((0.0, 0.0, 0.3, 90), (0.0, 0.0, 0.3, 45)),
+    ),
+    "both, diagonal": (
+        *((0.3, 0.3, 0.4, 0), (0.5, 0.3, 0.4, 0), (0.5, -0.3, 0.4, 0), (0.8, 0.3, 0.5, 0), (0.2, 0.5, 0.5, 0)),
+        *((0.5, 0.3, 0.4, 45), (0.8, 0.5, 0.5, 45), (0.4, -0.2, 0.4, -30), (0.3, 0.3, 0.4, 90), (0.5, 0.0, 0.4, 90)),
+        *((0.6, 0.0, 0.4, 45), (0.0, 0.3, 0.4, 90), (0.0, 0.3, 0.4, -90), (0.3, 0.0, 0.5, 180)),
+    ),
+    "three quarters, whole turn": ((0.0, 0.0, 0.5, 270), (0.0, 0.0, 0.5, 360)),
+}
+PERTURBED = ((0.0, 0.3, 0.4, 0), (0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.5, 180), (0.5, 0.3, 0.4, 0))
+ROBOTS = 100  # that differ from their model, for each of those targets
 MEASURED = ("iterations", "cpu_s", "cost")
 KINDS = {  # name -> targets, methods
     "starts": (STARTS, METHODS),
     "side": ([(x, y, 0.4, 0) for y in SIDE for x in AHEAD], METHODS[1:]),
     "turn": ([(0.0, 0.0, h, yaw) for h in RISE for yaw in YAW_DEG], METHODS[1:]),
+    "landed": ([target for group in LANDED.values() for target in group], METHODS[1:]),
+    "perturbed": (PERTURBED, METHODS[1:]),
 }
 
 
 def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> dict[str, Any]:
-    """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most."""
+    """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most.
+
+    ``runs`` of the landed are its playbacks, see :func:`played`; ``robots`` of the perturbed whether each one landed.
+    """
     ahead, side, rise, turn = target
     task, began = JumpTask(ahead, rise, side_m=side, yaw_rad=np.radians(turn)), time.process_time()
     row = {"kind": kind, "target": list(target), "method": method, "planned": False, "clean": False}
@@ -57,7 +85,27 @@ def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> 
     s, report = plan.whole_body.solution.statistics, audit(plan.tape, plan.robot, task)
     most, share = most_used(report)
     row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
-    return row | {"clean": report.passed}
+    row |= {"clean": report.passed}
+    if kind == "landed":
+        row["runs"] = {f"{e}, {mode}": played(plan, e, mode) for e, mode in product(sim.INSTALLED, MODES)}
+    if kind == "perturbed":
+        settings = TrialSettings()
+        keys = [TrialKey(0, k, settings.hash, "") for k in range(ROBOTS)]
+        drawn = (run_trial(plan.tape, plan.robot, sim.Scene.flat(), settings, key) for key in keys)
+        row["robots"] = [trial.landed for trial in drawn]
+    return row
+
+
+def played(plan: JumpPlan, engine: str, mode: str) -> dict[str, Any]:
+    """One playback: whether it stands and passes every check; how far place [mm], heading [deg], rise [mm] are off."""
+    result = sim.simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
+    m, task = result.metrics, plan.task
+    row: dict[str, Any] = {"stands": result.landed and result.checks_passed, "reason": result.reason}
+    if not result.landed:
+        return row
+    row["place_mm"] = 1e3 * float(np.hypot(m.foot_distance_m - task.distance_m, m.side_m - task.side_m))
+    row["heading_deg"] = float(np.degrees(m.yaw_rad - task.yaw_rad))
+    return row | {"rise_mm": 1e3 * (m.com_rise_m - task.height_m)}
 
 
 def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:
@@ -97,6 +145,32 @@ def compared(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             good = r["clean"] and not r.get("skipped")
             row |= {f"{name}, clean": good, **{f"{name}, {k}": r[k] if good else None for k in MEASURED}}
         out.append(row)
+    return out
+
+
+def landed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per group of :data:`LANDED`: plans, playbacks that stand, and the largest errors."""
+    by, out = {tuple(r["target"]): r for r in rows}, []
+    for name, targets in LANDED.items():
+        ours = [by[target] for target in targets]
+        runs = [x for r in ours for x in r.get("runs", {}).values()]
+        row = {"targets": name, "number": len(ours), "clean plans": sum(r["clean"] for r in ours)}
+        row |= {"median CPU of a plan [s]": float(np.median([r["cpu_s"] for r in ours]))}
+        row |= {"playbacks": len(runs), "stand": sum(x["stands"] for x in runs)}
+        for key, words in (("place_mm", "place [mm]"), ("heading_deg", "heading [deg]"), ("rise_mm", "rise [mm]")):
+            row[f"{words}, at most"] = max((abs(x[key]) for x in runs if key in x), default=np.nan)
+        out.append(row)
+    return out
+
+
+def perturbed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per target: how many of the robots that differ from their model land."""
+    out = []
+    for r in rows:
+        row = dict(zip(("ahead [m]", "side [m]", "rise [m]", "turn [deg]"), r["target"], strict=True))
+        low, high = wilson(sum(r["robots"]), len(r["robots"]))
+        row |= {"robots": len(r["robots"]), "land": sum(r["robots"])}
+        out.append(row | {"95 % interval": f"{low:.1%} ... {high:.1%}"})
     return out
 
 

@@ -1,17 +1,17 @@
-"""Progress bars, shown only while somebody looks.
+"""What belongs to a notebook that somebody looks at: counted loops, and whether anybody does.
 
-A notebook that papermill executes keeps everything that its cells print; there bars stay away.
+A cell that takes long shows what its work says of itself (:mod:`jumplab.show.waiting`); a notebook that papermill
+executes shows nothing.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
-from tqdm import tqdm
-from tqdm.notebook import tqdm as notebook_tqdm
+from jumplab.io.progress import tell
 
 T = TypeVar("T")
 SESSION = "JPY_SESSION_NAME"  # set by Jupyter's server for the kernel of a notebook that somebody has opened
@@ -24,24 +24,8 @@ def watched() -> bool:
     return bool(os.environ.get(SESSION)) or in_editor
 
 
-def progress(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-    """The items one by one, under a bar while somebody looks, which disappears at the end.
-
-    Parameters
-    ----------
-    label : what is being counted.
-    total : how many there are, where ``len(items)`` does not tell.
-    """
-    how = dict(desc=label, total=total, leave=False)
-    if not watched():
-        shown = sys.stderr is not None and sys.stderr.isatty()
-        yield from tqdm(items, **how) if shown else items
-        return
-    from IPython.display import display
-
-    bar = notebook_tqdm(items, display=False, **how)
-    place = display(bar.container, display_id=True)
-    try:
-        yield from bar
-    finally:
-        place.update({"text/plain": ""}, raw=True)  # a bar that stands still would stay
+def progress(items: Sequence[T], label: str) -> Iterator[T]:
+    """The items one by one, told as so many of so many; ``label`` says what is being done with each."""
+    for number, item in enumerate(items, 1):
+        tell(label, number, len(items))
+        yield item

@@ -1,0 +1,373 @@
+"""Disturbances: what is drawn, refused and put into a run; scenes; and why jumps fail."""
+
+import hashlib
+import json
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_core import jump
+from test_sim_world import Hold, momentum
+
+from jumplab.cli.common import disturbances
+from jumplab.errors import InputError
+from jumplab.robot.stance import stance_configuration
+from jumplab.sim import (
+    INSTALLED,
+    STEP_S,
+    Perturbation,
+    Ranges,
+    Scene,
+    SensorNoise,
+    Shove,
+    Sign,
+    engine_class,
+    ranges_of,
+    signs,
+    simulate_jump,
+)
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.perturbation import Push
+from jumplab.sim.playback import Motors
+from jumplab.sim.scene import REACH_M, Block
+
+OLD = ("seed", "mass", "inertia", "com", "friction", "delay_s", "known_delay_s", "motor_gain", "noise")
+FORCE_N = np.array([30.0, -20.0, 10.0])
+
+
+@cache
+def tape():
+    return jump(0.6, 0.3, method="direct").tape
+
+
+@pytest.fixture(params=INSTALLED)
+def engine(request):
+    return engine_class(request.param)
+
+
+# ------------------------------------------------------------------------------------------ draws
+
+
+def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):
+    """Further disturbances are drawn from a stream of their own, and change no number of those before."""
+    drawn = [Perturbation.draw(bhr, seed, noise=SensorNoise.typical()).to_json() for seed in range(20)]
+    rows = json.dumps([{name: row[name] for name in OLD} for row in drawn], sort_keys=True)
+    known = "fb24b5bdc85a7886e85d2b2f72fabbd2c0d9ae30dad53cc8ceb4f473448b9eab"
+    assert hashlib.sha256(rows.encode()).hexdigest() == known
+    nothing = Perturbation().to_json()
+    assert all(row[name] == nothing[name] for row in drawn for name in row if name not in OLD)
+    wide = Perturbation.draw(bhr, 3, Ranges(payload_kg=(0, 5), shove_flight_n_s=(5, 25))).to_json()
+    wider = Perturbation.draw(bhr, 3, Ranges(payload_kg=(0, 5), shove_flight_n_s=(5, 25), soft_m=(0, 0.02))).to_json()
+    assert {name for name in wide if wide[name] != wider[name]} == {"soft_m"}
+    assert {name: wide[name] for name in OLD if name != "noise"} == {n: drawn[3][n] for n in OLD if n != "noise"}
+
+
+def test_draws_stay_within_their_ranges(bhr):
+    most = {f.name: (f.metadata["least"], f.metadata["most"]) if isinstance(f.default, tuple) else f.metadata["most"]
+            for f in fields(Ranges)}  # fmt: skip
+    drawn = [Perturbation.draw(bhr, seed, Ranges(**most), SensorNoise.typical()) for seed in range(40)]
+    low, high = np.array([-0.08, -0.14, -0.33]), np.array([0.08, 0.14, 0.0])
+    for one in drawn:
+        assert 0 <= one.payload_kg <= 5 and all(0 <= x <= 0.2 for x in one.torque_loss.values())
+        assert all(0 <= x <= 0.1 for x in one.speed_loss.values()) and 0 <= one.sag_per_kw <= 0.05
+        assert abs(one.ground_m) <= 0.04 and max(map(abs, one.ground_tilt_rad)) <= np.radians(4)
+        assert [s.phase for s in one.shoves] == ["launch", "flight", "landing"] and 0 <= one.soft_m <= 0.03
+        assert all(0 <= s.impulse_n_s <= 25 and 0 <= s.share <= 1 for s in one.shoves)
+        assert all(abs(x) <= np.radians(3) for x in one.posture_rad.values())
+        assert 0 <= one.noise.gyro <= 4 * SensorNoise.typical().gyro
+        assert (np.array(one.payload_m)[:2] >= low[:2]).all() and (np.array(one.payload_m)[:2] <= high[:2]).all()
+    assert len({one.payload_m for one in drawn}) == 40 and max(one.payload_kg for one in drawn) > 4
+
+
+@pytest.mark.parametrize(
+    ("ranges", "sentence"),
+    [
+        (dict(payload_kg=(0, 6)), "the range payload_kg = 0 ... 6 is outside 0 ... 5; choose a smaller one"),
+        (dict(friction=(0.2, 1.0)), "the range friction = 0.2 ... 1 is outside 0.3 ... 1; choose a smaller one"),
+        (dict(soft_m=(0.02, 0.01)), "the range soft_m = 0.02 ... 0.01 is outside 0 ... 0.03; choose a smaller one"),
+        (dict(ground_m=0.05), "the range ground_m = 0.05 is outside 0 ... 0.04; choose a smaller one"),
+        (dict(mass=float("nan")), "the range mass = nan is outside 0 ... 0.2; choose a smaller one"),
+        (dict(delay_s=0.004), "the range delay_s must be two numbers, from and to, got 0.004"),
+        (dict(mass=(0.0, 0.1)), "the range mass must be one number, a half-width, got (0.0, 0.1)"),
+    ],
+)
+def test_ranges_beyond_what_is_documented_are_refused(ranges, sentence):
+    with pytest.raises(InputError) as e:
+        Ranges(**ranges)
+    assert str(e.value) == sentence
+
+
+def test_disturbances_as_they_are_typed():
+    told = disturbances("--disturb", ["payload_kg=5", "friction=0.3:1.0", "ground_m=0.02", "delay_s=0.008"])
+    ranges = ranges_of(told)
+    assert (ranges.payload_kg, ranges.friction, ranges.ground_m) == ((0, 5), (0.3, 1.0), 0.02)
+    assert ranges.delay_s == (0, 0.008) and ranges.mass == 0 and ranges_of({}, Ranges()) == Ranges()
+    assert ranges_of({"friction": (0.4,)}).friction == (0.4, 0.8) and ranges_of({"sensors": (3,)}).sensors == (1, 3)
+    for pairs, words in ((["wind=3"], "no disturbance is called 'wind'; there are mass, com_m, "),
+                         (["mass=0:1"], "the range mass is a half-width: give it one number, got 2"),
+                         (["mass"], "--disturb must be NAME=SIZE or NAME=FROM:TO, got 'mass'"),
+                         (["mass=x"], "--disturb mass must be a number, got 'x'")):  # fmt: skip
+        with pytest.raises(InputError) as e:
+            ranges_of(disturbances("--disturb", pairs))
+        assert str(e.value).startswith(words)
+
+
+# ------------------------------------------------------------------------------------------ robots
+
+
+def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
+    place = np.array([0.05, -0.1, -0.2])
+    real = Perturbation(payload_kg=4.0, payload_m=tuple(place.tolist())).robot(bhr)
+    one, other = bhr.model.inertias[1], real.model.inertias[1]
+    assert real.total_mass == pytest.approx(bhr.total_mass + 4)
+    assert other.lever * other.mass == pytest.approx(one.lever * one.mass + 4 * place)
+    cube = pin.Inertia(4.0, place, 4 * 0.1**2 / 6 * np.eye(3))
+    assert other.toDynamicParameters() == pytest.approx((one + cube).toDynamicParameters())
+    with engine(real, stance_configuration(bhr)) as world:
+        assert world.mass_kg == pytest.approx(bhr.total_mass + 4) and world.inertia_error() < 1e-9
+
+
+def test_weak_motors_and_an_empty_battery_shrink_the_limit_curve(bhr):
+    knee = bhr.joint_names.index("left_knee")
+    real = Perturbation(torque_loss={"left_knee": 0.2}, speed_loss={"left_knee": 0.1}).robot(bhr)
+    had, has = bhr.actuators["left_knee"], real.actuators["left_knee"]
+    shares = {"effort": 0.8, "speed": 0.9, "corner_speed": 0.9, "lower": 1.0, "upper": 1.0}
+    assert all(has[name] == pytest.approx(share * had[name]) for name, share in shares.items())
+    assert real.actuators["right_knee"] == bhr.actuators["right_knee"]
+    weak, rate, tau = Motors(bhr, {}, sag_per_kw=0.05), np.zeros(14), np.zeros(14)
+    rate[knee], tau[knee] = 0.75 * had["speed"], 1e4
+    full = weak.deliver(tau, rate)[knee]  # nothing was drawn before
+    assert full == pytest.approx(had["effort"] / 2)
+    left = 1 - 0.05 * full * rate[knee] / 1e3
+    assert weak.deliver(tau, rate)[knee] == pytest.approx(had["effort"] * (had["speed"] - rate[knee] / left)
+                                                          / (had["speed"] - had["corner_speed"]))  # fmt: skip
+    weak.deliver(-tau, rate)  # braking draws nothing
+    assert weak.deliver(tau, rate)[knee] == pytest.approx(full)
+
+
+def test_a_wrong_posture_leaves_the_soles_where_they_stand(bhr):
+    q = stance_configuration(bhr)
+    wrong = Perturbation.draw(bhr, 2, ranges_of({"posture_deg": (3.0,)})).start(bhr, q)
+    off = np.degrees(wrong[7:] - q[7:])
+    assert 1.0 < np.abs(off).max() < 6.0
+    for frame in Gauge(bhr).frames:
+        data = bhr.model.createData()
+        places = []
+        for x in (q, wrong):
+            pin.framesForwardKinematics(bhr.model, data, x)
+            places.append(data.oMf[frame].copy())
+        assert pin.log6(places[0].actInv(places[1])).vector == pytest.approx(np.zeros(6), abs=1e-9)
+    assert Perturbation().start(bhr, q) is q
+
+
+# ------------------------------------------------------------------------------------------ forces and ground
+
+
+def test_a_push_gives_its_impulse_and_its_moment(engine, bhr):
+    q, place = stance_configuration(bhr), np.array([0.1, 0.05, -0.2])
+    q[2] += 3
+    with engine(bhr, q) as world:
+        world.push(FORCE_N, place)
+        world.step()
+        com, linear, angular = momentum(bhr, *world.state())
+        world.step()
+        after = momentum(bhr, *world.state())[1]
+    attitude = pin.Quaternion(q[6], *q[3:6]).toRotationMatrix()
+    weight = np.array([0, 0, -42 * 9.8])
+    assert linear == pytest.approx((FORCE_N + weight) * STEP_S, abs=1e-6)
+    assert angular == pytest.approx(np.cross(q[:3] + attitude @ place - com, FORCE_N) * STEP_S, abs=1e-6)
+    assert after - linear == pytest.approx(weight * STEP_S, abs=1e-6)  # it lasts one step
+
+
+def test_ground_gives_way_by_what_was_said(engine, bhr):
+    q, soft_m = stance_configuration(bhr), 0.01
+    scene = Scene("soft", (replace(Scene.flat().blocks[0], soft_m=soft_m),))
+    hold, start = Hold(bhr, q), scene.seated(bhr, q)
+    assert start[2] == pytest.approx(q[2] - soft_m)
+    with engine(bhr, start, scene=scene, friction=0.7) as world:
+        for _ in range(400):
+            hold.step(world)
+        sink, contacts = q[2] - world.state()[0][2], world.contacts()
+        assert world.read_back()["friction"] == [pytest.approx(0.7)]
+    assert sink == pytest.approx(soft_m, rel=0.1)  # so that engines are within 20 % of each other
+    assert contacts.wrench[:, 2].sum() == pytest.approx(42 * 9.8, rel=0.02)
+
+
+def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
+    end, takeoff = float(tape().t[-1]), tape().takeoff_time
+    shoves = tuple(Shove(phase, 1.0, 15.0, np.pi / 2) for phase in ("launch", "flight", "landing"))
+    found = Perturbation(shoves=shoves).pushes(tape())
+    assert [p.step * STEP_S for p in found] == pytest.approx([x - 0.05 for x in (takeoff, end, end + 1)], abs=STEP_S)
+    assert all(p.steps == 50 and p.force_n == pytest.approx((0, 300, 0)) for p in found)
+    assert [Push(3, 2, (0.0, 0.0, 0.0)).at(k) for k in range(2, 6)] == [False, True, True, False]
+    with pytest.raises(InputError) as e:
+        Perturbation(shoves=shoves).pushes(None)
+    assert str(e.value) == "a shove, and other ground for the landing, belong to one jump; leave them away in a chain"
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_a_disturbed_run_is_honest_and_a_hidden_shove_is_not(bhr, name):
+    """Everything at once; the momentum in the log is that of gravity, ground and shove, for which the log says so."""
+    told = dict(payload_kg=(3, 3), torque_loss=(0.1, 0.1), sag_per_kw=(0.02, 0.02), ground_m=0.02, ground_tilt_deg=2,
+                soft_m=(0.003, 0.003), shove_flight_n_s=(8, 8), posture_deg=1)  # fmt: skip
+    drawn = Perturbation.draw(bhr, 5, Ranges.none(**told), SensorNoise.typical())
+    run = simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
+    assert run.checks_passed, [str(f) for f in run.checks if not f.passed]
+    assert run.settings["perception"]["state"] == "estimated" and run.link_names[-1] == "payload"
+    (push,) = run.settings["pushes"]
+    at, mass = slice(push["step"], push["step"] + 50), run.robot.total_mass
+    gained = mass * (run.com_velocity[at.stop] - run.com_velocity[at.start])[:2]
+    ground = run.foot_wrench[at, :, :2].sum(axis=(0, 1)) * STEP_S
+    assert gained - ground == pytest.approx(0.05 * np.array(push["force_n"][:2]), abs=0.2)
+    assert np.hypot(*push["force_n"][:2]) * 0.05 == pytest.approx(8.0)
+    from jumplab.sim.checks import check
+
+    hidden = replace(run, settings=run.settings | {"pushes": []})
+    assert "unexplained force on the body" in {f.name for f in check(hidden, run.robot) if not f.passed}
+
+
+def test_the_landing_is_moved_and_the_start_is_not(bhr):
+    ground = Perturbation(ground_m=0.03, ground_tilt_rad=(0.05, -0.03)).ground(Scene.flat(), bhr, tape())
+    end = Gauge(bhr).soles(tape().q[-1])
+    assert ground.top_at(0.0) == ground.top_at(0.1, 0.5) == 0
+    assert ground.top_at(end[0]) == pytest.approx(0.03, abs=2e-3)
+    slope = (ground.top_at(end[0] + 0.1) - ground.top_at(end[0])) / 0.1
+    assert slope == pytest.approx(-np.tan(0.05), rel=1e-3)  # a positive pitch goes downhill
+    assert (ground.top_at(end[0], 0.1) - ground.top_at(end[0])) / 0.1 == pytest.approx(-0.03, rel=0.01)
+    short = replace(tape(), q=np.vstack([tape().q[:-1], tape().q[:1]]))
+    with pytest.raises(InputError) as e:
+        Perturbation(ground_m=0.03).ground(Scene.flat(), bhr, short)
+    assert str(e.value) == (
+        "the soles land 0.00 m from where they start, on the same ground, which cannot differ only for the landing; "
+        "jump farther, or leave ground_* away"
+    )
+
+
+# ------------------------------------------------------------------------------------------ scenes
+
+
+def test_scenes_are_what_they_say(engine, bhr):
+    assert [Scene.stairs(0.3, 0.1, 0.25, 3).top_at(x) for x in (0, 0.4, 0.6, 0.9)] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert [Scene.ledge(0.3, 0.2).top_at(x) for x in (0, 1)] == [0, -0.2]
+    assert Scene.slope(0.1).top_at(1.0) == pytest.approx(-np.tan(0.1))
+    gravel = Scene.gravel(0.4, 1.0, 0.02, seed=3)
+    tops = [gravel.top_at(x, y) for x in (0.45, 0.65, 0.85) for y in (-0.1, 0.1)]
+    assert len(set(tops)) == 6 and 0 < min(tops) and max(tops) <= 0.02 and gravel.top_at(0.2) == 0
+    assert gravel == Scene.gravel(0.4, 1.0, 0.02, seed=3) != Scene.gravel(0.4, 1.0, 0.02, seed=4)
+    assert [b.soft_m for b in Scene.mat(0.4, 0.02).blocks] == [0, 0.02]
+    for scene in (gravel, Scene.slope(0.05, 0.03)):
+        start = scene.seated(bhr, stance_configuration(bhr))
+        with engine(bhr, start, scene=scene) as world:
+            hold = Hold(bhr, start)
+            for _ in range(30):
+                hold.step(world)
+            assert world.contacts().touching == {"left_foot", "right_foot"}
+            assert world.contacts().wrench[:, 2].sum() == pytest.approx(42 * 9.8, rel=0.1)
+
+
+def test_boxes_lie_where_the_heights_are():
+    """The corners of a turned box' top are on its plane, whatever the direction of the jump."""
+    block = Block(0.5, 1.5, 0.2, y_from=-0.4, y_to=0.6, pitch_rad=0.1, roll_rad=-0.2, pivot_m=0.8)
+    scene = Scene("one", (block,), along_rad=0.7)
+    ((half, centre, turn),) = scene.boxes()
+    axes = pin.Quaternion(turn[3], *turn[:3]).toRotationMatrix()
+    for x in (-1, 1):
+        for y in (-1, 1):
+            corner = centre + axes @ (half * [x, y, 1])
+            assert corner[2] == pytest.approx(block.height_at(*scene._along(corner)), abs=1e-12)
+    cut = scene.within(0.7, 3.0, 0.3).blocks[0]
+    assert (cut.x_from, cut.x_to, cut.y_from, cut.y_to, cut.pivot_m) == (0.7, 1.5, -0.3, 0.3, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        (Scene.slope(0.3), "its CoM is"),
+        (Scene.ditch(0.05, 1.0), "a corner of its soles is +1000 mm above the ground, at most 5; let the ground be "
+                                 "even around x = 0, at z = 0"),
+        (Scene.stairs(0.05, 0.1, 0.3, 1), "a corner of its soles is -100 mm above the ground, at most 5; let"),
+        (Scene("none", ()), f"a corner of its soles is +{1e3 * REACH_M:.0f} mm above the ground, at most 5; let"),
+    ],
+)  # fmt: skip
+def test_a_scene_that_the_robot_cannot_stand_on_is_refused(bhr, scene, sentence):
+    with pytest.raises(InputError) as e:
+        simulate_jump(tape(), bhr, scene=scene)
+    assert str(e.value).startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Scene.ledge(0.3, 0.0), "ledge at 0.3 m, 0 m high: both numbers must be positive"),
+        (lambda: Scene.mat(0.0, 0.01), "mat at 0 m, 0.01 m soft: both numbers must be positive"),
+        (lambda: Scene.stairs(0.3, 0.0, 0.2, 2),
+         "stairs at 0.3 m, 2 steps of 0 m rise and 0.2 m going: place, going and count must be positive, and the rise "
+         "not zero"),
+        (lambda: Scene.gravel(-0.3, 1.0, 0.02),
+         "gravel from -0.3 to 1 m, stones of 0.1 m, 0.02 m high: it must begin ahead of the robot, and all lengths be "
+         "positive"),
+    ],
+)  # fmt: skip
+def test_impossible_scenes_are_refused(make, sentence):
+    with pytest.raises(InputError) as e:
+        make()
+    assert str(e.value) == sentence
+
+
+# ------------------------------------------------------------------------------------------ causes
+
+
+@pytest.fixture(scope="module")
+def fall(bhr):
+    """A real one: a shove of 60 N s to the side while it lands."""
+    drawn = Perturbation(shoves=(Shove("landing", 0.0, 60.0, np.pi / 2),), friction=1.0)
+    return simulate_jump(tape(), bhr, perturbation=drawn)
+
+
+def test_a_shoved_robot_tips(fall):
+    found = signs(fall)
+    assert not fall.landed and fall.checks_passed
+    times = {sign.cause: sign.time_s for sign in found}
+    assert [sign.time_s for sign in found] == sorted(times.values())
+    begun = fall.settings["pushes"][0]["step"] * STEP_S
+    assert begun < times["tip"] < begun + 0.5
+    assert str(found[0]) == f"{found[0].cause} from {found[0].time_s:.3f} s"
+
+
+def test_each_cause_is_read_from_its_own_numbers(bhr, fall):
+    """Logs made up: a quiet stand that is called a failure, with one thing wrong in each."""
+    n, q = 400, stance_configuration(bhr)
+    whole = np.tile(q, (n, 1))
+    wrench = np.zeros((n, 2, 6))
+    wrench[:, :, 2] = 206.0
+    quiet = replace(
+        fall, t=np.arange(n) * STEP_S, q=whole, v=np.zeros((n, 20)), tau=np.full((n, 14), 0.1), foot_wrench=wrench,
+        com=np.tile(momentum(bhr, q, np.zeros(20))[0], (n, 1)), com_velocity=np.zeros((n, 3)),
+        phase=np.where(np.arange(n) < 100, "flight", "landing"), touching=np.zeros((n, len(fall.link_names)), bool),
+        robot=bhr)  # fmt: skip
+    assert signs(quiet) == (Sign("other", 0.399),)
+    slides, turned, stopped, spent, tips = (
+        getattr(quiet, x).copy() for x in ("foot_wrench", "q", "q", "tau", "com_velocity")
+    )
+    slides[200:240, 1, 0] = 0.98 * 206  # of friction 1
+    turned[100, 3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, 0.7, 0.0)).coeffs()
+    knee = 7 + bhr.joint_names.index("right_knee")
+    stopped[250:270, knee] = bhr.actuators["right_knee"]["upper"]
+    spent[300:360, 3] = bhr.actuators[bhr.joint_names[3]]["effort"]
+    tips[350:, 0] = 2.0
+    for changed, sign in ((dict(foot_wrench=slides), Sign("slip", 0.2)), (dict(q=turned), Sign("over-rotation", 0.1)),
+                          (dict(q=stopped), Sign("knee stop", 0.25)), (dict(tau=spent), Sign("torque", 0.3)),
+                          (dict(com_velocity=tips), Sign("tip", 0.35))):  # fmt: skip
+        (found,) = signs(replace(quiet, **changed))
+        assert found.cause == sign.cause and found.time_s == pytest.approx(sign.time_s)
+    both = signs(replace(quiet, tau=spent, com_velocity=tips, foot_wrench=slides))
+    assert [sign.cause for sign in both] == ["slip", "torque", "tip"]
+    short = slides.copy()
+    short[215:] = wrench[215:]
+    assert signs(replace(quiet, foot_wrench=short))[0].cause == "other"
+    landed = replace(quiet, metrics=replace(fall.metrics, landed=True))
+    assert signs(landed) == ()
+    with pytest.raises(ValueError, match="robot is not known"):
+        signs(replace(quiet, robot=None))
