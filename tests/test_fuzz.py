@@ -244,7 +244,7 @@ def injected(rng, folder):
         ("height_m", [None, False, "0.5", math.nan, 0.0, -0.3, 1.6, [0.5]]),
         ("robot", [None, 3, "", "asimo", "BHR", "a\0b", ["bhr"], f"{junk(rng)}?", "x" * 300]),
         (rng.choice(["out", "figures"]), [None, 3, "", True, ["x"], "a\0b"]),
-        (rng.choice(["distance", "Distance_m", "height", "robots", "n", "seed", "task", "plotting"]), [1, "x", None]),
+        (rng.choice(["distance", "Distance_m", "height", "robotics", "n", "seed", "task", "plotting"]), [1, "x", None]),
     ]
     choices += [own[path.name[:2]]] * 2 if path.name[:2] in own else []
     name, values = rng.choice(choices)

@@ -61,6 +61,7 @@ def lab(tmp_path_factory):
     (folder / "notebooks").mkdir()
     for source in SOURCES:
         shutil.copy(source, folder / "notebooks")
+    shutil.copytree(ROOT / "notebooks" / "paper", folder / "notebooks" / "paper")
     never = "jupyterlab.handlers.announcements.NeverCheckForUpdate"
     options = {"ip": "127.0.0.1", "port": port, "port_retries": 0, "open_browser": False, "root_dir": folder,
                "allow_root": True}  # fmt: skip

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from fixtures_core import jump
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from paper import experiments as pictures
 from paper.measurement import measure
@@ -40,8 +40,8 @@ def smallest_font(fig) -> float:
 
 
 def grounds(fig):
-    rectangles = [p for p in fig.axes[0].patches if isinstance(p, Rectangle)]
-    return [(p.get_x(), p.get_x() + p.get_width(), p.get_y() + p.get_height()) for p in rectangles]
+    corners = [p.get_xy() for p in fig.axes[0].patches if isinstance(p, Polygon)]
+    return [(*x[:, 0][[0, 2]], x[:, 1].max()) for x in corners]
 
 
 # ------------------------------------------------------------------------------------------ scenes

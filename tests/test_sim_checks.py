@@ -111,19 +111,19 @@ def test_a_helping_hand(bhr, tape, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cheat", "caught"),
+    ("cheat", "steps", "caught"),
     [
-        (lambda data: data.xfrc_applied.__setitem__((1, 2), 20.6), "unexplained force on the body"),
-        (lambda data: data.qpos.__setitem__(2, data.qpos[2] + 0.01), "largest jump of the state"),
-        (lambda data: data.qvel.__setitem__(0, data.qvel[0] + 0.1), "unexplained force on the body"),
+        (lambda data: data.xfrc_applied.__setitem__((1, 2), 20.6), 1000, "unexplained force on the body"),
+        (lambda data: data.qpos.__setitem__(2, data.qpos[2] + 0.01), 1, "largest jump of the state"),
+        (lambda data: data.qvel.__setitem__(0, data.qvel[0] + 0.1), 1, "unexplained force on the body"),
     ],
 )
-def test_hands_in_mujoco(bhr, tape, monkeypatch, cheat, caught):
+def test_hands_in_mujoco(bhr, tape, monkeypatch, cheat, steps, caught):
     """5 % of the weight from mid-flight on; a place set; a velocity set."""
     honest, count = MujocoEngine.step, [0]
 
     def step(world):
-        if count[0] == IN_FLIGHT:
+        if IN_FLIGHT <= count[0] < IN_FLIGHT + steps:
             cheat(world._data)
         count[0] += 1
         honest(world)
