@@ -41,7 +41,8 @@ def smallest_font(fig) -> float:
 
 def grounds(fig):
     corners = [p.get_xy() for p in fig.axes[0].patches if isinstance(p, Polygon)]
-    return [(*x[:, 0][[0, 2]], x[:, 1].max()) for x in corners]
+    seen = fig.axes[0].get_ylim()[0]
+    return [(*x[:, 0][[0, 2]], x[:, 1].max()) for x in corners if x[:, 1].max() > seen]
 
 
 # ------------------------------------------------------------------------------------------ scenes
