@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from fixtures_core import jump
-from matplotlib.patches import Polygon
+from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from paper import experiments as pictures
 from paper.measurement import measure
 
-from jumplab.show.style import LANDING, MIN_FONT_PT, PAGE_IN, VERMILION
+from jumplab.show.style import GROUND, LANDING, MIN_FONT_PT, PAGE_IN, VERMILION, tint
 from jumplab.sim import Engine, Scene, SensorNoise, simulate_jump
 from jumplab.studies.basin import BasinGrid, BasinReport
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
@@ -40,9 +40,9 @@ def smallest_font(fig) -> float:
 
 
 def grounds(fig):
-    corners = [p.get_xy() for p in fig.axes[0].patches if isinstance(p, Polygon)]
-    seen = fig.axes[0].get_ylim()[0]
-    return [(*x[:, 0][[0, 2]], x[:, 1].max()) for x in corners if x[:, 1].max() > seen]
+    ground = tint(GROUND, 0.35)
+    corners = [p.get_xy() for p in fig.axes[0].patches if to_hex(p.get_facecolor()) == to_hex(ground)]
+    return [(*x[:, 0][[0, 2]], x[:, 1].max()) for x in corners]
 
 
 # ------------------------------------------------------------------------------------------ scenes
