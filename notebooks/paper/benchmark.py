@@ -129,10 +129,13 @@ def sweeps_picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
     looks = dict(zip(WAYS, (dict(REFERENCE_STYLE), dict(color=PURPLE), dict(color=VERMILION)), strict=True))
     for (jobs, atlas), look in looks.items():
         ours = [r for r in rows if (r["processes"], r["atlas"]) == (jobs, atlas)]
-        label = f"{jobs} process{'es' * (jobs > 1)}, {'atlas' if atlas else 'each by itself'}"
+        label = "each by itself" if not atlas else f"atlas, {jobs} process{'es' * (jobs > 1)}"
         count, wall = [r["plans"] for r in ours], [r["wall_s"] / r["plans"] for r in ours]
         handles += ax.plot(count, wall, marker="o", markersize=3, label=label, **look)
     ax.set(xscale="log", yscale="log", xlabel="plans in the sweep", ylabel="wall time per plan [s]")
+    ticks = (0.2, 0.5, 1, 2, 5)
+    ax.set(yticks=ticks, yticklabels=[f"{x:g}" for x in ticks])
+    ax.minorticks_off()
     legend_above(fig, handles)
     return fig
 
