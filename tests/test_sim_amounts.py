@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +13,7 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.sim.checks import STOP_RAD, _worst, check, unexplained
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import Metrics, SimulationResult
+from jumplab.sim.scene import Block, Scene
 
 ROBOT = Robot.load()
 MODEL, FEET, JOINTS = ROBOT.model, ROBOT.foot.frames, ROBOT.joint_names
@@ -62,6 +63,7 @@ def run(n: int = 6, substeps: int = 1, **changes) -> SimulationResult:
         "touching": np.zeros((n, len(LINKS)), bool), "colliding": np.zeros(n, bool), "link_names": LINKS,
         "joint_names": JOINTS, "metrics": metrics}  # fmt: skip
     settings = {"engine": engine | changes.pop("engine", {}), "perturbation": {"friction": FRICTION}}
+    settings |= changes.pop("settings", {})
     return SimulationResult(**(quiet | changes), settings=settings)
 
 
@@ -155,6 +157,25 @@ def explained(result: SimulationResult, substeps: int) -> None:
     assert found["unexplained force on the body"] == pytest.approx(mean[0])
     assert found["unexplained moment on the body"] == pytest.approx(mean[1])
     assert found["unexplained joint torque"] == pytest.approx(np.abs(joints.mean(axis=0)).max())
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_stated_pushes_are_explained(substeps):
+    """Only in the steps that they are stated for, and with the moment of the place on which they act."""
+    result, arm = random_run(substeps + 7, substeps), np.array([0.1, -0.05, 0.2])
+    spans = {(2, 3): (30.0, -20.0, 5.0), (4, 4): (-7.0, 11.0, 0.0), (-2, 3): (0.0, 3.0, 9.0), (-5, 3): (50.0, 0.0, 0.0)}
+    told = [{"step": step, "steps": steps, "force_n": list(force)} for (step, steps), force in spans.items()]
+    alone, joints = unexplained(result, ROBOT)
+    for place in (arm, np.zeros(3)):
+        how = {"pushes": told} | ({"push_place_m": place.tolist()} if place.any() else {})
+        base, same = unexplained(replace(result, settings=result.settings | how), ROBOT)
+        np.testing.assert_array_equal(joints, same)
+        for k in range(11):
+            force = sum((np.array(f) for (step, n), f in spans.items() if step <= k < step + n), np.zeros(3))
+            turn = pin.Quaternion(result.q[k, 3:7]).matrix()
+            inward = np.concatenate([turn.T @ force, np.cross(place, turn.T @ force)])
+            outward = np.concatenate([force, np.cross(result.q[k, :3] + turn @ place, force)])
+            np.testing.assert_allclose(alone[k] - base[k], inward if substeps == 1 else outward, atol=1e-9)
 
 
 def test_where_the_log_cannot_say_nothing_is_asked():
@@ -300,6 +321,43 @@ def test_friction_and_centre_of_pressure():
     both[row, 0] = [400.0, 0, 50.0, 0, 0, 0]  # beside a loaded foot, one that is not
     both[5, 0] = [900.0, 0, 900.0, 0, 0, 0]  # the last line's wrench acted in no step of the log
     assert said(replace(pushed, foot_wrench=both))["friction used, of the stated coefficient"] == pytest.approx(share)
+
+
+def on(scene: Scene, **changes) -> SimulationResult:
+    return run(settings={"ground": asdict(scene)}, **changes)
+
+
+def test_friction_is_judged_along_the_ground_that_is_there():
+    middle = np.array([0.0, 0.0, ROBOT.foot.sole_z])
+    force = pin.rpy.rpyToMatrix(0.1, 0.2, 0.0) @ [90.0, 40.0, 300.0]
+    share = np.hypot(90, 40) / 300 / FRICTION
+    slope = with_cop(on(Scene.slope(0.2, 0.1)), 2, 0, middle, force)
+    assert said(slope)["friction used, of the stated coefficient"] == pytest.approx(share)
+    level = np.hypot(force[0], force[1]) / force[2] / FRICTION
+    for result in (on(Scene.flat()), run()):
+        found = said(with_cop(result, 2, 0, middle, force))
+        assert found["friction used, of the stated coefficient"] == pytest.approx(level) and abs(level - share) > 0.05
+
+
+@pytest.mark.parametrize("sunk, outside", [(0.0, 0.006), (0.01, 0.003), (0.02, 0.0), (0.05, 0.0)])
+def test_soft_ground_presses_as_high_as_the_foot_has_sunk(sunk, outside):
+    """A force that leans outward through a point 2 cm above the toe's edge meets the sole 6 mm beyond it."""
+    q = run().q - sunk * np.eye(MODEL.nq)[2]
+    point, force = np.array([ROBOT.foot.toe, 0.0, ROBOT.foot.sole_z + 0.02]), [-90.0, 0.0, 300.0]
+    soft = with_cop(on(Scene("soft", (Block(-9, 9, soft_m=0.03),)), q=q), 2, 0, point, force)
+    assert said(soft)["CoP outside the sole"] == pytest.approx(outside, abs=1e-12)
+    hard = with_cop(on(Scene.flat(), q=q), 2, 0, point, force)
+    assert said(hard)["CoP outside the sole"] == pytest.approx(0.006)
+
+
+@pytest.mark.parametrize("lean, outside", [(0.69, 0.0), (0.71, 0.03)])
+def test_a_foot_on_its_side_is_not_judged_by_its_sole(lean, outside):
+    result, foot = run(), ROBOT.foot
+    q = result.q.copy()
+    q[:, 3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(np.arccos(lean), 0.0, 0.0)).coeffs()
+    point = np.array([foot.toe + 0.03, 0.0, foot.sole_z])
+    found = said(with_cop(replace(result, q=q), 2, 0, point, [0.0, 0.0, 300.0]))
+    assert found["CoP outside the sole"] == pytest.approx(outside, abs=1e-12)
 
 
 def test_the_last_step_counts():

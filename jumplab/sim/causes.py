@@ -9,11 +9,11 @@ import pinocchio as pin
 
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
+from jumplab.sim.checks import LOADED_N, friction_used, ground_of
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import SATURATED, SimulationResult
 
 CAUSES = ("slip", "over-rotation", "knee stop", "torque", "tip", "other")
-LOADED_N = 50.0  # below it, the friction ratio is rounding
 SLIDING, SLIP_S = 0.97, 0.03  # [1] of the friction, used for so long: the impact of a sound landing slides less
 TURNED_RAD, SOLE_RAD = 0.5, 0.2  # trunk off its stance, or a sole off the level, at touchdown; sound jumps stay at half
 STOP_RAD, STOP_S = 0.02, 0.01  # a knee so close to its stop, for so long after touchdown
@@ -68,8 +68,14 @@ def _first(rows: list[int | None]) -> int | None:
 
 
 def _slip(result: SimulationResult, down: int | None, until: int) -> int | None:
-    force, most = result.foot_wrench[:until, :, :3], SLIDING * result.settings["perturbation"]["friction"]
-    sliding = (force[..., 2] > LOADED_N) & (np.hypot(force[..., 0], force[..., 1]) >= most * force[..., 2])
+    model, data = result.robot.model, result.robot.model.createData()
+    frames, ground = [model.getFrameId(name) for name in result.robot.foot.frames], ground_of(result)
+    sliding, most = result.foot_wrench[:until, :, 2] > LOADED_N, SLIDING * result.settings["perturbation"]["friction"]
+    for k in np.flatnonzero(sliding.any(axis=1)):
+        pin.framesForwardKinematics(model, data, result.q[k])
+        for side in np.flatnonzero(sliding[k]):
+            used = friction_used(result.foot_wrench[k, side, :3], data.oMf[frames[side]], ground)
+            sliding[k, side] = used >= most
     return _first([_lasting(foot, SLIP_S) for foot in sliding.T])
 
 

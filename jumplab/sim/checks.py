@@ -198,8 +198,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     """Friction and CoP of each foot, from its measured wrench."""
     model, data, foot = robot.model, robot.model.createData(), robot.foot
     frames = [model.getFrameId(name) for name in foot.frames]
-    slip, outside, told = 0.0, 0.0, result.settings.get("ground")
-    ground = None if told is None else Scene.told(told)
+    slip, outside, ground = 0.0, 0.0, ground_of(result)
     for k in np.flatnonzero((result.foot_wrench[:-1, :, 2] > LOADED_N).any(axis=1)):
         places = []  # a foot may move within a step: where it is at both ends of it
         for q in result.q[k : k + 2]:
@@ -207,7 +206,7 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
             places.append([data.oMf[frame].copy() for frame in frames])
         for wrench, before, after in zip(result.foot_wrench[k], *places, strict=True):
             if wrench[2] > LOADED_N:
-                slip = max(slip, _slip(wrench[:3], before, ground))
+                slip = max(slip, friction_used(wrench[:3], before, ground))
                 if before.rotation[2, 2] < FACING:
                     continue  # a foot that lies on its side presses with that
                 corners = np.array([before.act(corner) for corner in foot.corners])
@@ -221,7 +220,13 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[Finding, ...]:
     )
 
 
-def _slip(force: np.ndarray, place: pin.SE3, ground: Scene | None) -> float:
+def ground_of(result: SimulationResult) -> Scene | None:
+    """The ground of a run; None if it is hard and level."""
+    told = result.settings.get("ground")
+    return None if told is None else Scene.told(told)
+
+
+def friction_used(force: np.ndarray, place: pin.SE3, ground: Scene | None) -> float:
     """Friction that a force (3,) on a foot at ``place`` uses, along the ground there over across it [1]."""
     if ground is None:
         return float(np.hypot(*force[:2]) / force[2])

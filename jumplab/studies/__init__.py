@@ -7,5 +7,6 @@ at :func:`jumplab.studies.trials.run_trials`.
 import lazy_loader as lazy
 
 __getattr__, __dir__, __all__ = lazy.attach(
-    __name__, submodules=["basin", "bench", "certify", "chain", "clips", "envelope", "sweep", "trials"]
+    __name__,
+    submodules=["atlas", "basin", "bench", "certify", "chain", "clips", "envelope", "margins", "sweep", "trials"],
 )
