@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from functools import cache
 
 import numpy as np
@@ -364,6 +364,8 @@ def test_each_cause_is_read_from_its_own_numbers(bhr, fall):
         assert found.cause == sign.cause and found.time_s == pytest.approx(sign.time_s)
     both = signs(replace(quiet, tau=spent, com_velocity=tips, foot_wrench=slides))
     assert [sign.cause for sign in both] == ["slip", "torque", "tip"]
+    tilted = quiet.settings | {"ground": asdict(Scene.slope(0.1))}  # towards which the force leans
+    assert signs(replace(quiet, foot_wrench=slides, settings=tilted))[0].cause == "other"
     short = slides.copy()
     short[215:] = wrench[215:]
     assert signs(replace(quiet, foot_wrench=short))[0].cause == "other"
