@@ -46,6 +46,7 @@ MOVIE = needing("name a file that ends in .gif or .mp4", lambda text: text.lower
     opt("--out DIR", "results and executed notebooks (default: executed/ in the checkout, else here)", None, folder),
     opt("--figures DIR", "figures (default: DIR/figures with --out, else figures/ in the checkout)", None, folder),
     opt("--engine", "physics engine of the simulations (default: the first that is installed)", None, tuple(ENGINES)),
+    common.JOBS,
     opt("-p --parameter NAME=VALUE...", "any further parameter that a notebook declares; may be repeated", []),
 )
 def run(args: Namespace) -> None:
@@ -66,7 +67,8 @@ def run(args: Namespace) -> None:
             values[name] = text
     chosen = notebooks.find_notebooks(args.notebook)
     shown = "quiet" not in args
-    report = notebooks.run_notebooks(values, out=args.out, figures=args.figures, notebooks=chosen, progress=shown)
+    how = {"out": args.out, "figures": args.figures, "progress": shown, "jobs": args.jobs}
+    report = notebooks.run_notebooks(values, notebooks=chosen, **how)
     args.found |= {name: getattr(report, name) for name in ("out", "figures", "notebooks", "wall_s")}
     if (report.out / "plan.npz").is_file():
         common.print_summary(summary := store.read_plan(report.out)[2])

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any, ClassVar
+from typing import Any
 
 from jumplab import errors
 from jumplab.cli.common import Late
@@ -33,6 +33,7 @@ store, robots, sim = Late("jumplab.io.folder"), Late("jumplab.robot"), Late("jum
 
 STANDARD = {"distance_m": float, "height_m": float, "robot": str, "out": str, "figures": str}
 PATTERN = "[0-9][0-9]_*.ipynb"
+LOOK_S = 0.05  # how often it is looked whether a notebook has failed
 _PACKAGE = Path(__file__).resolve().parent.parent
 _PACKAGE_PARENT = _PACKAGE.parent
 
@@ -139,8 +140,12 @@ def run_notebooks(
     figures: str | Path | None = None,
     notebooks: list[Path] | None = None,
     progress: bool = True,
+    jobs: int | None = None,
 ) -> RunReport:
-    """Execute the notebooks in order, all of the package's if None; each gets those parameters that it declares.
+    """Execute the notebooks, all of the package's if None; each gets those parameters that it declares.
+
+    The first runs alone, since others use what it leaves in the result folder; the others then in their order,
+    ``jobs`` at a time.
 
     Raises :class:`InputError`, before anything has run, if a parameter is unknown to all notebooks or cannot be meant,
     or a folder cannot be written; a :class:`JumplabError` if a cell fails, of the class that the cell raised if that is
@@ -153,6 +158,7 @@ def run_notebooks(
     figures : their folder; if None, ``figures`` in ``out`` if that is given or there is no checkout, else in the
         checkout (or in its result folder where the checkout is read-only).
     progress : show a bar per notebook on stderr.
+    jobs : notebooks side by side; one per core if None.
     """
     start = time.perf_counter()
     if parameters is not None:
@@ -177,10 +183,13 @@ def run_notebooks(
         work = staging / "work"
         for name in ("result", "figures"):
             (work / name).mkdir(parents=True)
+        work_on, started = [], []
         for i, notebook in enumerate(notebooks, start=1):
             given = {k: v for k, v in values.items() if k in declared[notebook]}
             bar = progress and {"desc": f"{i}/{len(notebooks)} {notebook.stem}", "disable": None}  # on a terminal
-            _execute(notebook, given, work, bar, out / "failed")
+            work_on.append(partial(_execute, notebook, given, work, bar, out / "failed", started))
+        _side_by_side(work_on[:1], 1, started)
+        _side_by_side(work_on[1:], jobs or os.cpu_count() or 1, started)
         for old in executed.glob(PATTERN):
             if not (notebooks[0].parent / old.name).exists():  # executed once, since removed or renamed
                 old.unlink()
@@ -209,18 +218,18 @@ def _checked(values: dict[str, Any], declared: Iterable[dict]) -> dict[str, Any]
     return {"engine": sim.DEFAULT_ENGINE, **values, "out": "result", "figures": "figures"}
 
 
-def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool, failed: Path) -> None:
+def _execute(
+    notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool, failed: Path, started: list[int]
+) -> None:
     import papermill
     from nbclient.exceptions import DeadKernelError
 
     executed = work.parent / notebook.name
     with tempfile.TemporaryDirectory(prefix="jumplab-") as scratch:
-        manager = _kernel(scratch, notebook)
-        kernel = {"kernel_name": "jumplab", "language": "python", "kernel_manager_class": manager}
-        files = literal(notebook), literal(executed)
-        execute = partial(papermill.execute_notebook, *files, given, cwd=str(work), progress_bar=bar, **kernel)
+        kernel = {"kernel_name": "jumplab", "language": "python"}
+        kernel["kernel_manager_class"] = _kernel(scratch, notebook, work, started)
         try:
-            _aside(execute, manager.started)
+            papermill.execute_notebook(literal(notebook), literal(executed), given, progress_bar=bar, **kernel)
         except papermill.PapermillExecutionError as e:
             failed.mkdir(exist_ok=True)
             place = shutil.copy(executed, failed)
@@ -229,26 +238,36 @@ def _execute(notebook: Path, given: dict[str, Any], work: Path, bar: dict | bool
             raise JumplabError(f"notebook {notebook.name}: its Python process died; is there enough memory?") from e
 
 
-def _aside(execute: Callable[[], Any], started: list[int]) -> None:
-    """Do it in a thread, where the notebooks' client takes no signals; interrupted, its kernels are killed."""
-    raised: list[Exception] = []
+def _side_by_side(work: Sequence[Callable[[], None]], jobs: int, started: Sequence[int]) -> None:
+    """Do all of it in order, ``jobs`` at a time, in threads, where the notebooks' client takes no signals.
 
-    def work() -> None:
-        try:
-            execute()
-        except Exception as e:
-            raised.append(e)
+    After the first error, and interrupted, nothing more begins and the kernels, process groups that have ``started``,
+    are killed.
+    """
+    left, raised = iter(work), []
 
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
+    def lane() -> None:
+        for task in left:
+            try:
+                task()
+            except Exception as e:
+                raised.append(e)
+
+    lanes = [threading.Thread(target=lane, daemon=True) for _ in range(min(jobs, len(work)))]
+    for thread in lanes:
+        thread.start()
     try:
-        thread.join()
-    except BaseException:
-        for group in started:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(group, signal.SIGKILL)
-        thread.join(0.3)
-        raise
+        while any(thread.is_alive() for thread in lanes) and not raised:
+            time.sleep(LOOK_S)
+    finally:
+        if any(thread.is_alive() for thread in lanes):
+            for _ in left:  # nobody shall do these
+                pass
+            for group in started:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(group, signal.SIGKILL)
+            for thread in lanes:
+                thread.join(0.3)
     if raised:
         raise raised[0]
 
@@ -264,8 +283,11 @@ def _explained(name: str, e: Any, place: str) -> JumplabError:
     return (kind if ours else JumplabError)(f"notebook {name}, cell In [{e.exec_count}]: {text} (see {place})")
 
 
-def _kernel(scratch: str, notebook: Path) -> type:
-    """Kernel manager whose one kernel is this interpreter: no user configuration, the notebook's folder on its path."""
+def _kernel(scratch: str, notebook: Path, work: Path, started: list[int]) -> type:
+    """Kernel manager whose one kernel is this interpreter, working in ``work``, its process added to ``started``.
+
+    No user configuration counts, and the notebook's folder is on its path.
+    """
     from jupyter_client.kernelspec import KernelSpec
     from jupyter_client.manager import AsyncKernelManager
     from traitlets import Unicode
@@ -285,11 +307,11 @@ def _kernel(scratch: str, notebook: Path) -> type:
     class ThisInterpreter(AsyncKernelManager):
         kernel_spec = KernelSpec(**spec, display_name="Python of jumplab")
         connection_file = Unicode(f"{scratch}/kernel.json")
-        started: ClassVar[list[int]] = []  # process groups
 
         async def start_kernel(self, **kwargs: Any) -> None:
-            await super().start_kernel(stdout=DEVNULL, stderr=DEVNULL, **kwargs)  # cells print another way
-            self.started.append(self.provisioner.pid)
+            quiet = {"stdout": DEVNULL, "stderr": DEVNULL}  # cells print another way
+            await super().start_kernel(**kwargs | quiet | {"cwd": str(work)})
+            started.append(self.provisioner.pid)
 
     return ThisInterpreter
 
