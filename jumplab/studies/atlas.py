@@ -252,7 +252,8 @@ def key_of(body: WholeBodyPlanner) -> str:
     """What plans of a direct planner are made of."""
     problem = body.nlp.problem
     values = [
-        (o, t.name, t.weight, *(str(x) for x in (t.lower, t.upper) if not callable(x))) for o, t in problem.terms()
+        (o, t.name, t.weight, *(np.asarray(x).tolist() for x in (t.lower, t.upper) if not callable(x)))
+        for o, t in problem.terms()
     ]
     intervals = sorted(body.mesh.intervals().items())
     return fingerprint(problem, f"{body.robot.hash} {body.limits} {body.weights} {values} {intervals}")
