@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from dataclasses import replace
 from functools import cache
@@ -201,6 +202,15 @@ def test_files_and_their_names(tmp_path):
             for key, x in arrays.items():
                 np.testing.assert_array_equal(file[key], x)
         assert path.stat().st_size < raw + 300 * len(arrays)  # compressed
+    path, x = export.write("unitree-csv", short(), ROBOT, tmp_path / "x.csv"), frames(30.0)
+    expected = "".join(",".join(f"{v:.9g}" for v in (*a, *b, *c)) + "\n" for a, b, c in zip(x.place, x.turn, x.angles))
+    assert path.read_text() == expected  # no line of names
+    raw = export.write("gmr-pkl", short(), ROBOT, tmp_path / "x.pkl").read_bytes()
+    assert raw[:2] == b"\x80\x04"  # the protocol that every Python 3 in use reads
+    for key, values in export.retargeted(WHOLE, x, 30.0).items():
+        np.testing.assert_array_equal(pickle.loads(raw)[key], values)
+    odd = export.tracked(WHOLE, frames(29.97), 29.97)["fps"]
+    assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
     assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
                      "beyondmimic-npz": 50, "holosoma-npz": 50, "mujoco": 50}  # fmt: skip
@@ -300,6 +310,10 @@ def test_where_a_motion_comes_from(tmp_path):
     del record.foot_wrench
     record.a = short().v
     assert Motion.of(record).source == "plan" and Motion.of(record).contact[0].all()
+    record.f = wrench  # of a plan, its phases say what presses
+    assert Motion.of(record).wrench is wrench
+    pressing = [[phase != "flight"] * 2 for phase in ("launch",) * 11 + ("flight",) * 8 + ("landing",) * 4]
+    assert Motion.of(record).contact.tolist() == pressing
     assert refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT)) == (
         f"{str(tmp_path)!r} holds no simulation; run 'jumplab simulate {tmp_path}' first"
     )
@@ -310,6 +324,7 @@ def test_where_a_motion_comes_from(tmp_path):
     np.savez(path, **good)
     back = Motion.of_simulation_file(tmp_path, ROBOT)
     assert back.source == "simulation" and np.argwhere(back.contact).tolist() == [[3, 0]]
+    np.testing.assert_array_equal(back.wrench, wrench)
     for name in ("t", "q", "v", "tau", "phase"):
         np.testing.assert_array_equal(getattr(back, name), good[name])
     assert list(read_simulation(str(tmp_path), ROBOT, ("more", "t", "q", "v", "tau", "phase"))["more"]) == [0, 1, 2]
