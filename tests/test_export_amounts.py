@@ -203,7 +203,8 @@ def test_files_and_their_names(tmp_path):
                 np.testing.assert_array_equal(file[key], x)
         assert path.stat().st_size < raw + 300 * len(arrays)  # compressed
     path, x = export.write("unitree-csv", short(), ROBOT, tmp_path / "x.csv"), frames(30.0)
-    expected = "".join(",".join(f"{v:.9g}" for v in (*a, *b, *c)) + "\n" for a, b, c in zip(x.place, x.turn, x.angles))
+    states = np.hstack([x.place, x.turn, x.angles])
+    expected = "".join(",".join(f"{v:.9g}" for v in state) + "\n" for state in states)
     assert path.read_text() == expected  # no line of names
     raw = export.write("gmr-pkl", short(), ROBOT, tmp_path / "x.pkl").read_bytes()
     assert raw[:2] == b"\x80\x04"  # the protocol that every Python 3 in use reads
