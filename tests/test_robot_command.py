@@ -1,5 +1,8 @@
 """``jumplab robot`` from the outside."""
 
+import sys
+from types import ModuleType
+
 import pytest
 from fixtures_robots import GOOD, config, mirrored, write
 
@@ -44,11 +47,54 @@ def test_check_takes_a_persons_word(capsys, tmp_path):
     assert code == 0 and "robot mirrored" in out
 
 
+@pytest.fixture
+def library(monkeypatch, tmp_path):
+    """A package robot_descriptions of three robots; the third cannot be fetched."""
+    (tmp_path / "my.urdf").write_text(mirrored()[0])
+    known = ("mine_description", "theirs_description", "lost_description")
+    package, table = ModuleType("robot_descriptions"), ModuleType("robot_descriptions._descriptions")
+    package.__path__, table.DESCRIPTIONS = [str(tmp_path)], dict.fromkeys(known)
+    (tmp_path / "mine_description.py").write_text(f"URDF_PATH = {str(tmp_path / 'my.urdf')!r}")
+    (tmp_path / "theirs_description.py").write_text("XACRO_PATH = 'x.xacro'")
+    (tmp_path / "lost_description.py").write_text("raise OSError('git:\\nno route to host')")
+    for module in (package, table):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    for name in known:
+        monkeypatch.delitem(sys.modules, f"robot_descriptions.{name}", raising=False)
+
+
+def test_a_robot_of_the_common_library(capsys, tmp_path, library):
+    code, out, err = quoted(capsys, "check", "--robot-description", "mine_description")
+    assert (code, err) == (0, "") and out.startswith(f"robot description: {tmp_path / 'my.urdf'}\n")
+
+
+@pytest.mark.parametrize("name, sentence", [
+    ("theirs_description", "is a xacro template only; expand it, and check the URDF"),
+    ("lost_description", "robot_descriptions cannot fetch it (no route to host)"),
+    ("mine_descripton", "robot_descriptions has no robot of that name; did you mean mine_description, "
+                        "theirs_description, lost_description?"),
+    ("x", "robot_descriptions has no robot of that name"),
+])  # fmt: skip
+def test_descriptions_that_are_not_there(capsys, library, name, sentence):
+    code, _, err = quoted(capsys, "check", "--robot-description", name)
+    assert (code, err.strip()) == (2, f"jumplab: robot description {name!r}: {sentence}")
+
+
+def test_without_that_library(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "robot_descriptions", None)
+    code, _, err = quoted(capsys, "check", "--robot-description", "g1_description")
+    assert (code, err.strip()) == (2, "jumplab: robot description 'g1_description': the package robot_descriptions is "
+                                      "not installed; pip install 'jumplab[descriptions]'")  # fmt: skip
+
+
 @pytest.mark.parametrize("argv, sentence", [
     ((), "jumplab: jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible"),
     (("check", "bhr"),
      "jumplab: 'bhr' is the default robot, described as jumplab wants it; there is nothing to check"),
     (("check", "x.urdf", "--repair", "all"), "jumplab: --repair knows inertia, massless, got 'all'"),
+    (("check",), "jumplab: jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"),
+    (("check", "x.urdf", "--robot-description", "g1_description"),
+     "jumplab: jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"),
     (("check", "/no/such.urdf"), "jumplab: /no/such.urdf: there is no such file; give the path of a URDF"),
     (("check", "x.urdf", "--config", "/no/such.toml"),
      "jumplab: --config /no/such.toml: cannot be read as text (FileNotFoundError)"),

@@ -10,8 +10,7 @@ from jumplab.errors import InputError, JumplabError, RobotError
 
 robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
 store, jumper = Late("jumplab.io.folder"), Late("jumplab.robot_import.jumper")
-configs = Late("jumplab.robot_import.config")
-starters = Late("jumplab.robot_import.roles")
+configs, urdfs = Late("jumplab.robot_import.config"), Late("jumplab.robot_import.urdf")
 MARK = b"# unless edited, the sum of what is above: "
 tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
 
@@ -33,7 +32,8 @@ def list_(args: Namespace) -> None:
 
 
 @command(
-    opt("URDF", "the robot's URDF, or the name of a shipped robot"),
+    opt("URDF", "the robot's URDF or MJCF, or the name of a shipped robot", nargs="?"),
+    opt("--robot-description NAME", "instead of a file, one that robot_descriptions downloads, as g1_description"),
     opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
     opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
     opt("--force", "overwrite a configuration in DIR that somebody has edited"),
@@ -41,6 +41,11 @@ def list_(args: Namespace) -> None:
 )
 def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
+    if (args.urdf is None) == (args.robot_description is None):
+        raise InputError("jumplab robot check: name a URDF, or a robot by --robot-description; one of the two")
+    if args.urdf is None:
+        args.urdf = str(urdfs.described(args.robot_description))
+        print(f"robot description: {args.urdf}")
     for word in args.repair:
         if word not in jumper.REPAIRS:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")

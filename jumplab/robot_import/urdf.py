@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass, field, replace
-from importlib import metadata
+from difflib import get_close_matches
+from importlib import import_module, metadata
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,32 @@ def locate(name: str, beside: Path) -> Path:
         said = f"{name}: the package {PACKAGE} with the published robots is not installed"
         raise RobotError(f"{said}; pip install 'jumplab[robots]'")
     return Path(str(metadata.distribution(PACKAGE).locate_file(f"{PACKAGE_FOLDER}/{inside}")))
+
+
+def described(name: str) -> Path:
+    """Path of the URDF or MJCF that the package ``robot_descriptions`` has under ``name``, such as "g1_description".
+
+    That package downloads a robot once, and keeps it. Raises :class:`RobotError` if it is not installed, knows no such
+    robot, has it as a xacro template only, or cannot fetch it.
+    """
+    try:
+        known = import_module("robot_descriptions._descriptions").DESCRIPTIONS
+    except ModuleNotFoundError:
+        said = "the package robot_descriptions is not installed; pip install 'jumplab[descriptions]'"
+        raise RobotError(f"robot description {name!r}: {said}") from None
+    if name not in known:
+        near = get_close_matches(name, known, 3, 0.5)
+        said = f"; did you mean {', '.join(near)}?" if near else ""
+        raise RobotError(f"robot description {name!r}: robot_descriptions has no robot of that name{said}")
+    try:
+        module = import_module(f"robot_descriptions.{name}")
+    except Exception as e:  # git and the net fail in many ways
+        why = (str(e).strip().splitlines() or [type(e).__name__])[-1].strip()
+        raise RobotError(f"robot description {name!r}: robot_descriptions cannot fetch it ({why})") from e
+    path = getattr(module, "URDF_PATH", getattr(module, "MJCF_PATH", None))
+    if path is None:
+        raise RobotError(f"robot description {name!r}: is a xacro template only; expand it, and check the URDF")
+    return Path(path)
 
 
 def have_published() -> bool:
