@@ -44,6 +44,16 @@ def test_nothing_of_the_mass_is_lost(name, kg):
 
 
 @here
+def test_motors_of_the_g1_are_the_makers():
+    joints = Robot.load("g1").actuators
+    told = {name: (joints[f"left_{name}_joint"]["effort"], joints[f"left_{name}_joint"]["corner_speed"])
+            for name in ("hip_pitch", "hip_yaw", "knee", "hip_roll", "ankle_pitch")}  # fmt: skip
+    assert told == {"hip_pitch": (71.0, pytest.approx(22.63)), "hip_yaw": (71.0, pytest.approx(22.63)),
+                    "knee": (111.0, pytest.approx(14.5)), "hip_roll": (111.0, pytest.approx(14.5)),
+                    "ankle_pitch": (35.0, pytest.approx(29.4))}  # fmt: skip
+
+
+@here
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_what_is_found_is_what_the_configuration_says(name):
     robot = Robot.load(name)

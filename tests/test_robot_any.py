@@ -76,6 +76,19 @@ def test_a_robot_whose_sides_differ_is_left_as_it_is():
     assert not robot.planar
 
 
+def test_motors_that_are_known():
+    """A corner told for a role, another for one joint of it: kept as shares, so that they follow the speeds."""
+    told = "[limits.knee]\neffort = 100.0\nvelocity = 20.0\ncorner = 15.0\n[limits.right_knee]\ncorner = 12.0\n"
+    jumper = make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")
+    robot = Robot.from_text(jumper.urdf, jumper.config_text)
+    left, right, hip = (robot.actuators[name] for name in ("left_knee", "right_knee", "left_hip_pitch"))
+    assert (left["corner_speed"], left["effort"], left["speed"]) == (15.0, 100.0, 20.0)
+    assert right["corner_speed"] == pytest.approx(12.0) and hip["corner_speed"] == 0.5 * hip["speed"]
+    assert robot.sagittal.corner_speed[1] == pytest.approx(12.0)  # of both, what the weaker one can
+    slower = robot.with_limits(speed={"knee": 0.5})
+    assert slower.actuators["left_knee"]["corner_speed"] == pytest.approx(7.5)
+
+
 @pytest.mark.parametrize("variant", [mirrored, arm_base], ids=lambda v: v.__name__)
 def test_other_ways_to_write_the_same_robot(tmp_path, bhr, variant):
     robot = load(tmp_path, variant)
@@ -222,7 +235,10 @@ REFUSED = [
     (text(root()), config("x") + "[limits.neck]\neffort = 1.0\n",
      "my.urdf: [limits.neck] names neither a joint of the URDF nor a role"),
     (text(root()), config("x") + "[limits.knee]\ntorque = 1.0\n",
-     "robot configuration: 'limits.knee' may hold lower, upper, effort, velocity, got {'torque': 1.0}"),
+     "robot configuration: 'limits.knee' may hold lower, upper, effort, velocity, corner, got {'torque': 1.0}"),
+    (text(root()), config("x") + "[limits.knee]\nvelocity = 20.0\ncorner = 20.0\n",
+     "my.urdf: joint 'left_knee': corner = 20 rad/s must lie between 0 and the speed limit, 20 rad/s; correct "
+     "[limits.knee]"),
     (text(root()), config("x") + "[limits.knee]\neffort = -1.0\n",
      "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell it in "
      "[limits.knee] of the configuration"),

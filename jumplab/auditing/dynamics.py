@@ -92,7 +92,8 @@ def available_torque(r: Replay) -> np.ndarray:
     sign (motoring); full torque where the joint brakes.
     """
     peak, top, speed = r.model.upperEffortLimit[6:], r.model.upperVelocityLimit[6:], r.tape.v[:, 6:]
-    fall = (top - np.abs(speed)) / np.maximum(top - r.robot.corner_speed_ratio * top, 1e-9)
+    corner = np.array([r.robot.actuators[name]["corner_speed"] for name in map(str, r.tape.joint_names)])
+    fall = (top - np.abs(speed)) / np.maximum(top - corner, 1e-9)
     motoring = r.tape.tau * speed > 0
     return peak * np.where(motoring, np.clip(fall, METHOD.torque_floor, 1.0), 1.0)
 

@@ -91,6 +91,7 @@ class Robot(Shown):
     stance: Mapping[str, float] = field(init=False)  # knee_rad, trunk_pitch_rad, shoulder_rad of the standing posture
     rest: Mapping[str, float] = field(init=False)  # joint -> angle [rad] of the standing posture, beside those
     corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
+    corner_speed_ratios: Mapping[str, float] = field(init=False)  # joint -> its own share, where one is known
 
     def line(self) -> str:
         """Name, mass, joints, hash."""
@@ -152,9 +153,11 @@ class Robot(Shown):
         if not 0 < corner < 1:
             raise RobotError(f"robot configuration: corner_speed_ratio = {corner:g} must lie between 0 and 1")
         rest = {key: get("rest", key) for key in table(config, "rest")}
-        joints, stance, rest = (MappingProxyType(x) for x in (joints, stance, rest))
+        where = "actuators", "corner_speed_ratios"
+        own = {key: get(*where, key) for key in table(table(config, where[0]), where[1])}
+        joints, stance, rest, own = (MappingProxyType(x) for x in (joints, stance, rest, own))
         told = dict(name=get("name", kind=str), joints=joints, foot=foot, stance=stance, rest=rest)
-        told["corner_speed_ratio"] = corner
+        told |= dict(corner_speed_ratio=corner, corner_speed_ratios=own)
         for key, value in told.items():
             object.__setattr__(self, key, value)  # once: from here on the dataclass is frozen
         self._check_names()
@@ -168,6 +171,10 @@ class Robot(Shown):
             for name in pair:
                 if not self._model.existJointName(name):
                     raise RobotError(f"robot {self.name}: role {role} names the joint {name!r}, which the URDF lacks")
+        for name, ratio in self.corner_speed_ratios.items():
+            if not (self._model.existJointName(name) and 0 < ratio < 1):
+                told = f"corner_speed_ratios: {name} = {ratio:g}"
+                raise RobotError(f"robot {self.name}: {told} must be of a joint, and between 0 and 1")
         for name in self.foot.frames:
             if not self._model.existFrame(name):
                 raise RobotError(f"robot {self.name}: the foot link {name!r} is not in the URDF")
@@ -306,7 +313,8 @@ class Robot(Shown):
             iq, iv = m.idx_qs[j], m.idx_vs[j]
             told = m.lowerPositionLimit[iq], m.upperPositionLimit[iq], m.upperVelocityLimit[iv], m.upperEffortLimit[iv]
             row = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
-            out[name] = MappingProxyType(row | {"corner_speed": self.corner_speed_ratio * row["speed"]})
+            ratio = self.corner_speed_ratios.get(name, self.corner_speed_ratio)
+            out[name] = MappingProxyType(row | {"corner_speed": ratio * row["speed"]})
         return MappingProxyType(out)
 
     @cached_property

@@ -19,7 +19,7 @@ from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
 from jumplab.robot_import.roles import LEG
-from jumplab.robot_import.urdf import MOVING, Tree, parse
+from jumplab.robot_import.urdf import CORNER, LIMITS, MOVING, Tree, parse
 
 REPAIRS = ("inertia", "massless")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
@@ -143,7 +143,7 @@ def _urdf(config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float
         joint = _joint(robot, body.joint, "revolute", body.parent, body.name)
         _add(joint, "origin", xyz=body.place - by_name[body.parent].place, rpy="0 0 0")
         _add(joint, "axis", xyz=body.axis)
-        _add(joint, "limit", **body.limits)
+        _add(joint, "limit", **{key: body.limits[key] for key in LIMITS})
     ET.indent(robot)
     return f'<?xml version="1.0"?>\n{ET.tostring(robot, encoding="unicode")}\n'
 
@@ -321,7 +321,15 @@ def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], 
         sole=sole,
         stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE) + _rest(config, lumped),
         corner=entry(config, "actuators", "corner_speed_ratio"),
+        corners=_corners(lumped),
     )
+
+
+def _corners(lumped: Lumped) -> str:
+    """The table of joints whose corner speed was told, as a share of the speed limit."""
+    told = {b.joint: b.limits[CORNER] / b.limits["velocity"] for b in lumped.bodies if CORNER in b.limits}
+    rows = "".join(f"{texts([name])[1:-1]} = {ratio:.12g}\n" for name, ratio in told.items())
+    return f"\n\n[actuators.corner_speed_ratios]\n{rows.rstrip()}" if rows else ""
 
 
 def _rest(config: dict, lumped: Lumped) -> str:

@@ -16,7 +16,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.config import entry, table
 from jumplab.robot_import.roles import LEG, robot_axes
-from jumplab.robot_import.urdf import LIMITS, Tree
+from jumplab.robot_import.urdf import CORNER, LIMITS, Tree
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -40,7 +40,7 @@ class Body:
     joint: str  # of the URDF
     place: np.ndarray  # (3,) origin in the robot's axes [m], on the joint's axis; the trunk's in the plane of symmetry
     axis: np.ndarray  # (3,) of the joint, in the robot's axes
-    limits: dict[str, float]  # lower, upper [rad], effort [N m], velocity [rad/s]
+    limits: dict[str, float]  # lower, upper [rad], effort [N m], velocity and, where it is told, corner [rad/s]
     inertia: pin.Inertia  # about ``place``, in the robot's axes
 
 
@@ -148,8 +148,9 @@ def _limits(tree: Tree, config: dict, roles: RoleJoints, moving: list[str]) -> d
     for name, values in table(config, "limits").items():
         if name not in tree.joints and name not in roles:
             raise RobotError(f"{tree.where}: [limits.{name}] names neither a joint of the URDF nor a role")
-        if not isinstance(values, dict) or not set(values) <= set(LIMITS):
-            raise RobotError(f"robot configuration: 'limits.{name}' may hold {', '.join(LIMITS)}, got {values!r}")
+        if not isinstance(values, dict) or not set(values) <= {*LIMITS, CORNER}:
+            may = ", ".join((*LIMITS, CORNER))
+            raise RobotError(f"robot configuration: 'limits.{name}' may hold {may}, got {values!r}")
         told[name] = {key: entry(config, "limits", name, key) for key in values}
     out = {}
     for name in moving:
@@ -158,6 +159,12 @@ def _limits(tree: Tree, config: dict, roles: RoleJoints, moving: list[str]) -> d
         for sentence in limit_faults(tree.joints[name].element, tree.where, values):
             raise RobotError(f"{sentence}, or tell it in [limits.{role or name}] of the configuration")
         out[name] = {key: values.get(key, tree.joints[name].limits.get(key)) for key in LIMITS}
+        if CORNER in values:
+            corner, speed = values[CORNER], out[name]["velocity"]
+            if not 0 < corner < speed:
+                said = f"corner = {corner:g} rad/s must lie between 0 and the speed limit, {speed:g} rad/s"
+                raise RobotError(f"{tree.where}: joint {name!r}: {said}; correct [limits.{role or name}]")
+            out[name][CORNER] = corner
     return out
 
 

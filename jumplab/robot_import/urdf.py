@@ -32,6 +32,7 @@ ROOTS = {
 }
 MOVING = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "effort", "velocity")
+CORNER = "corner"  # [rad/s] up to which the whole effort is there; no URDF tells it
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
 SIZES["capsule"] = SIZES["cylinder"]
