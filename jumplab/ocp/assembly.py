@@ -119,6 +119,16 @@ class Assembled:
         hess = gather([b.upper("gauss_newton", b.weights) for b in self._blocks if b.e.costs], (self.size, self.size))
         return ca.Function("gauss_newton", [self._x, self._p], [hess], ["x", "p"], ["triu_hess_f"])
 
+    def held_hessian(self, hold: float) -> ca.Function:
+        """In place of ``hess_lag``: the Gauss-Newton Hessian and ``hold`` for every (scaled) variable.
+
+        It is bent the wrong way nowhere, and costs a fraction of the exact one.
+        """
+        exact = self.hess_lag
+        given = x, p, lam_f, _ = [ca.MX.sym(exact.name_in(i), exact.sparsity_in(i)) for i in range(exact.n_in())]
+        found = lam_f * self.gauss_newton(x, p) + hold * ca.DM.eye(self.size)
+        return ca.Function("nlp_hess_l", given, [found], exact.name_in(), exact.name_out())
+
     @cached_property
     def groups(self) -> list[tuple[str, Term, np.ndarray]]:
         """The rows by term: (owner, term, their indices (K, C)), at K places C components."""

@@ -73,14 +73,17 @@ class Nlp:
     ):
         began = time.perf_counter()
         tell(f"building {problem.name}")
-        self.problem, self._options = problem, {**IPOPT, **(options or {})}
+        self.problem, self._options, self._hold = problem, {**IPOPT, **(options or {})}, None
         self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
         self.build_s = time.perf_counter() - began
 
-    def with_options(self, options: Mapping) -> Nlp:
-        """The same problem, already built, under other options of ipopt."""
+    def with_options(self, options: Mapping, hold: float | None = None) -> Nlp:
+        """The same problem, already built, under other options of ipopt.
+
+        With ``hold`` ipopt gets :meth:`.Assembled.held_hessian` instead of the exact Hessian.
+        """
         other = copy(self)
-        other._options = {**IPOPT, **options}
+        other._options, other._hold = {**IPOPT, **options}, hold
         other.__dict__.pop("_solver", None)
         return other
 
@@ -92,7 +95,8 @@ class Nlp:
     @cached_property
     def _solver(self) -> ca.Function:
         a = self.assembled
-        options = {"ipopt": self._options, "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": a.hess_lag}
+        hessian = a.hess_lag if self._hold is None else a.held_hessian(self._hold)
+        options = {"ipopt": self._options, "grad_f": a.grad_f, "jac_g": a.jac_g, "hess_lag": hessian}
         quiet = ("print_time", "error_on_fail", "show_eval_warnings", "calc_lam_p")
         options |= dict.fromkeys(quiet, False) | {"no_nlp_grad": True}  # all derivatives are given
         return ca.nlpsol("solver", "ipopt", a.nlp, options)
