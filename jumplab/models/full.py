@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -130,7 +131,16 @@ class FullBody:
         self.gravity = -float(self.model.gravity.linear[2])
         self._read_tree()
         self._read_feet()
-        self.pairs, self.groups = self._pair_joints()
+
+    @property
+    def pairs(self) -> list[tuple[int, int, float]]:
+        """(left column, right column, sign) of every joint pair; :class:`RobotError` if they are no mirror images."""
+        return self._paired[0]
+
+    @property
+    def groups(self) -> dict[str, list[int]]:
+        """Rows of :attr:`pairs` by role."""
+        return self._paired[1]
 
     def _read_tree(self):
         model, n = self.model, self.model.njoints - 1
@@ -171,9 +181,10 @@ class FullBody:
     def _chain(self, joint: int) -> list[int]:
         return [j for j in self.model.supports[joint] if j > 1]
 
-    def _pair_joints(self):
+    @cached_property
+    def _paired(self) -> tuple[list[tuple[int, int, float]], dict[str, list[int]]]:
         """Pairs of joints, left and right, with the sign of a mirrored motion, and the pairs of each role."""
-        model, data, roles = self.model, self.data, self.robot.joints
+        model, data, roles = self.model, self.model.createData(), self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
         shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
         legs = [self._chain(j) for j in self.foot_joints]
@@ -186,13 +197,13 @@ class FullBody:
                 knee = model.names[left] == roles["knee"][0]
                 group = "shoulder" if arm else "hip" if left in hip else "knee" if knee else "ankle"
                 groups[group].append(len(pairs))
-                pairs.append((model.idx_vs[left], model.idx_vs[right], self._mirror_sign(left, right)))
+                pairs.append((model.idx_vs[left], model.idx_vs[right], self._mirror_sign(data, left, right)))
         return pairs, groups
 
-    def _mirror_sign(self, left: int, right: int) -> float:
+    def _mirror_sign(self, data: pin.Data, left: int, right: int) -> float:
         """+1 if equal angles mirror each other, -1 if opposite ones do: found by motion in the neutral pose."""
         model, frame = self.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        axes = [pin.getJointJacobian(model, self.data, j, frame)[3:, model.idx_vs[j]] for j in (left, right)]
+        axes = [pin.getJointJacobian(model, data, j, frame)[3:, model.idx_vs[j]] for j in (left, right)]
         mirrored = axes[0] * [-1.0, 1.0, -1.0]  # a rotation's mirror image in the x-z plane
         sign = float(np.sign(mirrored @ axes[1]))
         if np.abs(axes[1] - sign * mirrored).max() > PARALLEL_TOLERANCE:

@@ -28,9 +28,9 @@ from jumplab.task import JumpTask
 IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 250, "max_cpu_time": 40.0, "max_wall_time": 600.0}  # [s]
 SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
 QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
-# From afar the exact Hessian is bent the wrong way nearly everywhere; the cost's alone leads there in half the time, held
-# by so much [1] up to a turn [deg]; about half a turn the curvature of the rows is needed
-HOLDS, TREE_HOLDS = ((100, 0.1), (160, 1.0), (200, None), (300, 3.0)), ((160, 0.3),)
+# From afar the exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a
+# turn [deg], leads there in half the time; about half a turn the curvature of the rows is needed
+HOLDS = (100, 0.1), (160, 1.0), (200, None), (300, 3.0)
 HELD = {"max_iter": 110, "max_cpu_time": 15.0}  # [s]; the exact Hessian has its turn after that
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
@@ -76,7 +76,7 @@ class SpatialPlanner:
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
         self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
-        holds = HOLDS if robot.planar else TREE_HOLDS
+        holds = HOLDS if robot.planar else ()  # of others, what it leads to passes limits between the nodes
         self._held = {deg: self.nlp.with_options({**IPOPT, **HELD, **options}, hold) for deg, hold in holds}
 
     def plan(
