@@ -58,6 +58,7 @@ LANDED = {  # the same four numbers
     "three quarters, whole turn": ((0.0, 0.0, 0.5, 270), (0.0, 0.0, 0.5, 360)),
 }
 PERTURBED = ((0.0, 0.3, 0.4, 0), (0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.5, 180), (0.5, 0.3, 0.4, 0))
+HEADING_DEG = 3.0  # that a playback may miss
 ROBOTS = 100  # that differ from their model, for each of those targets
 MEASURED = ("iterations", "cpu_s", "cost")
 KINDS = {  # name -> targets, methods
@@ -156,7 +157,9 @@ def landed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         runs = [x for r in ours for x in r.get("runs", {}).values()]
         row = {"targets": name, "number": len(ours), "clean plans": sum(r["clean"] for r in ours)}
         row |= {"median CPU of a plan [s]": float(np.median([r["cpu_s"] for r in ours]))}
+        row |= {"most CPU of a plan [s]": max(r["cpu_s"] for r in ours)}
         row |= {"playbacks": len(runs), "stand": sum(x["stands"] for x in runs)}
+        row["heading within 3 deg"] = sum(abs(x.get("heading_deg", np.inf)) <= HEADING_DEG for x in runs)
         for key, words in (("place_mm", "place [mm]"), ("heading_deg", "heading [deg]"), ("rise_mm", "rise [mm]")):
             row[f"{words}, at most"] = max((abs(x[key]) for x in runs if key in x), default=np.nan)
         out.append(row)
