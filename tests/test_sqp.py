@@ -72,6 +72,22 @@ def test_what_joins_far_nodes_is_left_out():
     assert [order.a.rows[i].term.name for i in np.flatnonzero(~order.local)] == ["symmetric landing"]
 
 
+def test_the_held_hessian_is_that_and_a_little_of_each_variable(assembled):
+    x, p, rng = random_point(assembled, 6)
+    rows, hold = rng.normal(size=assembled.n_rows), 0.3
+    held = symmetric(assembled.held_hessian(hold)(x, p, 2.0, rows))
+    own = symmetric(assembled.gauss_newton(x, p))
+    np.testing.assert_allclose(held, 2.0 * own + hold * np.eye(assembled.size), atol=1e-9 * np.abs(own).max())
+
+
+def test_both_hessians_lead_to_the_same_minimum():
+    nlp = Nlp(move())
+    exact = nlp.solve({"goal": 1.0}, flat_guess())
+    held = nlp.with_options({}, hold=0.1).solve({"goal": 1.0}, flat_guess())
+    assert held.statistics.objective == pytest.approx(exact.statistics.objective, rel=1e-5)
+    assert nlp.with_options({}).solve({"goal": 1.0}, flat_guess()).statistics.iterations == exact.statistics.iterations
+
+
 def test_gauss_newton_is_the_hessian_without_curvature(assembled):
     """Sums of squares: 2 J^T W J, never indefinite; J by differences of the costs is too rough, so by the parts."""
     x, p, _ = random_point(assembled, 5)
