@@ -182,7 +182,7 @@ def test_a_refusal_names_a_smaller_target_that_is_planned(monkeypatch):
     monkeypatch.setattr(last, "_solved", solved)
     with pytest.raises(SolverError) as e:
         last.plan(replace(SIDE, side_m=0.9))
-    assert tried == [(0.9, False), (0.81, True), (0.63, True), (0.45, True)]
+    assert tried == [(0.9, False), (0.9, False), (0.81, True), (0.63, True), (0.45, True)]
     said = "spatial: no plan; at this height, 0 m ahead and 0.45 m to the left with a turn of 0 deg is planned"
     assert str(e.value) == said and e.value.violations
 
@@ -240,7 +240,10 @@ def test_command_line_plans_and_simulates_a_turn(tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [JumpTask(0.0, 0.4, 0.1, side_m=0.6), JumpTask(0.5, 0.45, 0.15, side_m=0.4)])
+@pytest.mark.parametrize(
+    "task",
+    [JumpTask(0.0, 0.4, 0.1, side_m=0.6), JumpTask(0.5, 0.45, 0.15, side_m=0.4), JumpTask(0.5, 0.4, 0.15, yaw_rad=0.5)],
+)
 def test_platforms_lie_along_the_travel(task):
     plan = jump(task)
     assert jl.audit(plan).passed

@@ -169,12 +169,7 @@ def run_notebooks(
     root, installed = notebooks[0].parent.parent, notebooks[0].is_relative_to(_PACKAGE)
     asked = out is not None
     out = store.ensure_writable(out if asked else (Path.cwd() if installed else root) / "executed").resolve()
-    if figures is None:
-        figures = out / "figures"
-        if not (asked or installed):
-            with contextlib.suppress(InputError):
-                figures = store.ensure_writable(root / "figures")
-    figures = store.ensure_writable(figures).resolve()
+    figures = _figures_folder(figures, out, None if asked or installed else root)
     executed = out / "notebooks"
     if executed.is_dir():
         with store.locked(executed, wait_s=0.0):
@@ -197,6 +192,16 @@ def run_notebooks(
         shutil.rmtree(work)
     shutil.rmtree(out / "failed", ignore_errors=True)
     return RunReport(out, figures, tuple(n.stem for n in notebooks), time.perf_counter() - start)
+
+
+def _figures_folder(asked: str | Path | None, out: Path, checkout: Path | None) -> Path:
+    """Where figures go: as asked, else in the checkout, else (there is none, or it is read-only) in ``out``."""
+    if asked is None:
+        asked = out / "figures"
+        if checkout:
+            with contextlib.suppress(InputError):
+                asked = store.ensure_writable(checkout / "figures")
+    return store.ensure_writable(asked).resolve()
 
 
 def _checked(values: dict[str, Any], declared: Iterable[dict]) -> dict[str, Any]:

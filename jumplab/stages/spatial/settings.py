@@ -37,6 +37,7 @@ class SpatialLimits:
     touchdown_roll: float = 0.10  # [rad] of the base, either way
     touchdown_yaw: float = 0.20  # [rad] of the base against the feet, either way
     edge_before_heel_m: float = 0.05  # a platform begins this far before the landing soles
+    edge_step_m: float = 0.08  # and for clearance its upper surface counts as reaching this much further
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02
