@@ -460,7 +460,7 @@ def test_a_flip_with_weights_begins_with_the_one_without():
 def test_the_resolve_for_jerk_keeps_own_terms():
     """A robot whose jerk jumps too far is solved again with a dearer jerk: with the same terms."""
     found = [jl.Planner(jl.Robot.load("g1"), terms={"whole body/flight": [calm(w)]}) for w in (0.0, 0.05)]
-    plans = [one.plan(jl.JumpTask(0.4, 0.2)) for one in found]
+    plans = [one.plan(jl.JumpTask(0.5, 0.25)) for one in found]
     assert any(plan.whole_body.uneven for plan in plans)
     assert ("flight", "calm arms") in plans[1].whole_body.solution.problem.own
     assert swing(plans[1].whole_body.solution.phases) < swing(plans[0].whole_body.solution.phases)

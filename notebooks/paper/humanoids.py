@@ -1,7 +1,8 @@
 """Published humanoids, each imported without a flag, planned and simulated once: the rows of ``humanoids.json``.
 
-``python -m paper.humanoids FOLDER [--jump]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of every row,
-and writes what became of it; ``--jump`` also plans and simulates what has not been yet. Notebook 07 draws the file.
+``python -m paper.humanoids FOLDER [--jump] [--bounds]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of
+every row, and writes what became of it; ``--jump`` also plans and simulates what has not been yet, ``--bounds`` tries
+whether the highest rise that a refusal before the solve names is one. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
@@ -9,25 +10,31 @@ from __future__ import annotations
 import json
 import resource
 import sys
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab import api
-from jumplab.errors import JumplabError
+from jumplab.errors import InfeasibleError, JumplabError
+from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.checkup import examine, first_look
 from jumplab.robot.description import Robot
 from jumplab.sim.playback import MODES
-from jumplab.task import JumpTask
+from jumplab.stages.planner import METHODS, Planner
+from jumplab.task import MAX_HEIGHT_M, JumpTask
 
 TABLE = Path(__file__).with_name("humanoids.json")
 LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
-PLAN_S = 120.0  # longest processor time for one plan with its audit and simulation
+LEAST_M = 0.02  # of a rise that can be asked for
+SHARES_OF_BOUND, BEYOND = (1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5), 1.15  # of the highest rise, that are tried
+PLAN_S = 300.0  # longest processor time for one plan with its audit and simulation
 
 
 def rows() -> list[dict[str, Any]]:
@@ -86,11 +93,39 @@ def jumped(path: Path) -> dict[str, Any]:
     return row
 
 
-def within_time(path: Path) -> dict[str, Any]:
-    """:func:`jumped` in a process of its own, given up after :data:`PLAN_S`."""
+def bounded(path: Path) -> dict[str, Any]:
+    """The rise on the spot that the closed forms call the highest, the highest plan, and what both methods find beyond.
+
+    Beyond the bound the closed forms are left out, and the optimisation itself has to say no.
+    """
+    EXPLAINED.set(False)  # nobody reads why
+    planner = Planner(examine(path).robot)
+    try:
+        planner.plan(JumpTask(0.0, MAX_HEIGHT_M))
+        return {"bound_m": None}
+    except InfeasibleError as e:
+        bound = float(e.bound or 0.0)
+    if BEYOND * bound < LEAST_M:  # it cannot leave the ground
+        return {"bound_m": bound}
+    shares = (share for share in SHARES_OF_BOUND if _clean(planner, share * bound, "direct"))
+    unchecked = patch("jumplab.stages.planner.check_reachable"), patch("jumplab.stages.srmp.planner.check_reachable")
+    with unchecked[0], unchecked[1]:
+        beyond = [method for method in METHODS if _clean(planner, BEYOND * bound, method)]
+    return {"bound_m": round(bound, 4), "planned": next(shares, None), "beyond": beyond}
+
+
+def _clean(planner: Planner, rise_m: float, method: str) -> bool:
+    try:
+        return api.audit(planner.plan(JumpTask(0.0, rise_m), method)).passed
+    except JumplabError:
+        return False
+
+
+def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any]:
+    """What ``work_on`` finds in a process of its own, given up after :data:`PLAN_S`."""
     limit = resource.RLIMIT_CPU, (int(PLAN_S), int(PLAN_S))
     with ProcessPoolExecutor(1, initializer=resource.setrlimit, initargs=limit) as pool:
-        work = pool.submit(jumped, path)
+        work = pool.submit(work_on, path)
         try:
             return work.result()
         except BrokenProcessPool:
@@ -120,8 +155,12 @@ def main(folder: str, *options: str) -> None:
         robot, told = imported(path, row["legs"])
         row["import"] = told
         if robot is not None and "--jump" in options and "jump" not in row:
-            row["jump"] = within_time(path)
-        print(row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), flush=True)
+            row["jump"] = within_time(jumped, path)
+        if robot is not None and robot.planar and "--bounds" in options and "highest" not in row:
+            row["highest"] = within_time(bounded, path)
+        print(
+            row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), row.get("highest", ""), flush=True
+        )
         TABLE.write_text(json.dumps(table, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -25,7 +25,7 @@ from jumplab.stages.whole_body.settings import Contact, Mesh
 from jumplab.task import JumpTask
 
 # beyond, the cost moves by less than one in a million; a solve that needs more time is lost
-IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 250, "max_cpu_time": 40.0, "max_wall_time": 600.0}  # [s]
+IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 250, "max_cpu_time": 40.0}  # [s]
 SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
 QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
 # From afar the exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a
