@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
 from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.start import from_tape
-from jumplab.stages.spatial.tape import make_tape
+from jumplab.stages.spatial.tape import holds_between, make_tape
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.whole_body.planner import BodyPlan
 from jumplab.stages.whole_body.settings import Contact, Mesh
@@ -35,6 +37,7 @@ HELD = {"max_iter": 110, "max_cpu_time": 15.0}  # [s]; the exact Hessian has its
 # close to a plan, up to the first of these turns, so much needs a third of the exact one's iterations, for a cost that
 # is at most 2 % higher
 HOLD_NEAR = 1.0
+FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
@@ -72,9 +75,10 @@ class SpatialPlanner:
         changes: StageChanges = StageChanges(),
     ):
         self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
-        self.limits, self.weights, self.changes = limits, weights, changes
+        self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
+        self._taped: tuple[SpatialPlan, Tape] | None = None
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
-        options = dict(options or {})
+        self._options = options = dict(options or {})
         problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
@@ -95,7 +99,7 @@ class SpatialPlanner:
         near: SpatialPlan | None = None,
         stance: np.ndarray | None = None,
     ) -> SpatialPlan:
-        """Solve for a target.
+        """Solve for a target; where the motion passes limits between the nodes, again on a finer mesh from there.
 
         Parameters
         ----------
@@ -112,6 +116,21 @@ class SpatialPlanner:
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
         how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
+        found = self._planned(task, (start, toe_phase_s, ramps), how, near)
+        if not holds_between(self.tape(found), self.robot):
+            with suppress(SolverError):
+                finer = self._finer._solved(self._finer._warm, task, found, how)
+                return finer if holds_between(self.tape(finer), self.robot) else found
+        return found
+
+    @cached_property
+    def _finer(self) -> SpatialPlanner:
+        """The same program on half as many nodes again."""
+        mesh = Mesh(*(math.ceil(FINER * n) for n in self.mesh.intervals().values()))
+        options = {"options": self._options, "keep": self._keep, "changes": self.changes}
+        return SpatialPlanner(self.robot, mesh, self.limits, self.weights, **options)
+
+    def _planned(self, task: JumpTask, begin: Begin, how: dict, near: SpatialPlan | None) -> SpatialPlan:
         turn = next((t for t in self._held if abs(np.degrees(task.yaw_rad)) <= t and not task.rotation_rad), None)
         if near is not None:
             if turn == next(iter(self._held), 0):
@@ -120,17 +139,17 @@ class SpatialPlanner:
             try:
                 return self._solved(self._warm, task, near, how)
             except SolverError:
-                if start is None:
+                if begin[0] is None:
                     raise
         if turn is not None:
             with suppress(SolverError):
-                return self._solved(self._held[turn], task, (start, toe_phase_s, ramps), how)
+                return self._solved(self._held[turn], task, begin, how)
         if not EXPLAINED.get():
-            return self._solved(self._quick, task, (start, toe_phase_s, ramps), how)
+            return self._solved(self._quick, task, begin, how)
         try:
-            return self._solved(self.nlp, task, (start, toe_phase_s, ramps), how | {"explain": True})
+            return self._solved(self.nlp, task, begin, how | {"explain": True})
         except SolverError as e:
-            less = self._smaller(task, (start, toe_phase_s, ramps), how)
+            less = self._smaller(task, begin, how)
             if less is not None and not e.violations:  # there is a motion: perhaps from here
                 try:
                     return self._solved(self._warm, task, less, how)
@@ -144,7 +163,7 @@ class SpatialPlanner:
         asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
         del how["stance"]
         if isinstance(begin, SpatialPlan):
-            guess, how = begin.solution.guess(), how | {"multipliers": begin.solution.multipliers}
+            guess, how = begin.solution.guess(self.mesh.intervals()), how | {"multipliers": begin.solution.multipliers}
         else:
             tape, toe_phase_s, ramps = begin
             if tape is None:
@@ -165,8 +184,10 @@ class SpatialPlanner:
         return None
 
     def tape(self, plan: SpatialPlan) -> Tape:
-        """The 1 kHz tape of a plan."""
-        return make_tape(self.terms, plan.solution.phases, plan.task.gravity)
+        """The 1 kHz tape of a plan; that of the last one is kept."""
+        if self._taped is None or self._taped[0] is not plan:
+            self._taped = plan, make_tape(self.terms, plan.solution.phases, plan.task.gravity)
+        return self._taped[1]
 
     def parameters(self, task: JumpTask, stance: np.ndarray | None = None) -> dict[str, Any]:
         """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""

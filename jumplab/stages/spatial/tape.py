@@ -25,6 +25,7 @@ BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # after take-off, over which joints pass from the launch as held by the ground to the planned flight
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
+RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 
 
@@ -53,6 +54,24 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
     times = np.concatenate([t - t[0], launch_s - t[0] + late])
     names = np.array(robot.foot.frames), np.array(robot.joint_names)
     return Tape(times, q, v, a, tau, phase, names[0], f, names[1], extra)
+
+
+def holds_between(tape: Tape, robot: Robot) -> bool:
+    """Whether the motors can give what the tape takes, also between the nodes, and its rates are those of its angles.
+
+    The limits are those of the audit.
+    """
+    motors = [robot.actuators[name] for name in robot.joint_names]
+    effort, speed, corner = (np.array([m[key] for m in motors]) for key in ("effort", "speed", "corner_speed"))
+    rate = tape.v[:, 6:]
+    left = np.clip((speed - np.sign(tape.tau) * rate) / (speed - corner), 0.0, 1.0)
+    step = np.diff(tape.t)[:, None]
+    moves = step[:, 0] > SHORTEST_STEP / RATE_HZ  # the instant of take-off is there twice
+    gaps = (
+        (np.diff(x, axis=0)[moves] / step[moves] - (y[1:] + y[:-1])[moves] / 2, most)
+        for x, y, most in ((tape.q[:, 7:], rate, RATE_GAP), (rate, tape.a[:, 6:], ACCELERATION_GAP))
+    )
+    return bool(np.all(np.abs(tape.tau) <= effort * left) and all(np.abs(gap).max() <= most for gap, most in gaps))
 
 
 def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
