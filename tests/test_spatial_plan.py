@@ -26,6 +26,7 @@ from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
 from jumplab.stages.spatial.start import spread
+from jumplab.stages.spatial.tape import holds_between
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
 from jumplab.stages.whole_body.settings import Contact
@@ -119,6 +120,25 @@ def test_neighbour_is_planned_from_the_plan():
     assert again < first / 2
     assert [row.stage for row in after.statistics] == ["spatial"]
     assert audit(after.tape, after.robot, after.task).passed
+
+
+def test_a_plan_that_passes_limits_between_the_nodes_is_solved_again_on_a_finer_mesh(monkeypatch):
+    last, verdicts = planner().stage("spatial"), iter([False, True, False, False])
+    coarse = jump(SIDE).whole_body
+    monkeypatch.setattr("jumplab.stages.spatial.planner.holds_between", lambda tape, robot: next(verdicts))
+    finer, kept = (last.plan(SIDE, near=coarse).solution.phases for _ in range(2))
+    assert [len(x.j) for x in finer.values()] == [18, 18, 24]
+    assert [len(x.j) for x in kept.values()] == [12, 12, 16]  # the finer one is no better
+
+
+def test_limits_between_the_nodes_are_seen(bhr):
+    tape = jump(SIDE).tape
+    assert holds_between(tape, bhr)
+    row, effort = len(tape.t) // 3, bhr.actuators["left_ankle_pitch"]["effort"]
+    for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
+        moved = getattr(tape, name).copy()
+        moved[row, column] += 2 * change
+        assert not holds_between(replace(tape, **{name: moved}), bhr), name
 
 
 def test_own_weights_and_terms_reach_it(bhr):
