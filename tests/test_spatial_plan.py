@@ -13,6 +13,7 @@ import pytest
 import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
+from jumplab.auditing.report import LIMITS
 from jumplab.cli.common import misses
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError, SolverError
@@ -26,7 +27,7 @@ from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
 from jumplab.stages.spatial.start import spread
-from jumplab.stages.spatial.tape import holds_between
+from jumplab.stages.spatial.tape import ACCELERATION_GAP, RATE_GAP, holds_between
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
 from jumplab.stages.whole_body.settings import Contact
@@ -134,6 +135,10 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_solved_again_on_a_finer_
 def test_limits_between_the_nodes_are_seen(bhr):
     tape = jump(SIDE).tape
     assert holds_between(tape, bhr)
+    assert [LIMITS[f"{x} against {y}"].limit for x, y in (("rates", "positions"), ("accelerations", "rates"))] == [
+        RATE_GAP,
+        ACCELERATION_GAP,
+    ]
     row, effort = len(tape.t) // 3, bhr.actuators["left_ankle_pitch"]["effort"]
     for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
         moved = getattr(tape, name).copy()

@@ -37,8 +37,8 @@ HELD = {"max_iter": 110, "max_cpu_time": 15.0}  # [s]; the exact Hessian has its
 # close to a plan, up to the first of these turns, so much needs a third of the exact one's iterations, for a cost that
 # is at most 2 % higher
 HOLD_NEAR = 1.0
-FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
+FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
