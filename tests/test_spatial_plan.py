@@ -13,7 +13,7 @@ import pytest
 import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
-from jumplab.auditing.report import LIMITS
+from jumplab.auditing.report import LIMITS, METHOD
 from jumplab.cli.common import misses
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError, SolverError
@@ -27,7 +27,7 @@ from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
 from jumplab.stages.spatial.start import spread
-from jumplab.stages.spatial.tape import ACCELERATION_GAP, RATE_GAP, holds_between
+from jumplab.stages.spatial.tape import ACCELERATION_GAP, FRICTION, LOADED_N, RATE_GAP, holds_between
 from jumplab.stages.spatial.terms import SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
 from jumplab.stages.whole_body.settings import Contact
@@ -72,6 +72,20 @@ def test_audit_is_clean_and_the_goal_is_reached(task):
     assert report["place"].value < 2 and report["heading"].value < 2
     found = plan.planned_distance_m, plan.planned_side_m, plan.planned_yaw_rad, plan.planned_rise_m
     assert found == pytest.approx((task.distance_m, task.side_m, task.yaw_rad, task.height_m), abs=2e-3)
+
+
+@pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
+def test_soles_come_down_steeply_enough_to_stick(task):
+    plan = jump(task)
+    gauge, data = Gauge(plan.robot), plan.robot.model.createData()
+    pin.forwardKinematics(plan.robot.model, data, plan.tape.q[-1], plan.tape.v[-1])
+    used = []
+    for frame in gauge.frames:
+        arm = pin.updateFramePlacement(plan.robot.model, data, frame).rotation @ plan.robot.foot.center
+        twist = pin.getFrameVelocity(plan.robot.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        speed = twist.linear + np.cross(twist.angular, arm)
+        used.append(np.abs(speed[:2]).max() / -speed[2])
+    assert 0.2 < max(used) < SpatialLimits().touchdown_slope + 1e-3  # and it matters to these targets
 
 
 def test_audit_sees_another_goal():
@@ -139,11 +153,15 @@ def test_limits_between_the_nodes_are_seen(bhr):
         RATE_GAP,
         ACCELERATION_GAP,
     ]
+    assert (FRICTION, LOADED_N) == (LIMITS["friction used"].limit, METHOD.friction_force_n)
     row, effort = len(tape.t) // 3, bhr.actuators["left_ankle_pitch"]["effort"]
     for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
         moved = getattr(tape, name).copy()
         moved[row, column] += 2 * change
         assert not holds_between(replace(tape, **{name: moved}), bhr), name
+    pushed = tape.f.copy()
+    pushed[row, 0, 1] += FRICTION * pushed[row, 0, 2]
+    assert not holds_between(replace(tape, f=pushed), bhr)
 
 
 def test_own_weights_and_terms_reach_it(bhr):

@@ -30,13 +30,11 @@ from jumplab.task import JumpTask
 IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 250, "max_cpu_time": 40.0}  # [s]
 SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
 QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
-# From afar the exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a
-# turn [deg], leads there in half the time; about half a turn the curvature of the rows is needed
-HOLDS = (100, 0.1), (160, 1.0), (200, None), (300, 3.0)
+# The exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a turn
+# [deg], leads there in half the time, first from afar, then from a plan close by, for a cost some percent higher; with
+# more than that to turn only the exact one settles
+HOLDS = (75, 0.1, 1.0), (100, 3.0, 1.0), (300, 10.0, 30.0)
 HELD = {"max_iter": 110, "max_cpu_time": 15.0}  # [s]; the exact Hessian has its turn after that
-# close to a plan, up to the first of these turns, so much needs a third of the exact one's iterations, for a cost that
-# is at most 2 % higher
-HOLD_NEAR = 1.0
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
@@ -83,10 +81,10 @@ class SpatialPlanner:
         key = f"{robot.hash} {limits} {weights}" if keep else None
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
-        self._near = self.nlp.with_options({**IPOPT, **NEAR, **options}, HOLD_NEAR)
         self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
         holds = HOLDS if robot.planar else ()  # of others, what it leads to passes limits between the nodes
-        self._held = {deg: self.nlp.with_options({**IPOPT, **HELD, **options}, hold) for deg, hold in holds}
+        self._held = {deg: self.nlp.with_options({**IPOPT, **HELD, **options}, hold) for deg, hold, _ in holds}
+        self._near = {deg: self.nlp.with_options({**IPOPT, **NEAR, **options}, hold) for deg, _, hold in holds}
 
     def plan(
         self,
@@ -133,9 +131,9 @@ class SpatialPlanner:
     def _planned(self, task: JumpTask, begin: Begin, how: dict, near: SpatialPlan | None) -> SpatialPlan:
         turn = next((t for t in self._held if abs(np.degrees(task.yaw_rad)) <= t and not task.rotation_rad), None)
         if near is not None:
-            if turn == next(iter(self._held), 0):
+            if turn is not None:
                 with suppress(SolverError):
-                    return self._solved(self._near, task, near, how)
+                    return self._solved(self._near[turn], task, near, how)
             try:
                 return self._solved(self._warm, task, near, how)
             except SolverError:

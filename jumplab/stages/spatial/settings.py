@@ -29,6 +29,7 @@ class SpatialLimits:
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
+    touchdown_slope: float = 0.42  # a sole's speed along the ground over that towards it: above the friction it slides
     touchdown_turning: float = (
         4.0  # [rad/s] of trunk and feet about the vertical besides, per half turn after the first
     )

@@ -25,6 +25,7 @@ BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # after take-off, over which joints pass from the launch as held by the ground to the planned flight
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
+FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 
@@ -57,7 +58,7 @@ def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolut
 
 
 def holds_between(tape: Tape, robot: Robot) -> bool:
-    """Whether the motors can give what the tape takes, also between the nodes, and its rates are those of its angles.
+    """Whether motors and ground can give what the tape takes, also between the nodes, and rates are those of angles.
 
     The limits are those of the audit.
     """
@@ -71,7 +72,9 @@ def holds_between(tape: Tape, robot: Robot) -> bool:
         (np.diff(x, axis=0)[moves] / step[moves] - (y[1:] + y[:-1])[moves] / 2, most)
         for x, y, most in ((tape.q[:, 7:], rate, RATE_GAP), (rate, tape.a[:, 6:], ACCELERATION_GAP))
     )
-    return bool(np.all(np.abs(tape.tau) <= effort * left) and all(np.abs(gap).max() <= most for gap, most in gaps))
+    along, load = np.linalg.norm(tape.f[..., :2], axis=-1), np.maximum(tape.f[..., 2], LOADED_N)
+    given = np.all(np.abs(tape.tau) <= effort * left) and np.all(along <= FRICTION * load)
+    return bool(given and all(np.abs(gap).max() <= most for gap, most in gaps))
 
 
 def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:

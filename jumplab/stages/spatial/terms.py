@@ -354,6 +354,17 @@ class SpatialTerms:
         speed = ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
         return (middle - self.com(p) - ahead - lim.capture_slope_s * speed)[:2]
 
+    def sole_speeds(self, p: Point) -> ca.SX:
+        """Velocity (3, 2) of the middle of each sole in flight [m/s]."""
+        state, gone = self.state(p), p.p.gravity * p.time
+        base = ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z - gone) - state.com_velocity
+        return ca.horzcat(*(base + state.point_velocity(*sole) for sole in zip(self.feet, self.soles, strict=True)))
+
+    def sliding(self, p: Point) -> ca.SX:
+        """By how much (8,) soles come down steeply enough to stick, each way along x and y [m/s]."""
+        speeds = self.sole_speeds(p)
+        return ca.vec(ca.mtimes(PYRAMID, speeds[:2, :]) - self.limits.touchdown_slope * ca.repmat(speeds[2, :], 4, 1))
+
     def capture_rows(self) -> Term:
         """Where the soles meet the ground, so that the robot can be caught."""
         lim, moment, window = self.limits, self.limits.capture_moment, self.limits.capture_window_m
@@ -399,6 +410,7 @@ class SpatialTerms:
         return [
             end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal, scale=0.1),
             end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, [0, 0, 1, 0, 0, 1])),
+            end("soles that stick at touchdown", "ours: friction", "m/s", self.sliding, *POSITIVE),
             end("attitude at touchdown", "ours", "rad", attitude, low, high),
             end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
             end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
