@@ -23,7 +23,7 @@ def test_cells_are_plans_within_the_limits(bhr, tmp_path):
     found = envelope(bhr, (0.4, 0.6), (0.3, 1.2), folder=tmp_path, tell=told.append)
     near, far, *refused = found.cells
     assert near.solved and far.solved and all(0.3 < c.share <= 1.0 for c in (near, far))
-    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "no plan is higher than" in refused[0].reason
+    assert [c.limiting for c in refused] == [VERDICT, VERDICT] and "by a straight push enough for" in refused[0].reason
     assert 0 < far.iterations < 60 and 0 < near.iterations < 60 and far.solve_s > 0
     assert (found.highest, found.farthest) == (far, far)
     assert told[0] == "height 0.30 m: 2 of 2 cells, up to 0.60 m"
@@ -148,7 +148,7 @@ def test_the_picture_has_every_reason():
              Cell(0.0, 0.2, False, VERDICT, math.nan), Cell(0.1, 0.2, False, BEYOND, math.nan))  # fmt: skip
     fig = envelope_map(Envelope("x", (0.0, 0.1), (0.1, 0.2), cells))
     labels = [t.get_text() for t in fig.axes[0].get_legend().get_texts()]
-    assert labels == ["friction", "no plan found", "refused before solving", "not tried"]
+    assert labels == ["friction", "no plan found", "beyond a straight push, and no plan found", "not tried"]
 
 
 def test_two_maps_at_once_are_refused(capsys, tmp_path):

@@ -10,9 +10,11 @@ import pytest
 from fixtures_core import srmp_planner
 from scipy.integrate import solve_ivp
 
+from jumplab.auditing import audit
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.ocp.nlp import Nlp
 from jumplab.robot import Robot
+from jumplab.stages.planner import Planner
 from jumplab.stages.srmp import SYMMETRY_OFF, SrmpSettings, build_problem, naive_guess, parameters
 from jumplab.stages.srmp.reachable import (
     SWING_GAIN,
@@ -63,9 +65,9 @@ def test_platforms_drops_flips_and_backward_jumps_pass(task):
 
 @pytest.mark.parametrize("task, words", [
     (JumpTask(1.0, 1.2), r"height = 1\.2 m: take-off at 4\.85 m/s, on average \d+ N over 0\.\d\d m of leg stroke"),
-    (JumpTask(2.8, 0.5), r"distance = 2\.8 m: .* at most \d\.\d\d m forward .* cover more than \d\.\d\d m"),
-    (JumpTask(-2.9, 0.2), r"distance = -2\.9 m: .* at most \d\.\d\d m backward"),
-    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* no such plan lands above 0\.\d\d m, and none lands on this one"),
+    (JumpTask(2.8, 0.5), r"distance = 2\.8 m: .* enough for \d\.\d\d m forward .*; at a height of \d\.\d\d m it is enough for"),
+    (JumpTask(-2.9, 0.2), r"distance = -2\.9 m: .* enough for \d\.\d\d m backward"),
+    (JumpTask(0.5, 0.2, 0.9), r"platform = 0\.9 m: .* a platform of 0\.\d\d m, and for this one at a height of"),
     (JumpTask(0.0, 0.2, rotation_rad=-4 * math.pi), r"rotation = -720 deg: .* heights of less than 0\.\d\d m"),
 ])  # fmt: skip
 def test_the_absurd_is_refused_in_words(task, words):
@@ -82,14 +84,14 @@ def number_after(words: str, text: str) -> float:
 
 
 def test_bounds_are_where_the_verdict_turns():
-    check(JumpTask(0.0, number_after("no plan is higher than", message(JumpTask(0.0, 1.2)))))
-    check(JumpTask(number_after("at most", message(JumpTask(2.8, 0.5))), 0.5))
-    check(JumpTask(-number_after("at most", message(JumpTask(-2.9, 0.2))), 0.2))
+    check(JumpTask(0.0, number_after("enough for", message(JumpTask(0.0, 1.2)))))
+    check(JumpTask(number_after("is enough for", message(JumpTask(2.8, 0.5))), 0.5))
+    check(JumpTask(-number_after("is enough for", message(JumpTask(-2.9, 0.2))), 0.2))
     text = message(JumpTask(2.6, 0.6))
-    check(JumpTask(number_after("cover more than", text), number_after("m, at", text)))
+    check(JumpTask(number_after("it is enough for", text), number_after("at a height of", text.rpartition("; ")[2])))
     text = message(JumpTask(0.5, 0.2, 0.9))
-    check(JumpTask(0.5, 0.2, number_after("lands above", text)))
-    check(JumpTask(0.5, number_after("a height of less than", text), 0.9))
+    check(JumpTask(0.5, 0.2, number_after("a platform of", text)))
+    check(JumpTask(0.5, number_after("for this one at a height of", text), 0.9))
     text = message(JumpTask(0.0, 0.2, rotation_rad=4 * math.pi))
     check(JumpTask(0.0, number_after("heights of less than", text), rotation_rad=4 * math.pi))
 
@@ -155,9 +157,23 @@ def test_limits_move_the_right_way():
 def test_a_robot_too_weak_to_leave_the_ground_is_told_so():
     reach = srmp_planner().reach
     text = message(JumpTask(0.0, 0.1), envelope=replace(reach, force_fit=0.15 * reach.force_fit))
-    assert re.search(r"cannot leave the ground, its legs give \d+ N on average for a weight of 412 N", text)
+    assert re.search(r"does not lift bhr off the ground, its legs give \d+ N on average for a weight of 412 N", text)
 
 
 def test_light_gravity_looks_no_further_than_a_task_may_ask():
     with pytest.raises(InfeasibleError, match=r"^(platform|distance) = "):
         check(JumpTask(3.0, 0.05, 0.9, gravity=1.62))
+
+
+def test_the_whole_body_is_tried_where_a_straight_push_is_not_enough(bhr):
+    """Arms and trunk add to the push: what the forms doubt is planned, and what has no plan is refused after a try."""
+    planner, doubted = Planner(bhr), JumpTask(0.0, 0.8)
+    message(doubted)
+    assert audit(planner.plan(doubted).tape, bhr, doubted).passed
+    with pytest.raises(
+        InfeasibleError, match=r"enough for 0\.\d\d m; the whole body.* was tried .*: no plan found$"
+    ) as e:
+        planner.plan(JumpTask(0.0, 1.2))
+    assert e.value.number == "height_m" and e.value.bound == pytest.approx(highest(can()))
+    with pytest.raises(InfeasibleError, match=r"by a straight push enough for 0\.\d\d m$"):  # stage 1 is that push
+        planner.plan(doubted, "three-step")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # pictures need no simulator
 
 REFUSED = {
     OPEN: ("#9A9A9A", "no plan found"),
-    VERDICT: ("#D5D5D5", "refused before solving"),
+    VERDICT: ("#D5D5D5", "beyond a straight push, and no plan found"),
     BEYOND: ("#F0F0F0", "not tried"),
 }
 MOST_TICKS = 14  # more would touch

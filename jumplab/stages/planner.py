@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InputError, SolverError, quoted, require_type
+from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
 from jumplab.ocp import PhaseGuess, Statistics, Term
@@ -271,12 +271,10 @@ class Planner:
             return less.plan(task, method, start=start)
         where = {} if start is None else {"start": start}
         if method == "direct":
-            check_reachable(task, self.stage("reach"), self.robot)
-            planner = self.stage("direct flip" if task.rotation_rad else "direct")
             if self.atlas is not None and not asked["whole body"]:
                 if (body := self.atlas.solve(self.stage("direct"), task, start)) is not None:
                     return self._finished(method, body)
-            return self._finished(method, planner.plan(task, weights=asked["whole body"].weights, **where))
+            return self._finished(method, self._direct(task, weights=asked["whole body"].weights, **where))
         if task.rotation_rad:
             return self._flip(task, asked)
         srmp, joints = self._first_two(task, start, asked)
@@ -284,6 +282,22 @@ class Planner:
         guess = guess_from_joints(joints, last, task, srmp.toe_s)
         body = last.plan(task, srmp, guess=guess, weights=asked["whole body"].weights, **where)
         return self._finished(method, body, srmp, joints, (_joint_row(joints),))
+
+    def _direct(self, task: JumpTask, **how: Any) -> WholeBodyPlan:
+        """The whole body alone. What a straight push cannot reach is tried all the same, with less patience.
+
+        Raises :class:`InfeasibleError` where neither can, with what the push is enough for.
+        """
+        planner = self.stage("direct flip" if task.rotation_rad else "direct")
+        try:
+            check_reachable(task, self.stage("reach"), self.robot)
+        except InfeasibleError as e:
+            try:
+                return planner.plan(task, **how, **({} if task.rotation_rad else {"brief": True}))
+            except SolverError:
+                said = f"{e}; the whole body, arms and trunk included, was tried for a few seconds: no plan found"
+                raise InfeasibleError(said, number=e.number, bound=e.bound) from e
+        return planner.plan(task, **how)
 
     def _finished(
         self,
@@ -440,12 +454,10 @@ class Planner:
             return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)
         self.prepared(previous.method)
-        srmp, last = None, "direct"
         if previous.method == "direct":
-            check_reachable(task, self.stage("reach"), self.robot)
-        else:
-            srmp, last = self._pendulum(task, start, near=previous.srmp), "whole body"
-        body = self.stage(last).plan(task, srmp, near=previous.whole_body, start=start)
+            return self._finished("direct", self._direct(task, near=previous.whole_body, start=start))
+        srmp = self._pendulum(task, start, near=previous.srmp)
+        body = self.stage("whole body").plan(task, srmp, near=previous.whole_body, start=start)
         return self._finished(previous.method, body, srmp)
 
 

@@ -53,7 +53,9 @@ def advised(refusal: JumplabError, planner: Planner, task: JumpTask, method: str
 
 def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str, began: float) -> str:
     easier, said = task, refusal
-    if getattr(refusal, "stage", "") in THREE_STEPS and _refused(planner, task, "direct") is None:
+    by_steps = getattr(refusal, "stage", "") in THREE_STEPS
+    by_steps |= isinstance(refusal, InfeasibleError) and method == "three-step"  # stage 1's limits are not the robot's
+    if by_steps and _refused(planner, task, "direct") is None:
         return "ask for the method 'direct', which has a plan"
     for number in range(TRIES):
         easier = _easier(easier, said, number)

@@ -34,7 +34,11 @@ USES = {"torque at speed": "torque", "joint speed": "speed", "friction used": "f
 GIVE_UP = 2  # so many cells in a row without a plan, and the farther ones of the row are not tried
 MAX_CELLS = 2500  # an hour or two of work
 
-OPEN, VERDICT, BEYOND = "no plan found", "refused before solving", "not tried, beyond cells without a plan"
+OPEN, VERDICT, BEYOND = (
+    "no plan found",
+    "beyond a straight push, and no plan found",
+    "not tried, beyond cells without a plan",
+)
 
 
 @dataclass(frozen=True)

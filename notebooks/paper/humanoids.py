@@ -2,7 +2,7 @@
 
 ``python -m paper.humanoids FOLDER [--jump] [--bounds]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of
 every row, and writes what became of it; ``--jump`` also plans and simulates what has not been yet, ``--bounds`` tries
-whether the highest rise that a refusal before the solve names is one. Notebook 07 draws the file.
+how far the whole body gets beyond the rise for which a straight push is enough. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
 
 from jumplab import api
-from jumplab.errors import InfeasibleError, JumplabError
+from jumplab.errors import JumplabError
 from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.checkup import examine, first_look
 from jumplab.robot.description import Robot
 from jumplab.sim.playback import MODES
-from jumplab.stages.planner import METHODS, Planner
-from jumplab.task import MAX_HEIGHT_M, JumpTask
+from jumplab.stages.planner import Planner
+from jumplab.stages.srmp.reachable import capability, highest
+from jumplab.task import GRAVITY, MAX_HEIGHT_M, JumpTask
 
 TABLE = Path(__file__).with_name("humanoids.json")
 LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
 LEAST_M = 0.02  # of a rise that can be asked for
-SHARES_OF_BOUND, BEYOND = (1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5), 1.15  # of the highest rise, that are tried
+SHARES_OF_PUSH = (2.0, 1.5, 1.3, 1.15, 1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # tried, the greatest first
 PLAN_S = 300.0  # longest processor time for one plan with its audit and simulation
 
 
@@ -94,29 +94,18 @@ def jumped(path: Path) -> dict[str, Any]:
 
 
 def bounded(path: Path) -> dict[str, Any]:
-    """The rise on the spot that the closed forms call the highest, the highest plan, and what both methods find beyond.
-
-    Beyond the bound the closed forms are left out, and the optimisation itself has to say no.
-    """
+    """The rise on the spot for which a straight push is enough, and the highest clean plan, as a share of it."""
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)
-    try:
-        planner.plan(JumpTask(0.0, MAX_HEIGHT_M))
-        return {"bound_m": None}
-    except InfeasibleError as e:
-        bound = float(e.bound or 0.0)
-    if BEYOND * bound < LEAST_M:  # it cannot leave the ground
-        return {"bound_m": bound}
-    shares = (share for share in SHARES_OF_BOUND if _clean(planner, share * bound, "direct"))
-    unchecked = patch("jumplab.stages.planner.check_reachable"), patch("jumplab.stages.srmp.planner.check_reachable")
-    with unchecked[0], unchecked[1]:
-        beyond = [method for method in METHODS if _clean(planner, BEYOND * bound, method)]
-    return {"bound_m": round(bound, 4), "planned": next(shares, None), "beyond": beyond}
+    push = highest(capability(planner.stage("reach"), GRAVITY))
+    rises = ((share, round(share * push, 4)) for share in SHARES_OF_PUSH)
+    tried = ((share, rise) for share, rise in rises if LEAST_M <= rise <= MAX_HEIGHT_M)
+    return {"push_m": round(push, 4), "planned": next((share for share, rise in tried if _clean(planner, rise)), None)}
 
 
-def _clean(planner: Planner, rise_m: float, method: str) -> bool:
+def _clean(planner: Planner, rise_m: float) -> bool:
     try:
-        return api.audit(planner.plan(JumpTask(0.0, rise_m), method)).passed
+        return api.audit(planner.plan(JumpTask(0.0, rise_m), "direct")).passed
     except JumplabError:
         return False
 

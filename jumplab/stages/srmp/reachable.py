@@ -1,4 +1,8 @@
-"""Whether a target can be reached at all, by closed forms, and a target close by where stage 1 finds no plan."""
+"""What a straight push by stage 1's pendulum can reach, by closed forms: its limits, and a forecast for the robot.
+
+The whole robot swings arms and trunk besides and was seen to jump farther: the direct method tries what these forms
+refuse.
+"""
 
 from __future__ import annotations
 
@@ -161,7 +165,7 @@ def _airtime(can: Capability, task: JumpTask) -> float:
 
 
 def check_reachable(task: JumpTask, envelope: Reach, robot: Robot, settings: SrmpSettings = SrmpSettings()) -> None:
-    """Refuse a target that no launch of this robot can meet, in words and with a bound that no plan passes.
+    """Refuse a target that no launch of stage 1's pendulum can meet, in words and with the number that it can.
 
     The conditions, in this order, are those of :func:`highest` (take-off speed, average force over the stroke),
     :func:`highest_platform` (apex over the bent landing leg), :func:`farthest` (extension speed, falling forward,
@@ -180,14 +184,14 @@ def _check_height(task: JumpTask, can: Capability, name: str) -> None:
         if can.mean_force > can.mass * can.gravity:
             why += f" and reach {can.speed:.2f} m/s"
         raise InfeasibleError(
-            f"height = {task.height_m:g} m: {name} cannot leave the ground, {why} ({_limiting(can)}); give it stronger "
-            f"joints or less gravity"
+            f"height = {task.height_m:g} m: a straight push does not lift {name} off the ground, {why} "
+            f"({_limiting(can)}); give it stronger joints or less gravity"
         )
     if task.height_m > limit:
         raise InfeasibleError(
             f"height = {task.height_m:g} m: take-off at {task.takeoff_speed:.2f} m/s, on average "
             f"{needed_force(can, task.height_m):.0f} N over {can.stroke:.2f} m of leg stroke; the legs of {name} reach "
-            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}); no plan is higher than "
+            f"{can.speed:.2f} m/s and {can.mean_force:.0f} N ({_limiting(can)}), by a straight push enough for "
             f"{_below(limit)} m",
             number="height_m",
             bound=limit,
@@ -206,11 +210,11 @@ def _check_platform(task: JumpTask, can: Capability, name: str) -> None:
     if task.platform_m <= limit:
         return
     enough = [h for h in _heights(can, task.height_m) if highest_platform(can, h, task.distance_m) >= task.platform_m]
-    higher = f", and none lands on this one from a height of less than {_above(enough[0])} m" if enough else ""
+    higher = f", and for this one at a height of {_above(enough[0])} m" if enough else ""
     raise InfeasibleError(
-        f"platform = {task.platform_m:g} m: at a height of {task.height_m:g} m the CoM of {name} rises to at most "
-        f"{can.takeoff_length + task.height_m:.2f} m, too low to stand there even on legs bent as far as a landing "
-        f"allows; no such plan lands above {_below(limit)} m{higher}",
+        f"platform = {task.platform_m:g} m: at a height of {task.height_m:g} m a straight push takes the CoM of {name} "
+        f"to {can.takeoff_length + task.height_m:.2f} m, too low to stand there even on legs bent as far as a landing "
+        f"allows; that is enough for a platform of {_below(limit)} m{higher}",
         number="platform_m",
         bound=limit,
     )
@@ -223,12 +227,12 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     heights = [h for h in _heights(can, LOWEST_M) if task.platform_m <= highest_platform(can, h, task.distance_m)]
     best = max(((farthest(can, _at(task, h)), h) for h in heights), default=(0.0, task.height_m))
     found = best[0] > limit + STEP_M
-    more = f"; at no height does it cover more than {_below(best[0])} m, at {best[1]:.2f} m" if found else ""
+    more = f"; at a height of {best[1]:.2f} m it is enough for {_below(best[0])} m" if found else ""
     way = "forward" if task.distance_m >= 0 else "backward"
     raise InfeasibleError(
-        f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, {name} "
-        f"covers at most {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at take-off, friction "
-        f"{can.settings.friction:g}){more}",
+        f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, a "
+        f"straight push of {name} is enough for {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at take-off, "
+        f"friction {can.settings.friction:g}){more}",
         number="distance_m",
         bound=limit,
     )

@@ -38,6 +38,7 @@ NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
 # what the coarse mesh leads to is a good start on the fine one but for its multipliers
 REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70}
 REFINED |= {"quality_function_max_section_steps": 3}  # a rough choice of the next barrier will do
+BRIEF = {"max_iter": 80, "max_cpu_time": 5.0}  # [s] for a target that most likely has no plan; more finds a few more
 EVENING = (2.0, 4.0, 8.0)  # factors of the jerk's weight, in turn, where it jumps farther than a tape can follow
 
 
@@ -50,6 +51,7 @@ class Asked:
     parameters: Mapping[str, Any]
     weights: Mapping[str, float] = field(default_factory=dict)  # instead of the terms' own
     off: tuple[str, ...] = ()  # terms left out
+    brief: bool = False  # whether to give up soon, unexplained
 
 
 @dataclass(frozen=True, repr=False)
@@ -146,6 +148,7 @@ class WholeBodyPlanner:
             self._coarse = Nlp(problem.on_mesh(mesh.coarse().intervals()), coarse, key, self.nlp)
             self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
+        self._brief = self.nlp.with_options({**FINE, **BRIEF, **options})
 
     def plan(
         self,
@@ -158,6 +161,7 @@ class WholeBodyPlanner:
         near: WholeBodyPlan | None = None,
         start: np.ndarray | None = None,
         settle: bool = True,
+        brief: bool = False,
     ) -> WholeBodyPlan:
         """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
 
@@ -170,13 +174,14 @@ class WholeBodyPlanner:
         start : absolute link angles (5,) in which the robot waits at rest, soles flat; the stance if None.
         settle : take a few steps from ``near`` if it is close enough, see :meth:`jumplab.ocp.nlp.Nlp.settled`; the
             least cost is found without.
+        brief : give up soon, and explain nothing: for a target that most likely has no plan.
 
         Raises
         ------
         SolverError
             If there is no plan; names the terms in conflict.
         """
-        asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off)
+        asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off, brief)
         return replace(self._evened(self._begun(asked, guess, near, settle), asked), limits=self.limits)
 
     def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
@@ -231,6 +236,8 @@ class WholeBodyPlanner:
         for way in ways:
             with suppress(SolverError):
                 return way()
+        if asked.brief:
+            return WholeBodyPlan(asked.task, self._run(self._brief.solve, asked, fresh(), explain=False))
         return WholeBodyPlan(
             asked.task, self._run(self.nlp.solve, asked, fresh())
         )  # the last word, and the explanation
@@ -285,7 +292,9 @@ class WholeBodyPlanner:
             try:
                 return refined(self._run(self._coarse.gauss_newton_steps, asked, guess, mesh))
             except SolverError:
-                pass  # too far away for linear rows; what stays inside all limits finds more, and takes longer
+                if asked.brief:
+                    raise
+                # too far away for linear rows; what stays inside all limits finds more, and takes longer
         return refined(self._run(self._coarse.solve, asked, guess, mesh, explain=False))
 
     def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:

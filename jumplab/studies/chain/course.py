@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, RobotError, quoted
+from jumplab.errors import InputError, RobotError, quoted
 from jumplab.robot import Robot
-from jumplab.robot.reach import Reach
 from jumplab.robot.stance import check_stance
 from jumplab.sim.scene import REACH_M, Block, Scene
-from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
@@ -133,18 +131,11 @@ class Course:
         jumps = zip(map(self.task, range(self.count)), (0.0, *self.goals_m), self.platforms_m, strict=False)
         return tuple((x + platform_edge_m(task, robot), top) for task, x, top in jumps if task.platform_m)
 
-    def check(self, robot: Robot, reach: Reach) -> None:
-        """Raise :class:`InputError` if a platform overlaps with a place where the robot stands, and
-        :class:`InfeasibleError` if a jump is beyond the robot's reach, by closed forms."""
-        self._check_platforms(robot)
-        for k in range(self.count):
-            try:
-                check_reachable(self.task(k), reach, robot)
-            except InfeasibleError as e:
-                raise InfeasibleError(f"jump {k + 1} of {self.count}: {e}") from e
+    def check(self, robot: Robot) -> None:
+        """Raise :class:`InputError` if a platform overlaps with a place where the robot stands.
 
-    def _check_platforms(self, robot: Robot) -> None:
-        """Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`."""
+        Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`.
+        """
         if any(self.platforms_m) and min(self.distances_m) < 0:
             k = int(np.argmin(self.distances_m))
             raise InputError(

@@ -68,7 +68,7 @@ def run_chain(
     if planner.robot.hash != waiting.hash:
         raise InputError(f"the planner is for {planner.robot.name} in another posture; make it for crouched(robot)")
     method = planner.chosen(method)
-    course.check(waiting, planner.stage("reach"))
+    course.check(waiting)
     if rehearsal is None and rehearse:
         rehearsal = Rehearsal.of(course, planner, method)
     run = Run(waiting, perturbation, course.scene(waiting), engine)
@@ -226,6 +226,6 @@ def _prepared(course: Course, robot: Robot, how: dict) -> tuple[Planner, Rehears
     if key not in _ready:
         _ready.clear()
         planner = planner or Planner(crouched(robot), keep=True)
-        course.check(planner.robot, planner.stage("reach"))
+        course.check(planner.robot)
         _ready[key] = planner, Rehearsal.of(course, planner, method) if rehearse else None
     return _ready[key]
