@@ -34,7 +34,8 @@ class RobotError(InputError):
 class InfeasibleError(JumplabError):
     """The question is well posed, but this robot cannot do it (or no plan was found within the limits).
 
-    ``number`` names what of the target is beyond its limit ("height_m"), ``bound`` is one that no plan passes [m].
+    ``number`` names what of the target is beyond its limit ("height_m"), ``bound`` how much of it a straight push of
+    the legs is enough for, or the least that is possible [m].
     """
 
     exit_code = 3

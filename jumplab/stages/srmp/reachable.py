@@ -231,8 +231,8 @@ def _check_distance(task: JumpTask, can: Capability, name: str) -> None:
     way = "forward" if task.distance_m >= 0 else "backward"
     raise InfeasibleError(
         f"distance = {task.distance_m:g} m: in the time that a height of {task.height_m:g} m leaves in the air, a "
-        f"straight push of {name} is enough for {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at take-off, "
-        f"friction {can.settings.friction:g}){more}",
+        f"straight push of {name} is enough for {_below(limit)} m {way} (legs {can.speed:.2f} m/s along the lean at "
+        f"take-off, friction {can.settings.friction:g}){more}",
         number="distance_m",
         bound=limit,
     )
