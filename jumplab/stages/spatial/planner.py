@@ -33,7 +33,7 @@ QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience 
 # The exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a turn
 # [deg], leads there in half the time, first from afar, then from a plan close by, for a cost some percent higher; with
 # more than that to turn only the exact one settles
-HOLDS = (75, 0.1, 1.0), (100, 3.0, 1.0), (300, 10.0, 30.0)
+HOLDS = (75, 0.1, 1.0), (100, 3.0, 3.0), (300, 10.0, 30.0)
 HELD = {"max_iter": 250, "max_cpu_time": 20.0}  # [s]; the exact Hessian has its turn after that
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes

@@ -73,7 +73,9 @@ def holds_between(tape: Tape, robot: Robot) -> bool:
         for x, y, most in ((tape.q[:, 7:], rate, RATE_GAP), (rate, tape.a[:, 6:], ACCELERATION_GAP))
     )
     along, load = np.linalg.norm(tape.f[..., :2], axis=-1), np.maximum(tape.f[..., 2], LOADED_N)
-    given = np.all(np.abs(tape.tau) <= effort * left) and np.all(along <= FRICTION * load)
+    given = (
+        np.all(np.abs(tape.tau) <= effort * left) and np.all(np.abs(rate) <= speed) and np.all(along <= FRICTION * load)
+    )
     return bool(given and all(np.abs(gap).max() <= most for gap, most in gaps))
 
 
@@ -127,7 +129,10 @@ class Legs:
         return q, v, a
 
     def _solved(self, slope: np.ndarray, off: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", np.linalg.pinv(slope[:, :, self.columns]), off)
+        """Least changes (n, .) of the columns that make up for what rows are off by (n, .)."""
+        rows = slope[:, :, self.columns]
+        across = rows.transpose(0, 2, 1)
+        return (across @ np.linalg.solve(rows @ across, off[..., None]))[..., 0]
 
 
 def _launch(terms, phases, legs: Legs, t: np.ndarray, gravity: float):
@@ -163,9 +168,10 @@ def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: floa
         need = np.array(list(_needed(model, *held, gravity)))
         return need[:, 4] + x * need[:, 2]
 
-    for _ in range(BALANCING):
-        missing = moment()
-        more = -missing / (moment(push) - missing)
+    missing = moment()
+    gained = moment(push) - missing  # hardly changed by the corrections
+    for k in range(BALANCING):
+        more = -(moment() if k else missing) / gained
         rate = cumulative_trapezoid(more, t[up], initial=0.0)
         for y, change in ((q, cumulative_trapezoid(rate, t[up], initial=0.0)), (v, rate), (a, more)):
             y[up, 0] += change
