@@ -1,15 +1,18 @@
 """Robots that no plane describes: canted hips, legs of five joints, uneven sides; from posture to landing."""
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_robots import canted, config, joint, one_axis_ankle, root, text, write
+from scipy.optimize import linprog
 
 import jumplab as jl
-from jumplab.errors import InputError, RobotError
+from jumplab.errors import InfeasibleError, InputError, RobotError
 from jumplab.robot import Robot
 from jumplab.robot.reduction import mirror
-from jumplab.robot.stance import knees, stance_configuration
+from jumplab.robot.stance import holding, knees, stance_configuration
 from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.roles import draft
@@ -140,6 +143,40 @@ def test_what_needs_five_links_is_refused(robot):
         jl.Planner(robot).plan(jl.JumpTask(0.3, 0.2), start=np.zeros(5))
     said = "robot wide begins in its stance: five links do not describe it; drop start"
     assert str(e.value) == said
+
+
+def test_what_cannot_hold_its_own_weight_is_refused_before_any_solve(robot):
+    """The share is the least: random ground forces that balance the robot ask for more; half the effort, twice it."""
+    q = stance_configuration(robot)
+    share, joint, torque = holding(robot, q, 0.42)
+    assert torque == pytest.approx(share * robot.actuators[joint]["effort"]) and 0.01 < share < 0.5
+    assert holding(robot.with_limits(effort=0.5), q, 0.42)[0] == pytest.approx(2 * share)
+    assert holding(robot.under_gravity(1.62), q, 0.42)[0] == pytest.approx(share * 1.62 / 9.8)
+    model, data, sole = robot.model, robot.model.createData(), robot.foot
+    effort, frames = (
+        np.array([robot.actuators[n]["effort"] for n in robot.joint_names]),
+        map(model.getFrameId, sole.frames),
+    )
+    pin.computeJointJacobians(model, data, q), pin.updateFramePlacements(model, data)
+    corners = []
+    for frame, corner in product(frames, sole.corners):
+        near = model.frames[frame].copy()
+        near.name, near.placement = "corner", near.placement * pin.SE3(np.eye(3), corner)
+        grown = model.copy()
+        k = grown.addFrame(near)
+        corners.append(pin.computeFrameJacobian(grown, grown.createData(), q, k, pin.LOCAL_WORLD_ALIGNED)[:3])
+    pushes, weight = np.concatenate(corners).T, pin.computeGeneralizedGravity(model, data, q)
+    level, rng = 0.42 / np.sqrt(2), np.random.default_rng(3)
+    cone = np.kron(np.eye(8), [[1, 0, -level], [-1, 0, -level], [0, 1, -level], [0, -1, -level]])
+    how = dict(A_ub=cone, b_ub=np.zeros(32), A_eq=pushes[:6], b_eq=weight[:6], bounds=[(-600, 600)] * 24)
+    for _ in range(20):  # forces on the corners that balance the robot
+        given = linprog(rng.normal(size=24), **how)
+        assert given.success and np.max(np.abs(weight[6:] - pushes[6:] @ given.x) / effort) >= share - 1e-9
+    weak = robot.with_limits(effort=0.9 * share)
+    with pytest.raises(
+        InfeasibleError, match=r"^robot wide cannot stand as it begins: .* a joint needs 1\.1 times its"
+    ):
+        jl.Planner(weak).plan(jl.JumpTask(0.3, 0.2))
 
 
 @pytest.mark.slow

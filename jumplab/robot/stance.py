@@ -187,3 +187,37 @@ def standing(robot: Robot) -> np.ndarray:
             f"{1e3 * np.abs(found.fun[:-1]).max():.0f} mm or mrad are missing; change [stance] in its configuration"
         )
     return q
+
+
+def holding(robot: Robot, q: np.ndarray, friction: float) -> tuple[float, str, float] | None:
+    """What joints need at least to hold a posture ``q`` (nq,) whose soles are on the ground, under the robot's gravity.
+
+    The ground's forces on the corners of both soles, within friction, are shared out so that the joint that uses most
+    of its effort uses as little as can be. Returns that share [1], the joint, and its torque [N m]; None if no forces
+    of the ground balance the posture.
+    """
+    from scipy.optimize import linprog  # slow to import
+
+    model, frames = robot.model, [robot.model.getFrameId(name) for name in robot.foot.frames]
+    data = model.createData()
+    weight = pin.computeGeneralizedGravity(model, data, q)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    level = friction / np.sqrt(2)
+    edges = np.array([[x, y, 1.0] for x in (-level, level) for y in (-level, level)])
+    pushes = []
+    for frame in frames:
+        slope = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        for corner in robot.foot.corners:
+            point = slope[:3] - pin.skew(data.oMf[frame].rotation @ corner) @ slope[3:]
+            pushes.extend(edges @ point)
+    pushed, effort = np.array(pushes).T, np.array([robot.actuators[name]["effort"] for name in robot.joint_names])
+    cost = np.append(np.zeros(pushed.shape[1]), 1.0)
+    rows = np.block([[-pushed[6:], -effort[:, None]], [pushed[6:], -effort[:, None]]])
+    base = np.hstack([pushed[:6], np.zeros((6, 1))])
+    found = linprog(cost, rows, np.concatenate([-weight[6:], weight[6:]]), base, weight[:6])
+    if not found.success:
+        return None
+    torque = weight[6:] - pushed[6:] @ found.x[:-1]
+    most = int(np.argmax(np.abs(torque) / effort))
+    return float(found.x[-1]), robot.joint_names[most], float(abs(torque[most]))

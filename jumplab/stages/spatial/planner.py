@@ -15,6 +15,7 @@ from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp
 from jumplab.robot import Robot
+from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial.generic import generic
 from jumplab.stages.spatial.problem import build_problem
@@ -75,6 +76,7 @@ class SpatialPlanner:
         self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
         self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
         self._taped: tuple[SpatialPlan, Tape] | None = None
+        self._stood: dict[tuple, tuple[float, str, float] | None] = {}
         self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
         self._options = options = dict(options or {})
         problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
@@ -188,9 +190,14 @@ class SpatialPlanner:
         return self._taped[1]
 
     def parameters(self, task: JumpTask, stance: np.ndarray | None = None) -> dict[str, Any]:
-        """Parameter values of the problem for a target; raises :class:`InfeasibleError` for an impossible platform."""
+        """Parameter values of the problem for a target.
+
+        Raises :class:`InfeasibleError` for an impossible platform, and if the robot cannot even stand as it begins.
+        """
         flat = self.terms["flat"]
         start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
+        if not self.robot.planar:  # of others stage 1's closed forms tell
+            self._check_standing(start, task.gravity)
         values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
         if not self.robot.planar:
@@ -200,6 +207,20 @@ class SpatialPlanner:
         # for clearance, also between the nodes, a platform counts as reaching further
         edge -= np.sign(task.platform_m) * min(self.limits.edge_step_m, room)
         return values | dict(edge=edge, along=ways, gravity=task.gravity)
+
+    def _check_standing(self, start: np.ndarray, gravity: float) -> None:
+        """Refuse a robot whose motors cannot hold the posture in which it waits."""
+        if (key := (gravity, start.tobytes())) not in self._stood:
+            q = self.terms["flat"].model.to_pinocchio(start[None], *np.zeros((2, 1, len(start))))[0][0]
+            self._stood[key] = holding(self.robot.under_gravity(gravity), q, self.limits.friction)
+        share, joint, torque = self._stood[key] or (0.0, "", 0.0)
+        if share > 1:
+            effort = self.robot.actuators[joint]["effort"]
+            raise InfeasibleError(
+                f"robot {self.robot.name} cannot stand as it begins: however the ground's forces are shared, a joint "
+                f"needs {share:.1f} times its effort, {joint} {torque:.3g} N m of {effort:.3g}; if these are motors' "
+                f"efforts before their gears, give those of the joints in [limits]"
+            )
 
     def _edge(self, task: JumpTask) -> tuple[float, float]:
         """Where the ground steps up or down [m], along the travel from the world's origin.
