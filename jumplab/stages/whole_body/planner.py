@@ -38,7 +38,7 @@ NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
 # what the coarse mesh leads to is a good start on the fine one but for its multipliers
 REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70}
 REFINED |= {"quality_function_max_section_steps": 3}  # a rough choice of the next barrier will do
-BRIEF = {"max_iter": 80, "max_cpu_time": 5.0}  # [s] for a target that most likely has no plan; more finds a few more
+BRIEF = {"max_cpu_time": 3.0}  # [s] for a target that most likely has no plan; what was found there took one
 EVENING = (2.0, 4.0, 8.0)  # factors of the jerk's weight, in turn, where it jumps farther than a tape can follow
 
 
@@ -148,7 +148,7 @@ class WholeBodyPlanner:
             self._coarse = Nlp(problem.on_mesh(mesh.coarse().intervals()), coarse, key, self.nlp)
             self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
         self._warm = self.nlp.with_options({**FINE, **WARM, **options})
-        self._brief = self.nlp.with_options({**FINE, **BRIEF, **options})
+        self._brief = self.nlp.with_options({**FINE, **REFINED, **BRIEF, **options})
 
     def plan(
         self,
@@ -236,8 +236,8 @@ class WholeBodyPlanner:
         for way in ways:
             with suppress(SolverError):
                 return way()
-        if asked.brief:
-            return WholeBodyPlan(asked.task, self._run(self._brief.solve, asked, fresh(), explain=False))
+        if asked.brief and ways:
+            raise SolverError(f"{self.nlp.problem.name}: no plan was found soon", stage=self.nlp.problem.name)
         return WholeBodyPlan(
             asked.task, self._run(self.nlp.solve, asked, fresh())
         )  # the last word, and the explanation
@@ -285,7 +285,8 @@ class WholeBodyPlanner:
             guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
 
         def refined(first):
-            solution = self._run(self._refined.solve, asked, first, explain=False)
+            nlp = self._brief if asked.brief else self._refined
+            solution = self._run(nlp.solve, asked, first, explain=False)
             return WholeBodyPlan(asked.task, solution, first.statistics)
 
         if self._steps:
