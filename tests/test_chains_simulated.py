@@ -162,7 +162,7 @@ HELP = "'jumplab chain --help' shows what is possible"
         ("--distance-m 0.6,0.2 --platform-m 0,0.1 --out x", 2,
          "jump 2 of 2: the surface 0.1 m high would begin under the sole that stands 0.2 m before it; place them "
          "0.34 m apart or more, toe to toe"),
-        ("--distance-m 0.6,2.9 --out x", 3, "jump 2 of 2: distance = 2.9 m"),
+        ("--distance-m 0.6,0.6 --height-m 0.3,1.4 --out x", 3, "jump 2 of 2: height = 1.4 m"),
     ],
 )  # fmt: skip
 def test_refusals_of_the_command(capsys, tmp_path, monkeypatch, arguments, code, sentence):

@@ -306,7 +306,8 @@ def test_settings_are_read(bhr):
 
 def test_envelope_is_the_robots(bhr):
     ours, other = srmp_planner().reach, reach(bhr)
-    np.testing.assert_array_equal(ours.inertia_high_fit, other.inertia_high_fit)
+    # the shipped ones were sampled on another machine, whose processor rounds otherwise
+    np.testing.assert_allclose(ours.inertia_high_fit, other.inertia_high_fit, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -57,11 +57,11 @@ def test_robots_that_differ():
 @pytest.mark.slow
 def test_a_small_sweep_is_one_table(tmp_path):
     """Two targets that can be planned, one that cannot: three rows, true to their plans."""
-    cases = sweep.grid([0.3, 2.9], [0.3]) + sweep.grid([0.3], [0.3], weights=[{"torque": 3e-4}])
+    cases = sweep.grid([0.3], [0.3, 1.4]) + sweep.grid([0.3], [0.3], weights=[{"torque": 3e-4}])
     rows = sweep.run(cases, tmp_path, jobs=1, progress=False)
     assert [row["planned"] for row in rows] == [True, False, True]
     assert rows[0]["clean"] and rows[0]["planned_distance_m"] == pytest.approx(0.3, abs=1e-3)
-    assert rows[1]["reason"].startswith("distance = 2.9 m: ") and rows[1]["cost"] is None
+    assert rows[1]["reason"].startswith("height = 1.4 m: ") and rows[1]["cost"] is None
     assert rows[2]["cost"] > rows[0]["cost"]
     with open(tmp_path / sweep.TABLE, newline="") as file:
         table = list(csv.DictReader(file))
