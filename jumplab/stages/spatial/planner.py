@@ -37,6 +37,8 @@ QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience 
 HOLDS = (75, 0.1, 1.0), (100, 3.0, 3.0), (300, 10.0, 30.0)
 HELD = {"max_iter": 250, "max_cpu_time": 20.0}  # [s]; the exact Hessian has its turn after that
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
+# where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
+PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4, "max_iter": 120, "max_cpu_time": 20.0}  # [s]
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
@@ -84,6 +86,7 @@ class SpatialPlanner:
         self.nlp = Nlp(problem, {**IPOPT, **options}, key)
         self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
         self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
+        self._patient = self.nlp.with_options({**IPOPT, **WARM, **PATIENT, **options})
         holds = HOLDS if robot.planar else ()  # of others, what it leads to passes limits between the nodes
         self._held = {deg: self.nlp.with_options({**IPOPT, **HELD, **options}, hold) for deg, hold, _ in holds}
         self._near = {deg: self.nlp.with_options({**IPOPT, **NEAR, **options}, hold) for deg, _, hold in holds}
@@ -99,7 +102,7 @@ class SpatialPlanner:
         near: SpatialPlan | None = None,
         stance: np.ndarray | None = None,
     ) -> SpatialPlan:
-        """Solve for a target; where the motion passes limits between the nodes, again on a finer mesh from there.
+        """Solve for a target; where the motion passes limits between the nodes, on to the end, then on a finer mesh.
 
         Parameters
         ----------
@@ -116,12 +119,14 @@ class SpatialPlanner:
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
         how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
-        found = self._planned(task, (start, toe_phase_s, ramps), how, near)
-        if not holds_between(self.tape(found), self.robot):
+        found = first = self._planned(task, (start, toe_phase_s, ramps), how, near)
+        for again in (lambda: (self, self._patient), lambda: (self._finer, self._finer._warm)):
+            if holds_between(self.tape(found), self.robot):
+                return found
+            planner, nlp = again()
             with suppress(SolverError):
-                finer = self._finer._solved(self._finer._warm, task, found, how)
-                return finer if holds_between(self.tape(finer), self.robot) else found
-        return found
+                found = planner._solved(nlp, task, found, how)
+        return found if holds_between(self.tape(found), self.robot) else first
 
     @cached_property
     def _finer(self) -> SpatialPlanner:

@@ -30,11 +30,10 @@ def _boxes(b: SpatialTerms) -> tuple[Bound, ...]:
     wide = np.full(base, ANGLE_BOX_RAD)
     wide[-2] = lim.roll_rad
     low, high = m["lower"] + lim.range_margin_rad, m["upper"] - lim.range_margin_rad
+    least = -np.inf if b.flying or b.robot.planar else lim.straight_knee_rad
     for k, sign, angle in b.knees:
-        if sign > 0:
-            high[k] = min(high[k], lim.knee_rad - angle)
-        else:
-            low[k] = max(low[k], angle - lim.knee_rad)
+        bent = sorted((sign * (least - angle), sign * (lim.knee_rad - angle)))
+        low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
     rates = np.concatenate([np.full(base, RATE_BOX), lim.speed_share * m["speed"]])
     torques, free = lim.torque_share * m["effort"], np.full(b.n_forces or 3, np.inf)
     least = np.zeros(b.n_forces) if b.n_forces else -free

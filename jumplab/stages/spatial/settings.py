@@ -20,6 +20,8 @@ class SpatialLimits:
     foot_share: float = 0.15  # of the weight, on each flat foot at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
+    straight_knee_rad: float = 0.15  # flexion at least while the feet stand, of robots that no plane describes: a leg
+    # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn
     flat_s: tuple[float, float] = (0.25, 0.70)  # duration of the flat-foot phase
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
