@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
@@ -148,7 +149,8 @@ class Pilot:
         if left <= LEAD_S:
             self._look_ahead(step, played, q, v, left)
         if self._reaim is not None:
-            aimed = self._reaim.correction(q, v, self._error(step, played), None if self._tuck is None else left)
+            turn = self._turn(step, played, q, v, left)
+            aimed = self._reaim.correction(q, v, turn, left, self._tuck is not None)
         if shift is None:
             command = self.playback.command(step, played, v, aimed)
         else:
@@ -161,19 +163,26 @@ class Pilot:
             return
         there = q, v
         if left > 0:
-            error = self._error(step, played)
-            correction = None if self._reaim is None else self._reaim.wish(q, v, error)
-            there = self.forecast.state(q, v, error, correction)
+            turn = self._turn(step, played, q, v, left)
+            correction = None if self._reaim is None else self._reaim.wish(q, v, turn)
+            there = self.forecast.state(q, v, turn, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 
-    def _error(self, step: int, played: np.ndarray) -> float:
-        """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
-        if self._tuck is None:
-            x, y, _ = self.playback.attitude_error(step, played)
-            error = y if self._heading == 0 else np.cos(self._heading) * y - np.sin(self._heading) * x
-        else:
-            error = self._tuck.miss
-        return float(np.arctan2(np.sin(error), np.cos(error)))
+    def _turn(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
+        """How far (3, 3) the trunk will be off its planned attitude at touchdown, in ``left`` seconds.
+
+        Of a flip only the pitch is told, as forecast; without re-aim only the pitch, as it is now.
+        """
+        if self._tuck is not None:
+            return pin.rpy.rpyToMatrix(0.0, _within_half_a_turn(self._tuck.miss), 0.0)
+        x, y, z = self.playback.attitude_error(step, played)
+        if self._heading != 0:
+            c, s = np.cos(self._heading), np.sin(self._heading)
+            x, y = c * x + s * y, c * y - s * x
+        if self._reaim is None:
+            return pin.rpy.rpyToMatrix(0.0, _within_half_a_turn(y), 0.0)
+        turn = pin.exp3(np.array([x, y, z]))
+        return self._reaim.turn_ahead(q, v, turn, left) if 0 < left < np.inf else turn
 
     def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
         self.touchdown = step
@@ -181,3 +190,7 @@ class Pilot:
             self._landing.reference = self._plan_landing(q, v)
             self.ahead.followed = "spring" if self._landing.reference is None else "given"
         self._look_ahead(step, played, q, v, 0.0)  # the ground came early
+
+
+def _within_half_a_turn(angle: float) -> float:
+    return float(np.arctan2(np.sin(angle), np.cos(angle)))
