@@ -26,7 +26,7 @@ def reaim(bhr):
 
 
 def spinning(robot, q, v, spin, push=(0.0, 0.0, 0.0)):
-    """The velocity (nv,) of a body that also turns about its CoM as told in world axes, and flies faster by ``push``."""
+    """The velocity (nv,) of a body that also turns about its CoM, world axes, and flies faster by ``push``."""
     data = robot.model.createData()
     pin.centerOfMass(robot.model, data, q, v)
     com, turn, out = data.com[0].copy(), pin.Quaternion(*q[[6, 3, 4, 5]]).toRotationMatrix(), v.copy()

@@ -11,7 +11,7 @@ from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, headed
+from jumplab.sim.kinematics import Gauge, headed, yaw_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
 from jumplab.sim.playback import Command, Playback
 from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
@@ -42,7 +42,8 @@ class Pilot:
 
     Attributes
     ----------
-    looks_rad : heading in which the robot shall land; all that looks ahead sees it along that one.
+    looks_rad : heading in which the robot shall land, or has landed if its legs are re-aimed; all that looks ahead sees
+        it along that one.
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
@@ -126,7 +127,7 @@ class Pilot:
         if self.touchdown is None:
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, played, q, v)
-            self._touch(step, played, q, v)
+            q = self._touch(step, played, q, v)
         since = step - self.touchdown
         if self._replan is not None and self.ahead.followed == "planned":
             self._landing.reference = self._replan.follow(since * STEP_S, q, v, self._landing.reference)
@@ -184,12 +185,20 @@ class Pilot:
         turn = pin.exp3(np.array([x, y, z]))
         return self._reaim.turn_ahead(q, v, turn, left) if 0 < left < np.inf else turn
 
-    def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+    def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Begin the landing; the configuration (nq,) comes back as it is seen from now on.
+
+        Re-aimed soles point where the trunk does, and along that heading the robot has to be caught.
+        """
         self.touchdown = step
+        if self._reaim is not None:
+            yaw = yaw_of(self._turn(step, played, q, v, 0.0))
+            self.looks_rad, q = self.looks_rad + yaw, headed(q, yaw)
         if self._plan_landing is not None:
             self._landing.reference = self._plan_landing(q, v)
             self.ahead.followed = "spring" if self._landing.reference is None else "given"
         self._look_ahead(step, played, q, v, 0.0)  # the ground came early
+        return q
 
 
 def _within_half_a_turn(angle: float) -> float:
