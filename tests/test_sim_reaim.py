@@ -115,8 +115,8 @@ def test_soles_of_a_turned_robot_meet_the_ground_flat(bhr, reaim, turn):
 def test_bounded_least_squares():
     slope = np.array([[1.0, 1.0], [0.0, 1.0]])
     wide, miss = np.full(2, 10.0), np.array([3.0, 1.0])
-    assert _within(slope, miss, -wide, wide) == pytest.approx([2, 1], abs=1e-3)
-    assert _within(slope, miss, -wide, np.array([0.5, 10.0])) == pytest.approx([0.5, 1.75], abs=1e-3)
+    assert _within(slope, miss, -wide, wide) == pytest.approx([2, 1], abs=4e-3)  # DAMPING is 1e-3
+    assert _within(slope, miss, -wide, np.array([0.5, 10.0])) == pytest.approx([0.5, 1.75], abs=4e-3)
     assert _within(slope, miss, -wide, np.array([0.5, 0.25])) == pytest.approx([0.5, 0.25])
 
 

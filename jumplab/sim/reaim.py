@@ -15,6 +15,7 @@ import pinocchio as pin
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, solved, turned, yaw_of
 from jumplab.sim.playback import Actuators
@@ -28,10 +29,11 @@ LARGEST_RAD = 0.8  # beyond 45 degrees the planned landing posture is lost anywa
 FASTEST_FALL = 1.0  # [m/s] below it the foothold says little about the moment
 SIDE_START_S, SIDE_RATE = 0.20, 8.0  # [s], [rad/s] yaw and roll joints swing nothing, and move legs that are heavy
 NEWTON_STEPS = 3  # twelve equations, nearly linear
-# of a sole's miss: forward, sideways, up [1/m], turned about these axes [1/rad]; a leg can hardly go inwards, and no
-# landing hangs on where a foot points
-WEIGHTS = np.array([1.0, 0.3, 1.0, 1.0, 1.0, 0.1])
-DAMPING = 1e-5  # [1] of the angles' squares, against a stretched knee
+# of a sole's miss: forward, sideways, up [1/m], turned about these axes [1/rad]; a sole off the level tips, a leg can
+# hardly go inwards, and no landing hangs on where a foot points
+WEIGHTS = np.array([1.0, 0.3, 1.0, 2.0, 2.0, 0.1])
+DAMPING = 1e-3  # [1] of the angles' squares: a leg that is nearly straight must not flap
+LEAST_KNEE_RAD = 0.4  # [rad] a knee keeps this bend, to give way
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
@@ -72,9 +74,11 @@ class Reaim:
         moving = {joint for frame in self._gauge.frames for joint in model.supports[model.frames[frame].parentJoint]}
         self._legs = np.array(sorted(model.joints[joint].idx_v for joint in moving if joint > 1)) - 6
         self._pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
-        planned = self._end[7:]
-        self._low = np.maximum(np.minimum(motors.lower + STOP_RAD, planned), planned - LARGEST_RAD)[self._legs]
-        self._high = np.minimum(np.maximum(motors.upper - STOP_RAD, planned), planned + LARGEST_RAD)[self._legs]
+        planned, low, high = self._end[7:], motors.lower + STOP_RAD, motors.upper - STOP_RAD
+        for knee, sign, straight in knees(robot):  # flexion = sign * angle + straight
+            (low if sign > 0 else high)[knee] = sign * (LEAST_KNEE_RAD - straight)
+        self._low = np.maximum(np.minimum(low, planned), planned - LARGEST_RAD)[self._legs]
+        self._high = np.minimum(np.maximum(high, planned), planned + LARGEST_RAD)[self._legs]
         self._places, self._attitudes = self._feet(self._end)
         self._middle = self._places.mean(axis=0)
         speed, self._momentum = self._motion(tape.q[-1], tape.v[-1])

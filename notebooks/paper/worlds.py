@@ -13,7 +13,7 @@ from jumplab.io.files import write_file
 from jumplab.sim import ENGINES, Ranges
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
-LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 40, 1  # draws that nothing was tuned on
+LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 20, 2  # draws that nothing was tuned on
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
