@@ -13,7 +13,7 @@ from jumplab.io.files import write_file
 from jumplab.sim import ENGINES, Ranges
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
-LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 20, 2  # draws that nothing was tuned on
+LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 15, 2  # draws that nothing was tuned on
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
@@ -28,7 +28,7 @@ def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: i
     What the folder's log has is not simulated again. ``python -m paper.worlds DIR [ROBOTS [JOBS]]`` calls it.
     """
     rows = []
-    for world, engine, reaim in product(WORLDS, ENGINES, (False, True)):
+    for world, engine, reaim in product(WORLDS, ENGINES, (True, False)):
         settings = TrialSettings(ranges=WORLDS[world], engine=engine, reaim=reaim)
         for trial in run_trials(folder, robots, SEED, settings, jobs=jobs).trials:
             row = {"world": world, "engine": engine, "re-aim": reaim, "number": trial.key.index, "landed": trial.landed}
@@ -42,18 +42,24 @@ def stored(path: Path = LOG) -> list[dict[str, Any]]:
 
 
 def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line per world and engine: how many land plain and re-aimed, Wilson's 95 % interval of the latter, why not."""
+    """A line per world and engine in which the same robots jumped re-aimed and plain.
+
+    It tells how many land of each, Wilson's 95 % interval of the re-aimed, and the causes of their falls.
+    """
     table = []
     for world, engine in dict.fromkeys((r["world"], r["engine"]) for r in rows):
-        here = [r for r in rows if (r["world"], r["engine"]) == (world, engine)]
-        plain, aimed = ([r for r in here if r["re-aim"] == on] for on in (False, True))
-        line = {"world": world, "engine": engine, "robots": len(aimed)}
-        for name, group in (("plain [%]", plain), ("re-aimed [%]", aimed)):
-            line[name] = 100 * sum(r["landed"] for r in group) / len(group)
-        low, high = wilson(sum(r["landed"] for r in aimed), len(aimed))
-        causes = Counter(r["cause"] for r in aimed if not r["landed"]).most_common()
-        told = ", ".join(f"{cause} {count}" for cause, count in causes)
-        table.append(line | {"from [%]": 100 * low, "to [%]": 100 * high, "falls of the re-aimed": told})
+        aimed, plain = (
+            {r["number"]: r for r in rows if (r["world"], r["engine"], r["re-aim"]) == (world, engine, on)}
+            for on in (True, False)
+        )
+        if aimed.keys() != plain.keys():
+            continue
+        landed, count = sum(r["landed"] for r in aimed.values()), len(aimed)
+        low, high = wilson(landed, count)
+        causes = Counter(r["cause"] for r in aimed.values() if not r["landed"]).most_common()
+        line = {"world": world, "engine": engine, "robots": count, "plain": sum(r["landed"] for r in plain.values())}
+        line |= {"re-aimed": landed, "re-aimed [%]": 100 * landed / count, "from [%]": 100 * low, "to [%]": 100 * high}
+        table.append(line | {"falls of the re-aimed": ", ".join(f"{cause} {n}" for cause, n in causes)})
     return table
 
 
