@@ -8,6 +8,7 @@ from fixtures_core import jump
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from paper import experiments as pictures
+from paper import worlds
 from paper.measurement import measure
 
 from jumplab.show.style import GROUND, LANDING, MIN_FONT_PT, PAGE_IN, VERMILION, tint
@@ -186,3 +187,22 @@ def test_titles_of_a_whole_basin_keep_apart():
     fig.draw_without_rendering()
     boxes = [ax._left_title.get_window_extent() for ax in fig.axes[3:6]]
     assert boxes[0].x1 < boxes[1].x0 and boxes[1].x1 < boxes[2].x0 and boxes[2].x1 <= fig.bbox.x1
+
+
+def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
+    def row(number, aimed, landed, engine="bullet", **more):
+        return {"world": "gale", "engine": engine, "re-aim": aimed, "number": number, "landed": landed} | more
+
+    rows = [row(0, True, True), row(1, True, False, cause="tip"), row(0, False, False, cause="slip")]
+    assert worlds.shares(rows) == []  # robot 1 did not jump plain
+    rows += [row(1, False, False, cause="tip"), row(0, True, True, "mujoco")]
+    (line,) = worlds.shares(rows)
+    low, high = wilson(1, 2)
+    assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": 0, "re-aimed": 1, "re-aimed [%]": 50.0,
+                    "from [%]": 100 * low, "to [%]": 100 * high, "falls of the re-aimed": "tip 1"}  # fmt: skip
+
+
+def test_rows_of_harder_worlds_are_of_known_worlds():
+    rows = worlds.stored()
+    assert {r["world"] for r in rows} <= set(worlds.WORLDS) and worlds.shares(rows)
+    assert all(r["landed"] != ("cause" in r) for r in rows)

@@ -293,7 +293,7 @@ def test_the_touchdown_is_foreseen(bhr, tape):
     touch = int(np.argmax(run.phase == "landing"))
     early = touch - 150
     assert forecast.time_left(run.q[early], run.v[early]) == pytest.approx(0.15, abs=0.003)
-    error = Playback(tape, bhr).attitude_error(early, run.q[early])[1]
+    error = pin.rpy.rpyToMatrix(0.0, Playback(tape, bhr).attitude_error(early, run.q[early])[1], 0.0)
     there = touchdown_of_state(bhr, *forecast.state(run.q[early], run.v[early], error), impact=False)
     real = touchdown_of_state(bhr, run.q[touch], run.v[touch], impact=False)
     assert there.com == pytest.approx(real.com, abs=0.01)

@@ -161,7 +161,7 @@ def test_report_counts(folder, coins):
     assert said["settings"]["noise"] == vars(SensorNoise.typical())  # sensors err unless told otherwise
     assert said["conditions"] == {
         "playback": "position mode in PyBullet",
-        "re-aim": "hips and ankles turn in the air against the error of the trunk's pitch",
+        "re-aim": "the legs turn in the air against errors of trunk, speed and momentum, about all axes",
         "drawn uniformly, each link and joint by itself": str(Ranges()),
         "measured (one standard deviation)": str(SensorNoise.typical()),
         "known exactly": monte_carlo.KNOWN,

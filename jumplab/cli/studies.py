@@ -66,7 +66,7 @@ def bars(args: Namespace) -> bool | None:
     opt("--basin", "the robot as planned, from 225 wrong states at the apex; writes basin.json"),
     MODE,
     ENGINE,
-    opt("--reaim", "turn the legs in the air against the trunk's pitch error", True),
+    opt("--reaim", "put the legs in the air to where they can catch the robot", True),
     opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
     DISTURB,
     opt("--keep-falls N", "run the first N failures again, each into falls/NUMBER, for 'view'", "0", whole(0, 100)),

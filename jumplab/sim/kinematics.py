@@ -36,9 +36,10 @@ def turned(q: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return out
 
 
-def pitched(q: np.ndarray, angle: float) -> np.ndarray:
-    """A copy of ``q`` (nq,) with its base turned in place by ``angle`` about y [rad]."""
-    return turned(q, pin.rpy.rpyToMatrix(0.0, angle, 0.0))
+def yaw_of(turn: np.ndarray) -> float:
+    """How far a rotation (3, 3) turns about the vertical, whatever it tilts besides [rad]."""
+    z, w = pin.Quaternion(turn).coeffs()[2:]
+    return float(2 * np.arctan2(z if w >= 0 else -z, abs(w)))
 
 
 def pitch_of(q: np.ndarray) -> np.ndarray:
@@ -77,6 +78,11 @@ class Gauge:
     def toe(self, q: np.ndarray) -> np.ndarray:
         """Middle between the toes (3,) [m]."""
         return self._on_feet(q, np.array([self.robot.foot.toe, 0.0, self.robot.foot.sole_z]))
+
+    def places(self, q: np.ndarray) -> list[pin.SE3]:
+        """Placements of both feet."""
+        pin.framesForwardKinematics(self.model, self.data, q)
+        return [self.data.oMf[frame].copy() for frame in self.frames]
 
     def _on_feet(self, q: np.ndarray, point: np.ndarray) -> np.ndarray:
         pin.framesForwardKinematics(self.model, self.data, q)

@@ -154,7 +154,7 @@ def simulate_jump(
     mode : "position" or "pd", how the tape is played until touchdown.
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
-    reaim : turn the legs in the air against the trunk's measured pitch error.
+    reaim : put the legs in the air to where they can catch the robot, see :class:`jumplab.sim.reaim.Reaim`.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state; "spring" leads to the
         stance by spring-dampers alone, and so does "planned" where stage 1 finds no landing. The result's
         ``settings["landing"]`` says what was followed, and what the plan's solve cost.

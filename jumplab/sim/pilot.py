@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, headed
+from jumplab.sim.kinematics import Gauge, headed, yaw_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
 from jumplab.sim.playback import Command, Playback
 from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
@@ -41,7 +42,8 @@ class Pilot:
 
     Attributes
     ----------
-    looks_rad : heading in which the robot shall land; all that looks ahead sees it along that one.
+    looks_rad : heading in which the robot shall land, or has landed if its legs are re-aimed; all that looks ahead sees
+        it along that one.
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
@@ -125,7 +127,7 @@ class Pilot:
         if self.touchdown is None:
             if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
                 return self._fly(step, played, q, v)
-            self._touch(step, played, q, v)
+            q = self._touch(step, played, q, v)
         since = step - self.touchdown
         if self._replan is not None and self.ahead.followed == "planned":
             self._landing.reference = self._replan.follow(since * STEP_S, q, v, self._landing.reference)
@@ -148,7 +150,8 @@ class Pilot:
         if left <= LEAD_S:
             self._look_ahead(step, played, q, v, left)
         if self._reaim is not None:
-            aimed = self._reaim.correction(q, v, self._error(step, played), None if self._tuck is None else left)
+            turn = self._turn(step, played, q, v, left)
+            aimed = self._reaim.correction(q, v, turn, left, self._tuck is not None)
         if shift is None:
             command = self.playback.command(step, played, v, aimed)
         else:
@@ -161,23 +164,42 @@ class Pilot:
             return
         there = q, v
         if left > 0:
-            error = self._error(step, played)
-            correction = None if self._reaim is None else self._reaim.wish(q, v, error)
-            there = self.forecast.state(q, v, error, correction)
+            turn = self._turn(step, played, q, v, left)
+            correction = None if self._reaim is None else self._reaim.wish(q, v, turn)
+            there = self.forecast.state(q, v, turn, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 
-    def _error(self, step: int, played: np.ndarray) -> float:
-        """How far the trunk will be off its planned pitch at touchdown [rad]: as now, or in a flip as forecast."""
-        if self._tuck is None:
-            x, y, _ = self.playback.attitude_error(step, played)
-            error = y if self._heading == 0 else np.cos(self._heading) * y - np.sin(self._heading) * x
-        else:
-            error = self._tuck.miss
-        return float(np.arctan2(np.sin(error), np.cos(error)))
+    def _turn(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
+        """How far (3, 3) the trunk will be off its planned attitude at touchdown, in ``left`` seconds.
 
-    def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> None:
+        Of a flip only the pitch is told, as forecast; without re-aim only the pitch, as it is now.
+        """
+        if self._tuck is not None:
+            return pin.rpy.rpyToMatrix(0.0, _within_half_a_turn(self._tuck.miss), 0.0)
+        x, y, z = self.playback.attitude_error(step, played)
+        if self._heading != 0:
+            c, s = np.cos(self._heading), np.sin(self._heading)
+            x, y = c * x + s * y, c * y - s * x
+        if self._reaim is None:
+            return pin.rpy.rpyToMatrix(0.0, _within_half_a_turn(y), 0.0)
+        turn = pin.exp3(np.array([x, y, z]))
+        return self._reaim.turn_ahead(q, v, turn, left) if 0 < left < np.inf else turn
+
+    def _touch(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Begin the landing; the configuration (nq,) comes back as it is seen from now on.
+
+        Re-aimed soles point where the trunk does, and along that heading the robot has to be caught.
+        """
         self.touchdown = step
+        if self._reaim is not None:
+            yaw = yaw_of(self._turn(step, played, q, v, 0.0))
+            self.looks_rad, q = self.looks_rad + yaw, headed(q, yaw)
         if self._plan_landing is not None:
             self._landing.reference = self._plan_landing(q, v)
             self.ahead.followed = "spring" if self._landing.reference is None else "given"
         self._look_ahead(step, played, q, v, 0.0)  # the ground came early
+        return q
+
+
+def _within_half_a_turn(angle: float) -> float:
+    return float(np.arctan2(np.sin(angle), np.cos(angle)))

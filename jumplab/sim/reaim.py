@@ -1,4 +1,7 @@
-"""Optional correction in flight: legs are turned against the trunk's pitch error, and a flip's tuck opens in time.
+"""Optional correction in flight: the legs are put where they can catch the robot, and a flip's tuck opens in time.
+
+A shove, or a robot unlike its plan, leaves speed, momentum and attitude other than planned, about all axes. What flies
+can no longer change the first two; where the soles meet the ground it still can.
 
 In the air L is constant and the trunk turns at (L - h) / I, where I is the pitch inertia about the CoM and h what the
 joints' own rates carry. A robot that took off with a few per cent too much L arrives a few tenths of a radian off.
@@ -12,8 +15,10 @@ import pinocchio as pin
 
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitch_of, pitched, planned_pitch, solved
+from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, solved, turned, yaw_of
+from jumplab.sim.playback import Actuators
 from jumplab.sim.scene import Scene
 
 # The paper prints none of these numbers.
@@ -22,9 +27,14 @@ RATE = 12.0  # [rad/s] 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the
 FLIP_START_S, FLIP_RATE = 0.12, 4.0  # [s], [rad/s] a flip's legs open at their limits: sooner, and more gently
 LARGEST_RAD = 0.8  # beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] below it the foothold says little about the moment
-NEWTON_STEPS = 2  # two equations, nearly linear
-HIP_ANKLE = (0, 2)  # rows of jumplab.robot.SAGITTAL_JOINTS
-PROBE_RAD = 1e-4  # of the finite differences
+SIDE_START_S, SIDE_RATE = 0.20, 8.0  # [s], [rad/s] yaw and roll joints swing nothing, and move legs that are heavy
+NEWTON_STEPS = 3  # twelve equations, nearly linear
+# of a sole's miss: forward, sideways, up [1/m], turned about these axes [1/rad]; a sole off the level tips, a leg can
+# hardly go inwards, and no landing hangs on where a foot points
+WEIGHTS = np.array([1.0, 0.3, 1.0, 2.0, 2.0, 0.1])
+DAMPING = 1e-3  # [1] of the angles' squares: a leg that is nearly straight must not flap
+LEAST_KNEE_RAD = 0.4  # [rad] a knee keeps this bend, to give way
+STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
 SOONER_S, LATER_S = 0.09, 0.03  # the tuck opens at most; opened later, hips have to pass their speed limits
@@ -41,73 +51,142 @@ def is_flip(tape: Tape) -> bool:
 
 
 class Reaim:
-    """Turns hips and ankles so that the soles meet the ground flat, and where they can catch the robot.
+    """Turns the legs' joints so that the soles meet the ground flat, and where they can catch the robot.
 
-    That is where the angular momentum about the soles' middle, L + m (z v_x + ahead v_z), is the planned one: an impact
-    under the soles does not change it, and what is left of it afterwards tips the robot over.
+    That is where the angular momentum about the middle of the soles is the planned one, about both level axes,
 
-    The posture at touchdown is predicted as the tape's last one, with the trunk as far off its planned pitch as it is
-    now. Without any error the correction is zero.
+        (L + m r x v)_xy   with r from there to the CoM,
+
+    since an impact under the soles does not change it, and what is left of it afterwards tips the robot over. With the
+    fall v_z known it says how far the soles are ahead of the CoM and to its left. The leg on that side goes twice as
+    far as the middle must, the other one stays: hips turn outwards, hardly inwards. All this is seen along the heading
+    of the robot, not of the plan: the feet point where the trunk does.
+
+    The posture at touchdown is predicted as the tape's last one, with the trunk off its planned attitude by what it is
+    now and by what it drifts until then, see :meth:`turn_ahead`. Without any error the correction is zero.
+
+    ``tape`` and ``scene`` are seen along the heading in which the robot shall land, and so is all that is told later.
     """
 
     def __init__(self, robot: Robot, tape: Tape, scene: Scene):
         self._gauge, self._scene, self._mass = Gauge(robot), scene, robot.total_mass
-        sides = [[(robot.joint_names.index(n), s) for n, row, s in robot.role_signs() if row == i] for i in HIP_ANKLE]
-        self._rows = [[7 + row for row, _ in side] for side in sides]
-        self._signs = [np.array([sign for _, sign in side]) for side in sides]  # left and right may turn opposite ways
-        self._end = tape.q[-1].copy()
-        ahead, self._tilt, height = self._aim(self._end)
-        speed, momentum = self._motion(tape.q[-1], tape.v[-1])
-        self._moment = momentum / self._mass + height * speed[0] + ahead * speed[2]
+        model, motors, self._end = robot.model, Actuators(robot), tape.q[-1].copy()
+        moving = {joint for frame in self._gauge.frames for joint in model.supports[model.frames[frame].parentJoint]}
+        self._legs = np.array(sorted(model.joints[joint].idx_v for joint in moving if joint > 1)) - 6
+        self._pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
+        planned, low, high = self._end[7:], motors.lower + STOP_RAD, motors.upper - STOP_RAD
+        for knee, sign, straight in knees(robot):  # flexion = sign * angle + straight
+            (low if sign > 0 else high)[knee] = sign * (LEAST_KNEE_RAD - straight)
+        self._low = np.maximum(np.minimum(low, planned), planned - LARGEST_RAD)[self._legs]
+        self._high = np.minimum(np.maximum(high, planned), planned + LARGEST_RAD)[self._legs]
+        self._places, self._attitudes = self._feet(self._end)
+        self._middle = self._places.mean(axis=0)
+        speed, self._momentum = self._motion(tape.q[-1], tape.v[-1])
+        self._inertia = self._gauge.data.Ig.inertia.copy()
+        self._tipping = (self._momentum / self._mass - np.cross(self._middle, speed))[:2]
         self._now = np.zeros(len(robot.joint_names))
 
-    def _motion(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
-        """CoM velocity (3,), and angular momentum about the pitch axis."""
+    def _motion(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """CoM velocity (3,), and angular momentum (3,) about the CoM."""
         data = self._gauge.data
         pin.ccrba(self._gauge.model, data, q, v)
-        return data.hg.linear / self._mass, float(data.hg.angular[1])
+        return data.hg.linear / self._mass, data.hg.angular.copy()
 
-    def _aim(self, q: np.ndarray) -> np.ndarray:
-        """Middle of the soles ahead of the CoM [m], the soles' pitch [rad], CoM above the soles [m]."""
-        com, middle = self._gauge.com(q), self._gauge.soles(q)
-        feet = [self._gauge.data.oMf[frame].rotation for frame in self._gauge.frames]
-        tilt = np.mean([np.arctan2(-foot[2, 0], foot[2, 2]) for foot in feet])
-        return np.array([middle[0] - com[0], tilt, com[2] - middle[2]])
+    def _feet(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Middles of the soles (2, 3) from the CoM [m], and their attitudes (2, 3, 3)."""
+        com, feet = self._gauge.com(q), self._gauge.places(q)
+        middles = [foot.act(self._gauge.robot.foot.center) - com for foot in feet]
+        return np.array(middles), np.array([foot.rotation for foot in feet])
 
-    def correction(self, q: np.ndarray, v: np.ndarray, error: float, opening: float | None = None) -> np.ndarray:
+    def turn_ahead(self, q: np.ndarray, v: np.ndarray, turn: np.ndarray, left_s: float) -> np.ndarray:
+        """How far (3, 3) the body will be turned off the plan in ``left_s``, if it is by ``turn`` (3, 3) now.
+
+        With inertia I and angular momentum L_p of the plan, and the joints as planned, it turns by
+        ``turn`` I^-1 (turn^T L - L_p) [rad/s]. That is taken from halfway, with the mean of I now and at touchdown.
+        """
+        momentum = self._motion(q, v)[1]
+        now = turn.T @ self._gauge.data.Ig.inertia @ turn
+        rate = turn @ solved(now, turn.T @ momentum - self._momentum)
+        halfway = pin.exp3(rate * left_s / 2) @ turn
+        rate = halfway @ solved((now + self._inertia) / 2, halfway.T @ momentum - self._momentum)
+        return pin.exp3(rate * left_s) @ turn
+
+    def correction(self, q: np.ndarray, v: np.ndarray, turn: np.ndarray, left_s: float, flip: bool) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at :data:`RATE` at most.
 
-        ``error`` of the trunk's pitch at touchdown, as now or as forecast [rad], is within half a turn; ``opening`` is,
-        in a flip, the time until touchdown [s].
+        ``turn`` (3, 3) is the trunk's attitude at touchdown, in ``left_s``, times that of the plan transposed.
         """
         middle = self._gauge.soles(q)
         near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
-        if near or (opening is not None and opening < FLIP_START_S):
-            most = (RATE if near else FLIP_RATE) * STEP_S
-            self._now = self._now + np.clip(self.wish(q, v, error) - self._now, -most, most)
+        if flip:
+            moving = np.full(len(self._now), near or left_s < FLIP_START_S)
+        else:
+            moving = np.where(self._pitching, near, near or left_s < SIDE_START_S)
+        if moving.any():
+            most = np.where(self._pitching, RATE if near else FLIP_RATE, SIDE_RATE) * STEP_S
+            self._now = self._now + np.where(moving, np.clip(self.wish(q, v, turn) - self._now, -most, most), 0.0)
         return self._now
 
-    def wish(self, q: np.ndarray, v: np.ndarray, pitch_error: float) -> np.ndarray:
+    def wish(self, q: np.ndarray, v: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """Correction (nv - 6,) with which the predicted touchdown has the soles flat and well placed."""
         speed, momentum = self._motion(q, v)
-        com = self._gauge.data.com[0].copy()
-        top = self._scene.top_at(self._gauge.soles(q)[0])
-        guess = pitched(self._end, pitch_error)
+        above = self._gauge.data.com[0][2] + self._middle[2] - self._scene.top_at(self._gauge.soles(q)[0])
+        fall = np.sqrt(max(speed[2] ** 2 + 2 * self._gauge.robot.gravity * above, FASTEST_FALL**2))
+        own = pin.rpy.rpyToMatrix(0.0, 0.0, -yaw_of(turn))
+        goals = self._places + self.shifts(own @ speed, own @ momentum, fall)
+        return self._reached(turned(self._end, own @ turn), goals)
+
+    def shifts(self, speed: np.ndarray, momentum: np.ndarray, fall: float) -> np.ndarray:
+        """How far (2, 3) the soles have to be from their planned places under the CoM [m].
+
+        ``speed`` (3,) of the CoM and ``momentum`` (3,) are seen along the robot's heading, ``fall`` is the speed
+        downwards at touchdown.
+        """
+        roll, pitch = momentum[:2] / self._mass - self._tipping
+        down = self._middle[2]
+        ahead, left = (pitch - down * speed[0]) / fall, (-roll - down * speed[1]) / fall
+        shifts = np.zeros((2, 3))
+        shifts[:, 0], off = ahead - self._middle[0], left - self._middle[1]
+        shifts[:, 1] = np.where((self._places[:, 1] - self._middle[1]) * off > 0, 2 * off, 0.0)
+        return shifts
+
+    def _reached(self, guess: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """Correction (nv - 6,) that leads the soles of ``guess`` to ``goals`` (2, 3) from the CoM, flat as planned."""
+        rows, planned = 7 + self._legs, self._end[7:]
         for _ in range(NEWTON_STEPS):
-            here = self._aim(guess)
-            fall = np.sqrt(
-                max(speed[2] ** 2 + 2 * self._gauge.robot.gravity * (com[2] - here[2] - top), FASTEST_FALL**2)
+            slope, miss = self._slope(guess, goals)
+            guess[rows] += _within(slope, miss, self._low - guess[rows], self._high - guess[rows])
+        return guess[7:] - planned  # zero but for the legs
+
+    def _slope(self, q: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted motions (12, k) of the soles under the CoM per leg joint, and what is missing (12,)."""
+        model, data, (places, attitudes) = self._gauge.model, self._gauge.data, self._feet(q)
+        pin.computeJointJacobians(model, data, q)
+        own, columns = pin.jacobianCenterOfMass(model, data, q)[:, 6:], 6 + self._legs
+        slope, miss = [], []
+        for side, frame in enumerate(self._gauge.frames):
+            jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
+            jacobian[:3] -= (
+                pin.skew(attitudes[side] @ self._gauge.robot.foot.center) @ jacobian[3:] + own[:, self._legs]
             )
-            goal = np.array([(momentum / self._mass + here[2] * speed[0] - self._moment) / fall, self._tilt])
-            slope = np.empty((2, 2))
-            for column, (rows, signs) in enumerate(zip(self._rows, self._signs, strict=True)):
-                probe = guess.copy()
-                probe[rows] += PROBE_RAD * signs
-                slope[:, column] = (self._aim(probe) - here)[:2] / PROBE_RAD
-            turns = solved(slope, goal - here[:2])
-            for rows, signs, angle in zip(self._rows, self._signs, turns, strict=True):
-                guess[rows] += angle * signs
-        return np.clip(guess[7:] - self._end[7:], -LARGEST_RAD, LARGEST_RAD)  # zero but for hips and ankles
+            turn = pin.log3(self._attitudes[side] @ attitudes[side].T)
+            slope.append(WEIGHTS[:, None] * jacobian)
+            miss.append(WEIGHTS * np.concatenate([goals[side] - places[side], turn]))
+        return np.vstack(slope), np.concatenate(miss)
+
+
+def _within(slope: np.ndarray, miss: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Least squares of ``slope`` x = ``miss`` within ``low`` <= x <= ``high``; what meets a bound stays there."""
+    x, free = np.zeros(len(low)), np.ones(len(low), bool)
+    while free.any():
+        part = slope[:, free]
+        right = part.T @ (miss - slope[:, ~free] @ x[~free])
+        x[free] = np.ravel(solved(part.T @ part + DAMPING * np.eye(free.sum()), right))
+        beyond = free & ((x < low) | (x > high))
+        if not beyond.any():
+            break
+        x, free = np.clip(x, low, high), free & ~beyond
+    return x
 
 
 class Tuck:

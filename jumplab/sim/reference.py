@@ -17,7 +17,7 @@ from jumplab.errors import JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitched, rotation
+from jumplab.sim.kinematics import Gauge, rotation, turned, yaw_of
 from jumplab.sim.scene import Scene
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
 
@@ -111,17 +111,19 @@ class Forecast:
         return float(left)
 
     def state(
-        self, q: np.ndarray, v: np.ndarray, pitch_error: float, correction: np.ndarray | None = None
+        self, q: np.ndarray, v: np.ndarray, turn: np.ndarray, correction: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured state in flight.
 
-        The trunk's ``pitch_error`` [rad] stays; ``correction`` (nv - 6,) will have been added to the tape by then.
+        The trunk will be off its planned attitude by ``turn`` (3, 3), and ``correction`` (nv - 6,) will have been added
+        to the tape by then. The forecast is seen along the heading that the robot will have.
         """
         model, data = self._gauge.model, self._gauge.data
         pin.ccrba(model, data, q, v)
-        speed, momentum = data.vcom[0].copy(), data.hg.angular[1]
+        own = pin.rpy.rpyToMatrix(0.0, 0.0, -yaw_of(turn))
+        speed, momentum = own @ data.vcom[0], float((own @ data.hg.angular)[1])
         speed[2] -= self._gauge.robot.gravity * self.time_left(q, v)
-        end, rates = pitched(self._q, pitch_error), self._v.copy()
+        end, rates = turned(self._q, own @ turn), self._v.copy()
         if correction is not None:
             end[7:] += correction
         # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM flies on

@@ -84,7 +84,7 @@ class TrialSettings:
     """How the robots of a Monte Carlo are drawn and made to jump."""
 
     mode: str = "position"  # or "pd": how the tape is played until touchdown
-    reaim: bool = True  # turn the legs in the air against the trunk's measured pitch error
+    reaim: bool = True  # put the legs in the air to where they can catch the robot
     noise: SensorNoise = field(default_factory=SensorNoise.typical)  # on what the controllers are told
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
@@ -97,7 +97,11 @@ class TrialSettings:
     @property
     def conditions(self) -> dict[str, str]:
         """In sentences: what differs from robot to robot, what corrects it, what is measured, what is known exactly."""
-        aim = "hips and ankles turn in the air against the error of the trunk's pitch" if self.reaim else "no"
+        aim = (
+            "the legs turn in the air against errors of trunk, speed and momentum, about all axes"
+            if self.reaim
+            else "no"
+        )
         return {
             "playback": f"{self.mode} mode in {engine_class(self.engine).title}",
             "re-aim": aim,

@@ -327,7 +327,7 @@ class ChainPilot:
         tape, pilot = self.used[-1].plan.tape, self.pilots[-1]
         row = np.searchsorted(tape.t, (step - self.began[-1]) * STEP_S)
         turned, q = pitch_of(q) - pitch_of(tape.q[min(row, len(tape.t) - 1)]), pilot.seen(q)
-        end, _ = pilot.forecast.state(q, v, turned)
+        end, _ = pilot.forecast.state(q, v, pin.rpy.rpyToMatrix(0.0, float(turned), 0.0))
         end[:3] += self._gauge.com_ahead(q, v, left) - self._gauge.com(end)
         if self._foresight.course.in_plane:
             return self._pose(end)

@@ -1,0 +1,67 @@
+"""Harder worlds: how many perturbed robots land in each, with the legs re-aimed in the air and without."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from jumplab.io.files import write_file
+from jumplab.sim import ENGINES, Ranges
+from jumplab.studies.trials import TrialSettings, run_trials, wilson
+
+LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 15, 2  # draws that nothing was tuned on
+WORLDS = {
+    "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
+    "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
+    "twice the usual ranges": Ranges(0.10, 0.03, 0.20, (0.3, 1.0), (0.0, 0.008), 0.10),  # friction: the least there is
+    "the usual ranges": Ranges(),
+}
+
+
+def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: int | None = None) -> None:
+    """Let ``robots`` jump the plan in ``folder`` in every world and engine; one row each, written after every series.
+
+    What the folder's log has is not simulated again. ``python -m paper.worlds DIR [ROBOTS [JOBS]]`` calls it.
+    """
+    rows = []
+    for world, engine, reaim in product(WORLDS, ENGINES, (True, False)):
+        settings = TrialSettings(ranges=WORLDS[world], engine=engine, reaim=reaim)
+        for trial in run_trials(folder, robots, SEED, settings, jobs=jobs).trials:
+            row = {"world": world, "engine": engine, "re-aim": reaim, "number": trial.key.index, "landed": trial.landed}
+            rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
+        write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+
+
+def stored(path: Path = LOG) -> list[dict[str, Any]]:
+    """The kept rows."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per world and engine in which the same robots jumped re-aimed and plain.
+
+    It tells how many land of each, Wilson's 95 % interval of the re-aimed, and the causes of their falls.
+    """
+    table = []
+    for world, engine in dict.fromkeys((r["world"], r["engine"]) for r in rows):
+        aimed, plain = (
+            {r["number"]: r for r in rows if (r["world"], r["engine"], r["re-aim"]) == (world, engine, on)}
+            for on in (True, False)
+        )
+        if aimed.keys() != plain.keys():
+            continue
+        landed, count = sum(r["landed"] for r in aimed.values()), len(aimed)
+        low, high = wilson(landed, count)
+        causes = Counter(r["cause"] for r in aimed.values() if not r["landed"]).most_common()
+        line = {"world": world, "engine": engine, "robots": count, "plain": sum(r["landed"] for r in plain.values())}
+        line |= {"re-aimed": landed, "re-aimed [%]": 100 * landed / count, "from [%]": 100 * low, "to [%]": 100 * high}
+        table.append(line | {"falls of the re-aimed": ", ".join(f"{cause} {n}" for cause, n in causes)})
+    return table
+
+
+if __name__ == "__main__":
+    study(sys.argv[1], *map(int, sys.argv[2:3]), jobs=int(sys.argv[3]) if len(sys.argv) > 3 else None)

@@ -1,0 +1,141 @@
+"""Re-aim in the air: what is forecast, where the soles are wished, and a shove that only re-aimed robots survive."""
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_core import jump
+
+from jumplab.sim import INSTALLED, Perturbation, Scene, Shove, simulate_jump
+from jumplab.sim.kinematics import Gauge, headed, turned, yaw_of
+from jumplab.sim.playback import Actuators, Playback
+from jumplab.sim.reaim import Reaim, _within
+
+DISTANCE_M, HEIGHT_M = 0.6, 0.3
+
+
+@cache
+def tape():
+    return jump(DISTANCE_M, HEIGHT_M, method="direct").tape
+
+
+@pytest.fixture
+def reaim(bhr):
+    return Reaim(bhr, tape(), Scene.flat())
+
+
+def spinning(robot, q, v, spin, push=(0.0, 0.0, 0.0)):
+    """The velocity (nv,) of a body that also turns about its CoM, world axes, and flies faster by ``push``."""
+    data = robot.model.createData()
+    pin.centerOfMass(robot.model, data, q, v)
+    com, turn, out = data.com[0].copy(), pin.Quaternion(*q[[6, 3, 4, 5]]).toRotationMatrix(), v.copy()
+    out[:3] += turn.T @ (np.cross(spin, q[:3] - com) + push)
+    out[3:6] += turn.T @ np.asarray(spin)
+    return out
+
+
+def about_the_soles(robot, q, speed, momentum):
+    """L + m r x v about the middle of the soles, over the mass, about x and y."""
+    gauge = Gauge(robot)
+    return (momentum / robot.total_mass + np.cross(gauge.com(q) - gauge.soles(q), speed))[:2]
+
+
+def motion(robot, q, v):
+    data = robot.model.createData()
+    pin.ccrba(robot.model, data, q, v)
+    return data.hg.linear / robot.total_mass, data.hg.angular.copy()
+
+
+@pytest.mark.parametrize("spin", [(0.5, 0.0, 0.0), (0.0, -0.4, 0.0), (0.0, 0.0, 0.8), (0.3, 0.2, -0.6)])
+def test_a_body_turns_on_as_fast_as_it_does_beyond_the_plan(bhr, reaim, spin):
+    """A moment ahead by I^-1 (L - L_p), which is the very spin; a push through the CoM turns nothing."""
+    q, v, moment = tape().q[-1], tape().v[-1], 1e-4
+    for speed, push in ((spin, (0.3, -0.4, 0.1)), ((0.0, 0.0, 0.0), (0.3, -0.4, 0.1))):
+        turn = reaim.turn_ahead(q, spinning(bhr, q, v, speed, push), np.eye(3), moment)
+        assert pin.log3(turn) / moment == pytest.approx(speed, abs=1e-3)
+
+
+def test_a_turned_body_turns_on_as_its_momentum_stays(bhr, reaim):
+    """Planned and turned body spin alike in their own axes, L does not turn: turn I^-1 (turn^T L - L_p)."""
+    t, moment, turn = tape(), 1e-4, pin.exp3(np.array([0.1, -0.2, 0.3]))
+    q = turned(t.q[-1], turn)
+    v = t.v[-1].copy()  # in base axes: the momentum turns along
+    ahead = reaim.turn_ahead(q, v, turn, moment)
+    assert pin.log3(ahead @ turn.T) / moment == pytest.approx([0, 0, 0], abs=1e-3)
+
+
+def test_the_heading_of_a_turn():
+    for yaw in (-2.0, -0.3, 0.0, 0.7):
+        tilted = pin.rpy.rpyToMatrix(0.0, 0.0, yaw) @ pin.exp3(np.array([0.3, -0.2, 0.0]))
+        assert yaw_of(tilted) == pytest.approx(yaw)
+    assert yaw_of(pin.rpy.rpyToMatrix(0.0, 3.0, 0.0)) == yaw_of(pin.rpy.rpyToMatrix(0.0, -0.2, 0.0)) == 0
+
+
+def test_a_flight_as_planned_is_left_alone(bhr, reaim):
+    """At touchdown nothing is wished; on the way down nothing that matters, the plan's flight being free."""
+    t = tape()
+    assert np.abs(reaim.wish(t.q[-1], t.v[-1], np.eye(3))).max() < 1e-6
+    assert np.abs(reaim.wish(t.q[-150], t.v[-150], np.eye(3))).max() < 5e-3
+
+
+@pytest.mark.parametrize("push", [(0.15, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.25, 0.0), (0.1, -0.25, 0.0)])
+def test_the_soles_go_where_nothing_tips_the_robot(bhr, reaim, push):
+    """The middle of the soles that are wished: the momentum about it is the planned one, about both level axes."""
+    q, v = tape().q[-1], tape().v[-1]
+    shoved = spinning(bhr, q, v, (0.0, 0.0, 0.0), push)
+    speed, momentum = motion(bhr, q, shoved)
+    planned = about_the_soles(bhr, q, *motion(bhr, q, v))
+    there = q.copy()
+    there[7:] += reaim.wish(q, shoved, np.eye(3))
+    assert about_the_soles(bhr, there, speed, momentum) == pytest.approx(planned, abs=0.02)
+    assert np.abs(about_the_soles(bhr, q, speed, momentum) - planned).max() > 0.05  # without
+    before, after = (np.array([p.act(bhr.foot.center) for p in Gauge(bhr).places(x)])[:, 1] for x in (q, there))
+    if push[1]:  # the leg on that side goes out, the other one hardly moves
+        out = int(push[1] < 0)
+        assert (after - before)[out] * np.sign(push[1]) > 0.05 > 0.03 > abs(after - before)[1 - out]
+
+
+@pytest.mark.parametrize("turn", [(0.15, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4), (0.1, -0.15, -0.3)])
+def test_soles_of_a_turned_robot_meet_the_ground_flat(bhr, reaim, turn):
+    """Seen along the heading of the robot itself: the same posture whatever the yaw, within the joints' stops."""
+    t, turn = tape(), pin.exp3(np.array(turn))
+    wish = reaim.wish(turned(t.q[-1], turn), t.v[-1], turn)
+    there = turned(t.q[-1], turn)
+    there[7:] += wish
+    tilts = [np.arccos(place.rotation[2, 2]) for place in Gauge(bhr).places(there)]
+    assert max(tilts) < 0.03 and np.ptp([p.translation[2] for p in Gauge(bhr).places(there)]) < 0.01
+    motors = Actuators(bhr)
+    assert (there[7:] >= motors.lower).all() and (there[7:] <= motors.upper).all()
+    more = pin.rpy.rpyToMatrix(0.0, 0.0, 0.5)
+    q, v = headed(t.q[-1], -0.5), t.v[-1]
+    assert reaim.wish(q, v, more) == pytest.approx(reaim.wish(t.q[-1], t.v[-1], np.eye(3)), abs=1e-9)
+
+
+def test_bounded_least_squares():
+    slope = np.array([[1.0, 1.0], [0.0, 1.0]])
+    wide, miss = np.full(2, 10.0), np.array([3.0, 1.0])
+    assert _within(slope, miss, -wide, wide) == pytest.approx([2, 1], abs=4e-3)  # DAMPING is 1e-3
+    assert _within(slope, miss, -wide, np.array([0.5, 10.0])) == pytest.approx([0.5, 1.75], abs=4e-3)
+    assert _within(slope, miss, -wide, np.array([0.5, 0.25])) == pytest.approx([0.5, 0.25])
+
+
+def test_a_shoved_robot_is_forecast_in_flight(bhr, reaim):
+    """Attitude at touchdown about all axes, 0.15 s before, of a robot that nothing corrects."""
+    aside = Perturbation(shoves=(Shove("flight", 0.3, 8.0, np.pi / 2),))
+    run = simulate_jump(tape(), bhr, perturbation=aside, stand_s=0.05)
+    playback, touch = Playback(tape(), bhr), int(np.argmax(run.phase == "landing"))
+    early = touch - 150
+    seen, real = (playback.attitude_error(k, run.q[k]) for k in (early, touch))
+    forecast = pin.log3(reaim.turn_ahead(run.q[early], run.v[early], pin.exp3(seen), 0.15))
+    assert forecast == pytest.approx(real, abs=0.02)
+    assert np.linalg.norm(real - seen) > 0.06  # much was still to come
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_shove_aside_is_landed_with_reaim_alone(bhr, engine):
+    aside = Perturbation(shoves=(Shove("flight", 0.3, 15.0, np.pi / 2),))
+    plain, aimed = (simulate_jump(tape(), bhr, perturbation=aside, reaim=on, engine=engine) for on in (False, True))
+    assert "touched the ground" in plain.reason
+    assert aimed.landed and aimed.checks_passed, aimed.reason
