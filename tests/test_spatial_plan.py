@@ -137,13 +137,16 @@ def test_neighbour_is_planned_from_the_plan():
     assert audit(after.tape, after.robot, after.task).passed
 
 
-def test_a_plan_that_passes_limits_between_the_nodes_is_solved_again_on_a_finer_mesh(monkeypatch):
-    last, verdicts = planner().stage("spatial"), iter([False, True, False, False])
+def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_again_on_a_finer_mesh(monkeypatch):
+    last, verdicts = planner().stage("spatial"), iter([False, True, False, False, True, False, False, False])
     coarse = jump(SIDE).whole_body
+    first = last.plan(SIDE, near=coarse).solution
     monkeypatch.setattr("jumplab.stages.spatial.planner.holds_between", lambda tape, robot: next(verdicts))
-    finer, kept = (last.plan(SIDE, near=coarse).solution.phases for _ in range(2))
-    assert [len(x.j) for x in finer.values()] == [18, 18, 24]
-    assert [len(x.j) for x in kept.values()] == [12, 12, 16]  # the finer one is no better
+    settled, finer, kept = (last.plan(SIDE, near=coarse).solution for _ in range(3))
+    assert [len(x.j) for x in settled.phases.values()] == [12, 12, 16]
+    assert settled.statistics.objective < first.statistics.objective
+    assert [len(x.j) for x in finer.phases.values()] == [18, 18, 24]
+    assert kept.statistics.objective == first.statistics.objective  # neither is any better: the first stands
 
 
 def test_limits_between_the_nodes_are_seen(bhr):
