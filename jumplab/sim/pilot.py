@@ -165,7 +165,7 @@ class Pilot:
         there = q, v
         if left > 0:
             turn = self._turn(step, played, q, v, left)
-            correction = None if self._reaim is None else self._reaim.wish(q, v, turn)
+            correction, turn = (None, turn) if self._reaim is None else self._reaim.touchdown(q, v, turn)
             there = self.forecast.state(q, v, turn, correction)
         self._landing.reference = self.ahead.plan(self._robot, *there, step * STEP_S, left)
 

@@ -1,7 +1,8 @@
 """Optional correction in flight: the legs are put where they can catch the robot, and a flip's tuck opens in time.
 
 A shove, or a robot unlike its plan, leaves speed, momentum and attitude other than planned, about all axes. What flies
-can no longer change the first two; where the soles meet the ground it still can.
+can no longer change the first two; where the soles meet the ground it still can. Legs that swing forward turn the trunk
+forward, and arms that swing back hold it: where the trunk will be far off its plan, both are reckoned with.
 
 In the air L is constant and the trunk turns at (L - h) / I, where I is the pitch inertia about the CoM and h what the
 joints' own rates carry. A robot that took off with a few per cent too much L arrives a few tenths of a radian off.
@@ -34,6 +35,10 @@ NEWTON_STEPS = 3  # twelve equations, nearly linear
 WEIGHTS = np.array([1.0, 0.3, 1.0, 2.0, 2.0, 0.1])
 DAMPING = 1e-3  # [1] of the angles' squares: a leg that is nearly straight must not flap
 LEAST_KNEE_RAD = 0.4  # [rad] a knee keeps this bend, to give way
+FAR_RAD = 0.15  # forecast of the trunk in roll or pitch, forward; robots of the usual ranges stay below 0.08
+FAR_WEIGHTS = WEIGHTS * [1.0, 1.0, 0.5, 1.0, 1.0, 1.0]  # a trunk far forward leaves the legs too short for all of it
+TRUNK_WEIGHT = 1.0  # [1/rad] on the trunk's pitch at touchdown, which the arms alone shall mend
+ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
@@ -65,6 +70,10 @@ class Reaim:
     The posture at touchdown is predicted as the tape's last one, with the trunk off its planned attitude by what it is
     now and by what it drifts until then, see :meth:`turn_ahead`. Without any error the correction is zero.
 
+    Once it will be off by :data:`FAR_RAD`, the shoulders swing as well, so that it arrives upright, and what the trunk
+    turns while legs and arms are on their way is part of the prediction: with all momentum kept, joints that move by x
+    turn the body by -I^-1 A x, A being their part of the centroidal momentum matrix.
+
     ``tape`` and ``scene`` are seen along the heading in which the robot shall land, and so is all that is told later.
     """
 
@@ -74,11 +83,15 @@ class Reaim:
         moving = {joint for frame in self._gauge.frames for joint in model.supports[model.frames[frame].parentJoint]}
         self._legs = np.array(sorted(model.joints[joint].idx_v for joint in moving if joint > 1)) - 6
         self._pitching = np.isin(robot.joint_names, [name for name, _, _ in robot.role_signs()])
+        arms = np.array([robot.joint_names.index(name) for name in robot.joints["shoulder_pitch"]])
+        self._limbs, self._is_arm = np.concatenate([self._legs, arms]), np.isin(np.arange(len(motors.lower)), arms)
+        self._far = False
         planned, low, high = self._end[7:], motors.lower + STOP_RAD, motors.upper - STOP_RAD
         for knee, sign, straight in knees(robot):  # flexion = sign * angle + straight
             (low if sign > 0 else high)[knee] = sign * (LEAST_KNEE_RAD - straight)
-        self._low = np.maximum(np.minimum(low, planned), planned - LARGEST_RAD)[self._legs]
-        self._high = np.minimum(np.maximum(high, planned), planned + LARGEST_RAD)[self._legs]
+        most = np.where(self._is_arm, np.inf, LARGEST_RAD)
+        self._low = np.maximum(np.minimum(low, planned), planned - most)
+        self._high = np.minimum(np.maximum(high, planned), planned + most)
         self._places, self._attitudes = self._feet(self._end)
         self._middle = self._places.mean(axis=0)
         speed, self._momentum = self._motion(tape.q[-1], tape.v[-1])
@@ -118,23 +131,39 @@ class Reaim:
         """
         middle = self._gauge.soles(q)
         near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
+        if not flip:
+            tilt = pin.log3(turn)[:2]
+            self._far |= bool(tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD)
         if flip:
             moving = np.full(len(self._now), near or left_s < FLIP_START_S)
         else:
             moving = np.where(self._pitching, near, near or left_s < SIDE_START_S)
+        if self._far:
+            moving = moving | self._is_arm
         if moving.any():
             most = np.where(self._pitching, RATE if near else FLIP_RATE, SIDE_RATE) * STEP_S
+            if self._far:
+                most = np.where(self._is_arm, ARM_RATE * STEP_S, most)
             self._now = self._now + np.where(moving, np.clip(self.wish(q, v, turn) - self._now, -most, most), 0.0)
         return self._now
 
     def wish(self, q: np.ndarray, v: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """Correction (nv - 6,) with which the predicted touchdown has the soles flat and well placed."""
+        return self.touchdown(q, v, turn)[0]
+
+    def touchdown(self, q: np.ndarray, v: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The correction (nv - 6,) to wish for, and how far (3, 3) the body will be turned off the plan with it."""
         speed, momentum = self._motion(q, v)
         above = self._gauge.data.com[0][2] + self._middle[2] - self._scene.top_at(self._gauge.soles(q)[0])
         fall = np.sqrt(max(speed[2] ** 2 + 2 * self._gauge.robot.gravity * above, FASTEST_FALL**2))
         own = pin.rpy.rpyToMatrix(0.0, 0.0, -yaw_of(turn))
         goals = self._places + self.shifts(own @ speed, own @ momentum, fall)
-        return self._reached(turned(self._end, own @ turn), goals)
+        guess = turned(self._end, own @ turn)
+        if not self._far:
+            return self._reached(guess, goals), turn
+        guess[7:] += self._now
+        correction, level = self._balanced(guess, goals, own @ turn)
+        return correction, own.T @ level
 
     def shifts(self, speed: np.ndarray, momentum: np.ndarray, fall: float) -> np.ndarray:
         """How far (2, 3) the soles have to be from their planned places under the CoM [m].
@@ -154,24 +183,48 @@ class Reaim:
         """Correction (nv - 6,) that leads the soles of ``guess`` to ``goals`` (2, 3) from the CoM, flat as planned."""
         rows, planned = 7 + self._legs, self._end[7:]
         for _ in range(NEWTON_STEPS):
-            slope, miss = self._slope(guess, goals)
-            guess[rows] += _within(slope, miss, self._low - guess[rows], self._high - guess[rows])
+            slope, miss = self._slope(guess, goals, self._legs, WEIGHTS)
+            low, high = self._low[self._legs], self._high[self._legs]
+            guess[rows] += _within(slope, miss, low - guess[rows], high - guess[rows])
         return guess[7:] - planned  # zero but for the legs
 
-    def _slope(self, q: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted motions (12, k) of the soles under the CoM per leg joint, and what is missing (12,)."""
+    def _balanced(self, guess: np.ndarray, goals: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Correction (nv - 6,) as of :meth:`_reached`, of legs and arms that turn the body on their way.
+
+        ``guess`` is the touchdown if no joint went further off the tape than it is, ``level`` (3, 3) the body's turn
+        off the plan there; the one that is reached is given back.
+        """
+        joints, rows, planned = self._limbs, 7 + self._limbs, self._end[7:]
+        low, high, arms = self._low[joints], self._high[joints], self._is_arm[joints]
+        for _ in range(NEWTON_STEPS):
+            pin.ccrba(self._gauge.model, self._gauge.data, guess, np.zeros(self._gauge.model.nv))
+            turns = -solved(self._gauge.data.Ig.inertia.copy(), self._gauge.data.Ag[3:, 6 + joints].copy())  # (3, k)
+            slope, miss = self._slope(guess, goals, joints, FAR_WEIGHTS, turns)
+            slope = np.vstack([slope, TRUNK_WEIGHT * np.where(arms, turns[1], 0.0)])
+            miss = np.append(miss, -TRUNK_WEIGHT * pin.log3(level)[1])
+            step = _within(slope, miss, low - guess[rows], high - guess[rows])
+            guess[rows] += step
+            more = pin.exp3(turns @ step)
+            guess, level = turned(guess, more), more @ level
+        return guess[7:] - planned, level
+
+    def _slope(self, q, goals, joints, weights, turns=None) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted motions (12, k) of the soles under the CoM per joint, and what is missing (12,).
+
+        The trunk keeps its attitude, or turns by ``turns`` (3, k) per joint.
+        """
         model, data, (places, attitudes) = self._gauge.model, self._gauge.data, self._feet(q)
         pin.computeJointJacobians(model, data, q)
-        own, columns = pin.jacobianCenterOfMass(model, data, q)[:, 6:], 6 + self._legs
+        own, columns = pin.jacobianCenterOfMass(model, data, q)[:, 6:], 6 + joints
         slope, miss = [], []
         for side, frame in enumerate(self._gauge.frames):
             jacobian = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
-            jacobian[:3] -= (
-                pin.skew(attitudes[side] @ self._gauge.robot.foot.center) @ jacobian[3:] + own[:, self._legs]
-            )
+            jacobian[:3] -= pin.skew(attitudes[side] @ self._gauge.robot.foot.center) @ jacobian[3:] + own[:, joints]
+            if turns is not None:
+                jacobian += np.vstack([-pin.skew(places[side]) @ turns, turns])
             turn = pin.log3(self._attitudes[side] @ attitudes[side].T)
-            slope.append(WEIGHTS[:, None] * jacobian)
-            miss.append(WEIGHTS * np.concatenate([goals[side] - places[side], turn]))
+            slope.append(weights[:, None] * jacobian)
+            miss.append(weights * np.concatenate([goals[side] - places[side], turn]))
         return np.vstack(slope), np.concatenate(miss)
 
 
