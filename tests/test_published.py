@@ -2,6 +2,7 @@
 
 import json
 import sys
+from importlib.util import find_spec
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +16,7 @@ from jumplab.robot.checkup import check
 from jumplab.robot.description import SHIPPED
 from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
-from jumplab.sim import Scene, simulate_jump
+from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
@@ -152,6 +153,19 @@ def test_a_downloaded_robot_is_what_its_configuration_says(downloaded):
     if robot.planar:
         e = reduction_error(robot)
         assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["h1", "h1_2"])
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_legs_whose_axes_coincide_are_led_by_their_angles(name, engine):
+    """Without roll at the ankle, or with yaw and roll about one axis where the thigh is level."""
+    if name not in DOWNLOADED or not find_spec("robot_descriptions"):
+        pytest.skip("robot_descriptions is not installed")
+    robot = Robot.load(name)
+    plan = Planner(robot).plan(JumpTask(0.3, 0.15))
+    m = simulate_jump(plan.tape, robot, engine=engine).metrics
+    assert m.foot_distance_m == pytest.approx(0.3, abs=0.005) and m.com_rise_m == pytest.approx(0.15, abs=0.003)
 
 
 def test_another_file_of_a_downloaded_robots_repository(monkeypatch, tmp_path):
