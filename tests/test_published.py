@@ -57,7 +57,13 @@ def test_motors_of_the_g1_are_the_makers():
             for name in ("hip_pitch", "hip_yaw", "knee", "hip_roll", "ankle_pitch")}  # fmt: skip
     assert told == {"hip_pitch": (71.0, pytest.approx(22.63)), "hip_yaw": (71.0, pytest.approx(22.63)),
                     "knee": (111.0, pytest.approx(14.5)), "hip_roll": (111.0, pytest.approx(14.5)),
-                    "ankle_pitch": (35.0, pytest.approx(29.4))}  # fmt: skip
+                    "ankle_pitch": (35.0, pytest.approx(30.86))}  # fmt: skip
+    own = {name: [joints[f"left_{name}_joint"][key] for key in ("no_load_speed", "armature", "friction", "damping")]
+           for name in ("hip_pitch", "knee", "ankle_roll")}  # fmt: skip
+    assert own == {"hip_pitch": pytest.approx([35.52, 0.01017752, 1.6, 0.16]),
+                   "knee": pytest.approx([22.7, 0.025101925, 2.4, 0.24]),
+                   "ankle_roll": pytest.approx([40.13, 2 * 0.003609725, 1.2, 0.12])}  # fmt: skip
+    assert joints["left_knee_joint"]["speed"] == 20.0 and joints["left_ankle_pitch_joint"]["speed"] == 30.0
 
 
 @here

@@ -33,7 +33,12 @@ ROOTS = {
 }
 MOVING = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "effort", "velocity")
-CORNER = "corner"  # [rad/s] up to which the whole effort is there; no URDF tells it
+CORNER, NO_LOAD = (
+    "corner",
+    "no_load",
+)  # [rad/s] up to which the whole effort is there, and from which none; not in URDFs
+OWN = ("armature", "friction", "damping")  # of a motor at its joint [kg m^2, N m, N m s/rad], as no URDF tells it
+MOTOR = (CORNER, NO_LOAD, *OWN)
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
 SIZES["capsule"] = SIZES["cylinder"]

@@ -148,7 +148,7 @@ def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits | None = No
 
 def _torque_speed(ax: Axes, tape: Tape, robot: Robot, i: int, limits: Limits) -> None:
     m = robot.sagittal
-    turning.motor(ax, m.speed[i], m.corner_speed[i], m.effort[i], limits)
+    turning.motor(ax, m.speed[i], m.corner_speed[i], m.no_load_speed[i], m.effort[i], limits)
     rates, torques = (tape.extra[f"planar_{name}"][:, i] for name in ("joint_rates", "torques"))
     style.by_phase(ax, rates, torques, tape.phase, linewidth=1.3)
 

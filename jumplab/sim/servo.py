@@ -62,6 +62,7 @@ class Servo:
         self._step_s, self._late, self._ahead_s = STEP_S + late_s, (1 - 1 / substeps) / 2, STEP_S / substeps / 2
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
+        self._robot = robot
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -78,6 +79,8 @@ class Servo:
         error = command.q + self._ahead_s * command.rate - q[7:]
         wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
         tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
+        if self._robot.lossy:  # at the due rate: a measured one would swing with its noise
+            tau = tau + self._robot.lost_torque(command.rate)
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
 
