@@ -1,7 +1,7 @@
 """What a G1 can do within its motors' curves, and by how much they forbid the rest: the rows of ``acrobatics.json``.
 
-``python -m paper.acrobatics`` in the folder of the notebooks plans every jump of :data:`ASKED` that has no row yet; those
-that are planned clean are played back in both engines and both modes. Notebook 07 prints the rows.
+``python -m paper.acrobatics`` in the folder of the notebooks plans every jump of :data:`ASKED` that has no row yet;
+those that are planned clean are played back in both engines and both modes. Notebook 07 prints the rows.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 from jumplab import api
 from jumplab.errors import JumplabError
+from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.sim import INSTALLED
 from jumplab.sim.playback import MODES
@@ -24,7 +25,17 @@ from jumplab.task import JumpTask
 TABLE = Path(__file__).with_name("acrobatics.json")
 # robot, factor on efforts and speeds of all motors, distance, rise, platform [m], turns about +y, method
 Asked = tuple[str, float, float, float, float, int, str]
-LEAST, MOST = "direct", "three-step"
+FORWARD = [(0.6, 0.3), (0.8, 0.3), (1.0, 0.3), (0.8, 0.4), (1.0, 0.4)]  # distance and rise [m]
+PLATFORMS = [(0.5, 0.35, 0.2), (0.5, 0.45, 0.3)]  # and height of the platform [m]
+FACTORS = (2.0, 1.0, 1.5, 1.25)  # on efforts and speeds, for flips
+RISE_M = 0.45  # of flips
+ASKED: list[Asked] = [
+    *(("g1", factor, 0.0, RISE_M, 0.0, -1, "three-step") for factor in FACTORS),
+    *(("g1", 1.0, far, high, 0.0, 0, "direct") for far, high in FORWARD),
+    *(("g1", 1.0, far, high, step, 0, "direct") for far, high, step in PLATFORMS),
+    *(("g1", factor, 0.0, RISE_M, 0.0, 1, "three-step") for factor in FACTORS),
+    *(("g1_arms", factor, 0.0, RISE_M, 0.0, turns, "direct") for factor in FACTORS for turns in (-1, 1)),
+]
 
 
 def rows() -> list[dict[str, Any]]:
@@ -42,7 +53,9 @@ def planner(name: str, factor: float) -> Planner:
 def attempt(asked: Asked) -> dict[str, Any]:
     """One row: the plan, its audit, and, where that is clean, its simulations."""
     name, factor, distance, height, platform, turns, method = asked
-    row: dict[str, Any] = dict(zip(("robot", "factor", "distance_m", "height_m", "platform_m", "turns", "method"), asked))
+    row: dict[str, Any] = dict(
+        zip(("robot", "factor", "distance_m", "height_m", "platform_m", "turns", "method"), asked, strict=True)
+    )
     task = JumpTask(distance, height, platform_m=platform, rotation_rad=2 * math.pi * turns)
     start = time.process_time()
     try:
@@ -65,3 +78,43 @@ def _landing(plan: Any, engine: str, mode: str) -> list[Any]:
     sound = run.landed and all(finding.passed for finding in run.checks)
     far, high = run.metrics.foot_distance_m, run.metrics.com_rise_m
     return [sound, far and round(far, 3), high and round(high, 3), run.reason]
+
+
+def named(row: dict[str, Any]) -> str:
+    """A jump in words."""
+    turn = {-1: "backflip, ", 0: "", 1: "front flip, "}[row["turns"]]
+    step = f", onto {row['platform_m']:g} m" if row["platform_m"] else ""
+    way = f"{row['distance_m']:g} m ahead, " if row["distance_m"] else ""
+    return f"{turn}{way}{row['height_m']:g} m up{step}"
+
+
+def verdicts(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per row: what was asked of which motors, and what became of it."""
+    out = []
+    for row in found:
+        landed = list(row.get("landed", {}).values())
+        name, share, joint = row.get("used", ("", 0.0, ""))
+        fullest = f"{name}, {share:.0f} %, {joint}" if name else ""
+        line = {
+            "robot": row["robot"],
+            "jump": named(row),
+            "motors": "as made" if row["factor"] == 1 else f"{row['factor']:g} x",
+        }
+        line |= {"plan": "clean" if row["clean"] else row["said"].split(";")[0], "fullest limit": fullest}
+        out.append(line | {"lands": f"{sum(x[0] for x in landed)} of {len(landed)}" if landed else ""})
+    return out
+
+
+def main() -> None:
+    """Fill the table."""
+    done = rows() if TABLE.exists() else []
+    keys = "robot", "factor", "distance_m", "height_m", "platform_m", "turns", "method"
+    for asked in ASKED:
+        if not any(all(row[k] == x for k, x in zip(keys, asked, strict=True)) for row in done):
+            done.append(attempt(asked))
+            write_file(TABLE, ("[\n" + ",\n".join(map(json.dumps, done)) + "\n]\n").encode())
+            print(*asked, done[-1]["clean"], done[-1]["said"], done[-1].get("landed"), flush=True)
+
+
+if __name__ == "__main__":
+    main()
