@@ -179,7 +179,7 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
 
 
 def _motors(tape: Tape, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Of the motors, which no URDF knows: armature (nv - 6,) [kg m^2], and torques (N, nv - 6) lost to friction [N m]."""
+    """Of the motors, which no URDF knows: armature (nv - 6,) [kg m^2], torques (N, nv - 6) lost to friction [N m]."""
     rows = [robot.actuators[name] for name in map(str, tape.joint_names)]
     armature, dry, viscous = (np.array([row[key] for row in rows]) for key in ("armature", "friction", "damping"))
     rate = tape.v[:, 6:]

@@ -37,7 +37,7 @@ def pairs(robot: Robot) -> dict[str, list[int]]:
 
 
 def motor(ax: Axes, speed: float, corner: float, free: float, effort: float, limits: Limits | SpatialLimits) -> None:
-    """What a motor can do, torque against speed, up to ``free``, its no-load speed, and dashed what the planner may use."""
+    """What a motor can do, torque against speed up to its no-load speed ``free``; dashed what the planner may use."""
     # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
     x = np.array([-free, -corner, 0.0, corner, free])
     upper = np.array([effort, effort, effort, effort, 0.0])

@@ -1,11 +1,11 @@
 """Armature and friction of the motors for an engine that has none: from outside, as torques.
 
-A rotor turns with its joint, by the rate s_c - s_p of the spins of child and parent about the axis a. Its torque on the
-child is -J a (s_c' - s_p'), on the parent the opposite. Torques that follow measured accelerations are unstable where J is
-larger than the link's own inertia. So both links are lent the inertia J, about all axes alike, by which they feel J w' of
-their own at once; and in each step they are given back what was too much of it in the step before: on the child
-J (w_c' - a s_c' + a s_p'), on the parent J (w_p' - a s_p' + a s_c'). That converges for every J: what is lent is at least
-half of what it replaces.
+A rotor turns with its joint, by the rate s_c - s_p of the spins of child and parent about the axis a. Its torque on
+the child is -J a (s_c' - s_p'), on the parent the opposite. Torques that follow measured accelerations are unstable
+where J is larger than the link's own inertia. So both links are lent the inertia J, about all axes alike, by which they
+feel J w' of their own at once; and in each step they are given back what was too much of it in the step before: on the
+child J (w_c' - a s_c' + a s_p'), on the parent J (w_p' - a s_p' + a s_c'). That converges for every J: the inertia with
+what is lent is at least half of the inertia with armature.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Armature:
         return here, model.parents[here], axis, model.jointPlacements[here].rotation @ axis
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
-        """Torque (3,) for each link, world axes, in the step that begins at (q, v) [N m]; to be called once for each."""
+        """Torque (3,) for each link, world axes, in the step that begins at (q, v) [N m]; to be called once for each
+        step."""
         spins = self._spins(q, v)
         change = np.zeros_like(spins) if self._last is None else (spins - self._last) / STEP_S
         self._last, out = spins, {link: np.zeros(3) for link in self.lent}
@@ -101,5 +102,5 @@ class Friction:
         self._viscous = viscous / (1 + viscous / self._stop)
 
     def torque(self, rates: np.ndarray) -> np.ndarray:
-        """Torque (nv - 6,) that is lost at joint rates (nv - 6,) [N m]; of dry friction what stops the joint at most."""
+        """Torque (nv - 6,) that is lost at joint rates (nv - 6,) [N m]; dry friction at most stops a joint."""
         return np.clip(self._stop * rates, -self._dry, self._dry) + self._viscous * rates

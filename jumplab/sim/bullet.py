@@ -258,8 +258,8 @@ class BulletEngine(Engine):
                 self._bullet.applyExternalTorque(self._body, link, returned[name], bullet.WORLD_FRAME)
 
     def applied(self) -> np.ndarray:
-        """Torque that the motors gave in the last step (nv - 6,) [N m], as they were told: PyBullet reports those of its
-        own only."""
+        """Torque that the motors gave in the last step (nv - 6,) [N m], as they were told: PyBullet reports those of
+        its own only."""
         return self._torque
 
     def contacts(self) -> Contacts:

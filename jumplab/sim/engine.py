@@ -75,7 +75,7 @@ class Engine(ABC):
 
     @abstractmethod
     def _build(self, friction: float) -> None:
-        """Make scene and robot, with damping, armature and friction of the robot's motors, and none of the engine's own."""
+        """Make scene and robot, with damping, armature and friction of its motors, and none of the engine's own."""
 
     @abstractmethod
     def _tangled(self, angles: np.ndarray) -> bool:
