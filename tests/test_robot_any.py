@@ -235,7 +235,8 @@ REFUSED = [
     (text(root()), config("x") + "[limits.neck]\neffort = 1.0\n",
      "my.urdf: [limits.neck] names neither a joint of the URDF nor a role"),
     (text(root()), config("x") + "[limits.knee]\ntorque = 1.0\n",
-     "robot configuration: 'limits.knee' may hold lower, upper, effort, velocity, corner, got {'torque': 1.0}"),
+     "robot configuration: 'limits.knee' may hold lower, upper, effort, velocity, corner, no_load, armature, "
+     "friction, damping, source, got {'torque': 1.0}"),
     (text(root()), config("x") + "[limits.knee]\nvelocity = 20.0\ncorner = 20.0\n",
      "my.urdf: joint 'left_knee': corner = 20 rad/s must lie between 0 and the speed limit, 20 rad/s; correct "
      "[limits.knee]"),

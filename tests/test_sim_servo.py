@@ -77,6 +77,28 @@ def test_in_the_air_an_error_is_met_by_a_damper_of_the_free_body(bhr, tape):
     assert pulled - free == pytest.approx(stiff @ (GAINS.corner * error), abs=1e-9)
 
 
+def test_on_the_ground_an_error_is_met_by_a_damper_of_a_robot_whose_feet_give_way(bhr):
+    """The same where the feet stand, on springs of no mass instead of rows that hold them."""
+    q, v, dt = stance_configuration(bhr), np.zeros(bhr.model.nv), STEP_S
+    servo, data = Servo(bhr), bhr.model.createData()
+    error = np.random.default_rng(0).normal(size=14) * 1e-3
+    free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e), q, v) for e in (0 * error, error))
+    damping = np.diag(np.r_[np.zeros(6), GAINS.damping * Actuators(bhr).effort / Actuators(bhr).effort.max()])
+    mass = pin.crba(bhr.model, data, q)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    pin.computeJointJacobians(bhr.model, data, q)
+    rows = []
+    for frame in map(bhr.model.getFrameId, bhr.foot.frames):
+        placed = pin.updateFramePlacement(bhr.model, data, frame)
+        jacobian = pin.getFrameJacobian(bhr.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        jacobian[:3] -= pin.skew(placed.rotation @ bhr.foot.center) @ jacobian[3:]
+        rows.append(jacobian * np.repeat([1.0, GAINS.lever_m], 3)[:, None])
+    feet = np.vstack(rows)
+    wish = np.r_[np.zeros(6), GAINS.corner * error]
+    after = np.linalg.solve(mass + dt * damping + feet.T @ feet / GAINS.give, dt * damping @ wish)
+    assert pulled - free == pytest.approx((damping @ (wish - after))[6:], abs=1e-6)
+
+
 def test_torques_keep_to_the_share_of_the_motors(bhr):
     q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
     far = told(bhr, q, q=q[7:] + 10.0, share=0.2)

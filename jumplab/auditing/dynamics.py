@@ -74,7 +74,7 @@ def _takeoff(r: Replay) -> list[Check]:
 
 
 def _balances(r: Replay) -> list[Check]:
-    power = (r.tape.tau * r.tape.v[:, 6:]).sum(axis=1)
+    power = ((r.tape.tau - r.lost) * r.tape.v[:, 6:]).sum(axis=1)
     missing = r.energy - r.energy[0] - r.integral(power)
     span, s = max(float(np.ptp(r.energy)), 1e-9), r.launch
     push, accelerated = r.tape.f[s][..., 2].sum(axis=1), r.com_acceleration[s][:, 2] + r.gravity
@@ -88,12 +88,13 @@ def _balances(r: Replay) -> list[Check]:
 def available_torque(r: Replay) -> np.ndarray:
     """(N, nv - 6) torque that each motor has left at its speed [N m].
 
-    Full torque up to the corner speed, then a line to zero at the speed limit, where torque and speed have the same
+    Full torque up to the corner speed, then a line to zero at the no-load speed, where torque and speed have the same
     sign (motoring); full torque where the joint brakes.
     """
-    peak, top, speed = r.model.upperEffortLimit[6:], r.model.upperVelocityLimit[6:], r.tape.v[:, 6:]
-    corner = np.array([r.robot.actuators[name]["corner_speed"] for name in map(str, r.tape.joint_names)])
-    fall = (top - np.abs(speed)) / np.maximum(top - corner, 1e-9)
+    peak, speed = r.model.upperEffortLimit[6:], r.tape.v[:, 6:]
+    rows = [r.robot.actuators[name] for name in map(str, r.tape.joint_names)]
+    corner, free = (np.array([row[key] for row in rows]) for key in ("corner_speed", "no_load_speed"))
+    fall = (free - np.abs(speed)) / np.maximum(free - corner, 1e-9)
     motoring = r.tape.tau * speed > 0
     return peak * np.where(motoring, np.clip(fall, METHOD.torque_floor, 1.0), 1.0)
 

@@ -13,6 +13,7 @@ from jumplab.auditing.report import METHOD
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
+from jumplab.robot.description import SLIDING_RATE
 from jumplab.task import GRAVITY, JumpTask
 
 BASE = ("base x", "base y", "base z", "base roll", "base pitch", "base yaw")
@@ -49,13 +50,14 @@ class Replay:
     com_velocity: np.ndarray
     com_acceleration: np.ndarray
     momentum: np.ndarray  # (N, 3) angular momentum about the CoM [kg m^2/s]
-    energy: np.ndarray  # (N,) kinetic plus potential [J]
+    energy: np.ndarray  # (N,) kinetic, that of the motors' armature included, plus potential [J]
     base: np.ndarray  # (N, 3) origin of the base link [m]
     base_rotation: np.ndarray  # (N, 3, 3)
     foot: np.ndarray  # (N, K, 3) origin of each contact frame [m]
     foot_rotation: np.ndarray  # (N, K, 3, 3)
     base_residual: np.ndarray  # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
-    tau: np.ndarray  # (N, nv - 6) joint torques that the motion and the contact wrenches need [N m]
+    tau: np.ndarray  # (N, nv - 6) motor torques that the motion and the contact wrenches need [N m]
+    lost: np.ndarray  # (N, nv - 6) of them, what the motors' friction takes [N m]
     coordinates: tuple[str, ...]  # (nv,) names of the columns of v
     gravity: float  # of the replayed model, positive [m/s^2]
     mass: float  # of the URDF [kg]
@@ -164,6 +166,9 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
     motion = _motion(tape, model, frames)
     need = dict(zip(("base_residual", "tau"), _inverse_dynamics(tape, model, frames, motion), strict=True))
+    armature, need["lost"] = _motors(tape, robot)
+    need["tau"] = need["tau"] + armature * tape.a[:, 6:] + need["lost"]
+    motion["energy"] = motion["energy"] + (armature * tape.v[:, 6:] ** 2).sum(axis=1) / 2
     gravity, mass = float(-model.gravity.linear[2]), float(pin.computeTotalMass(model))
     rows = {"launch": slice(0, tape.takeoff_index), "flight": slice(tape.takeoff_index, len(tape.t))}
     told = {"gravity": gravity, "mass": mass, "weight": mass * gravity, "step": np.diff(tape.t)}
@@ -171,6 +176,14 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
     return Replay(
         tape, robot, task, edge_m, model, geometry, soles, coordinates=names, **motion, **need, **rows, **told
     )
+
+
+def _motors(tape: Tape, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Of the motors, which no URDF knows: armature (nv - 6,) [kg m^2], torques (N, nv - 6) lost to friction [N m]."""
+    rows = [robot.actuators[name] for name in map(str, tape.joint_names)]
+    armature, dry, viscous = (np.array([row[key] for row in rows]) for key in ("armature", "friction", "damping"))
+    rate = tape.v[:, 6:]
+    return armature, dry * np.tanh(rate / SLIDING_RATE) + viscous * rate
 
 
 def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: int) -> Sole:

@@ -19,8 +19,10 @@ tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies")
 def list_(args: Namespace) -> None:
     """The shipped robots."""
     rows = []
-    for name in describe.SHIPPED:
+    for name, file in describe.SHIPPED.items():
         try:
+            if urdfs.DESCRIPTIONS in file.read_text(encoding="utf-8"):  # a list downloads nothing
+                raise RobotError(f"{name}: is downloaded when it is first loaded, with jumplab[descriptions]")
             robot = robots.Robot.load(name)
             kg, joints, note = robot.total_mass, len(robot.joint_names), ""
             arms = "swing" if robot.joints["shoulder_pitch"] else "held"

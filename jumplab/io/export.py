@@ -205,7 +205,10 @@ def _qvel(x: Frames) -> np.ndarray:
 
 
 def _mujoco(whole: Whole, x: Frames, fps: float) -> dict[str, bytes]:
-    """The robot on level ground as MuJoCo's XML, a motor on every joint, and ``qpos``, ``qvel``, ``ctrl`` (torques)."""
+    """The robot on level ground as MuJoCo's XML, a motor on every joint, and ``qpos``, ``qvel``, ``ctrl`` (torques).
+
+    Armature, friction and damping of the motors are the joints'.
+    """
     import mujoco
 
     spec = mujoco.MjSpec.from_string(whole.urdf)
@@ -215,6 +218,14 @@ def _mujoco(whole: Whole, x: Frames, fps: float) -> dict[str, bytes]:
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     for name in whole.joints:
         spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    motors = whole.robot.motors
+    for name in set(motors["armature"]) | set(motors["friction"]) | set(motors["damping"]):
+        joint = spec.joint(name)
+        joint.armature = motors["armature"].get(name, joint.armature)
+        joint.frictionloss = motors["friction"].get(name, joint.frictionloss)
+        if name in motors["damping"]:  # of a polynomial in the rate, in newer versions, the first coefficient
+            more = np.size(joint.damping) - 1
+            joint.damping = [motors["damping"][name], *[0.0] * more] if more else motors["damping"][name]
     spec.compile()
     names = {"joint_names": np.array(whole.joints), "contact": x.contact, "phase": x.phase, "fps": np.array(fps)}
     states = {"time": x.t, "qpos": _qpos(x), "qvel": _qvel(x), "ctrl": x.torques}

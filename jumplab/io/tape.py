@@ -23,7 +23,9 @@ DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedErro
 class Tape(Shown):
     """Launch and flight of the full robot at 1 kHz.
 
-    Configurations are in Pinocchio's free-flyer order. The instant of take-off appears twice, once per phase. ``extra``
+    Configurations are in Pinocchio's free-flyer order. Torques are what motors give: they move the links, turn the
+    motors' own armature, and overcome their friction, where these are known (:attr:`.Robot.actuators`); otherwise they
+    are the joints' torques of inverse dynamics. The instant of take-off appears twice, once per phase. ``extra``
     (SRMP and planar solutions) is for study, and not needed to play the tape.
     """
 
@@ -31,7 +33,7 @@ class Tape(Shown):
     q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
     v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
     a: np.ndarray  # (N, nv) time derivative of v [m/s^2, rad/s^2]
-    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
+    tau: np.ndarray  # (N, nv - 6) motor torques at the joints [N m]
     phase: np.ndarray  # (N,) "launch" or "flight"
     contact_frames: np.ndarray  # (K,) names of the foot links; where wrenches act
     f: np.ndarray  # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]

@@ -78,7 +78,7 @@ class FullTerms(FullMotion):
     """
 
     M: np.ndarray  # inertia matrix M^js (nv, nv)
-    H: np.ndarray  # bias force H^js (nv,), gravity included
+    H: np.ndarray  # bias force H^js (nv,), gravity and the motors' friction included
     A_c: np.ndarray  # Jacobian (3, nv) of the CoM
     B_c: np.ndarray  # its drift (3,)
     A_h: np.ndarray  # centroidal momentum matrix (6, nv)
@@ -237,6 +237,8 @@ class FullBody:
         A_c, B_c, momentum = A_h[:3] / mass, B_h[:3] / mass, A_h @ v
         velocity, place = momentum[:3] / mass, self._placements()
         H = pin.nonLinearEffects(model, data, q, v).copy()
+        if self.robot.lossy:
+            H[6:] += self.robot.lost_torque(v[6:])
         M = np.triu(pin.crba(model, data, q))  # Pinocchio leaves the lower triangle to chance
         M += np.triu(M, 1).T
         # linear and angular velocity, and both at theta'' = 0 differentiated, about the world origin, of each body

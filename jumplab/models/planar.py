@@ -15,6 +15,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from jumplab.robot.description import SLIDING_RATE
 from jumplab.robot.sagittal import JOINT_OF_ANGLES, SagittalModel
 from jumplab.task import GRAVITY
 
@@ -175,9 +176,9 @@ class PlanarState:
         return ca.DM(JOINT_OF_ANGLES) @ self.rates
 
     def torques(self, toe_acceleration: tuple[float, float] | None = (0.0, 0.0)) -> ca.SX:
-        """Joint torques hip, knee, ankle, shoulder, both sides summed [N m] (4,); needs no ground wrench.
+        """Motor torques hip, knee, ankle, shoulder, both sides summed [N m] (4,); needs no ground wrench.
 
-        ``toe_acceleration`` (x, z) [m/s^2]; None if the CoM falls freely.
+        They move the links, and :meth:`motors`. ``toe_acceleration`` (x, z) [m/s^2]; None if the CoM falls freely.
         """
 
         def moment(joint, links):
@@ -189,7 +190,14 @@ class PlanarState:
             return inertial + z * ax - x * (az + self.gravity)
 
         # lower joints of the links: toe, ankle, knee, hip, shoulder
-        return ca.vertcat(-moment(3, (3, 4)), -moment(2, (2, 3, 4)), -moment(1, (1, 2, 3, 4)), moment(4, (4,)))
+        links = ca.vertcat(-moment(3, (3, 4)), -moment(2, (2, 3, 4)), -moment(1, (1, 2, 3, 4)), moment(4, (4,)))
+        return links + self.motors() if self.model.heavy_motors else links
+
+    def motors(self) -> ca.SX:
+        """Torques (4,) that the motors take themselves: armature, damping, dry friction [N m]."""
+        m, rate, accel = self.model, self.joint_rates, ca.DM(JOINT_OF_ANGLES) @ self.accels
+        sliding = ca.DM(m.friction) * ca.tanh(rate / SLIDING_RATE)
+        return ca.DM(m.armature) * accel + ca.DM(m.damping) * rate + sliding
 
     def ground_wrench(self) -> ca.SX:
         """(3,) F_x, F_z [N] and moment about the toe [N m] on the robot while the toe stands still."""

@@ -28,6 +28,13 @@ if TYPE_CHECKING:
     from jumplab.robot_import.jumper import Jumper
 
 HERE = Path(__file__).parent
+MOTORS = {
+    "no_load_ratios": 1.0,
+    "armature": 0.0,
+    "friction": 0.0,
+    "damping": 0.0,
+}  # tables of [actuators], and defaults
+SLIDING_RATE = 0.1  # [rad/s] from about here on dry friction is there in full: a step would have no slope to plan with
 SHIPPED = {path.stem: path for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))}
 
 
@@ -92,6 +99,9 @@ class Robot(Shown):
     rest: Mapping[str, float] = field(init=False)  # joint -> angle [rad] of the standing posture, beside those
     corner_speed_ratio: float = field(init=False)  # [1] share of the speed limit up to which full torque is available
     corner_speed_ratios: Mapping[str, float] = field(init=False)  # joint -> its own share, where one is known
+    motors: Mapping[str, Mapping[str, float]] = field(
+        init=False
+    )  # key of MOTORS -> joint -> number, where one is known
 
     def line(self) -> str:
         """Name, mass, joints, hash."""
@@ -155,9 +165,12 @@ class Robot(Shown):
         rest = {key: get("rest", key) for key in table(config, "rest")}
         where = "actuators", "corner_speed_ratios"
         own = {key: get(*where, key) for key in table(table(config, where[0]), where[1])}
-        joints, stance, rest, own = (MappingProxyType(x) for x in (joints, stance, rest, own))
+        motors = {key: table(table(config, where[0]), key) for key in MOTORS}
+        motors = {key: {name: get(where[0], key, name) for name in told} for key, told in motors.items()}
+        motors = {key: MappingProxyType(told) for key, told in motors.items()}
+        joints, stance, rest, own, motors = (MappingProxyType(x) for x in (joints, stance, rest, own, motors))
         told = dict(name=get("name", kind=str), joints=joints, foot=foot, stance=stance, rest=rest)
-        told |= dict(corner_speed_ratio=corner, corner_speed_ratios=own)
+        told |= dict(corner_speed_ratio=corner, corner_speed_ratios=own, motors=motors)
         for key, value in told.items():
             object.__setattr__(self, key, value)  # once: from here on the dataclass is frozen
         self._check_names()
@@ -172,9 +185,16 @@ class Robot(Shown):
                 if not self._model.existJointName(name):
                     raise RobotError(f"robot {self.name}: role {role} names the joint {name!r}, which the URDF lacks")
         for name, ratio in self.corner_speed_ratios.items():
-            if not (self._model.existJointName(name) and 0 < ratio < 1):
+            most = max(1.0, self.motors["no_load_ratios"].get(name, 1.0))
+            if not (self._model.existJointName(name) and 0 < ratio < most):
                 told = f"corner_speed_ratios: {name} = {ratio:g}"
-                raise RobotError(f"robot {self.name}: {told} must be of a joint, and between 0 and 1")
+                raise RobotError(f"robot {self.name}: {told} must be of a joint, and between 0 and {most:g}")
+        for key, told in self.motors.items():
+            least = MOTORS[key]  # no motor gives less than nothing at the speed limit
+            for name, value in told.items():
+                if name not in self.joint_names or value < least:
+                    said = f"{key}: {name} = {value:g} must be of a joint that moves, and at least {least:g}"
+                    raise RobotError(f"robot {self.name}: {said}")
         for name in self.foot.frames:
             if not self._model.existFrame(name):
                 raise RobotError(f"robot {self.name}: the foot link {name!r} is not in the URDF")
@@ -216,13 +236,17 @@ class Robot(Shown):
         except ValueError as e:
             raise RobotError(f"robot {self.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}") from e
         model.gravity.linear = np.array([0.0, 0.0, -self.gravity])
+        for name, armature in self.motors["armature"].items():
+            if model.existJointName(name):  # if not, it is refused in a moment
+                model.armature[model.idx_vs[model.getJointId(name)]] = armature
         return model
 
     @property
     def model(self) -> pin.Model:
         """Pinocchio model with a free-flyer base, a new copy each time (10 us): what is written to it stays in it.
 
-        Keep it in a variable, and call ``model.createData()`` for each user.
+        Its inverse dynamics and inertia matrix know the armature of the motors, not their :meth:`lost_torque`. Keep it
+        in a variable, and call ``model.createData()`` for each user.
         """
         return self._model.copy()
 
@@ -237,7 +261,9 @@ class Robot(Shown):
         speed: float | Mapping[str, float] = 1.0,
         joints: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     ) -> Robot:
-        """Another robot, with other torques, speeds or ranges; the corner speeds follow the speeds.
+        """Another robot, with other torques, speeds or ranges; corner and no-load speeds follow the speeds.
+
+        Armature, friction and damping of the motors stay as they are.
 
         Parameters
         ----------
@@ -306,7 +332,12 @@ class Robot(Shown):
 
     @cached_property
     def actuators(self) -> Mapping[str, Mapping[str, float]]:
-        """joint -> lower, upper [rad], speed [rad/s], effort [N m], corner_speed [rad/s]; from the URDF."""
+        """joint -> lower, upper [rad], speed [rad/s], effort [N m], corner_speed, no_load_speed [rad/s], armature
+        [kg m^2], friction [N m], damping [N m s/rad]; from the URDF, and from the TOML what no URDF tells.
+
+        A motor gives its effort up to the corner speed, then less along a line that ends at the no-load speed. Without
+        numbers of its own that is the speed limit, and armature, friction and damping are zero.
+        """
         m, out = self._model, {}
         for name in self.joint_names:
             j = m.getJointId(name)
@@ -314,8 +345,34 @@ class Robot(Shown):
             told = m.lowerPositionLimit[iq], m.upperPositionLimit[iq], m.upperVelocityLimit[iv], m.upperEffortLimit[iv]
             row = dict(zip(("lower", "upper", "speed", "effort"), map(float, told), strict=True))
             ratio = self.corner_speed_ratios.get(name, self.corner_speed_ratio)
-            out[name] = MappingProxyType(row | {"corner_speed": ratio * row["speed"]})
+            free, *own = (self.motors[key].get(name, default) for key, default in MOTORS.items())
+            row |= {"corner_speed": ratio * row["speed"], "no_load_speed": free * row["speed"]}
+            out[name] = MappingProxyType(row | dict(zip(tuple(MOTORS)[1:], own, strict=True)))
         return MappingProxyType(out)
+
+    @cached_property
+    def armature(self) -> np.ndarray:
+        """Inertia of the motors (nv - 6,) as felt at the joints [kg m^2]."""
+        return read_only([self.actuators[name]["armature"] for name in self.joint_names])
+
+    @cached_property
+    def lossy(self) -> bool:
+        """Whether the friction of any motor is known."""
+        return any(row["friction"] or row["damping"] for row in self.actuators.values())
+
+    @cached_property
+    def _losses(self) -> tuple[np.ndarray, np.ndarray]:
+        rows = [self.actuators[name] for name in self.joint_names]
+        return tuple(read_only([row[key] for row in rows]) for key in ("friction", "damping"))
+
+    def lost_torque(self, rates: np.ndarray) -> np.ndarray:
+        """Torque (..., nv - 6) that the motors lose to their own friction at joint rates (..., nv - 6) [N m].
+
+        friction tanh(rate / :data:`SLIDING_RATE`) + damping rate, in the sense of the rate: what a motor gives is that
+        of inverse dynamics and this.
+        """
+        friction, damping = self._losses
+        return friction * np.tanh(np.asarray(rates) / SLIDING_RATE) + damping * rates
 
     @cached_property
     def sagittal(self) -> SagittalModel:

@@ -23,7 +23,8 @@ SAGITTAL_JOINTS = ("hip", "knee", "ankle", "shoulder")
 # hip = thigh - trunk, knee = shank - thigh, ankle = foot - shank, shoulder = arm - trunk  (absolute link angles)
 JOINT_OF_ANGLES = np.array([[0.0, 0, 1, -1, 0], [0, 1, -1, 0, 0], [1, -1, 0, 0, 0], [0, 0, 0, -1, 1]])  # (joint, angle)
 # limits of the massless arm of a robot whose arms are held: it hardly moves and never binds
-HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "effort": 10.0}
+HELD_ARM = {"lower": -0.1, "upper": 0.1, "speed": 10.0, "corner_speed": 5.0, "no_load_speed": 10.0, "effort": 10.0}
+HELD_ARM |= {"armature": 0.0, "friction": 0.0, "damping": 0.0}
 
 
 def read_only(values: Any) -> np.ndarray:
@@ -60,7 +61,11 @@ class SagittalModel:
     upper: np.ndarray  # (4,) [rad]
     speed: np.ndarray  # (4,) [rad/s]
     effort: np.ndarray  # (4,) of both sides together [N m]
-    corner_speed: np.ndarray  # (4,) [rad/s]
+    corner_speed: np.ndarray  # (4,) [rad/s] up to which the effort is there
+    no_load_speed: np.ndarray  # (4,) [rad/s] from which there is none
+    armature: np.ndarray  # (4,) of both sides' motors together [kg m^2]
+    friction: np.ndarray  # (4,) dry, of both together [N m]
+    damping: np.ndarray  # (4,) of both together [N m s/rad]
     points: Mapping  # on the links, for clearance: name -> (link index, (x, z) from the link's lower joint)
 
     def __post_init__(self) -> None:
@@ -77,6 +82,11 @@ class SagittalModel:
     def total_mass(self) -> float:
         """Mass of the whole robot [kg]."""
         return float(self.mass.sum())
+
+    @property
+    def heavy_motors(self) -> bool:
+        """Whether armature or friction of any motor is known."""
+        return bool(self.armature.any() or self.friction.any() or self.damping.any())
 
     def point_arms(self, link: int, point: np.ndarray) -> np.ndarray:
         """(5, 2) array d: a point fixed in ``link`` sits at sum over j of R(a_j) d[j] from the toe."""
@@ -132,7 +142,10 @@ def _axis_signs(model: pin.Model, data: pin.Data, role: str, pair) -> list[float
 
 
 def _limits(actuators: Mapping, pair, signs) -> dict[str, float]:
-    """What both sides can do: the overlap of their ranges, the lower speed, twice the lower effort."""
+    """What both sides can do: the overlap of their ranges, the lower speeds, twice the lower effort.
+
+    And what they take: armature, friction and damping of both.
+    """
     both = [actuators[name] for name in pair]
     ranges = [sorted((s * a["lower"], s * a["upper"])) for a, s in zip(both, signs, strict=True)]
     out = {"lower": max(r[0] for r in ranges), "upper": min(r[1] for r in ranges)}
@@ -141,7 +154,8 @@ def _limits(actuators: Mapping, pair, signs) -> dict[str, float]:
             f"{pair[0]!r} and {pair[1]!r} have no angle in common: {ranges[0][0]:g} ... {ranges[0][1]:g} and "
             f"{ranges[1][0]:g} ... {ranges[1][1]:g} rad about the same axis; correct their limits"
         )
-    out |= {key: min(a[key] for a in both) for key in ("speed", "corner_speed")}
+    out |= {key: min(a[key] for a in both) for key in ("speed", "corner_speed", "no_load_speed")}
+    out |= {key: both[0][key] + both[1][key] for key in ("armature", "friction", "damping")}
     return out | {"effort": 2 * min(a["effort"] for a in both)}
 
 
@@ -167,7 +181,7 @@ def reduce(model: pin.Model, joints: Mapping, foot: Any, actuators: Mapping, urd
     ----------
     model : Pinocchio model with a free-flyer base.  urdf : the robot's XML, for its collision shapes.
     joints : role -> (left, right) joint names; () for held arms.  foot : :class:`.description.Foot`.
-    actuators : joint name -> lower, upper, speed, effort, corner_speed.
+    actuators : joint name -> its numbers, as :attr:`.description.Robot.actuators`.
 
     Raises :class:`RobotError` if a role's joints do not turn about the pitch axis, or share no range. Left and right
     may turn opposite ways.

@@ -19,7 +19,7 @@ from jumplab.robot_import.checks import check
 from jumplab.robot_import.config import entry, filled, roles_table, table, texts
 from jumplab.robot_import.lump import Body, Lumped, RoleJoints, beyond, lump
 from jumplab.robot_import.roles import LEG
-from jumplab.robot_import.urdf import CORNER, LIMITS, MOVING, Tree, parse
+from jumplab.robot_import.urdf import CORNER, LIMITS, MOVING, NO_LOAD, OWN, Tree, parse
 
 REPAIRS = ("inertia", "massless")
 STANCE = ("knee_rad", "trunk_pitch_rad", "shoulder_rad")
@@ -321,7 +321,7 @@ def _toml(config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], 
         sole=sole,
         stance="\n".join(f"{key} = {entry(config, 'stance', key):.12g}" for key in STANCE) + _rest(config, lumped),
         corner=entry(config, "actuators", "corner_speed_ratio"),
-        corners=_corners(lumped),
+        corners=_corners(lumped) + _motors(lumped),
     )
 
 
@@ -330,6 +330,19 @@ def _corners(lumped: Lumped) -> str:
     told = {b.joint: b.limits[CORNER] / b.limits["velocity"] for b in lumped.bodies if CORNER in b.limits}
     rows = "".join(f"{texts([name])[1:-1]} = {ratio:.12g}\n" for name, ratio in told.items())
     return f"\n\n[actuators.corner_speed_ratios]\n{rows.rstrip()}" if rows else ""
+
+
+def _motors(lumped: Lumped) -> str:
+    """The tables of what else was told of motors; the no-load speed as a share of the speed limit."""
+    found = []
+    for key, ratio in ((NO_LOAD, True), *((own, False) for own in OWN)):
+        told = {
+            b.joint: b.limits[key] / (b.limits["velocity"] if ratio else 1) for b in lumped.bodies if key in b.limits
+        }
+        rows = "".join(f"{texts([name])[1:-1]} = {value:.12g}\n" for name, value in told.items())
+        name = f"{key}_ratios" if ratio else key
+        found += [f"\n\n[actuators.{name}]\n{rows.rstrip()}"] if rows else []
+    return "".join(found)
 
 
 def _rest(config: dict, lumped: Lumped) -> str:

@@ -16,7 +16,7 @@ from jumplab.errors import RobotError
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.config import entry, table
 from jumplab.robot_import.roles import LEG, robot_axes
-from jumplab.robot_import.urdf import CORNER, LIMITS, Tree
+from jumplab.robot_import.urdf import CORNER, LIMITS, MOTOR, NO_LOAD, OWN, Tree
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -28,6 +28,8 @@ AXIS_RAD = 1e-4  # URDFs print a right angle as 1.5708; axes this close to x, y 
 ALIKE = 1e-6  # [m] and relative: as strict as the audit's idea of mirrored joints
 CAD_M, CAD_SHARE = 0.005, 0.01  # of places, and of a body's mass or inertia: what a CAD export leaves is evened out
 PAIR_M = 0.10  # farther apart two joints are no counterparts
+SOURCE = "source"  # of a motor's numbers, in words
+MOST_ARMATURE = 10.0  # [kg m^2] a tenth of it is much, reflected by the gears of a humanoid's hip
 SAME = 0.98  # cosine between a joint's axis and the mirror image of its counterpart's
 
 
@@ -40,7 +42,7 @@ class Body:
     joint: str  # of the URDF
     place: np.ndarray  # (3,) origin in the robot's axes [m], on the joint's axis; the trunk's in the plane of symmetry
     axis: np.ndarray  # (3,) of the joint, in the robot's axes
-    limits: dict[str, float]  # lower, upper [rad], effort [N m], velocity and, where it is told, corner [rad/s]
+    limits: dict[str, float]  # lower, upper [rad], effort [N m], velocity [rad/s]; of MOTOR what is told
     inertia: pin.Inertia  # about ``place``, in the robot's axes
 
 
@@ -148,10 +150,11 @@ def _limits(tree: Tree, config: dict, roles: RoleJoints, moving: list[str]) -> d
     for name, values in table(config, "limits").items():
         if name not in tree.joints and name not in roles:
             raise RobotError(f"{tree.where}: [limits.{name}] names neither a joint of the URDF nor a role")
-        if not isinstance(values, dict) or not set(values) <= {*LIMITS, CORNER}:
-            may = ", ".join((*LIMITS, CORNER))
+        if not isinstance(values, dict) or not set(values) <= {*LIMITS, *MOTOR, SOURCE}:
+            may = ", ".join((*LIMITS, *MOTOR, SOURCE))
             raise RobotError(f"robot configuration: 'limits.{name}' may hold {may}, got {values!r}")
-        told[name] = {key: entry(config, "limits", name, key) for key in values}
+        told[name] = {key: entry(config, "limits", name, key) for key in values if key != SOURCE}
+        entry(config, "limits", name, SOURCE, kind=str, default="")
     out = {}
     for name in moving:
         role = next((r for r, pair in roles.items() if name in pair), "")
@@ -159,13 +162,30 @@ def _limits(tree: Tree, config: dict, roles: RoleJoints, moving: list[str]) -> d
         for sentence in limit_faults(tree.joints[name].element, tree.where, values):
             raise RobotError(f"{sentence}, or tell it in [limits.{role or name}] of the configuration")
         out[name] = {key: values.get(key, tree.joints[name].limits.get(key)) for key in LIMITS}
-        if CORNER in values:
-            corner, speed = values[CORNER], out[name]["velocity"]
-            if not 0 < corner < speed:
-                said = f"corner = {corner:g} rad/s must lie between 0 and the speed limit, {speed:g} rad/s"
-                raise RobotError(f"{tree.where}: joint {name!r}: {said}; correct [limits.{role or name}]")
-            out[name][CORNER] = corner
+        if sentence := _motor_fault(values, out[name]):
+            raise RobotError(f"{tree.where}: joint {name!r}: {sentence}; correct [limits.{role or name}]")
+        out[name] |= {key: values[key] for key in MOTOR if key in values}
     return out
+
+
+def _motor_fault(told: dict[str, float], limits: dict[str, float]) -> str:
+    """What is wrong with what is told of a motor, in a sentence; empty if nothing is."""
+    speed, effort = limits["velocity"], limits["effort"]
+    free = told.get(NO_LOAD, speed)
+    if free < speed:
+        return f"no_load = {free:g} rad/s is below the speed limit, {speed:g} rad/s, at which it would give no torque"
+    if CORNER in told and not 0 < told[CORNER] < free:
+        end = "no-load speed" if NO_LOAD in told else "speed limit"
+        return f"corner = {told[CORNER]:g} rad/s must lie between 0 and the {end}, {free:g} rad/s"
+    for key in OWN:
+        if told.get(key, 0.0) < 0:
+            return f"{key} = {told[key]:g} must not be negative"
+    if told.get("armature", 0.0) > MOST_ARMATURE:
+        return f"armature = {told['armature']:g} kg m^2 is more than {MOST_ARMATURE:g} kg m^2, that of no joint"
+    lost = told.get("friction", 0.0) + told.get("damping", 0.0) * speed
+    if lost >= effort:
+        return f"friction and damping take {lost:g} N m at the speed limit, and the effort is {effort:g} N m"
+    return ""
 
 
 # bodies ---------------------------------------------------------------------------------------------------------

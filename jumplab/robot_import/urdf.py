@@ -23,6 +23,7 @@ from jumplab.errors import RobotError
 
 MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
 PACKAGE = "example-robot-data"  # the optional package of published robots (extra "robots")
+DESCRIPTIONS = "robot_descriptions"  # the optional package that downloads one at a time (extra "descriptions")
 PACKAGE_FOLDER = "cmeel.prefix/share/example-robot-data/robots"
 ROOTS = {
     "sdf": "an SDF file, not a URDF",
@@ -32,7 +33,12 @@ ROOTS = {
 }
 MOVING = ("revolute", "continuous", "prismatic")
 LIMITS = ("lower", "upper", "effort", "velocity")
-CORNER = "corner"  # [rad/s] up to which the whole effort is there; no URDF tells it
+CORNER, NO_LOAD = (
+    "corner",
+    "no_load",
+)  # [rad/s] up to which the whole effort is there, and from which none; not in URDFs
+OWN = ("armature", "friction", "damping")  # of a motor at its joint [kg m^2, N m, N m s/rad], as no URDF tells it
+MOTOR = (CORNER, NO_LOAD, *OWN)
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
 SIZES["capsule"] = SIZES["cylinder"]
@@ -54,8 +60,14 @@ def numbers(text: str | None, count: int) -> np.ndarray | None:
 
 
 def locate(name: str, beside: Path) -> Path:
-    """Path of a URDF: ``example-robot-data:folder/file.urdf``, or a path relative to the folder ``beside``."""
+    """Path of a URDF: relative to the folder ``beside``, or of a package.
+
+    ``example-robot-data:folder/file.urdf``; or ``robot_descriptions:h1_description``, where another file of the same
+    repository may be named instead of the robot's own: ``robot_descriptions:h1_description:folder/file.urdf``.
+    """
     package, colon, inside = name.partition(":")
+    if colon and package == DESCRIPTIONS:
+        return described(*inside.split(":", 1))
     if not (colon and package == PACKAGE):
         return beside / name
     if not have_published():
@@ -64,11 +76,12 @@ def locate(name: str, beside: Path) -> Path:
     return Path(str(metadata.distribution(PACKAGE).locate_file(f"{PACKAGE_FOLDER}/{inside}")))
 
 
-def described(name: str) -> Path:
+def described(name: str, file: str | None = None) -> Path:
     """Path of the URDF or MJCF that the package ``robot_descriptions`` has under ``name``, such as "g1_description".
 
-    That package downloads a robot once, and keeps it. Raises :class:`RobotError` if it is not installed, knows no such
-    robot, has it as a xacro template only, or cannot fetch it.
+    ``file`` is another one in that robot's repository. That package downloads a robot once, and keeps it. Raises
+    :class:`RobotError` if it is not installed, knows no such robot, has it as a xacro template only, or
+    cannot fetch it.
     """
     try:
         known = import_module("robot_descriptions._descriptions").DESCRIPTIONS
@@ -84,6 +97,8 @@ def described(name: str) -> Path:
     except Exception as e:  # git and the net fail in many ways
         why = (str(e).strip().splitlines() or [type(e).__name__])[-1].strip()
         raise RobotError(f"robot description {name!r}: robot_descriptions cannot fetch it ({why})") from e
+    if file is not None:
+        return Path(module.REPOSITORY_PATH, file)
     path = getattr(module, "URDF_PATH", getattr(module, "MJCF_PATH", None))
     if path is None:
         raise RobotError(f"robot description {name!r}: is a xacro template only; expand it, and check the URDF")

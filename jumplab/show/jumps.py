@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -147,7 +148,7 @@ def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits | None = No
 
 def _torque_speed(ax: Axes, tape: Tape, robot: Robot, i: int, limits: Limits) -> None:
     m = robot.sagittal
-    turning.motor(ax, m.speed[i], m.corner_speed[i], m.effort[i], limits)
+    turning.motor(ax, m.speed[i], m.corner_speed[i], m.no_load_speed[i], m.effort[i], limits)
     rates, torques = (tape.extra[f"planar_{name}"][:, i] for name in ("joint_rates", "torques"))
     style.by_phase(ax, rates, torques, tape.phase, linewidth=1.3)
 
@@ -173,13 +174,44 @@ AXIS_WORDS |= {"side_m": "to the left [m]", "yaw_rad": "turn [rad]"}
 
 
 @style.styled
-def envelope_map(envelope: Envelope) -> Figure:
-    """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much of it."""
-    fig = style.new_figure(1.6 * style.COLUMN_IN, 3.2)
-    ax = fig.subplots()
-    names = sorted({c.limiting for c in envelope.cells if c.solved})
+def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
+    """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much of it.
+
+    Maps of ``others`` over the same two numbers stand beside it, four in a row, under one legend.
+    """
+    maps = envelope, *others
+    across, up = (AXIS_WORDS[name] for name in envelope.axes)
+    cells = [c for found in maps for c in found.cells]
     palette = matplotlib.color_sequences["okabe_ito"]
-    colors = {name: palette[(i + 1) % len(palette)] for i, name in enumerate(names)}
+    colors = {
+        name: palette[(i + 1) % len(palette)] for i, name in enumerate(sorted({c.limiting for c in cells if c.solved}))
+    }
+    if others:
+        rows = -(-len(maps) // 4)
+        fig = style.new_figure(style.PAGE_IN, 0.9 + 1.75 * rows)
+        axes = fig.subplots(rows, 4, squeeze=False)
+        for ax in axes.flat[len(maps) :]:
+            ax.set_axis_off()
+        fig.supxlabel(across, fontsize=8)
+        fig.supylabel(up, fontsize=8)
+    else:
+        fig = style.new_figure(1.6 * style.COLUMN_IN, 3.2)
+        axes = np.array([fig.subplots()])
+        axes[0].set(xlabel=across, ylabel=up)
+    for ax, found in zip(axes.flat, maps, strict=False):
+        _map_cells(ax, found, colors)
+        ax.set_title(found.robot if others else f"{found.robot}: limit used most, in %")
+    seen = {c.limiting for c in cells}
+    handles = [Patch(color=color, label=name) for name, color in colors.items()]
+    handles += [Patch(color=color, label=text) for kind, (color, text) in REFUSED.items() if kind in seen]
+    if others:
+        fig.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=7)
+    else:
+        axes[0].legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=7, frameon=False)
+    return fig
+
+
+def _map_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any]) -> None:
     edges = envelope.distances, envelope.heights
     size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in edges])
     for c in envelope.cells:
@@ -191,17 +223,10 @@ def envelope_map(envelope: Envelope) -> Figure:
             face = REFUSED[c.limiting][0]
         ax.add_patch(Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6))
     x, y = ((min(values) - d / 2, max(values) + d / 2) for values, d in zip(edges, size, strict=True))
-    title = f"{envelope.robot}: limit used most, in %"
-    across, up = (AXIS_WORDS[name] for name in envelope.axes)
-    ax.set(xlim=x, ylim=y, xlabel=across, ylabel=up, title=title)
+    ax.set(xlim=x, ylim=y)
     if max(map(len, edges)) <= MOST_TICKS:
         ax.set(xticks=envelope.distances, yticks=envelope.heights)
     ax.grid(False)
-    seen = {c.limiting for c in envelope.cells}
-    handles = [Patch(color=color, label=name) for name, color in colors.items()]
-    handles += [Patch(color=color, label=text) for kind, (color, text) in REFUSED.items() if kind in seen]
-    ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=7, frameon=False)
-    return fig
 
 
 @style.styled

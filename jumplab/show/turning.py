@@ -36,19 +36,20 @@ def pairs(robot: Robot) -> dict[str, list[int]]:
     return out
 
 
-def motor(ax: Axes, speed: float, corner: float, effort: float, limits: Limits | SpatialLimits) -> None:
-    """What a motor can do, torque against speed, and dashed what the planner may use of it."""
+def motor(ax: Axes, speed: float, corner: float, free: float, effort: float, limits: Limits | SpatialLimits) -> None:
+    """What a motor can do, torque against speed up to its no-load speed ``free``; dashed what the planner may use."""
     # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
-    x = np.array([-speed, -corner, 0.0, corner, speed])
+    x = np.array([-free, -corner, 0.0, corner, free])
     upper = np.array([effort, effort, effort, effort, 0.0])
     ax.fill_between(x, -upper[::-1], upper, color=style.BAND, linewidth=0)
     for bound in (upper, -upper[::-1]):
         ax.plot(x, bound, **style.LIMIT_STYLE)
     cut, top = limits.speed_share * speed, limits.torque_share * effort
-    allowed = np.array([[-cut, corner, cut, cut], [top, top, top * (speed - cut) / (speed - corner), -top]])
+    left = min(1.0, (free - cut) / (free - corner))
+    allowed = np.array([[-cut, min(corner, cut), cut, cut], [top, top, top * left, -top]])
     for sign in (1, -1):
         ax.plot(*(sign * allowed), **style.REFERENCE_STYLE)
-    ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * speed, 1.08 * speed), ylim=(-1.12 * effort, 1.12 * effort))
+    ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * free, 1.08 * free), ylim=(-1.12 * effort, 1.12 * effort))
 
 
 def joint_trajectories(tape: Tape, robot: Robot, heel_up: float, guess: tuple[np.ndarray, ...] | None) -> Figure:
@@ -122,7 +123,7 @@ def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits, heel_up: f
     axes = fig.subplots(lines, COLUMNS).ravel()
     for ax, (name, sides) in zip(axes, joints.items(), strict=False):
         a = robot.actuators[robot.joint_names[sides[0]]]
-        motor(ax, a["speed"], a["corner_speed"], a["effort"], limits)
+        motor(ax, a["speed"], a["corner_speed"], a["no_load_speed"], a["effort"], limits)
         for i, alpha in zip(sides, (1.0, PALE), strict=False):
             style.by_phase(ax, tape.v[:, 6 + i], tape.tau[:, i], tape.phase, linewidth=1.1, alpha=alpha)
         ax.set(title=name, ylabel="torque [N m]")

@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
+from jumplab.sim.armature import Armature, Friction
 from jumplab.sim.engine import Engine
 from jumplab.sim.kinematics import inertial, rotation
 from jumplab.sim.scene import REACH_M, Contacts
@@ -106,6 +107,7 @@ class BulletEngine(Engine):
 
     name, title = "bullet", "PyBullet"
     _client: int | None = None
+    _friction: Friction | None = None  # of the motors, if any is known
 
     def _build(self, friction: float) -> None:
         self._client = bullet.connect(bullet.DIRECT)
@@ -163,8 +165,16 @@ class BulletEngine(Engine):
             still = dict(linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, restitution=0.0)
             change(link, maxJointVelocity=SETTINGS.fastest, **still)
             change(link, lateralFriction=friction)  # ignored if in the call above
+        self._armature = Armature(self.robot)
+        self._lent = [(self.links.index(name) - 1, name) for name in self._armature.lent]
+        self.late_armature = bool(self._lent)
+        for link, name in self._lent:
+            own = self._bullet.getDynamicsInfo(self._body, link)[2]
+            change(link, localInertiaDiagonal=[x + self._armature.lent[name] for x in own])
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
+        if self.robot.lossy:
+            self._friction = Friction(self.robot, q)
         position, quaternion, velocity, rate = base_to_bullet(q, v, self._lever)
         self._bullet.resetBasePositionAndOrientation(self._body, position, quaternion)
         self._bullet.resetBaseVelocity(self._body, velocity, rate)
@@ -181,7 +191,10 @@ class BulletEngine(Engine):
     @property
     def inertials(self) -> dict[str, pin.Inertia]:
         """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
-        return {k: inertial(r[0], r[3], r[4], r[2]) for k, r in zip(self.links, self._dynamics(), strict=True)}
+        found = {k: inertial(r[0], r[3], r[4], r[2]) for k, r in zip(self.links, self._dynamics(), strict=True)}
+        for link, more in self._armature.lent.items():  # what was lent is given back in every step
+            found[link] = pin.Inertia(found[link].mass, found[link].lever, found[link].inertia - more * np.eye(3))
+        return found
 
     @property
     def gravity(self) -> list[float]:
@@ -200,7 +213,8 @@ class BulletEngine(Engine):
 
     @property
     def damping(self) -> float:
-        """Largest damping or dry friction of a joint as the engine has it, in SI units."""
+        """Largest damping or dry friction of a joint as the engine has it, in SI units: those of motors come in
+        :meth:`step`."""
         rows = (self._bullet.getJointInfo(self._body, joint) for joint in self._joints)
         return max(max(row[6:8]) for row in rows)
 
@@ -215,7 +229,11 @@ class BulletEngine(Engine):
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
         self._torque = np.array(tau, float)
-        self._bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=self._torque)
+        if self._friction is None:
+            self._drive(self._torque)
+
+    def _drive(self, tau: np.ndarray) -> None:
+        self._bullet.setJointMotorControlArray(self._body, self._joints, bullet.TORQUE_CONTROL, forces=tau)
 
     def push(self, force: np.ndarray, place: np.ndarray) -> None:
         """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
@@ -225,10 +243,23 @@ class BulletEngine(Engine):
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""
+        if self._friction is not None or self._lent:
+            self._add_motors()
         self._bullet.stepSimulation()
 
+    def _add_motors(self) -> None:
+        """What armature and friction of the motors do in this step."""
+        q, v = self.state()
+        if self._friction is not None:
+            self._drive(self._torque - self._friction.torque(v[6:]))
+        if self._lent:
+            returned = self._armature.returned(q, v)
+            for link, name in self._lent:
+                self._bullet.applyExternalTorque(self._body, link, returned[name], bullet.WORLD_FRAME)
+
     def applied(self) -> np.ndarray:
-        """Torque of the last step (nv - 6,) [N m], as PyBullet was told: it reports those of its own motors only."""
+        """Torque that the motors gave in the last step (nv - 6,) [N m], as they were told: PyBullet reports those of
+        its own only."""
         return self._torque
 
     def contacts(self) -> Contacts:

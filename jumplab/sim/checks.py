@@ -14,6 +14,7 @@ import pinocchio as pin
 from jumplab.robot import Robot
 from jumplab.robot.description import Foot
 from jumplab.sim import STEP_S
+from jumplab.sim.armature import Armature
 from jumplab.sim.kinematics import rotation
 from jumplab.sim.playback import Actuators
 from jumplab.sim.result import STAND_S, Finding, SimulationResult
@@ -29,6 +30,7 @@ NUMERIC = 1e-6  # rounding
 JUMP_M = 1e-4  # [m, rad] the engine's own step is kept to 1e-5
 SUBSTEPPED_JUMP_M = 1e-3  # [m, rad] a light foot that chatters swings by 0.2 mrad within a step and is back at its end
 SWING = 3.0  # [1] where a contact begins or ends, velocities swing within a step by some times what the log shows
+SLIDES = 0.5  # [rad/s] from here on dry friction is there in full: engines let it grow over some tenths
 STOP_RAD = 0.02  # this close to its stop, a joint may lean on it
 LOADED_N = 50.0  # below it, CoP and friction ratio are rounding
 SOLE_M = 0.001  # contact points of sound feet lie within the sole to 1e-7 m
@@ -124,11 +126,29 @@ def unexplained(result: SimulationResult, robot: Robot) -> tuple[np.ndarray, np.
     if result.settings["engine"]["substeps"] > 1:
         left[:, :6] = _momentum_unexplained(result, robot)
     left[:, 6:] -= result.tau[:-1]
+    if result.settings["engine"].get("late_armature"):
+        left -= Armature(robot).late(result.q, result.v)
+    if robot.lossy:
+        left[:, 6:] = _rubbed(left[:, 6:], result, robot)
     feet = np.isin(result.link_names, robot.foot.frames)
     left[result.touching[:-1, ~feet].any(axis=1)] = 0.0
     motors, angle = Actuators(robot), result.q[:-1, 7:]
     at_stop = (angle < motors.lower + STOP_RAD) | (angle > motors.upper - STOP_RAD)
     return left[:, :6], np.where(at_stop | result.colliding[:-1, None], 0.0, left[:, 6:])
+
+
+def _rubbed(left: np.ndarray, result: SimulationResult, robot: Robot) -> np.ndarray:
+    """What the motors' friction does not explain of joint torques (N - 1, nv - 6).
+
+    A joint that hardly moves within a step, or turns back, is held by anything up to its dry friction.
+    """
+    rows = [robot.actuators[name] for name in robot.joint_names]
+    dry, viscous = (np.array([row[key] for row in rows]) for key in ("friction", "damping"))
+    before, after = result.v[:-1, 6:], result.v[1:, 6:]
+    left = left + viscous * (before + after) / 2
+    slides = (np.minimum(np.abs(before), np.abs(after)) > SLIDES) & (before * after > 0)
+    held = np.sign(left) * np.maximum(np.abs(left) - dry, 0.0)
+    return np.where(slides, left + dry * np.sign(before), held)
 
 
 def _momentum_unexplained(result: SimulationResult, robot: Robot) -> np.ndarray:

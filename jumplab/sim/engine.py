@@ -39,6 +39,7 @@ class Engine(ABC):
     ----------
     name : as in :data:`jumplab.sim.ENGINES`.  title : as in sentences.
     links : names of the robot's links, the base first.
+    late_armature : whether the engine has no armature, and that of motors comes by :class:`.armature.Armature`.
     substeps : semi-implicit steps that the engine takes within one of the simulation.
 
     Raises
@@ -52,6 +53,7 @@ class Engine(ABC):
     name: str
     title: str
     substeps: int = 1
+    late_armature: bool = False
     links: tuple[str, ...]
 
     def __init__(self, robot: Robot, q: np.ndarray, v=None, *, scene: Scene | None = None, friction: float = FRICTION):
@@ -73,7 +75,7 @@ class Engine(ABC):
 
     @abstractmethod
     def _build(self, friction: float) -> None:
-        """Make scene and robot, without damping, armature or joint friction of the engine's own."""
+        """Make scene and robot, with damping, armature and friction of its motors, and none of the engine's own."""
 
     @abstractmethod
     def _tangled(self, angles: np.ndarray) -> bool:
@@ -114,7 +116,8 @@ class Engine(ABC):
     @property
     @abstractmethod
     def damping(self) -> float:
-        """Largest damping, armature or dry friction of a joint as the engine has it, in SI units; zero is wanted."""
+        """Largest damping, armature or dry friction of a joint as the engine has it, less what the robot's motors have
+        and the engine was told, in SI units; zero is wanted."""
 
     @abstractmethod
     def state(self) -> tuple[np.ndarray, np.ndarray]:
@@ -122,11 +125,11 @@ class Engine(ABC):
 
     @abstractmethod
     def set_torque(self, tau: np.ndarray) -> None:
-        """Torque of every joint (nv - 6,) for the next step [N m]; the caller clips."""
+        """Torque of every motor (nv - 6,) for the next step [N m]; the caller clips."""
 
     @abstractmethod
     def applied(self) -> np.ndarray:
-        """Torque (nv - 6,) that the engine gave to the joints in the last step [N m]."""
+        """Torque (nv - 6,) that the motors gave in the last step, before their own friction [N m]."""
 
     @abstractmethod
     def push(self, force: np.ndarray, place: np.ndarray) -> None:
@@ -164,12 +167,14 @@ class Engine(ABC):
 
     def read_back(self) -> dict[str, Any]:
         """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg], how
-        wrong inertias are, damping in the joints, gravity [m/s^2], whether links collide, and how far beyond the stated
-        sole a foot ever touched [m]."""
+        wrong inertias are, damping in the joints, gravity [m/s^2], whether links collide, how far beyond the stated
+        sole a foot ever touched [m], and where it is so, that armature comes late."""
         feet = [self.friction[foot] for foot in self.robot.foot.frames]
         friction = sorted({foot * block for foot in feet for block in self.ground_friction})
         read = dict(friction=friction, mass_kg=self.mass_kg, inertia_error=self.inertia_error(), damping=self.damping)
         read |= dict(gravity=self.gravity, self_collision=self._solid)
+        if self.late_armature:
+            read["late_armature"] = True
         return dict(name=self.name, substeps=self.substeps, **read, beyond_sole_m=self.beyond_sole_m)
 
     def _compare(self, friction: float) -> None:

@@ -33,6 +33,7 @@ SOFT_CONE_RATIO = 1000.0  # the same on soft ground, whose pressure gives way by
 CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
 ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
 THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
+MOTOR = "damping", "armature", "friction"  # of a motor, as the engine has them
 FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
 SOFT_FIRST, SOFT_SHARE = 2, 0.1  # geoms of soft ground have it; small shares of acceleration make a plain spring
 
@@ -60,11 +61,13 @@ class MujocoEngine(Engine):
             geom.solimp = [*self.softness.impedance, self.softness.depth_m, 0.5, 2.0]
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        for own in (self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss):
-            own[:] = 0.0
         self._model.jnt_solref[:] = [self.softness.time_s, self.softness.damping_ratio]
         self._index_links()
         self._soften(friction)
+
+    def _motors(self) -> tuple[np.ndarray, ...]:
+        """Damping, armature and dry friction (nv,) of the engine's joints, to be written to: as :data:`MOTOR`."""
+        return self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss
 
     def _soften(self, friction: float) -> None:
         """Make springs of soft blocks, which then decide their contacts, friction included.
@@ -103,6 +106,11 @@ class MujocoEngine(Engine):
         joints = [model.joint(name) for name in self.robot.joint_names]
         self._angles = np.array([joint.qposadr[0] for joint in joints])
         self._rates = np.array([joint.dofadr[0] for joint in joints])
+        rows = [self.robot.actuators[name] for name in self.robot.joint_names]
+        self._stated = [np.zeros(model.nv) for _ in MOTOR]
+        for own, stated, key in zip(self._motors(), self._stated, MOTOR, strict=True):
+            stated[self._rates] = [row[key] for row in rows]
+            own[:] = stated
         self._feet = {model.body(name).id: side for side, name in enumerate(self.robot.foot.frames)}
         self._torque = np.zeros(len(joints))
         self._wrench, self._touching, self._colliding = np.zeros((2, 6)), set(), set()
@@ -156,9 +164,9 @@ class MujocoEngine(Engine):
 
     @property
     def damping(self) -> float:
-        """Largest damping, armature or dry friction of a joint as the engine has it, in SI units."""
-        model = self._model
-        return float(max(np.abs(x).max() for x in (model.dof_damping, model.dof_armature, model.dof_frictionloss)))
+        """Largest difference of a joint's damping, armature or dry friction from the stated, in SI units."""
+        pairs = zip(self._motors(), self._stated, strict=True)
+        return float(max(np.abs(x - stated).max() for x, stated in pairs))
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""

@@ -28,26 +28,27 @@ ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
 class Actuators:
     """Torque limits of all joints at a given speed.
 
-    Full torque up to the corner speed, then a line to zero at the speed limit; against the motion the full torque
+    Full torque up to the corner speed, then a line to zero at the no-load speed; against the motion the full torque
     remains, as in any electric drive.
     """
 
     def __init__(self, robot: Robot):
         rows = [robot.actuators[name] for name in robot.joint_names]
-        self.effort, self.speed, corner, self.lower, self.upper = (
-            np.array([row[key] for row in rows]) for key in ("effort", "speed", "corner_speed", "lower", "upper")
+        keys = "effort", "speed", "corner_speed", "no_load_speed", "lower", "upper"
+        self.effort, self.speed, corner, self._free, self.lower, self.upper = (
+            np.array([row[key] for row in rows]) for key in keys
         )
-        self._slope = 1 / (self.speed - corner)
+        self._slope = 1 / (self._free - corner)
 
     def range(self, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest torque (nv - 6,) [N m] at the joint rates ``rate`` [rad/s]."""
-        lower = -self.effort * np.clip((self.speed + rate) * self._slope, 0.0, 1.0)
-        upper = self.effort * np.clip((self.speed - rate) * self._slope, 0.0, 1.0)
+        lower = -self.effort * np.clip((self._free + rate) * self._slope, 0.0, 1.0)
+        upper = self.effort * np.clip((self._free - rate) * self._slope, 0.0, 1.0)
         return lower, upper
 
     def either_way(self, rate: np.ndarray) -> np.ndarray:
         """Torque (nv - 6,) [N m] that is available in both directions: the limit of the servo law."""
-        return self.effort * np.clip((self.speed - np.abs(rate)) * self._slope, 0.0, 1.0)
+        return self.effort * np.clip((self._free - np.abs(rate)) * self._slope, 0.0, 1.0)
 
 
 @dataclass(frozen=True)

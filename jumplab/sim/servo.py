@@ -11,10 +11,14 @@ where f_p is the plan's, none where both feet carry alike: what they push agains
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may be far stiffer than
 what is computed from the velocity before the step,
 
-    tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f   and   J v+ = 0,
+    tau + d (wish - v+)   where   M (v+ - v) / step + h = S^T (tau + d (wish - v+)) + J^T f
+                          and     J v+ = give step (f_t - f),
 
-and the wished rate is the due one plus corner times the error of the angle. Where torques are known to arrive late, the
-step is longer by as much: a light limb whose error is asked away within a millisecond overshoots until that is seen.
+with f_t the wrenches that tau goes with: ground that gives way a little. Of rigid ground a leg would expect to hold
+what it cannot where its axes nearly coincide, as H1_2's hip yaw and roll do with the thigh level, and without any roll
+at the ankle, as H1's. The wished rate is the due one plus corner times the error of the angle. Where torques are known
+to arrive late, the step is longer by as much: a light limb whose error is asked away within a millisecond overshoots
+until that is seen.
 """
 
 from __future__ import annotations
@@ -37,6 +41,7 @@ class ServoGains:
     damping: float = 45.0  # [N m s/rad] of the strongest motor; 60 swings with commands that are 4 ms old
     corner: float = 25.0  # [rad/s] stiffness over damping
     lever_m: float = 0.1  # moments on a foot count as forces at this distance
+    give: float = 1e-4  # [1/kg] rate of a foot per impulse on it; 1e-5 is too little for H1_2, 1e-3 for H1 as good
     epsilon: float = 1e-8  # [(m/s^2)^2/N^2] settles what each foot takes, and nothing else
 
 
@@ -57,6 +62,7 @@ class Servo:
         self._step_s, self._late, self._ahead_s = STEP_S + late_s, (1 - 1 / substeps) / 2, STEP_S / substeps / 2
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
+        self._robot = robot
         self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -69,17 +75,19 @@ class Servo:
         feet, drift, units = self._feet(command.feet)
         push = feet.T * units
         shared = self._shared(command) / units if command.wrench is not None else 0.0
-        tau = self._feed_forward(command.acceleration, feet, drift, push, shared)
+        tau, carried = self._feed_forward(command.acceleration, feet, drift, push, shared)
         error = command.q + self._ahead_s * command.rate - q[7:]
         wish = command.rate + self._step_s * command.acceleration + self._gains.corner * error
-        tau = tau + self._damping * (wish - self._rates_after(tau, wish, v, push))
+        tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
+        if self._robot.lossy:  # at the due rate: a measured one would swing with its noise
+            tau = tau + self._robot.lost_torque(command.rate)
         most = command.share * self._motors.either_way(v[6:])
         return np.clip(tau, -most, most)
 
     def _feed_forward(
         self, joints: np.ndarray, feet: np.ndarray, drift: np.ndarray, push: np.ndarray, shared: np.ndarray | float
-    ) -> np.ndarray:
-        """Torques (nv - 6,) that accelerate the ``joints`` as told, while the feet stay where they are.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Torques (nv - 6,) that accelerate the ``joints`` as told, while the feet stay where they are; wrenches (k,).
 
         The wrenches on them are as near to those ``shared`` (k,) out by the plan as that allows.
         """
@@ -93,19 +101,25 @@ class Servo:
         right[6:held] = self._gains.epsilon * shared
         right[:6], right[held:] = -feet[:, :6].T @ (drift + feet[:, 6:] @ joints), -offset[:6]
         x = solved(kkt, right)
-        return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held]
+        return offset[6:] + data.M[6:, :6] @ x[:6] - push[6:] @ x[6:held], x[6:held]
 
-    def _rates_after(self, tau: np.ndarray, wish: np.ndarray, v: np.ndarray, push: np.ndarray) -> np.ndarray:
-        """Joint rates (nv - 6,) at the end of the step, if ``tau`` and damping towards ``wish`` act [rad/s]."""
+    def _rates_after(
+        self, tau: np.ndarray, carried: np.ndarray, wish: np.ndarray, v: np.ndarray, push: np.ndarray
+    ) -> np.ndarray:
+        """Joint rates (nv - 6,) at the end of the step, if ``tau`` and damping towards ``wish`` act [rad/s].
+
+        The feet give way to what they have to carry beyond ``carried`` (k,).
+        """
         data, nv, held = self._gauge.data, len(v), push.shape[1]
         kkt, right, joints = np.zeros((nv + held, nv + held)), np.zeros(nv + held), range(6, nv)
         kkt[:nv, :nv] = data.M
         step_s = self._step_s
         kkt[joints, joints] += step_s * self._damping
         kkt[:nv, nv:], kkt[nv:, :nv] = -push, -push.T
-        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.epsilon * step_s
+        kkt[range(nv, nv + held), range(nv, nv + held)] = -self._gains.give
         right[:nv] = data.M @ v - step_s * data.nle
         right[6:nv] += step_s * (tau + self._damping * wish)
+        right[nv:] = -self._gains.give * step_s * carried
         return solved(kkt, right)[6:nv]
 
     def _shared(self, command: Command) -> np.ndarray:

@@ -147,7 +147,7 @@ def _base_motion(robot, motion):
 
 
 def _forces(robot, q, v, a, wrench, toe, on_ground):
-    """Wrenches on the feet (n, K, 6), half of the planar one (n, 3) each, and the joint torques that go with them."""
+    """Wrenches on the feet (n, K, 6), half of the planar one (n, 3) each, and the motor torques that go with them."""
     model = robot.model
     data = model.createData()
     f, external = _foot_wrenches(robot, data, q[on_ground], wrench[on_ground], toe[on_ground])
@@ -162,7 +162,7 @@ def _forces(robot, q, v, a, wrench, toe, on_ground):
         tau[k] = pin.rnea(model, data, q[k], v[k], a[k], forces)[6:]
     for k in np.flatnonzero(~on_ground):
         tau[k] = pin.rnea(model, data, q[k], v[k], a[k])[6:]
-    return wrenches, tau
+    return wrenches, tau + robot.lost_torque(v[:, 6:]) if robot.lossy else tau
 
 
 def _foot_wrenches(robot, data, q, wrench, toe):

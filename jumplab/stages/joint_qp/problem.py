@@ -90,7 +90,8 @@ class JointRows:
     def __init__(self, body: FullBody, nominal: np.ndarray, limits: Limits):
         self.limits = limits
         actuators = [body.robot.actuators[name] for name in body.robot.joint_names]
-        column = {k: np.array([a[k] for a in actuators]) for k in ("lower", "upper", "speed", "effort", "corner_speed")}
+        keys = "lower", "upper", "speed", "effort", "corner_speed", "no_load_speed"
+        column = {k: np.array([a[k] for a in actuators]) for k in keys}
         margin = limits.range_margin_rad or 0.0
         inertia = np.diag(body.terms(nominal, np.zeros(body.nv)).M)[6:]
         self.brake = limits.stop_share * column["effort"] / inertia  # [rad/s^2]
@@ -98,13 +99,14 @@ class JointRows:
         off = np.full(len(actuators), OFF_SPEED)
         self.speed = off if limits.speed_share is None else column["speed"] * limits.speed_share
         self.effort = column["effort"] * (limits.torque_share or 1.0)
-        self.full_speed, self.corner = column["speed"], column["corner_speed"]
+        self.free_speed, self.corner = column["no_load_speed"], column["corner_speed"]
 
     def torque(self, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest torque (n,) available at joint rates: full to the corner speed, then a line to zero."""
+        """Lowest and highest torque (n,) available at joint rates: full to the corner speed, then a line to zero at the
+        no-load speed."""
         if self.limits.torque_share is None:
             return np.full(len(rates), -OFF_TORQUE), np.full(len(rates), OFF_TORQUE)
-        left = (self.full_speed - np.abs(rates)) / (self.full_speed - self.corner)
+        left = (self.free_speed - np.abs(rates)) / (self.free_speed - self.corner)
         driving = self.effort * np.minimum(np.maximum(left, 0.0), 1.0)
         return np.where(rates < 0, -driving, -self.effort), np.where(rates > 0, driving, self.effort)
 

@@ -63,9 +63,10 @@ def holds_between(tape: Tape, robot: Robot) -> bool:
     The limits are those of the audit.
     """
     motors = [robot.actuators[name] for name in robot.joint_names]
-    effort, speed, corner = (np.array([m[key] for m in motors]) for key in ("effort", "speed", "corner_speed"))
+    keys = "effort", "speed", "corner_speed", "no_load_speed"
+    effort, speed, corner, free = (np.array([m[key] for m in motors]) for key in keys)
     rate = tape.v[:, 6:]
-    left = np.clip((speed - np.sign(tape.tau) * rate) / (speed - corner), 0.0, 1.0)
+    left = np.clip((free - np.sign(tape.tau) * rate) / (free - corner), 0.0, 1.0)
     step = np.diff(tape.t)[:, None]
     moves = step[:, 0] > SHORTEST_STEP / RATE_HZ  # the instant of take-off is there twice
     gaps = (
@@ -306,7 +307,7 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
 def forces(
     robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, standing: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Wrenches at the feet's frames (n, 2, 6), joint torques, CoM with velocity (n, 6), L about the CoM (n, 3).
+    """Wrenches at the feet's frames (n, 2, 6), motor torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
     What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
     """
@@ -336,7 +337,8 @@ def forces(
     f[:standing] = total
     f[:standing, :, 3:] -= np.cross(places, total[..., :3])
     need[:standing] -= np.einsum("nkij,nki->nj", slopes, total)
-    return f, need[:, 6:], com, spin
+    tau = need[:, 6:] + robot.lost_torque(v[:, 6:]) if robot.lossy else need[:, 6:]
+    return f, tau, com, spin
 
 
 def _shared(wrench: np.ndarray, soles: np.ndarray, missing: np.ndarray, least: float) -> np.ndarray:

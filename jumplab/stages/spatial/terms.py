@@ -9,6 +9,7 @@ import pinocchio as pin
 from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
+from jumplab.robot.description import SLIDING_RATE
 from jumplab.robot.reduction import mirror
 from jumplab.robot.stance import knees, stance_configuration
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
@@ -113,7 +114,7 @@ class SpatialTerms:
         return p.memo["state"]
 
     def torques(self, p: Point) -> ca.SX:
-        """Joint torques [N m]."""
+        """Motor torques [N m]."""
         return p.z[self.n_forces or 3 :]
 
     def base(self, p: Point) -> ca.SX:
@@ -145,7 +146,8 @@ class SpatialTerms:
         return [ca.vertcat(self.limits.friction * (PYRAMID.T @ f[:, i]), ca.sum1(f[:, i])) for i in range(k)]
 
     def needed(self, p: Point) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """(force, moment about the base, torques) that the motion needs besides the ground's forces; made once."""
+        """(force, moment about the base, torques of the motors) that the motion needs besides the ground's forces; made
+        once."""
         if "needed" not in p.memo:
             s, wrenches = self.state(p), {}
             for side, body in enumerate(self.feet if not self.flying else ()):
@@ -153,8 +155,14 @@ class SpatialTerms:
                 arms = [ca.DM(c) - origin for c in self.corners[side]]
                 moment = sum(ca.cross(arm, f) for arm, f in zip(arms, forces, strict=True))
                 wrenches[body] = sum(forces), moment
-            p.memo["needed"] = s.dynamics(wrenches)
+            force, moment, torques = s.dynamics(wrenches)
+            p.memo["needed"] = force, moment, torques + self.lost(p) if self.robot.lossy else torques
         return p.memo["needed"]
+
+    def lost(self, p: Point) -> ca.SX:
+        """Torques that the motors lose to their own friction, as :meth:`.Robot.lost_torque` [N m]."""
+        m, rates = self.motors, p.v[len(self.coordinates) - self.model.joints :]
+        return ca.DM(m["friction"]) * ca.tanh(rates / SLIDING_RATE) + ca.DM(m["damping"]) * rates
 
     # all phases -------------------------------------------------------------------------------------------------
     def smoothness(self) -> list[Term]:
@@ -193,8 +201,8 @@ class SpatialTerms:
     def motor_lines(self) -> Term:
         """Torque against speed of every joint."""
         m, first = self.motors, len(self.coordinates) - self.model.joints
-        slope = m["effort"] / (m["speed"] - m["corner_speed"]) * self.limits.torque_share
-        top = slope * m["speed"]
+        slope = m["effort"] / (m["no_load_speed"] - m["corner_speed"]) * self.limits.torque_share
+        top = slope * m["no_load_speed"]
         return row(
             "torque-speed",
             "ours: motor line",

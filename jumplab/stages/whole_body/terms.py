@@ -70,7 +70,7 @@ class WholeBodyTerms:
         return p.memo["wrench"]
 
     def torques(self, p: Point) -> ca.SX:
-        """Joint torques (4,) of both sides together [N m]; made once per point."""
+        """Motor torques (4,) of both sides together [N m]; made once per point."""
         if "torques" not in p.memo:
             p.memo["torques"] = self.state(p).torques(None if self.flying else (0.0, 0.0))
         return p.memo["torques"]
@@ -100,8 +100,8 @@ class WholeBodyTerms:
         """Range, speed, torque, and torque against speed of every joint; all ours."""
         m, s, lim = self.model, self.state, self.limits
         speed, peak, margin = lim.speed_share * m.speed, lim.torque_share * m.effort, lim.range_margin_rad
-        slope = m.effort / (m.speed - m.corner_speed) * lim.torque_share
-        top = np.tile(slope * m.speed, 2)
+        slope = m.effort / (m.no_load_speed - m.corner_speed) * lim.torque_share
+        top = np.tile(slope * m.no_load_speed, 2)
 
         def motor(p):
             tau, rate = self.torques(p), s(p).joint_rates

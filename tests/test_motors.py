@@ -1,0 +1,311 @@
+"""Armature, friction and no-load speed of motors: read, refused, planned with, audited, simulated, exported."""
+
+import pickle
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_robots import config, root, text
+
+from jumplab.auditing.audit import audit
+from jumplab.auditing.report import METHOD
+from jumplab.errors import RobotError
+from jumplab.io import export
+from jumplab.io.motion import Motion
+from jumplab.models.planar import evaluator
+from jumplab.robot import Robot
+from jumplab.robot.description import SHIPPED, SLIDING_RATE
+from jumplab.robot.sagittal import JOINT_OF_ANGLES
+from jumplab.robot.stance import stance_configuration
+from jumplab.robot_import.config import read_toml
+from jumplab.robot_import.jumper import make_jumper
+from jumplab.sim import INSTALLED, STEP_S, simulate_jump
+from jumplab.sim.checks import check
+from jumplab.sim.engine import engine_class
+from jumplab.stages.planner import Planner
+from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.whole_body.settings import Contact
+from jumplab.task import JumpTask
+
+NUMBERS = {"hip_pitch": (0.03, 1.5, 0.15), "knee": (0.04, 2.0, 0.2), "ankle_pitch": (0.02, 1.0, 0.1),
+           "shoulder_pitch": (0.01, 0.5, 0.05)}  # fmt: skip
+KEYS = "armature", "friction", "damping"
+KNEE = "[limits.knee]\n"
+
+
+def with_motors(robot: Robot, keys=KEYS, **more) -> Robot:
+    """A robot whose pitch joints have motors, of which ``keys`` are known; ``more`` are further tables."""
+    told = ""
+    for key, column in zip(KEYS, zip(*NUMBERS.values(), strict=True), strict=True):
+        if key in keys:
+            rows = zip(NUMBERS, column, strict=True)
+            told += f"\n[actuators.{key}]\n" + "".join(f"{n} = {x}\n" for r, x in rows for n in robot.joints[r])
+    for key, rows in more.items():
+        told += f"\n[actuators.{key}]\n" + "".join(f"{n} = {x}\n" for n, x in rows.items())
+    return Robot.from_text(robot.urdf, robot.config_text + told)
+
+
+@pytest.fixture(scope="module")
+def heavy(bhr):
+    return with_motors(bhr)
+
+
+@pytest.fixture(scope="module")
+def plan(heavy):
+    return Planner(heavy).plan(JumpTask(0.4, 0.2))
+
+
+def numbers(robot: Robot, key: str) -> np.ndarray:
+    return np.array([robot.actuators[name][key] for name in robot.joint_names])
+
+
+# told ---------------------------------------------------------------------------------------------------------------
+def imported(told: str) -> Robot:
+    jumper = make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")
+    return Robot.from_text(jumper.urdf, jumper.config_text)
+
+
+def test_read_for_a_role_and_for_one_of_its_joints():
+    robot = imported(KNEE + 'source = "a catalogue"\nvelocity = 20.0\ncorner = 15.0\nno_load = 25.0\narmature = 0.05\n'
+                     "friction = 2.0\ndamping = 0.1\n[limits.right_knee]\narmature = 0.06\n")  # fmt: skip
+    left, right, hip = (robot.actuators[name] for name in ("left_knee", "right_knee", "left_hip_pitch"))
+    assert [left[k] for k in (*KEYS, "corner_speed", "no_load_speed")] == [0.05, 2.0, 0.1, 15.0, 25.0]
+    assert [right[k] for k in KEYS] == [0.06, 2.0, 0.1]
+    assert [hip[k] for k in KEYS] == [0.0, 0.0, 0.0] and hip["no_load_speed"] == hip["speed"]
+    s = robot.sagittal  # both sides together; of the speeds, the lower one
+    assert [s.armature[1], s.friction[1], s.damping[1], s.no_load_speed[1]] == pytest.approx([0.11, 4.0, 0.2, 25.0])
+    assert not s.armature[[0, 2, 3]].any()
+
+
+def test_kept_by_what_makes_other_robots():
+    robot = imported(KNEE + "velocity = 20.0\nno_load = 25.0\narmature = 0.05\nfriction = 2.0\n")
+    others = robot.with_limits(effort=0.9, speed=0.8), robot.with_mass("trunk", factor=1.1), robot.with_legs(1.02)
+    for other in (*others, robot.with_stance(knee_rad=0.6), pickle.loads(pickle.dumps(robot))):
+        assert np.array_equal(other.armature, robot.armature) and other.lossy
+        assert np.array_equal(other.model.armature[6:], robot.armature)
+    assert others[0].actuators["left_knee"]["no_load_speed"] == pytest.approx(20.0)  # with the speed limit
+
+
+def test_a_corner_beyond_the_speed_limit_needs_a_no_load_speed():
+    robot = imported(KNEE + "velocity = 10.0\ncorner = 12.0\nno_load = 15.0\n")
+    assert robot.actuators["left_knee"]["corner_speed"] == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize("name", [name for name in SHIPPED if not name.startswith("g1")])
+def test_robots_without_such_numbers_are_as_ever(name):
+    try:
+        robot = Robot.load(name)
+    except RobotError as e:
+        assert "jumplab[robots]" in str(e)
+        return pytest.skip("the published robots are not installed")
+    assert not robot.armature.any() and not robot.lossy and not robot.model.armature.any()
+    assert np.array_equal(numbers(robot, "no_load_speed"), numbers(robot, "speed"))
+    assert not any(robot.motors.values()) and not robot.sagittal.heavy_motors
+
+
+@pytest.mark.parametrize("told, sentence", [
+    ("armature = -0.1\n", "armature = -0.1 must not be negative"),
+    ("friction = -1.0\n", "friction = -1 must not be negative"),
+    ("damping = -1.0\n", "damping = -1 must not be negative"),
+    ("armature = 25.0\n", "armature = 25 kg m^2 is more than 10 kg m^2, that of no joint"),
+    ("effort = 50.0\nvelocity = 20.0\nfriction = 10.0\ndamping = 2.0\n",
+     "friction and damping take 50 N m at the speed limit, and the effort is 50 N m"),
+    ("velocity = 20.0\nno_load = 15.0\n",
+     "no_load = 15 rad/s is below the speed limit, 20 rad/s, at which it would give no torque"),
+    ("velocity = 20.0\nno_load = 25.0\ncorner = 25.0\n",
+     "corner = 25 rad/s must lie between 0 and the no-load speed, 25 rad/s"),
+])  # fmt: skip
+def test_refused(told, sentence):
+    with pytest.raises(RobotError) as e:
+        imported(KNEE + told)
+    assert str(e.value) == f"my.urdf: joint 'left_knee': {sentence}; correct [limits.knee]"
+
+
+@pytest.mark.parametrize("told, sentence", [
+    ({"armature": {"left_knee": -1.0}}, "armature: left_knee = -1 must be of a joint that moves, and at least 0"),
+    ({"friction": {"neck": 1.0}}, "friction: neck = 1 must be of a joint that moves, and at least 0"),
+    ({"no_load_ratios": {"left_knee": 0.9}},
+     "no_load_ratios: left_knee = 0.9 must be of a joint that moves, and at least 1"),
+    ({"no_load_ratios": {"left_knee": 1.2}, "corner_speed_ratios": {"left_knee": 1.2}},
+     "corner_speed_ratios: left_knee = 1.2 must be of a joint, and between 0 and 1.2"),
+])  # fmt: skip
+def test_refused_of_a_robot(bhr, told, sentence):
+    with pytest.raises(RobotError) as e:
+        with_motors(bhr, (), **told)
+    assert str(e.value) == f"robot bhr: {sentence}"
+
+
+def test_a_source_is_a_text():
+    with pytest.raises(RobotError, match=r"'limits.knee.source' = 3, must be a text$"):
+        imported(KNEE + "source = 3\n")
+
+
+# planned ------------------------------------------------------------------------------------------------------------
+def test_five_links_turn_the_motors_too(bhr, heavy):
+    """Torques less those of the robot without motors are J q'' + d q' + f tanh(q' / r), of both sides."""
+    rng, s = np.random.default_rng(1), heavy.sagittal
+    of = [evaluator(robot.sagittal) for robot in (heavy, bhr)]
+    for size in (0.01, 1.0, 10.0):
+        angles, rates, accels = rng.normal(size=5), size * rng.normal(size=5), 10 * size * rng.normal(size=5)
+        given, needed = (f(angles, rates, accels, np.zeros(2))[9].full().ravel() for f in of)
+        rate, accel = JOINT_OF_ANGLES @ rates, JOINT_OF_ANGLES @ accels
+        told = s.armature * accel + s.damping * rate + s.friction * np.tanh(rate / SLIDING_RATE)
+        np.testing.assert_allclose(given - needed, told, atol=1e-9)
+    assert s.armature == pytest.approx([0.06, 0.08, 0.04, 0.02])
+
+
+def test_the_tree_turns_the_motors_too(heavy):
+    """Spatial torques in flight are Pinocchio's inverse dynamics without motors, plus what these take."""
+    b = SpatialTerms(heavy, SpatialLimits(), SpatialWeights(), Contact.FLIGHT)
+    n, rng = len(b.coordinates), np.random.default_rng(2)
+    q, v, a, z = (ca.SX.sym(key, count) for key, count in (("q", n), ("v", n), ("a", n), ("z", 3 + b.model.joints)))
+    point = SimpleNamespace(q=q, v=v, a=a, z=z, p=SimpleNamespace(gravity=9.8), memo={})
+    needed = ca.Function("needed", [q, v, a, z], [b.needed(point)[2]])
+    chart, rates, accels = (np.concatenate([np.zeros(3), 0.3 * rng.normal(size=n)]) for _ in "qva")
+    told = needed(chart[3:], rates[3:], accels[3:], np.zeros(3 + b.model.joints)).full().ravel()
+    model = pin.buildModelFromXML(heavy.urdf, pin.JointModelFreeFlyer())  # knows nothing of motors
+    model.gravity.linear = np.zeros(3)
+    own = [x[0] for x in b.model.to_pinocchio(chart[None], rates[None], accels[None])]
+    rigid = pin.rnea(model, model.createData(), *own)[6:]
+    armature, friction, damping = (numbers(heavy, key) for key in KEYS)
+    rate = rates[6:]
+    motors = armature * accels[6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
+    np.testing.assert_allclose(told, rigid + motors, atol=1e-9)
+
+
+def rigid_torques(robot: Robot, tape) -> np.ndarray:
+    """Inverse dynamics of a tape without motors (N, nv - 6) [N m]."""
+    model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
+    model.gravity.linear = np.array([0.0, 0.0, -robot.gravity])
+    data, out = model.createData(), []
+    frames = [model.getFrameId(str(name)) for name in tape.contact_frames]
+    for q, v, a, f in zip(tape.q, tape.v, tape.a, tape.f, strict=True):
+        need = pin.rnea(model, data, q, v, a).copy()
+        pin.computeJointJacobians(model, data, q)
+        pin.updateFramePlacements(model, data)
+        for frame, wrench in zip(frames, f, strict=True):
+            need -= pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED).T @ wrench
+        out.append(need[6:])
+    return np.array(out)
+
+
+def test_a_planned_tape_holds_motor_torques(heavy, plan):
+    tape = plan.tape
+    assert audit(tape, plan.robot, plan.task).passed
+    rate, (armature, friction, damping) = tape.v[:, 6:], (numbers(heavy, key) for key in KEYS)
+    motors = armature * tape.a[:, 6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
+    assert np.abs(motors).max() > 3.0
+    np.testing.assert_allclose(tape.tau, rigid_torques(heavy, tape) + motors, atol=1e-6)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_the_audit_misses_what_a_tape_leaves_out(heavy, plan, key):
+    """A tape whose torques lack armature, friction or damping is no jump of this robot."""
+    tape, rate = plan.tape, plan.tape.v[:, 6:]
+    own = {"armature": tape.a[:, 6:], "damping": rate, "friction": np.tanh(rate / SLIDING_RATE)}[key]
+    lacking = replace(tape, tau=tape.tau - numbers(heavy, key) * own)
+    found = {c.name: c for c in audit(lacking, plan.robot, plan.task).checks}["joint torque consistency"]
+    worst = 100 * np.abs(numbers(heavy, key) * own / numbers(heavy, "effort")).max()
+    assert not found.passed and found.value == pytest.approx(worst, rel=1e-3)
+
+
+def test_energy_counts_rotors_and_losses(bhr, heavy, plan):
+    """What motors put in is in links and rotors, or lost: without either, the balance is off by as much."""
+
+    def found(robot):
+        return {c.name: c.value for c in audit(plan.tape, robot, plan.task).checks}["energy balance"]
+
+    assert found(heavy) < 0.05 < 1.0 < found(bhr)
+
+
+def test_torque_at_speed_ends_at_the_no_load_speed(bhr):
+    robot = with_motors(bhr, (), no_load_ratios={"left_knee": 1.5, "right_knee": 1.5})
+    knee = robot.actuators["left_knee"]
+    assert (knee["speed"], knee["corner_speed"], knee["no_load_speed"]) == (20.0, 10.0, 30.0)
+    from jumplab.sim.playback import Actuators
+
+    at, k = np.zeros(len(robot.joint_names)), robot.joint_names.index("left_knee")
+    for rate, share in ((10.0, 1.0), (20.0, 0.5), (30.0, 0.0), (-10.0, 1.0)):
+        at[k] = rate
+        low, high = (x[k] for x in Actuators(robot).range(at))
+        assert high == pytest.approx(share * knee["effort"]) and low == -knee["effort"]
+    assert robot.sagittal.no_load_speed[1] == 30.0 and METHOD.torque_floor == 0.01
+
+
+# simulated ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("engine", INSTALLED)
+@pytest.mark.parametrize("keys", [("armature",), ("armature", "damping"), KEYS], ids=len)
+def test_a_pendulum_with_a_motor(bhr, engine, keys):
+    """An arm on a trunk that nothing moves: I q'' = tau - f - d q', from rest and in free fall, in closed form."""
+    robot = with_motors(bhr.with_mass("trunk", mass_kg=1e7), keys)
+    k, model = robot.joint_names.index("left_shoulder_pitch"), robot.model
+    data, q = model.createData(), stance_configuration(robot).copy()
+    q[2] = 10.0
+    inertia = pin.crba(model, data, q)[6 + k, 6 + k]
+    row, torque, steps = robot.actuators["left_shoulder_pitch"], 3.0, 100
+    assert row["armature"] > 0.05 * (inertia - row["armature"])
+    tau = np.zeros(model.nv - 6)
+    tau[k] = torque
+    with engine_class(engine)(robot, q) as world:
+        assert world.inertia_error() < 1e-6 and world.damping == 0
+        for _ in range(steps):
+            world.set_torque(tau)
+            world.step()
+        rate, t = world.state()[1][6 + k], steps * STEP_S
+    push, damping = torque - row["friction"], row["damping"]
+    due = push / damping * (1 - np.exp(-damping * t / inertia)) if damping else push * t / inertia
+    assert rate == pytest.approx(due, rel=2e-3 if keys != KEYS else 2e-2)  # engines let dry friction grow with the rate
+
+
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_robot_in_the_air_moves_as_with_armature(bhr, engine):
+    """Against Pinocchio's forward dynamics; PyBullet gives a part of it a step late."""
+    robot = with_motors(bhr, ("armature",))
+    model, data = robot.model, robot.model.createData()
+    q, v = stance_configuration(robot).copy(), np.zeros(model.nv)
+    q[2] = 5.0
+    with engine_class(engine)(robot, q) as world:
+        for k in range(100):
+            tau = 10.0 * np.sin(0.05 * k + np.arange(model.nv - 6)) * np.isin(np.arange(model.nv - 6) % 7, (2, 3, 6))
+            world.set_torque(tau)
+            world.step()
+            for _ in range(10):
+                v = v + STEP_S / 10 * pin.aba(model, data, q, v, np.concatenate([np.zeros(6), tau]))
+                q = pin.integrate(model, q, v * STEP_S / 10)
+        there, speed = world.state()
+    assert np.abs(v[6:]).max() > 1.0
+    close = {"bullet": (1.5e-3, 0.08), "mujoco": (2.5e-4, 1e-4)}[engine]
+    assert np.abs(pin.difference(model, q, there))[3:].max() < close[0] and np.abs(speed - v)[3:].max() < close[1]
+
+
+@pytest.mark.parametrize("engine", INSTALLED)
+@pytest.mark.parametrize("mode", ["position", "pd"])
+def test_a_jump_with_motors_lands(plan, engine, mode):
+    run = simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
+    assert run.landed, run.reason
+    assert [f.name for f in run.checks if not f.passed] == []
+    assert run.metrics.com_rise_m == pytest.approx(0.2, abs=0.01)
+    assert run.metrics.foot_distance_m == pytest.approx(0.4, abs=0.01)
+    assert run.settings["engine"].get("late_armature", False) == (engine == "bullet")
+
+
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_physics_without_the_motors_is_noticed(bhr, plan, engine):
+    """The findings know armature and friction: of a robot without, the same log has torques from nowhere."""
+    run = simulate_jump(plan.tape, plan.robot, engine=engine)
+    said = {f.name: f for f in check(run, bhr)}
+    assert not said["unexplained joint torque"].passed
+
+
+# exported -----------------------------------------------------------------------------------------------------------
+def test_exported(heavy, plan, tmp_path):
+    folder = export.write("mujoco", Motion.of(plan.tape), heavy, tmp_path / "mujoco")
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    rows = [model.joint(name).dofadr[0] for name in heavy.joint_names]
+    for key, own in zip(KEYS, (model.dof_armature, model.dof_frictionloss, model.dof_damping), strict=True):
+        assert np.allclose(own[rows], numbers(heavy, key)) and own[:6].max() == 0
