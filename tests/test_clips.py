@@ -39,8 +39,8 @@ def world(monkeypatch):
     """One plan for all targets, and what each engine measures; calls are listed."""
     world, plan = SimpleNamespace(say=lambda engine: {}, calls=[], refuse=set()), jump(0.6, 0.3, method="direct")
 
-    def planned(self, task):
-        world.calls.append(task.distance_m)
+    def planned(self, task, method):
+        world.calls.append((task.distance_m, method))
         if task.distance_m in world.refuse:
             raise InfeasibleError("the knee is too slow")
         return plan
@@ -65,7 +65,7 @@ def test_thirty_targets_of_every_kind_grow_with_the_leg(bhr):
     assert found["forward-1"] == JumpTask(round(0.2 * leg, 2), round(0.2 * leg, 2))
     assert found["back-4"].distance_m == -round(0.4 * leg, 2) and found["side-2"].side_m == -round(0.15 * leg, 2)
     assert found["platform-5"].platform_m < 0 < found["platform-1"].platform_m
-    assert found["turn-4"].yaw_rad == math.radians(-60)
+    assert found["turn-4"].yaw_rad == math.radians(-40)
 
 
 def test_what_passes_is_exported_and_the_rest_is_left_out_with_its_reason(world, tmp_path, capsys):
@@ -90,12 +90,21 @@ def test_what_passes_is_exported_and_the_rest_is_left_out_with_its_reason(world,
     assert store.read_json(tmp_path / "lib" / "forward-1" / "simulation.json")["engine"] == DEFAULT_ENGINE
 
 
+def test_where_the_usual_plan_is_not_clean_three_steps_plan(world, monkeypatch, bhr, tmp_path):
+    reports = iter([False, True])
+    monkeypatch.setattr(clips, "audit", lambda tape, robot, task: SimpleNamespace(passed=next(reports)))
+    assert len(clips.make_clips(bhr, tmp_path, jobs=1, only=["forward-1"]).rows) == 1
+    assert [method for _, method in world.calls] == ["usual", "three-step"]
+
+
 def test_clips_that_failed_are_tried_again(world, tmp_path):
     robot = Robot.load()
     world.refuse = {task.distance_m for task in clips.targets(robot).values()}
     assert len(clips.make_clips(robot, tmp_path, jobs=1).left_out) == 2
     world.refuse = set()
-    assert len(clips.make_clips(robot, tmp_path, jobs=1).rows) == 2 and len(world.calls) == 4
+    assert (
+        len(clips.make_clips(robot, tmp_path, jobs=1).rows) == 2 and len(world.calls) == 6
+    )  # in three steps as well where it failed
 
 
 def test_engines_that_do_not_agree_leave_a_clip_out(world, tmp_path, capsys):

@@ -1,8 +1,10 @@
 """Published robots from the optional package example-robot-data: shipped configurations and true refusals."""
 
 import json
+import re
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -208,3 +210,12 @@ def test_stored_maps_are_of_robots_that_ship():
         except RobotError:
             continue
         assert row["hash"] == robot.hash, "python -m paper.shipped measures it again"
+
+
+def test_the_readme_tells_the_stored_jumps():
+    from paper import shipped
+
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    for line in shipped.verdicts():
+        name, *cells = map(str, line.values())
+        assert re.search(rf"^\| `{name}`, [^|]+ \| {re.escape(' | '.join(cells))} \|$", readme, re.M), line

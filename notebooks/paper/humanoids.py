@@ -1,8 +1,8 @@
 """Published humanoids, each imported without a flag, planned and simulated once: the rows of ``humanoids.json``.
 
 ``python -m paper.humanoids FOLDER [--jump] [--bounds]`` in the folder of the notebooks looks for FOLDER/NAME/FILE of
-every row, and writes what became of it; ``--jump`` also plans and simulates what has not been yet, ``--bounds`` tries
-how far the whole body gets beyond the rise for which a straight push is enough. Notebook 07 draws the file.
+every row, and writes what became of it; ``--jump`` also plans and simulates what has not been yet, ``--bounds`` looks
+for the highest jump on the spot of those that are planned in the plane. Notebook 07 draws the file.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ LEG = ("hip_pitch", "knee", "ankle_pitch")
 SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankle
 SMALLER = (0.5, 0.25)  # of both, where the whole jump has no clean plan or does not land
 LEAST_M = 0.02  # of a rise that can be asked for
-SHARES_OF_PUSH = (2.0, 1.5, 1.3, 1.15, 1.0, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # tried, the greatest first
+STEP = 1.15  # between the rises that are tried
 PLAN_S = 300.0  # longest processor time for one plan with its audit and simulation
+LADDER_S = 900.0  # and for all plans of a ladder
 
 
 def rows() -> list[dict[str, Any]]:
@@ -111,33 +112,61 @@ def largest(path: Path, first: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def bounded(path: Path) -> dict[str, Any]:
-    """The rise on the spot for which a straight push is enough, and the highest clean plan, as a share of it."""
+    """How high a robot jumps on the spot: the first rung with a clean plan, on the way down a ladder.
+
+    The ladder's rungs are :data:`STEP` apart about the rise for which a straight push is enough, so that no method has
+    a clean plan on any rung above; ``refused`` tells why not on the next one.
+    """
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)
     push = highest(capability(planner.stage("reach"), GRAVITY))
-    rises = ((share, round(share * push, 4)) for share in SHARES_OF_PUSH)
-    tried = ((share, rise) for share, rise in rises if LEAST_M <= rise <= MAX_HEIGHT_M)
-    return {"push_m": round(push, 4), "planned": next((share for share, rise in tried if _clean(planner, rise)), None)}
+    rungs = (round(push * STEP**power, 4) for power in range(6, -9, -1))
+    above, refused = None, {}
+    for rise in rungs:
+        if LEAST_M <= rise <= MAX_HEIGHT_M:
+            faults = _faults(planner, rise)
+            if None in faults.values():
+                return {"push_m": round(push, 4), "rise_m": rise, "above_m": above, "refused": refused}
+            above, refused = rise, faults
+    return {"push_m": round(push, 4), "rise_m": None, "above_m": above, "refused": refused}
 
 
-def _clean(planner: Planner, rise_m: float) -> bool:
-    try:
-        return api.audit(planner.plan(JumpTask(0.0, rise_m), "direct")).passed
-    except JumplabError:
-        return False
+def _faults(planner: Planner, rise_m: float) -> dict[str, str | None]:
+    """By method, why it has no clean plan; None ends the search."""
+    faults: dict[str, str | None] = {}
+    for method in ("three-step", "direct"):
+        try:
+            failed = api.audit(planner.plan(JumpTask(0.0, rise_m), method)).failed
+        except JumplabError as e:
+            faults[method] = str(e)
+        else:
+            faults[method] = ", ".join(check.name for check in failed) or None
+        if faults[method] is None:
+            break
+    return faults
 
 
-def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any]:
-    """What ``work_on`` finds in a process of its own, given up after :data:`PLAN_S`."""
-    limit = resource.RLIMIT_CPU, (int(PLAN_S), int(PLAN_S))
+def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s: float = PLAN_S) -> dict[str, Any]:
+    """What ``work_on`` finds in a process of its own, given up after ``longest_s`` [s] of processor time."""
+    limit = resource.RLIMIT_CPU, (int(longest_s), int(longest_s))
     with ProcessPoolExecutor(1, initializer=resource.setrlimit, initargs=limit) as pool:
         work = pool.submit(work_on, path)
         try:
             return work.result()
         except BrokenProcessPool:
-            return {"clean": None, "landed": None, "reason": f"no plan within {PLAN_S:g} s of one core"}
+            return {"clean": None, "landed": None, "reason": f"no plan within {longest_s:g} s of one core"}
         except Exception as e:  # an internal error is a result as well: the aim is none
             return {"clean": None, "landed": None, "reason": f"internal error: {type(e).__name__}: {e}"}
+
+
+def heights(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row per robot whose highest jump on the spot was looked for: that, and where no method found one."""
+    found = [(row["name"], row["highest"]) for row in table if "rise_m" in row.get("highest", {})]
+    words = "straight push [m]", "highest clean plan [m]", "none by any method [m]"
+    return [
+        {"robot": name, **dict(zip(words, (h[k] for k in ("push_m", "rise_m", "above_m")), strict=True))}
+        for name, h in found
+    ]
 
 
 def verdicts(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -164,7 +193,7 @@ def main(folder: str, *options: str) -> None:
         if robot is not None and "--jump" in options:
             row["jump"] = largest(path, row.get("jump"))
         if robot is not None and robot.planar and "--bounds" in options and "highest" not in row:
-            row["highest"] = within_time(bounded, path)
+            row["highest"] = within_time(bounded, path, LADDER_S)
         print(
             row["name"], told["legs right"], told["faults"][:1], row.get("jump", ""), row.get("highest", ""), flush=True
         )

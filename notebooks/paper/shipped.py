@@ -79,11 +79,12 @@ def mapped(name: str) -> Envelope:
 
 def verdicts() -> list[dict[str, Any]]:
     """A line per robot: its jump, how many of the playbacks stand, and the ends of its map with what limits them."""
-    lines = []
-    for name, row in rows().items():
-        found, jump = mapped(name), row["jump"]
+    lines, table = [], rows()
+    for name in (name for name in SHIPPED if name in table):
+        row, found = table[name], mapped(name)
+        jump = row["jump"]
         line: dict[str, Any] = {"robot": name, "kg": row["kg"], "program": row["planner"]}
-        line["jump"] = f"{jump['distance_m']:.2f} m, {jump['rise_m']:.2f} m" if jump else "none"
+        line["jump"] = f"{jump['distance_m']:.2f} m, {jump['rise_m']:.2f} m" if jump else "none found"
         line["stands"] = f"{sum(r['stands'] for r in jump['runs'].values())} of {len(jump['runs'])}" if jump else ""
         for what, end in ("highest", found.highest), ("farthest", found.farthest):
             line[what] = f"{end.distance_m:.2f} m, {end.height_m:.2f} m ({end.limiting})" if end else "no jump found"
