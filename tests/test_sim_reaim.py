@@ -8,9 +8,10 @@ import pytest
 from fixtures_core import jump
 
 from jumplab.sim import INSTALLED, Perturbation, Scene, Shove, simulate_jump
+from jumplab.sim import reaim as module
 from jumplab.sim.kinematics import Gauge, headed, turned, yaw_of
 from jumplab.sim.playback import Actuators, Playback
-from jumplab.sim.reaim import Reaim, _within
+from jumplab.sim.reaim import FAR_RAD, Reaim, _within
 
 DISTANCE_M, HEIGHT_M = 0.6, 0.3
 
@@ -112,6 +113,32 @@ def test_soles_of_a_turned_robot_meet_the_ground_flat(bhr, reaim, turn):
     assert reaim.wish(q, v, more) == pytest.approx(reaim.wish(t.q[-1], t.v[-1], np.eye(3)), abs=1e-9)
 
 
+def tilted_ahead(pitch_rad):
+    return pin.rpy.rpyToMatrix(0.0, pitch_rad, 0.0)
+
+
+def joints_of(robot, *roles):
+    return [robot.joint_names.index(name) for role in roles for name in robot.joints[role]]
+
+
+@pytest.mark.parametrize("pitch_rad", [-2 * FAR_RAD, 0.9 * FAR_RAD, 1.1 * FAR_RAD])
+def test_arms_swing_only_if_the_trunk_will_be_far_forward(bhr, reaim, pitch_rad):
+    """High above the ground, where legs wait; to the back as their way, which turns a trunk back."""
+    t, turn = tape(), tilted_ahead(pitch_rad)
+    high = turned(t.q[-1], turn)
+    high[2] += 1.0
+    arms = reaim.correction(high, t.v[-1], turn, 0.4, flip=False)[joints_of(bhr, "shoulder_pitch")]
+    if pitch_rad < FAR_RAD:
+        assert not arms.any()
+        return
+    data = bhr.model.createData()
+    pin.ccrba(bhr.model, data, high, t.v[-1])
+    carried = data.Ag[4, 6:][joints_of(bhr, "shoulder_pitch")]  # of L_y, by each rad/s of an arm
+    assert (carried * arms > 0).all()
+    reaim.correction(high, t.v[-1], tilted_ahead(0.0), 0.3, flip=False)
+    assert reaim.correction(high, t.v[-1], tilted_ahead(0.0), 0.3, flip=False).any()  # they go on until touchdown
+
+
 def test_bounded_least_squares():
     slope = np.array([[1.0, 1.0], [0.0, 1.0]])
     wide, miss = np.full(2, 10.0), np.array([3.0, 1.0])
@@ -139,3 +166,16 @@ def test_a_shove_aside_is_landed_with_reaim_alone(bhr, engine):
     plain, aimed = (simulate_jump(tape(), bhr, perturbation=aside, reaim=on, engine=engine) for on in (False, True))
     assert "touched the ground" in plain.reason
     assert aimed.landed and aimed.checks_passed, aimed.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_shove_forward_early_in_flight_is_landed_with_the_arms(bhr, engine, monkeypatch):
+    """Without them the trunk comes down almost a radian forward, further than legs can reach."""
+    ahead = Perturbation(shoves=(Shove("flight", 0.1, 15.0, 0.3),))
+    arms = simulate_jump(tape(), bhr, perturbation=ahead, reaim=True, engine=engine)
+    monkeypatch.setattr(module, "FAR_RAD", np.inf)
+    legs = simulate_jump(tape(), bhr, perturbation=ahead, reaim=True, engine=engine)
+    assert arms.landed and arms.checks_passed, arms.reason
+    assert "touched the ground" in legs.reason
+    assert arms.metrics.touchdown_trunk_pitch_rad < legs.metrics.touchdown_trunk_pitch_rad - 0.3
