@@ -26,7 +26,7 @@ from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.checkup import examine, first_look
 from jumplab.robot.description import Robot
 from jumplab.sim.playback import MODES
-from jumplab.stages.planner import Planner
+from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.srmp.reachable import capability, highest
 from jumplab.task import GRAVITY, MAX_HEIGHT_M, JumpTask
 
@@ -112,38 +112,50 @@ def largest(path: Path, first: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def bounded(path: Path) -> dict[str, Any]:
-    """How high a robot jumps on the spot: the first rung with a clean plan, on the way down a ladder.
+    """How high a robot jumps on the spot, as far as plans are found, on a ladder of rises :data:`STEP` apart.
 
-    The ladder's rungs are :data:`STEP` apart about the rise for which a straight push is enough, so that no method has
-    a clean plan on any rung above; ``refused`` tells why not on the next one.
+    From above what a straight push may give, the ladder is gone down to the first rung with a clean plan by either
+    method, and from there up again, each plan begun with the one below. ``refused`` tells by method why there is none
+    on the rung above.
     """
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)
     push = highest(capability(planner.stage("reach"), GRAVITY))
-    rungs = (round(push * STEP**power, 4) for power in range(6, -9, -1))
-    above, refused = None, {}
-    for rise in rungs:
-        if LEAST_M <= rise <= MAX_HEIGHT_M:
-            faults = _faults(planner, rise)
-            if None in faults.values():
-                return {"push_m": round(push, 4), "rise_m": rise, "above_m": above, "refused": refused}
-            above, refused = rise, faults
-    return {"push_m": round(push, 4), "rise_m": None, "above_m": above, "refused": refused}
+    rungs = [round(push * STEP**power, 4) for power in range(-8, 7)]
+    rungs = [rise for rise in rungs if LEAST_M <= rise <= MAX_HEIGHT_M]
+    level, plan, refused = len(rungs), None, {}
+    while level and plan is None:
+        level -= 1
+        above, (plan, refused) = refused, _tried({m: partial(planner.plan, _up(rungs[level]), m) for m in METHODS})
+    if plan is None:
+        return {"push_m": round(push, 4), "rise_m": None, "above_m": rungs[0], "refused": refused}
+    beside = {}
+    while not beside and level + 1 < len(rungs):
+        higher, beside = _tried({"begun with the plan below": partial(planner.replan, plan, _up(rungs[level + 1]))})
+        if higher is not None:
+            level, plan = level + 1, higher
+    above_m = rungs[level + 1] if level + 1 < len(rungs) else None
+    return {"push_m": round(push, 4), "rise_m": rungs[level], "above_m": above_m, "refused": above | beside}
 
 
-def _faults(planner: Planner, rise_m: float) -> dict[str, str | None]:
-    """By method, why it has no clean plan; None ends the search."""
-    faults: dict[str, str | None] = {}
-    for method in ("three-step", "direct"):
+def _up(rise_m: float) -> JumpTask:
+    return JumpTask(0.0, rise_m)
+
+
+def _tried(ways: dict[str, Callable[[], Any]]) -> tuple[Any, dict[str, str]]:
+    """The first plan that is clean, and nothing else; or None and by way why there is none."""
+    reasons = {}
+    for name, way in ways.items():
         try:
-            failed = api.audit(planner.plan(JumpTask(0.0, rise_m), method)).failed
+            plan = way()
         except JumplabError as e:
-            faults[method] = str(e)
-        else:
-            faults[method] = ", ".join(check.name for check in failed) or None
-        if faults[method] is None:
-            break
-    return faults
+            reasons[name] = str(e)
+            continue
+        failed = api.audit(plan).failed
+        if not failed:
+            return plan, {}
+        reasons[name] = ", ".join(check.name for check in failed)
+    return None, reasons
 
 
 def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s: float = PLAN_S) -> dict[str, Any]:
@@ -162,7 +174,7 @@ def within_time(work_on: Callable[[Path], dict[str, Any]], path: Path, longest_s
 def heights(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """One row per robot whose highest jump on the spot was looked for: that, and where no method found one."""
     found = [(row["name"], row["highest"]) for row in table if "rise_m" in row.get("highest", {})]
-    words = "straight push [m]", "highest clean plan [m]", "none by any method [m]"
+    words = "straight push [m]", "highest clean plan [m]", "no clean plan found at [m]"
     return [
         {"robot": name, **dict(zip(words, (h[k] for k in ("push_m", "rise_m", "above_m")), strict=True))}
         for name, h in found
