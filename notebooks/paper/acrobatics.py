@@ -22,21 +22,22 @@ from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 TABLE = Path(__file__).with_name("acrobatics.json")
-# robot, factor on efforts and speeds of all motors, distance, rise, platform [m], turns about +y, method
-Asked = tuple[str, float, float, float, float, int, str]
+# robot, factors on efforts and on speeds of all motors, distance, rise, platform [m], turns about +y, method
+Asked = tuple[str, float, float, float, float, float, int, str]
+KEYS = "robot", "effort", "speed", "distance_m", "height_m", "platform_m", "turns", "method"
 FARTHEST = {"Farthest": "distance_m", "Highest platform": "platform_m", "Highest": "height_m"}
-RISE_M = 0.45  # of flips
 ASKED: list[Asked] = [
-    ("g1", 1.0, 0.6, 0.3, 0.0, 0, "direct"),
-    ("g1", 1.0, 0.5, 0.35, 0.2, 0, "direct"),
-    ("g1", 1.0, 0.9, 0.3, 0.0, 0, "direct"),
-    ("g1", 1.0, 0.0, RISE_M, 0.0, -1, "direct"),
-    ("g1", 1.0, 0.0, RISE_M, 0.0, 1, "direct"),
-    ("g1", 1.0, 0.0, RISE_M, 0.0, -1, "three-step"),
-    ("g1", 1.5, 0.0, RISE_M, 0.0, -1, "direct"),
-    ("g1", 2.0, 0.0, RISE_M, 0.0, -1, "direct"),
-    ("g1", 1.0, 0.7, 0.4, 0.0, 0, "direct"),
-    ("g1", 1.0, 0.5, 0.45, 0.3, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.6, 0.3, 0.0, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.5, 0.35, 0.2, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.9, 0.3, 0.0, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.7, 0.4, 0.0, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.5, 0.45, 0.3, 0, "direct"),
+    ("g1", 1.0, 1.0, 0.2, 0.27, 0.0, 1, "direct"),
+    ("g1", 1.0, 1.0, 0.0, 0.35, 0.0, -1, "direct"),
+    ("g1", 1.0, 1.0, 0.0, 0.35, 0.0, -1, "three-step"),
+    ("g1", 1.0, 2.0, 0.0, 0.35, 0.0, -1, "direct"),
+    ("g1", 2.0, 1.0, 0.0, 0.35, 0.0, -1, "direct"),
+    ("g1", 2.0, 2.0, 0.0, 0.35, 0.0, -1, "direct"),
 ]
 
 
@@ -46,22 +47,20 @@ def rows() -> list[dict[str, Any]]:
 
 
 @cache
-def planner(name: str, factor: float) -> Planner:
-    """Of a robot with motors that are stronger, and faster, by a factor."""
+def planner(name: str, effort: float, speed: float) -> Planner:
+    """Of a robot with motors that are stronger, and faster, by factors."""
     robot = Robot.load(name)
-    return Planner(robot if factor == 1 else robot.with_limits(effort=factor, speed=factor))
+    return Planner(robot if effort == speed == 1 else robot.with_limits(effort=effort, speed=speed))
 
 
 def attempt(asked: Asked) -> dict[str, Any]:
     """One row: the plan, its audit, and, where that is clean, its simulations."""
-    name, factor, distance, height, platform, turns, method = asked
-    row: dict[str, Any] = dict(
-        zip(("robot", "factor", "distance_m", "height_m", "platform_m", "turns", "method"), asked, strict=True)
-    )
+    name, effort, speed, distance, height, platform, turns, method = asked
+    row: dict[str, Any] = dict(zip(KEYS, asked, strict=True))
     task = JumpTask(distance, height, platform_m=platform, rotation_rad=2 * math.pi * turns)
     start = time.process_time()
     try:
-        plan = planner(name, factor).plan(task, method=method)
+        plan = planner(name, effort, speed).plan(task, method=method)
     except JumplabError as e:
         return row | {"clean": False, "said": str(e), "cpu_s": round(time.process_time() - start, 1)}
     report = api.audit(plan)
@@ -100,35 +99,37 @@ def verdicts(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         line = {
             "robot": row["robot"],
             "jump": named(row),
-            "motors": "as made" if row["factor"] == 1 else f"{row['factor']:g} x",
+            "motors": motors(row),
         }
         line |= {"plan": "clean" if row["clean"] else row["said"].split(";")[0], "fullest limit": fullest}
         out.append(line | {"lands": f"{sum(x[0] for x in landed)} of {len(landed)}" if landed else ""})
     return out
 
 
+def motors(row: dict[str, Any]) -> str:
+    """What was asked of them, in words."""
+    changed = [f"{name} x {row[name]:g}" for name in ("effort", "speed") if row[name] != 1]
+    return ", ".join(changed) or "as made"
+
+
 def told(found: list[dict[str, Any]]) -> list[str]:
-    """What the table says: the farthest jump and the highest platform, and of each flip the least factor found."""
+    """What the table says: the farthest jump and the highest platform, and of each flip which motors do it, and by how
+    much those that do not fall short."""
     sound = [row for row in found if row["clean"] and all(landing[0] for landing in row["landed"].values())]
-    made = [row for row in sound if row["factor"] == 1 and not row["turns"]]
+    made = [row for row in sound if motors(row) == "as made" and not row["turns"]]
     lines = [f"{what}: {named(max(made, key=lambda row, key=key: row[key]))}" for what, key in FARTHEST.items() if made]
-    for turns, name in ((-1, "Backflip"), (1, "Front flip")):
-        tried = sorted({row["factor"] for row in found if row["turns"] == turns})
-        least = min((row["factor"] for row in sound if row["turns"] == turns), default=None)
-        factors = ", ".join(f"{x:g}" for x in tried)
-        if least is not None:
-            lines.append(f"{name}: lands with efforts and speeds times {least:g}; tried were {factors}")
-        elif tried:
-            lines.append(f"{name}: no plan was found with efforts and speeds times {factors}")
-    return lines
+    for turns in (-1, 1):
+        for row in (row for row in found if row["turns"] == turns):
+            became = "lands" if row in sound else row["said"] or "does not land"
+            lines.append(f"{named(row)}, {row['method']}, motors {motors(row)}: {became}")
+    return [line[0].upper() + line[1:] for line in lines]
 
 
 def main() -> None:
     """Fill the table."""
     done = rows() if TABLE.exists() else []
-    keys = "robot", "factor", "distance_m", "height_m", "platform_m", "turns", "method"
     for asked in ASKED:
-        if not any(all(row[k] == x for k, x in zip(keys, asked, strict=True)) for row in done):
+        if not any(all(row[k] == x for k, x in zip(KEYS, asked, strict=True)) for row in done):
             done.append(attempt(asked))
             write_file(TABLE, ("[\n" + ",\n".join(map(json.dumps, done)) + "\n]\n").encode())
             print(*asked, done[-1]["clean"], done[-1]["said"], done[-1].get("landed"), flush=True)

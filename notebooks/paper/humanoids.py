@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot.checkup import examine, first_look
 from jumplab.robot.description import Robot
 from jumplab.sim.playback import MODES
+from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import METHODS, Planner
 from jumplab.stages.srmp.reachable import capability, highest
 from jumplab.task import GRAVITY, MAX_HEIGHT_M, JumpTask
@@ -36,8 +38,9 @@ SHARES = (0.38, 0.19)  # distance and rise, of the leg's length from hip to ankl
 SMALLER = (0.5, 0.25)  # of both, where the whole jump has no clean plan or does not land
 LEAST_M = 0.02  # of a rise that can be asked for
 STEP = 1.15  # between the rises that are tried
+AHEAD = 0.5, 1.0, 2.0  # rises; jumps so far ahead are tried as a beginning of one on the spot
 PLAN_S = 300.0  # longest processor time for one plan with its audit and simulation
-LADDER_S = 900.0  # and for all plans of a ladder
+LADDER_S = 1800.0  # and for all plans of a ladder
 
 
 def rows() -> list[dict[str, Any]]:
@@ -115,8 +118,8 @@ def bounded(path: Path) -> dict[str, Any]:
     """How high a robot jumps on the spot, as far as plans are found, on a ladder of rises :data:`STEP` apart.
 
     From above what a straight push may give, the ladder is gone down to the first rung with a clean plan by either
-    method, and from there up again, each plan begun with the one below. ``refused`` tells by method why there is none
-    on the rung above.
+    method, and from there up again, each plan begun with the one below or with a jump ahead. ``refused`` tells by
+    method why there is none on the rung above.
     """
     EXPLAINED.set(False)  # nobody reads why
     planner = Planner(examine(path).robot)
@@ -126,16 +129,24 @@ def bounded(path: Path) -> dict[str, Any]:
     level, plan, refused = len(rungs), None, {}
     while level and plan is None:
         level -= 1
-        above, (plan, refused) = refused, _tried({m: partial(planner.plan, _up(rungs[level]), m) for m in METHODS})
+        plan, refused[level] = _tried({m: partial(planner.plan, _up(rungs[level]), m) for m in METHODS})
     if plan is None:
-        return {"push_m": round(push, 4), "rise_m": None, "above_m": rungs[0], "refused": refused}
-    beside = {}
-    while not beside and level + 1 < len(rungs):
-        higher, beside = _tried({"begun with the plan below": partial(planner.replan, plan, _up(rungs[level + 1]))})
-        if higher is not None:
-            level, plan = level + 1, higher
-    above_m = rungs[level + 1] if level + 1 < len(rungs) else None
-    return {"push_m": round(push, 4), "rise_m": rungs[level], "above_m": above_m, "refused": above | beside}
+        return {"push_m": round(push, 4), "rise_m": None, "above_m": rungs[0], "refused": refused[0]}
+    while level + 1 < len(rungs):
+        task = _up(rungs[level + 1])
+        ways = {"begun with the plan below": partial(planner.replan, plan, task)}
+        ways |= {f"begun with {x:g} times the rise ahead": partial(_eased, planner, task, x) for x in AHEAD}
+        higher, beside = _tried(ways)
+        if higher is None:
+            break
+        level, plan = level + 1, higher
+    above, why = (rungs[level + 1], refused[level + 1] | beside) if level + 1 < len(rungs) else (None, {})
+    return {"push_m": round(push, 4), "rise_m": rungs[level], "above_m": above, "refused": why}
+
+
+def _eased(planner: Planner, task: JumpTask, share: float) -> JumpPlan:
+    """A jump on the spot, begun with one ``share`` times its rise ahead."""
+    return planner.replan(planner.plan(replace(task, distance_m=share * task.height_m), "direct"), task)
 
 
 def _up(rise_m: float) -> JumpTask:

@@ -21,7 +21,7 @@ from jumplab.studies.basin import landing_basin
 from jumplab.studies.trials import Trial, TrialSettings, in_parallel, run_trials, wilson
 from jumplab.task import JumpTask
 
-LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 200  # drawn in each engine
+LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 250  # drawn in each engine
 
 
 def outcomes(runs: Mapping[str, SimulationResult], task: JumpTask) -> list[dict]:

@@ -21,7 +21,7 @@ from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
-EFFORT = {"max_iter": 150}  # a solve that needs more is lost; a count, so that a busy machine plans the same
+EFFORT = {"max_iter": 250}  # a solve that needs more is lost; a count, so that a busy machine plans the same
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}  # the second search, where the adaptive barrier wanders
 # Postures of the guess: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip of 0.6 m on
 # the spot; six of the flat foot, three of the toe phase, six of the flight. Back: the arms swing up and forward, the
@@ -104,7 +104,8 @@ class FlipPlanner(WholeBodyPlanner):
         Raises
         ------
         SolverError
-            After some seconds, if a search ends without a plan; it says at which height.
+            After some seconds, if a search ends without a plan; it says at which height, and where the last one found
+            no motion at all, which terms the best compromise violates, and by how much.
         """
         usual = self._usual or (self if weights or off else None)
         if usual is not None:
@@ -124,25 +125,26 @@ class FlipPlanner(WholeBodyPlanner):
         asked = [Asked(t, one, self.parameters(t, one), weights or {}, off) for t, one in zip(way, plans, strict=True)]
         try:
             searches = self._searches if guess is None else self._searches[:1]
-            solution, first = self._search(asked[0], guess or self.naive_guess(way[0]), searches)
+            solution, first = self._search(asked[0], guess or self.naive_guess(way[0]), searches, explain=guess is None)
             for following in asked[1:]:
                 solution = self._run(self.nlp.solve, following, solution.guess(), explain=False)
         except SolverError as e:
             where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
             text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
             remedy = "limits"
-            raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status) from e
+            raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status, violations=e.violations) from e
         return WholeBodyPlan(task, solution, first, self.limits)
 
-    def _search(self, asked: Asked, guess, searches) -> tuple[Solution, Statistics]:
-        """The fine solution from a guess, and what the coarse one before it cost."""
+    def _search(self, asked: Asked, guess, searches, *, explain: bool) -> tuple[Solution, Statistics]:
+        """The fine solution from a guess, and what the coarse one before it cost; ``explain`` says why none is found."""
         failure = None
         for search in searches:
             try:
-                first = self._run(search.solve, asked, guess, self.rough, explain=False)
+                last = explain and search is searches[-1]
+                first = self._run(search.solve, asked, guess, self.rough, explain=last)
                 return self._run(self.nlp.solve, asked, self._finer(first), explain=False), first.statistics
             except SolverError as e:
-                failure = failure or e
+                failure = e
         raise failure
 
     def _finer(self, first: Solution) -> dict[str, PhaseGuess]:
