@@ -43,7 +43,7 @@ def test_what_is_used_most_is_the_plans(bhr):
             ("speed", rate / motor["speed"]),
         ):
             shares[f"{joint} {what}"] = max(share.max(), shares.get(f"{joint} {what}", 0.0))
-    name, share = most_used(audit(tape, bhr, plan.task))
+    name, share = most_used(audit(tape, bhr, plan.task), bhr)
     assert name == max(shares, key=shares.get) and share == pytest.approx(shares[name], rel=1e-3) and 0.3 < share <= 1.0
 
 

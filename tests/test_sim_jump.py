@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,6 +21,7 @@ from jumplab.sim import (
     Disturbance,
     LandingReference,
     Perturbation,
+    Ranges,
     Scene,
     SensorNoise,
     SimulationResult,
@@ -333,6 +335,12 @@ def test_a_fall_is_called_a_fall(bhr, tape):
 def test_a_short_look_is_no_landing(bhr, tape):
     run = simulate(tape, bhr, stand_s=1.0)
     assert not run.landed and run.reason == "watched for 1.05 s only, not 3 s"
+
+
+def test_a_fall_before_touchdown_is_told_as_one(bhr, tape):
+    """Ground so soft that the crouch puts a shank on it: no landing is watched, and the verdict says why."""
+    run = simulate(tape, bhr, perturbation=Perturbation.draw(bhr, 0, Ranges.none(soft_m=(0.03, 0.03))))
+    assert not run.landed and re.fullmatch(r"\w+ touched the ground 0\.\d\d s before touchdown", run.reason), run.reason
 
 
 def test_standing_still_is_no_jump(bhr, tape):

@@ -199,7 +199,7 @@ def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
         axes = np.array([fig.subplots()])
         axes[0].set(xlabel=across, ylabel=up)
     for ax, found in zip(axes.flat, maps, strict=False):
-        _map_cells(ax, found, colors)
+        _map_cells(ax, found, colors, "{:.2g}" if others else "{:g}")
         ax.set_title(found.robot if others else f"{found.robot}: limit used most, in %")
     seen = {c.limiting for c in cells}
     handles = [Patch(color=color, label=name) for name, color in colors.items()]
@@ -211,21 +211,23 @@ def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     return fig
 
 
-def _map_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any]) -> None:
+def _map_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: str) -> None:
     edges = envelope.distances, envelope.heights
     size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in edges])
     for c in envelope.cells:
         place = np.array([getattr(c, name) for name in envelope.axes])
         if c.solved:
             face = style.tint(colors[c.limiting], 0.25 + 0.75 * float(np.clip(c.share, 0, 1)))
-            ax.text(*place, f"{100 * c.share:.0f}", ha="center", va="center", fontsize=5.5)
+            ink = "black" if np.mean(face) > 0.3 else "white"
+            ax.text(*place, f"{100 * c.share:.0f}", ha="center", va="center", fontsize=5.5, color=ink)
         else:
             face = REFUSED[c.limiting][0]
         ax.add_patch(Rectangle(place - size / 2, *size, facecolor=face, edgecolor="white", linewidth=0.6))
     x, y = ((min(values) - d / 2, max(values) + d / 2) for values, d in zip(edges, size, strict=True))
     ax.set(xlim=x, ylim=y)
     if max(map(len, edges)) <= MOST_TICKS:
-        ax.set(xticks=envelope.distances, yticks=envelope.heights)
+        ax.set_xticks(envelope.distances, map(tick.format, envelope.distances))
+        ax.set_yticks(envelope.heights, map(tick.format, envelope.heights))
     ax.grid(False)
 
 

@@ -293,13 +293,18 @@ class Recorder:
             return 0.0, False, "the feet never left the ground"
         if touchdown is None:
             return 0.0, False, "the feet never touched down"
+        names = [n for n in self._links if n not in self._feet]
         fallen = np.flatnonzero(stray[touchdown:].any(axis=1))
         steps = fallen[0] if len(fallen) else len(log["t"]) - touchdown
         standing = float(steps * STEP_S)
         if len(fallen):
-            names = [n for n in self._links if n not in self._feet]
             name = names[int(np.argmax(stray[touchdown + steps]))]
             return standing, False, f"{name} touched the ground {standing:.2f} s after touchdown"
+        early = np.flatnonzero(stray[:touchdown].any(axis=1))
+        if len(early) and standing < STAND_S:
+            name = names[int(np.argmax(stray[early[0]]))]
+            before_s = float((touchdown - early[0]) * STEP_S)
+            return standing, False, f"{name} touched the ground {before_s:.2f} s before touchdown"
         if standing < STAND_S:
             return standing, False, f"watched for {standing:.2f} s only, not {STAND_S:g} s"
         speed = float(np.linalg.norm(log["com_velocity"][-1]))

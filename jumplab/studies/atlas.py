@@ -278,7 +278,7 @@ def _between(axis: Sequence[float], x: float) -> tuple[int, float]:
 def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
     jerks = {row["weight"] for row in plan.solution.cost_shares if row["name"] == "jerk"}
     jerk = jerks.pop() if len(jerks) == 1 and jerks != {body.weights.jerk} else None
-    most = most_used(audit(make_tape(plan, body.robot), body.robot, plan.task))
+    most = most_used(audit(make_tape(plan, body.robot), body.robot, plan.task), body.robot)
     cost, x = plan.solution.statistics.objective, pack(body.nlp.assembled, plan.solution.guess())
     return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, *most, x)
 

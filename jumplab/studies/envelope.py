@@ -88,12 +88,16 @@ class Envelope:
         return max((c for c in self.cells if c.solved), key=lambda c: (c.distance_m, c.height_m), default=None)
 
 
-def most_used(report: AuditReport) -> tuple[str, float]:
-    """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the share of it [1]."""
-    found = []
+def most_used(report: AuditReport, robot: Robot) -> tuple[str, float]:
+    """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the share of it [1].
+
+    A joint with a role is named by it.
+    """
+    found, roles = [], {joint: role for role, pair in robot.joints.items() for joint in pair}
     for check in report.checks:
         if what := USES.get(check.name):
-            joint = check.note.rpartition("; worst: ")[2].removeprefix("left_").removeprefix("right_")
+            worst = check.note.rpartition("; worst: ")[2]
+            joint = roles.get(worst, worst).removeprefix("left_").removeprefix("right_")
             found.append((check.value / check.limit, what if what == "friction" else f"{joint} {what}"))
     share, name = max(found)
     return name.replace("_", " "), float(share)
@@ -182,7 +186,7 @@ def _solve(planner: Planner, task: JumpTask, near: JumpPlan | None, *, cold: boo
         report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
         work = sum(x.iterations for x in plan.statistics), sum(x.solve_s for x in plan.statistics)
         if report.passed:
-            return Cell.of(task, True, *most_used(report), *work), plan
+            return Cell.of(task, True, *most_used(report, plan.robot), *work), plan
         reason = f"outside the limits of the audit: {', '.join(check.name for check in report.failed)}"
     return Cell.of(task, False, OPEN, math.nan, *work, reason=reason), near if cold else None
 

@@ -120,7 +120,8 @@ def told(found: list[dict[str, Any]]) -> list[str]:
     lines = [f"{what}: {named(max(made, key=lambda row, key=key: row[key]))}" for what, key in FARTHEST.items() if made]
     for turns in (-1, 1):
         for row in (row for row in found if row["turns"] == turns):
-            became = "lands" if row in sound else row["said"] or "does not land"
+            short = row["said"].partition("): ")[2].partition("; they leave")[0]
+            became = "lands" if row in sound else short or row["said"] or "does not land"
             lines.append(f"{named(row)}, {row['method']}, motors {motors(row)}: {became}")
     return [line[0].upper() + line[1:] for line in lines]
 

@@ -84,7 +84,7 @@ def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> 
         return row | {"cpu_s": time.process_time() - began, "reason": str(e)[:160]}
     row |= {"planned": True, "cpu_s": time.process_time() - began, "skipped": (plan.skipped or "")[:160]}
     s, report = plan.whole_body.solution.statistics, audit(plan.tape, plan.robot, task)
-    most, share = most_used(report)
+    most, share = most_used(report, plan.robot)
     row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
     row |= {"clean": report.passed}
     if kind == "landed":

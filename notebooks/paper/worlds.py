@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from jumplab.io.files import write_file
-from jumplab.sim import ENGINES, Ranges
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.sim import ENGINES, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
+from jumplab.studies.margins import ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 15, 2  # draws that nothing was tuned on
@@ -20,6 +23,19 @@ WORLDS = {
     "twice the usual ranges": Ranges(0.10, 0.03, 0.20, (0.3, 1.0), (0.0, 0.008), 0.10),  # friction: the least there is
     "the usual ranges": Ranges(),
 }
+
+# what a fall of the default jump begins with: the robot's seed, and the disturbances that it meets at their limits
+FALLS = {
+    "slip": (0, "friction+ground_tilt_deg+payload_kg"),
+    "over-rotation": (0, "shove_flight_n_s"),
+    "torque": (3, "torque_loss+speed_loss+payload_kg"),
+}
+
+
+def falls(tape: Tape, robot: Robot, scene: Scene, **how: Any) -> dict[str, SimulationResult]:
+    """The falls of :data:`FALLS`, simulated without re-aim; ``how`` as of :func:`jumplab.sim.simulate_jump`."""
+    draws = {cause: Perturbation.draw(robot, seed, ranges_at(names, 1.0)) for cause, (seed, names) in FALLS.items()}
+    return {cause: simulate_jump(tape, robot, scene=scene, perturbation=p, **how) for cause, p in draws.items()}
 
 
 def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: int | None = None) -> None:

@@ -136,7 +136,7 @@ class FlipPlanner(WholeBodyPlanner):
         return WholeBodyPlan(task, solution, first, self.limits)
 
     def _search(self, asked: Asked, guess, searches, *, explain: bool) -> tuple[Solution, Statistics]:
-        """The fine solution from a guess, and what the coarse one before it cost; ``explain`` says why none is found."""
+        """The fine solution from a guess, and what the coarse one before it cost; ``explain`` tells why none is."""
         failure = None
         for search in searches:
             try:
