@@ -16,7 +16,7 @@ from jumplab.sim import ENGINES, Perturbation, Ranges, Scene, SimulationResult, 
 from jumplab.studies.margins import ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
-LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 15, 2  # draws that nothing was tuned on
+LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
