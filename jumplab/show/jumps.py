@@ -246,7 +246,11 @@ def margin_radar(report: MarginReport) -> Figure:
     words = [name.replace("+", " +\n") for name in names]
     ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
     ax.set_xticks(angles, words, fontsize=6.5)
-    ax.set_yticks([25, 50, 75, 100], ["25 %", "", "75 %", "100 % of what is tried"], fontsize=6)
+    for label, angle in zip(ax.get_xticklabels(), angles, strict=True):  # clear of the circle
+        side = np.sin(angle)
+        label.set_ha("center" if abs(side) < 0.1 else "left" if side > 0 else "right")
+    ax.set_yticks([25, 50, 75, 100], ["25 %", "50 %", "75 %", "100 %"], fontsize=6)
+    ax.set_rlabel_position(-180 / len(names))  # between the last and the first
     ax.legend(loc="lower left", bbox_to_anchor=(1.05, 0.0), frameon=False)
     return fig
 
