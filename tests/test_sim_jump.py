@@ -337,6 +337,37 @@ def test_a_short_look_is_no_landing(bhr, tape):
     assert not run.landed and run.reason == "watched for 1.05 s only, not 3 s"
 
 
+@pytest.mark.parametrize("seed", [8, 10, 14])
+def test_a_wrong_posture_at_the_start_is_led_back_without_tipping(bhr, tape, seed):
+    """Joints up to three degrees off: put right at once, the trunk's way there tips the robot over its soles."""
+    wrong = Perturbation.draw(bhr, seed, Ranges.none(posture_deg=3.0))
+    assert simulate(tape, bhr, perturbation=wrong).landed
+
+
+def test_playback_leaves_a_wrong_posture_smoothly(bhr, tape):
+    off, wrong = 0.04 * np.ones(len(bhr.joint_names)), tape.q[0].copy()
+    wrong[7:] += off
+    rest, plan, play = np.zeros(len(off)), Playback(tape, bhr), Playback(tape, bhr)
+    play.command(0, wrong, np.zeros(bhr.model.nv), rest)
+    led, due = ([p.command(k, wrong, np.zeros(bhr.model.nv), rest) for k in range(1, plan.steps)] for p in (play, plan))
+    gap = np.array([a.q - b.q for a, b in zip(led, due, strict=True)])
+    rate = np.array([a.rate - b.rate for a, b in zip(led, due, strict=True)])
+    assert np.allclose(gap[0], off, atol=1e-6) and np.abs(rate[0]).max() < 1e-3
+    assert np.allclose(np.diff(gap, axis=0) / STEP_S, (rate[1:] + rate[:-1]) / 2, atol=1e-4)
+    gone = int(np.flatnonzero((gap == 0).all(axis=1))[0])
+    assert {command.feet for command in led[:gone]} == {"flat"} and not gap[gone:].any()
+
+
+def test_playback_takes_no_notice_of_what_sensors_err(bhr, tape):
+    wrong = tape.q[0].copy()
+    wrong[7:] += 0.019
+    plan, play, rest = Playback(tape, bhr), Playback(tape, bhr), np.zeros(len(bhr.joint_names))
+    play.command(0, wrong, np.zeros(bhr.model.nv), rest)
+    for k in (1, 100, 500):
+        a, b = (p.command(k, tape.q[0], np.zeros(bhr.model.nv), rest) for p in (play, plan))
+        assert (a.q == b.q).all() and (a.rate == b.rate).all()
+
+
 def test_a_fall_before_touchdown_is_told_as_one(bhr, tape):
     """Ground so soft that the crouch puts a shank on it: no landing is watched, and the verdict says why."""
     run = simulate(tape, bhr, perturbation=Perturbation.draw(bhr, 0, Ranges.none(soft_m=(0.03, 0.03))))

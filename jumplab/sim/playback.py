@@ -23,6 +23,7 @@ FLAT, TOE, AIR = "flat", "toe", "air"  # how both feet stand
 HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
 LEAST_VOLTAGE = 0.5  # share that a battery holds, whatever is drawn
 ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
+WRONG_RAD = 0.02  # a start farther off than sensors err is led back until the heels rise; sooner, the robot tips
 
 
 class Actuators:
@@ -187,6 +188,8 @@ class Playback:
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
         """Command to send at one step, from the measured state; ``correction`` is added to the angles."""
+        if step == 0:
+            self._approach(q)
         step += self.lead
         now, holding = min(step, self.steps), step >= self.steps
         q, v = self._arriving(step, q, v)
@@ -202,6 +205,15 @@ class Playback:
             return Command(tau=self._tau[now] + self._kp * error + self._kd * rate_error, change=self._change[now])
         wish = GAINS.flight_bandwidth * (GAINS.flight_corner * error + rate_error)
         return Command(tau=self._tau[now] + self._inertia(q) @ wish, change=self._change[now])
+
+    def _approach(self, q: np.ndarray) -> None:
+        """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the plan smoothly."""
+        off = q[7:] - self._q[0]
+        rows = slice(min(self._heel_off, self._takeoff))
+        if rows.stop and np.abs(off).max() > WRONG_RAD:
+            share = np.linspace(0.0, 1.0, rows.stop)[:, None]
+            self._q[rows] += (1 - share**3 * (10 - 15 * share + 6 * share**2)) * off
+            self._rate[rows] -= 30 * share**2 * (1 - share) ** 2 / (rows.stop * STEP_S) * off
 
     def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as now."""
