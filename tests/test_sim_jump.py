@@ -348,7 +348,7 @@ def test_playback_leaves_a_wrong_posture_smoothly(bhr, tape):
     off, wrong = 0.04 * np.ones(len(bhr.joint_names)), tape.q[0].copy()
     wrong[7:] += off
     rest, plan, play = np.zeros(len(off)), Playback(tape, bhr), Playback(tape, bhr)
-    play.command(0, wrong, np.zeros(bhr.model.nv), rest)
+    play.approach(wrong)
     led, due = ([p.command(k, wrong, np.zeros(bhr.model.nv), rest) for k in range(1, plan.steps)] for p in (play, plan))
     gap = np.array([a.q - b.q for a, b in zip(led, due, strict=True)])
     rate = np.array([a.rate - b.rate for a, b in zip(led, due, strict=True)])
@@ -362,7 +362,7 @@ def test_playback_takes_no_notice_of_what_sensors_err(bhr, tape):
     wrong = tape.q[0].copy()
     wrong[7:] += 0.019
     plan, play, rest = Playback(tape, bhr), Playback(tape, bhr), np.zeros(len(bhr.joint_names))
-    play.command(0, wrong, np.zeros(bhr.model.nv), rest)
+    play.approach(wrong)
     for k in (1, 100, 500):
         a, b = (p.command(k, tape.q[0], np.zeros(bhr.model.nv), rest) for p in (play, plan))
         assert (a.q == b.q).all() and (a.rate == b.rate).all()

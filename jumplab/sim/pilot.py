@@ -38,7 +38,8 @@ class Pilot:
 
     Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
     :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead. ``start_rad`` is the heading
-    in which the robot stands at the start, where the tape begins with zero.
+    in which the robot stands at the start, where the tape begins with zero. ``leads_back`` is for a start at rest: a
+    wrong posture is led back to the plan, see :meth:`Playback.approach`.
 
     Attributes
     ----------
@@ -63,6 +64,7 @@ class Pilot:
         stand_s: float = STAND_S,
         lead_s: float = 0.0,
         start_rad: float = 0.0,
+        leads_back: bool = True,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
@@ -88,7 +90,7 @@ class Pilot:
         if self._tuck is not None:
             self._tape_until = min(self._earliest, round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S))
         self._none = self._tau = np.zeros(len(robot.joint_names))
-        self._stand_s = stand_s
+        self._stand_s, self._leads_back = stand_s, leads_back
         self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
         self.touchdown: int | None = None
 
@@ -121,6 +123,8 @@ class Pilot:
         shall land.
         """
         played = headed(q, self._start)
+        if step == 0 and self._leads_back:
+            self.playback.approach(played)
         if self.touchdown is None and step < self._tape_until:
             return self.playback.command(step, played, v, self._none)
         q = self.seen(q)

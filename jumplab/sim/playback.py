@@ -188,8 +188,6 @@ class Playback:
 
     def command(self, step: int, q: np.ndarray, v: np.ndarray, correction: np.ndarray) -> Command:
         """Command to send at one step, from the measured state; ``correction`` is added to the angles."""
-        if step == 0:
-            self._approach(q)
         step += self.lead
         now, holding = min(step, self.steps), step >= self.steps
         q, v = self._arriving(step, q, v)
@@ -206,7 +204,7 @@ class Playback:
         wish = GAINS.flight_bandwidth * (GAINS.flight_corner * error + rate_error)
         return Command(tau=self._tau[now] + self._inertia(q) @ wish, change=self._change[now])
 
-    def _approach(self, q: np.ndarray) -> None:
+    def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the plan smoothly."""
         off = q[7:] - self._q[0]
         rows = slice(min(self._heel_off, self._takeoff))

@@ -348,7 +348,7 @@ class ChainPilot:
         self._from, self._uneven = pose, _over_feet(tape, self._robot, q)
         self._offset = q[7:] - tape.q[0, 7:] - self._uneven(0.0), v[6:].copy()
         self.used.append(ahead)
-        how = dict(lead_s=self._lead_s, start_rad=float(pose[2]))
+        how = dict(lead_s=self._lead_s, start_rad=float(pose[2]), leads_back=False)  # :meth:`_blended` does
         self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, **how))
         self.began.append(step)
 
