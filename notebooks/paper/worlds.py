@@ -13,7 +13,7 @@ from jumplab.io.files import write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, Perturbation, Ranges, Scene, SimulationResult, simulate_jump
-from jumplab.studies.margins import ranges_at
+from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
@@ -55,6 +55,12 @@ def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: i
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
     """The kept rows."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def margins() -> dict[str, MarginReport]:
+    """The kept margins of the default jump, by engine."""
+    found = json.loads(Path(__file__).with_name("margins.json").read_text(encoding="utf-8"))
+    return {engine: MarginReport.from_json(told) for engine, told in found.items()}
 
 
 def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
