@@ -351,8 +351,8 @@ def test_chain_runs_and_publishes(chain):
 
 
 def test_figures_say_what_they_show_and_not_when(chain):
-    """Captions with target, robot and versions, but for drawings of no jump; no dates in pictures."""
-    drawings = {"f02_framework", "f04_pendulum"}
+    """Captions with target, robot and versions, but for drawings of no jump and maps of many; no dates in pictures."""
+    drawings = {"f02_framework", "f04_pendulum", "shipped_envelopes"}  # the last has a title for every robot
     robot_alone = {"f03_link_models", "f03b_simulation_model", "your_robot", "your_robot_envelope"}
     for path in chain.figures.rglob("*.txt"):
         said = path.read_text(encoding="utf-8")
