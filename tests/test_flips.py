@@ -204,7 +204,7 @@ def test_a_flip_beyond_the_robot_is_refused_in_words():
 
 @pytest.mark.slow
 def test_a_flip_that_motors_forbid_says_what_is_missing():
-    """With a third of its efforts no robot comes round: what is missed is named, with how much of it."""
+    """With a third of its efforts it does not come round: the rows that are missed are named, and by how much."""
     weak = FlipPlanner(Robot.load().with_limits(effort=0.3), tracking=False, options={"max_iter": 50})
     with pytest.raises(SolverError, match=r"the best compromise still violates .+ by .+; every search") as caught:
         weak.plan(JumpTask(0.0, 0.5, rotation_rad=-TURN))

@@ -207,11 +207,11 @@ class Playback:
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the plan smoothly."""
         off = q[7:] - self._q[0]
-        rows = slice(min(self._heel_off, self._takeoff))
-        if rows.stop and np.abs(off).max() > WRONG_RAD:
-            share = np.linspace(0.0, 1.0, rows.stop)[:, None]
-            self._q[rows] += (1 - share**3 * (10 - 15 * share + 6 * share**2)) * off
-            self._rate[rows] -= 30 * share**2 * (1 - share) ** 2 / (rows.stop * STEP_S) * off
+        steps = min(self._heel_off, self._takeoff)
+        if steps and np.abs(off).max() > WRONG_RAD:
+            share = np.arange(steps)[:, None] / steps
+            self._q[:steps] += (1 - share**3 * (10 - 15 * share + 6 * share**2)) * off
+            self._rate[:steps] -= 30 * share**2 * (1 - share) ** 2 / (steps * STEP_S) * off
 
     def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as now."""

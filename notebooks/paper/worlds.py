@@ -33,9 +33,11 @@ FALLS = {
 
 
 def falls(tape: Tape, robot: Robot, scene: Scene, **how: Any) -> dict[str, SimulationResult]:
-    """The falls of :data:`FALLS`, simulated without re-aim; ``how`` as of :func:`jumplab.sim.simulate_jump`."""
+    """The falls of :data:`FALLS`, without re-aim; ``how`` are options of :func:`jumplab.sim.simulate_jump`."""
     draws = {cause: Perturbation.draw(robot, seed, ranges_at(names, 1.0)) for cause, (seed, names) in FALLS.items()}
-    return {cause: simulate_jump(tape, robot, scene=scene, perturbation=p, **how) for cause, p in draws.items()}
+    return {
+        cause: simulate_jump(tape, robot, scene=scene, perturbation=p, reaim=False, **how) for cause, p in draws.items()
+    }
 
 
 def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: int | None = None) -> None:

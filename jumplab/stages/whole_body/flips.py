@@ -10,7 +10,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from jumplab.errors import SolverError
-from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution, Statistics
+from jumplab.ocp.nlp import EXPLAINED, Nlp, PhaseGuess, Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe
 from jumplab.stages.changes import StageChanges
@@ -21,7 +21,7 @@ from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.terms import relative
 from jumplab.task import JumpTask
 
-EFFORT = {"max_iter": 250}  # a solve that needs more is lost; a count, so that a busy machine plans the same
+EFFORT = {"max_iter": 150}  # a solve that needs more is lost; a count, so that a busy machine plans the same
 MONOTONE = {"mu_strategy": "monotone", "mu_init": 0.1}  # the second search, where the adaptive barrier wanders
 # Postures of the guess: absolute angles of foot, shank, thigh, trunk, arm [rad], rounded from a solved flip of 0.6 m on
 # the spot; six of the flat foot, three of the toe phase, six of the flight. Back: the arms swing up and forward, the
@@ -110,12 +110,15 @@ class FlipPlanner(WholeBodyPlanner):
         usual = self._usual or (self if weights or off else None)
         if usual is not None:
             asked = Asked(task, srmp, self.parameters(task, srmp), weights or {}, off)
+            explained = EXPLAINED.set(False)  # without the changes, nobody asked
             try:
                 near = usual.plan(task, srmp, guess=guess, stage1=stage1)
                 return replace(near, solution=self._run(self._warm.solve, asked, near.solution, explain=False))
             except SolverError:  # perhaps only with the changes there is a solution
                 if guess is not None:  # without them the postures would be next, so they are
                     raise
+            finally:
+                EXPLAINED.reset(explained)
         return self._searched(task, srmp, guess, weights, off, stage1)
 
     def _searched(self, task: JumpTask, srmp: SrmpPlan | None, guess, weights, off, stage1) -> WholeBodyPlan:
@@ -130,9 +133,9 @@ class FlipPlanner(WholeBodyPlanner):
                 solution = self._run(self.nlp.solve, following, solution.guess(), explain=False)
         except SolverError as e:
             where = "" if len(way) == 1 else f", on the way up from a flip of {way[0].height_m:g} m"
-            text = f"{e}; every search from a flip's postures ended so{where}: this robot may not do it within its"
-            remedy = "limits"
-            raise SolverError(f"{text} {remedy}", stage=e.stage, status=e.status, violations=e.violations) from e
+            text = f"{e}; every search from a flip's postures ended so{where}"
+            text += ": this robot may not do it within its limits" * bool(e.violations)
+            raise SolverError(text, stage=e.stage, status=e.status, violations=e.violations) from e
         return WholeBodyPlan(task, solution, first, self.limits)
 
     def _search(self, asked: Asked, guess, searches, *, explain: bool) -> tuple[Solution, Statistics]:
