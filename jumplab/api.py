@@ -15,7 +15,7 @@ from jumplab.task import JumpTask
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
     from jumplab.auditing import AuditReport
     from jumplab.show.viewer import Page
-    from jumplab.sim import SimulationResult
+    from jumplab.sim import Ranges, SimulationResult
 
 
 class Saved(NamedTuple):
@@ -30,6 +30,7 @@ def plan(
     robot: Robot | str | Path = "bhr",
     *,
     method: str = USUAL,
+    robust: Ranges | None = None,
     **changes: Any,
 ) -> JumpPlan:
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz tape.
@@ -41,6 +42,8 @@ def plan(
     method : "direct" (the whole body alone, from a crouch) or "three-step" (SRMP, joint-space QPs, whole body: what the
         paper does). The default is "direct", but "three-step" for flips, and where stages 1 or 2 are changed, see
         :meth:`jumplab.Planner.plan`.
+    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come to rest as
+        near to the middle of their soles as can be, see :mod:`jumplab.studies.robust`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
         :class:`jumplab.Planner`, which plans many targets with them.
 
@@ -53,6 +56,10 @@ def plan(
     from jumplab.studies.advice import plan_or_advise
 
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    if robust is not None:
+        from jumplab.studies.robust import robust_changes
+
+        changes = robust_changes(task, robot, robust, changes)
     return plan_or_advise(Planner(robot, keep=True, **changes), task, method)
 
 

@@ -34,6 +34,7 @@ store, motions, exports = Late("jumplab.io.folder"), Late("jumplab.io.motion"), 
 robots, planner, auditing = Late("jumplab.robot"), Late("jumplab.stages.planner"), Late("jumplab.auditing")
 sim, pages, notebooks = Late("jumplab.sim"), Late("jumplab.show.viewer"), Late("jumplab.cli.notebooks")
 advice, memory = Late("jumplab.studies.advice"), Late("jumplab.studies.atlas")
+allowances = Late("jumplab.studies.robust")
 movies = Late("jumplab.show.movies")
 
 HTML = needing("name a file that ends in .html", lambda text: text.lower().endswith(".html"))
@@ -91,6 +92,8 @@ def run(args: Namespace) -> None:
     opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
     opt("--method", "whole body alone, usual but for flips, or the paper's three steps", "usual", ("usual", *METHODS)),
     opt("--atlas DIR", "folder of an atlas to begin with ('jumplab atlas'); the method is then direct", None, folder),
+    opt("--robust", "allow for robots that differ as those of 'trials' do, and as --disturb says"),
+    DISTURB,
 )
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
@@ -99,8 +102,13 @@ def plan(args: Namespace) -> None:
     task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    known = args.atlas and memory.Atlas.load(args.atlas)
-    found = advice.plan_or_advise(planner.Planner(robot, keep=True, atlas=known), task, args.method)
+    known, changes = args.atlas and memory.Atlas.load(args.atlas), {}
+    if args.robust:
+        ranges = sim.ranges_of(common.disturbances("--disturb", args.disturb), sim.Ranges())
+        changes = allowances.robust_changes(task, robot, ranges, {})
+    else:
+        common.without(args, "says what --robust allows for, which is not given", disturb=[])
+    found = advice.plan_or_advise(planner.Planner(robot, keep=True, atlas=known, **changes), task, args.method)
     report = store.write_plan(args.out, found.tape, found.robot, found.summary, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": found.summary, "audit": _audited(report)}
     common.print_summary(found.summary)

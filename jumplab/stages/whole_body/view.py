@@ -8,7 +8,9 @@ from typing import NamedTuple
 import casadi as ca
 
 from jumplab.errors import InputError, quoted
+from jumplab.models.planar import PlanarState
 from jumplab.ocp.problem import Point
+from jumplab.robot.sagittal import SagittalModel
 from jumplab.stages.whole_body.terms import WholeBodyTerms
 
 
@@ -87,6 +89,10 @@ class BodyView:
     def wrench(self) -> ca.SX:
         """The ground's force and its moment about the toe: F_x, F_z [N], M_y [N m] (3,); zero in flight."""
         return ca.SX.zeros(3) if self._terms.flying else self._terms.wrench(self._point)
+
+    def moved(self, model: SagittalModel) -> PlanarState:
+        """Another robot in the same motion, its quantities from its own toe: that of stage 3's model, by its links."""
+        return PlanarState(model, *(self._terms.links(x) for x in (self._point.q, self._point.v, self._point.a)))
 
     def point(self, name: str) -> ca.SX:
         """Place (2,) [m] of "toe", "heel", "knee", "hip", "shoulder", "hand" or "mid-arm"."""

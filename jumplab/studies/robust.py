@@ -1,0 +1,117 @@
+"""A plan that allows for robots other than the planned one: sampled robots make the same motion, and shall be caught.
+
+Each of them takes off with a momentum of its own and drifts in attitude until its soles meet the ground. Where it then
+comes to rest is its capture point; the further that is from the middle of the soles, the sooner it falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from jumplab.errors import InputError, require_type
+from jumplab.ocp import Term
+from jumplab.robot import Robot
+from jumplab.robot.sagittal import SagittalModel
+from jumplab.sim import Perturbation, Ranges
+from jumplab.stages.changes import settled
+from jumplab.stages.whole_body import Limits
+from jumplab.task import JumpTask
+
+SAMPLES = 6  # draws, each with its opposite: to first order their mean is the planned robot
+WEIGHT = 500.0  # [1/m^2] robots that come to rest 4 cm off the middle of the soles cost 3 % of a jump of 1 m
+FRICTION_SHARE = 0.9  # of the least friction: the planner counts on 0.45, where robots have 0.5
+BRAKE_S = 0.035  # by which legs that give way take up the fall later than an impact would; shoves either way (measured)
+INSTEAD_OF = "capture window"  # of the planned robot alone
+MOVING = "mass", "com_m", "inertia", "payload_kg"  # what makes sampled robots differ
+LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may use less of
+
+
+def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``changes`` of a :class:`jumplab.Planner` with those of a robust plan, which allow for ``ranges``.
+
+    In place of the capture window stands the cost of :func:`capture_term` over sampled robots. Friction, torque and
+    speed are used up to the least that ``ranges`` leave. What else differs (delay, motors, ground, shoves, sensors,
+    posture) is not seen: it does not depend on the plan's masses or limits. Own limits win.
+
+    Raises :class:`InputError` if ``ranges`` are none, or have nothing that a plan can allow for, or if the jump turns
+    or leaves the plane: then other terms say where the soles belong.
+    """
+    require_type(ranges, Ranges, "robust: how far robots differ")
+    if task.rotation_rad or not (task.in_plane and robot.planar):
+        raise InputError(
+            "robust: only upright jumps straight ahead or back, of robots that a plane describes, allow for other "
+            "robots; leave robust away, and let the legs be re-aimed in flight"
+        )
+    nothing = Ranges.none()
+    if all(getattr(ranges, name) == getattr(nothing, name) for name in (*MOVING, *LIMITING)):
+        raise InputError(
+            f"robust: none of these ranges changes a plan; it allows for {', '.join((*MOVING, *LIMITING))}"
+        )
+    usual, given = Limits(), changes.get("limits")
+    given = settled(Limits, given)
+    limits = {
+        "friction": min(usual.friction, FRICTION_SHARE * ranges.friction[0]),
+        "torque_share": usual.torque_share * (1 - ranges.torque_loss[1]),
+        "speed_share": usual.speed_share * (1 - ranges.speed_loss[1]),
+    }
+    own = {name: value for name, value in asdict(given).items() if value != getattr(usual, name)}
+    terms = {name: _listed(extra) for name, extra in (changes.get("terms") or {}).items()}
+    terms["whole body"] = [*terms.get("whole body", ()), capture_term(robot, ranges)]
+    return {**changes, "terms": terms, "off": [*changes.get("off", ()), INSTEAD_OF], "limits": limits | own}
+
+
+def _listed(terms: Term | Iterable[Term]) -> list[Term]:
+    return [terms] if isinstance(terms, Term) else list(terms)
+
+
+def capture_term(robot: Robot, ranges: Ranges, weight: float = WEIGHT) -> Term:
+    """The mean square of the distance from the middle of the soles to where sampled robots come to rest [m^2].
+
+    A cost at "problem" of stage 3, ours: E[xi^2] = mean^2 + variance of the capture point xi, over
+    2 :data:`SAMPLES` robots, the same ones for every plan.
+    """
+    models = sampled(robot, ranges)
+
+    def points(ends: Mapping[str, SimpleNamespace]) -> ca.SX:
+        return ca.vertcat(*(capture_point(model, ends) for model in models)) / np.sqrt(len(models))
+
+    return Term("capture of sampled robots", "ours: scenarios", "m", "problem", points, weight=weight)
+
+
+def sampled(robot: Robot, ranges: Ranges) -> list[SagittalModel]:
+    """Sagittal models of drawn robots and of their opposites; of the planned one, if none of their masses differs."""
+    only = replace(Ranges.none(), **{name: getattr(ranges, name) for name in MOVING})
+    if only == Ranges.none():
+        return [robot.sagittal]
+    drawn = [Perturbation.draw(robot, seed, only) for seed in range(SAMPLES)]
+    return [each.robot(robot).sagittal for one in drawn for each in (one, opposite(one))]
+
+
+def opposite(drawn: Perturbation) -> Perturbation:
+    """The robot that differs as much the other way; a payload is as heavy, and where it was."""
+    masses, inertias = ({name: 2 - x for name, x in told.items()} for told in (drawn.mass, drawn.inertia))
+    return replace(drawn, mass=masses, inertia=inertias, com={n: tuple(-x for x in c) for n, c in drawn.com.items()})
+
+
+def capture_point(model: SagittalModel, ends: Mapping[str, SimpleNamespace]) -> ca.SX:
+    """Where another robot that makes this motion comes to rest, ahead of the middle of its soles [m].
+
+    Its joints move as planned, and its feet with them until take-off: there it has the momentum that its own masses
+    give. In flight that stays, and the body drifts at (L - L of the joints and the trunk as planned) / rho, taken as
+    growing evenly from nothing. The impact, :data:`BRAKE_S` later, keeps the angular momentum about the soles; what
+    is left of it leads a pendulum of the CoM's height z to x + v / sqrt(g / z).
+    """
+    takeoff, end = ends["toe"].end, ends["flight"].end
+    there, here, flight_s, gravity = takeoff.moved(model), end.moved(model), end.duration, end.p.gravity
+    L, (vx, vz) = there.angular_momentum, ca.vertsplit(there.com_velocity)
+    drift = (L - here.angular_momentum) / here.inertia * flight_s / 2
+    x, z = ca.vertsplit(here.com - here.point(model.point_arms(0, model.sole_center)))
+    x, z = x + drift * z, z - drift * x
+    speed = (L / model.total_mass + z * vx - (x + BRAKE_S * vx) * (vz - gravity * flight_s)) / z
+    return x + speed * ca.sqrt(z / gravity)

@@ -1,0 +1,105 @@
+"""Plans that allow for other robots: sampled robots against the whole model, and the margins that move."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import jumplab as jl
+from jumplab.errors import InputError
+from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
+from jumplab.stages.planner import Planner
+from jumplab.studies import robust
+from jumplab.studies.margins import ranges_at
+
+TASK = jl.JumpTask(1.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def plans(bhr):
+    return jl.plan(TASK, bhr), jl.plan(TASK, bhr, robust=Ranges())
+
+
+def ends_of(plan, model):
+    """Points of a finished plan as the term sees them, in numbers."""
+    from jumplab.models.planar import PlanarState
+
+    found = {}
+    for name, x in plan.whole_body.solution.phases.items():
+        pad = 5 - x.q.shape[1]
+        row = [ca.SX(np.pad(y[-1], (pad, 0))) for y in (x.q, x.v, x.a)]
+        moved = lambda m, row=row: PlanarState(m, *row)  # noqa: E731
+        found[name] = SimpleNamespace(
+            end=SimpleNamespace(moved=moved, duration=x.duration, p=SimpleNamespace(gravity=9.8))
+        )
+    return float(ca.DM(ca.evalf(robust.capture_point(model, found))))
+
+
+def test_a_robot_as_planned_has_the_capture_point_of_the_tape(bhr, plans):
+    """From the 1 kHz tape: CoM, its speed and L there, by Pinocchio."""
+    import pinocchio as pin
+
+    for plan in plans:
+        tape, data = plan.tape, bhr.model.createData()
+        pin.ccrba(bhr.model, data, tape.q[-1], tape.v[-1])
+        pin.framesForwardKinematics(bhr.model, data, tape.q[-1])
+        sole = np.mean([data.oMf[bhr.model.getFrameId(f)].act(bhr.foot.center) for f in bhr.foot.frames], axis=0)
+        (x, _, z), (vx, _, vz) = data.com[0] - sole, data.hg.linear / bhr.total_mass
+        speed = (data.hg.angular[1] / bhr.total_mass + z * vx - (x + robust.BRAKE_S * vx) * vz) / z
+        assert ends_of(plan, bhr.sagittal) == pytest.approx(x + speed * np.sqrt(z / 9.8), abs=1e-3)
+
+
+def test_samples_and_their_opposites_are_the_planned_robot_on_average(bhr):
+    models = robust.sampled(bhr, Ranges())
+    assert len(models) == 2 * robust.SAMPLES
+    assert np.mean([m.mass for m in models], axis=0) == pytest.approx(bhr.sagittal.mass, rel=1e-3)
+    heavy = robust.sampled(bhr, Ranges.none(payload_kg=(2.0, 2.0)))
+    assert [m.total_mass - bhr.total_mass for m in heavy] == pytest.approx([2.0] * len(heavy))
+    assert robust.sampled(bhr, Ranges.none(friction=(0.4, 0.4))) == [bhr.sagittal]
+
+
+def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, plans):
+    spread = [[ends_of(plan, model) for model in robust.sampled(bhr, Ranges())] for plan in plans]
+    plain, found = (np.sqrt(np.mean(np.square(x))) for x in spread)
+    assert found < 0.8 * plain
+    assert jl.audit(plans[1]).passed
+    effort = [
+        np.abs(plan.tape.tau).max(axis=0) / [bhr.actuators[n]["effort"] for n in bhr.joint_names] for plan in plans
+    ]
+    assert effort[1].max() <= 1.15 * effort[0].max()
+
+
+def test_limits_that_robots_lose_are_not_planned_with(bhr):
+    ranges = Ranges.none(friction=(0.4, 0.4), torque_loss=(0.0, 0.1), speed_loss=(0.0, 0.05))
+    made = Planner(bhr, **robust.robust_changes(TASK, bhr, ranges, {"limits": {"hand_clearance_m": 0.06}}))
+    assert made.limits.friction == pytest.approx(0.36) and made.limits.torque_share == pytest.approx(0.765)
+    assert made.limits.speed_share == pytest.approx(0.855) and made.limits.hand_clearance_m == 0.06
+    own = robust.robust_changes(TASK, bhr, ranges, {"limits": {"torque_share": 0.8}})
+    assert Planner(bhr, **own).limits.torque_share == 0.8
+
+
+@pytest.mark.parametrize(
+    "task, ranges, words",
+    [
+        (TASK, "wide", "robust: how far robots differ must be a Ranges"),
+        (TASK, Ranges.none(delay_s=(0.0, 0.004)), "robust: none of these ranges changes a plan; it allows for mass"),
+        (replace(TASK, rotation_rad=-2 * np.pi), Ranges(), "robust: only upright jumps straight ahead or back"),
+        (replace(TASK, side_m=0.2), Ranges(), "robust: only upright jumps straight ahead or back"),
+    ],
+)
+def test_what_no_plan_can_allow_for_is_refused(bhr, task, ranges, words):
+    with pytest.raises(InputError, match=words):
+        jl.plan(task, bhr, robust=ranges)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, share, index", [("payload_kg", 0.5, 4), ("mass", 1.0, 1), ("com_m", 0.5, 3)])
+def test_robots_that_fall_with_the_plain_plan_stand_with_the_robust_one(bhr, plans, name, share, index):
+    from jumplab.studies.trials import TrialKey
+
+    seed = TrialKey(0, index, "", "").robot_seed
+    drawn = Perturbation.draw(bhr, seed, ranges_at(name, share))
+    plain, found = (simulate_jump(plan.tape, bhr, perturbation=drawn, scene=Scene.flat()) for plan in plans)
+    assert not plain.landed and found.landed and found.checks_passed
