@@ -42,8 +42,8 @@ def plan(
     method : "direct" (the whole body alone, from a crouch) or "three-step" (SRMP, joint-space QPs, whole body: what the
         paper does). The default is "direct", but "three-step" for flips, and where stages 1 or 2 are changed, see
         :meth:`jumplab.Planner.plan`.
-    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come to rest as
-        near to the middle of their soles as can be, see :mod:`jumplab.studies.robust`.
+    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come
+        to rest as near to the middle of their soles as can be, see :mod:`jumplab.studies.robust`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
         :class:`jumplab.Planner`, which plans many targets with them.
 

@@ -67,6 +67,7 @@ def bars(args: Namespace) -> bool | None:
     MODE,
     ENGINE,
     opt("--reaim", "put the legs in the air to where they can catch the robot", True),
+    opt("--step", "allow one recovery step where the feet alone cannot catch the robot"),
     opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
     DISTURB,
     opt("--keep-falls N", "run the first N failures again, each into falls/NUMBER, for 'view'", "0", whole(0, 100)),
@@ -83,7 +84,7 @@ def trials(args: Namespace) -> None:
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine)
+    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine, args.step)
     try:
         how = {"jobs": args.jobs, "progress": bars(args)}
         if args.basin:
@@ -97,7 +98,9 @@ def trials(args: Namespace) -> None:
     for what, said in report.conditions.items():
         print(f"{what}: {said}")
     low, high = report.interval
-    print(f"{report.landed} of {report.count} land: {report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}")
+    steps = f" ({report.stepped} with a recovery step)" if args.step else ""
+    rate = f"{report.success_rate:.1%}, 95 % interval {low:.1%} ... {high:.1%}"
+    print(f"{report.landed} of {report.count} land{steps}: {rate}")
     for reason, count in report.reasons.items():
         print(f"{count:>5} failed: {reason}")
     if report.causes:
@@ -116,6 +119,7 @@ def trials(args: Namespace) -> None:
     opt("DIR", "folder of a plan; trials.jsonl and margins.json are written there"),
     opt("--disturb NAME...", "only these; A+B for two together; a wrong name shows all; may be repeated", []),
     opt("--n N", "number of robots at each size (default 20)", "20", whole(1, MOST)),
+    opt("--step", "allow one recovery step where the feet alone cannot catch the robot"),
     opt("--steps N", "of the bisection (default 4, to a sixteenth of the limit)", "4", whole(0, 20)),
     SEED,
     MODE,
@@ -127,7 +131,10 @@ def margins(args: Namespace) -> None:
     start = time.perf_counter()
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
-    settings, names = many.TrialSettings(args.mode, engine=args.engine), args.disturb or (*bounds.SINGLE, *bounds.PAIRS)
+    settings, names = (
+        many.TrialSettings(args.mode, engine=args.engine, step=args.step),
+        args.disturb or (*bounds.SINGLE, *bounds.PAIRS),
+    )
     try:
         how = {"steps": args.steps, "jobs": args.jobs, "progress": bars(args)}
         report = bounds.margins(args.dir, names, args.n, args.seed or 0, settings, **how)

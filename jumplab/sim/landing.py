@@ -18,6 +18,7 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.sim.kinematics import Gauge
 from jumplab.sim.playback import Actuators
 from jumplab.sim.reference import Reference
+from jumplab.sim.step import RecoveryStep
 
 
 class BodyTerms:
@@ -116,6 +117,7 @@ STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so mu
 SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
 SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
 MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
+MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
 UNBOUNDED = 1e20  # ProxQP's infinity
 TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
 MAX_ITERATIONS = 300  # ten times what the hardest recorded QP took
@@ -142,6 +144,7 @@ class LandingGains:
     trunk_weight: float = 0.5
     foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning
     swing_weight: tuple[float, float] = (1.0, 0.05)
+    step_weight: tuple[float, float] = (20.0, 0.5)  # of a foot in a recovery step
     arm_posture_weight: float = 0.02
     leg_posture_weight: float = 0.002  # pitch joints; feet, CoM and trunk decide them already
     lateral_posture_weight: float = 0.2  # yaw and roll joints
@@ -156,11 +159,20 @@ class LandingController:
 
     ``robot`` is as planned: the controller knows no perturbation. ``reference`` is followed if given; otherwise
     spring-dampers lead to the middle of the feet at standing height. ``solves`` and ``failures`` count the QPs posed,
-    and those without a solution.
+    and those without a solution. With ``may_step`` it takes one step, ``step``, where its feet alone cannot catch the
+    robot; what was planned ends there.
     """
 
-    def __init__(self, robot: Robot, *, reference: Reference | None = None, gains: LandingGains | None = None):
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        reference: Reference | None = None,
+        gains: LandingGains | None = None,
+        may_step: bool = False,
+    ):
         self.reference, self.gains = reference, gains or LandingGains()
+        self.step = RecoveryStep(robot, SOLE_SHARE) if may_step else None
         self.solves = self.failures = 0
         self._terms, self._actuators = BodyTerms(robot, WRENCH_SCALE), Actuators(robot)
         self._posture_weight, self._corners = self._posture_weights(robot), _corner_rows(robot)
@@ -178,14 +190,28 @@ class LandingController:
         """Joint torques (nv - 6,) [N m], ``time`` after touchdown, from measured state and vertical foot forces."""
         body = self._terms
         body.update(q, v)
+        if self.step is not None:
+            self.step.look(time, body, np.asarray(foot_force))
+            if self.stepped:
+                self.reference = None
         body.set_contact(contact := self._contact(time, np.asarray(foot_force)))
         x = self._solve(*self._wishes(time, q, v, contact), v)
         tau = -FALLBACK_DAMPING * v[6:] + body.gravity_torque(contact) if x is None else body.torque(x)
         return np.clip(np.round(tau, TORQUE_DIGITS), *self._actuators.range(v[6:]))
 
+    @property
+    def stepped(self) -> bool:
+        """Whether the recovery step has begun."""
+        return self.step is not None and self.step.began_s is not None
+
+    def _swings(self, side: int) -> bool:
+        return self.step is not None and self.step.side == side
+
     def _contact(self, time: float, foot_force: np.ndarray) -> np.ndarray:
         """Which feet (2,) may carry weight: those that did a moment ago, and any that hovers just beside one."""
         self._last_contact[foot_force > CONTACT_FORCE_N] = time
+        if self.step is not None and self.step.side is not None:
+            return np.arange(2) != self.step.side
         loaded = time - self._last_contact <= CONTACT_HOLD_S
         if not loaded.any():
             return loaded
@@ -197,6 +223,8 @@ class LandingController:
         g, body = self.gains, self._terms
         ground = body.soles[contact] if contact.any() else body.soles
         com_wish, momentum_wish = self._balance(time, ground.mean(axis=0))
+        if self.step is not None and self.step.side is not None:
+            com_wish[:2] = self.step.com_acceleration(body)
         trunk_rows = np.zeros((3, body.nx))
         trunk_rows[:, 3:6] = np.eye(3)
         rows = [body.force_rows, body.momentum_rows / NOMINAL_INERTIA, trunk_rows]
@@ -205,8 +233,12 @@ class LandingController:
         weights = [on * np.array(g.com_weight), np.full(3, on * g.momentum_weight), np.full(3, g.trunk_weight)]
         for side in (0, 1):
             rows.append(body.sole_rows[side])
-            targets.append(self._foot_wish(side, contact[side], ground[:, 2].min()) - body.sole_drift[side])
-            weights.append(np.repeat(g.foot_weight if contact[side] else g.swing_weight, 3))
+            wish = self._foot_wish(side, contact[side], ground[:, 2].min())
+            if self._swings(side):
+                wish[:3] = np.clip(self.step.foot_acceleration(time, body), -MAX_STEP, MAX_STEP)
+            targets.append(wish - body.sole_drift[side])
+            in_air = g.step_weight if self._swings(side) else g.swing_weight
+            weights.append(np.repeat(g.foot_weight if contact[side] else in_air, 3))
         return np.vstack(rows), np.concatenate(targets), np.concatenate(weights), *self._posture(q, v)
 
     def _balance(self, time, foot_middle):

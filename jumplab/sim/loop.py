@@ -139,6 +139,7 @@ def simulate_jump(
     perturbation: Perturbation | None = None,
     scene: Scene | None = None,
     reaim: bool = False,
+    step: bool = False,
     landing: str = "planned",
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
@@ -155,6 +156,7 @@ def simulate_jump(
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
     reaim : put the legs in the air to where they can catch the robot, see :class:`jumplab.sim.reaim.Reaim`.
+    step : allow one recovery step after touchdown, see :class:`jumplab.sim.step.RecoveryStep`; the metrics tell it.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state; "spring" leads to the
         stance by spring-dampers alone, and so does "planned" where stage 1 finds no landing. The result's
         ``settings["landing"]`` says what was followed, and what the plan's solve cost.
@@ -178,14 +180,15 @@ def simulate_jump(
     _check(tape, robot, perturbation, scene, reference, stand_s)
     run = Run(robot, perturbation, scene, engine, tape)
     known_delay_s = run.perturbation.known_delay_s
-    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s)
+    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s, may_step=step)
     if disturbance is None:
-        step, q, v = 0, run.ground.seated(robot, run.perturbation.start(robot, tape.q[0])), tape.v[0]
+        first, q, v = 0, run.ground.seated(robot, run.perturbation.start(robot, tape.q[0])), tape.v[0]
     else:
-        step, q, v = disturbance.apex(tape, robot)
-    run.play(pilot, q, v, step)
-    said = dict(mode=mode, reaim=reaim, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
-    return run.result(0, pilot.solves, landing=pilot.landing_said(), **said)
+        first, q, v = disturbance.apex(tape, robot)
+    run.play(pilot, q, v, first)
+    said = dict(mode=mode, reaim=reaim, step=step, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
+    result = run.result(0, pilot.solves, landing=pilot.landing_said(), **said)
+    return replace(result, metrics=replace(result.metrics, recovery_step_s=pilot.stepped_s))
 
 
 def simulate_landing(tape: Tape, robot: Robot, disturbance: Disturbance, **options: Any) -> SimulationResult:

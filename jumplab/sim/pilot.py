@@ -39,7 +39,8 @@ class Pilot:
     Tape, robot and scene are as planned; ``mode`` is that of :class:`Playback`, the rest that of
     :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead. ``start_rad`` is the heading
     in which the robot stands at the start, where the tape begins with zero. ``leads_back`` is for a start at rest: a
-    wrong posture is led back to the plan, see :meth:`Playback.approach`.
+    wrong posture is led back to the plan, see :meth:`Playback.approach`. With ``may_step`` the landing may take a
+    recovery step.
 
     Attributes
     ----------
@@ -65,6 +66,7 @@ class Pilot:
         lead_s: float = 0.0,
         start_rad: float = 0.0,
         leads_back: bool = True,
+        may_step: bool = False,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
@@ -75,7 +77,8 @@ class Pilot:
         scene = scene.seen_along(self.looks_rad, robot, self.goal)
         self.forecast = Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
-        self._landing = LandingController(robot, reference=None if callable(reference) else reference)
+        given = None if callable(reference) else reference
+        self._landing = LandingController(robot, reference=given, may_step=may_step)
         self.ahead = LandingAhead(landing if reference is None else "given")
         if self.ahead.source == "planned":
             self._prepare()
@@ -110,6 +113,11 @@ class Pilot:
         """What the settings of a result say about the landing, and how often that of a flip was planned anew."""
         return self.ahead.to_json() | {"again": self._replan and self._replan.to_json()}
 
+    @property
+    def stepped_s(self) -> float | None:
+        """When a recovery step began, since the touchdown; None if none did."""
+        return self._landing.step.began_s if self._landing.stepped else None
+
     def over(self, step: int, fallen_s: float) -> bool:
         """Whether the robot has stood or lain for long enough, or will never come down."""
         if self.touchdown is None:
@@ -133,7 +141,7 @@ class Pilot:
                 return self._fly(step, played, q, v)
             q = self._touch(step, played, q, v)
         since = step - self.touchdown
-        if self._replan is not None and self.ahead.followed == "planned":
+        if self._replan is not None and self.ahead.followed == "planned" and not self._landing.stepped:
             self._landing.reference = self._replan.follow(since * STEP_S, q, v, self._landing.reference)
         if since % PERIOD_STEPS == 0:
             self._tau = self._landing.torque(since * STEP_S, q, v, force)

@@ -93,6 +93,7 @@ class Metrics:
     launch_impulse: tuple[float, float]  # of the ground until lift-off [N s]
     landing_impulse: tuple[float, float] | None = None  # of the ground in the 0.1 s after touchdown [N s]
     landing_force_n: float | None = None  # largest mean over 20 ms of what presses on both feet then [N]
+    recovery_step_s: float | None = None  # when, after touchdown, a foot left to catch the robot elsewhere
     qp_solves: int  # of the landing controller
     qp_failures: int
 
@@ -127,7 +128,8 @@ class SimulationResult(Shown, Named):
         """Travel, rise and verdict."""
         m = self.metrics
         far, high = ("none" if x is None else f"{x:.3f} m" for x in (m.foot_distance_m, m.com_rise_m))
-        verdict = f"stands {m.standing_s:.2f} s" if m.landed else f"FAILED, {m.reason}"
+        stepped = "" if m.recovery_step_s is None else " after a recovery step"
+        verdict = f"stands {m.standing_s:.2f} s{stepped}" if m.landed else f"FAILED, {m.reason}"
         return f"travel {far}, rise {high}, {verdict}"
 
     @property
@@ -181,7 +183,7 @@ class SimulationResult(Shown, Named):
             names = {name: tuple(logs.pop(name).tolist()) for name in ("link_names", "joint_names")}
             if {len(log) for log in logs.values()} != {logs["t"].size}:
                 raise ValueError("logs of different lengths")
-            numbers = {f.name: said[f.name] for f in fields(Metrics)}
+            numbers = {f.name: said[f.name] for f in fields(Metrics) if f.name in said}
             metrics = Metrics(**{k: tuple(x) if isinstance(x, list) else x for k, x in numbers.items()})
             findings = tuple(Finding(*(row[f.name] for f in fields(Finding))) for row in said["honesty"])
             settings = dict(said["settings"])

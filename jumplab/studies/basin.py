@@ -110,6 +110,13 @@ def drop(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: T
     """Simulate one state from the apex on."""
     wrong = Disturbance(state.speed_factor, float(np.radians(state.pitch_deg)), state.height_m)
     floor = Perturbation(key.robot_seed, friction=state.friction, noise=settings.noise)
-    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=floor, scene=scene)
+    how = dict(
+        mode=settings.mode,
+        reaim=settings.reaim,
+        step=settings.step,
+        engine=settings.engine,
+        perturbation=floor,
+        scene=scene,
+    )
     verdict = series.judged(lambda: simulate_landing(tape, robot, wrong, **how))
     return Trial(key, floor.to_json(), asdict(state), *verdict).as_kept()

@@ -90,16 +90,19 @@ class MarginReport(Shown):
     engine: str
     n: int  # robots per size
     target: dict[str, float]
+    step: bool = False  # whether one recovery step was allowed
 
     def line(self) -> str:
         """How many disturbances are borne to their limits."""
         whole = sum(m.share == 1 for m in self.margins)
-        return f"{len(self.margins)} margins in {self.engine}, {whole} of them at the limit of what is tried"
+        stepped = ", one recovery step allowed" * self.step
+        return f"{len(self.margins)} margins in {self.engine}{stepped}, {whole} of them at the limit of what is tried"
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``margins.json``."""
         rows = [asdict(m) | {"sizes": m.sizes, "interval": m.interval} for m in self.margins]
-        said = dict(schema=SCHEMA, wanted=WANTED, engine=self.engine, n=self.n, target=self.target, margins=rows)
+        said = dict(schema=SCHEMA, wanted=WANTED, engine=self.engine, n=self.n, step=self.step, target=self.target)
+        said["margins"] = rows
         return said | {"versions": store.versions()}
 
     @classmethod
@@ -108,7 +111,7 @@ class MarginReport(Shown):
         try:
             rows = [{f.name: row[f.name] for f in fields(Margin)} for row in data["margins"]]
             found = [Margin(**(row | {"probes": tuple(map(tuple, row["probes"]))})) for row in rows]
-            return cls(tuple(found), data["engine"], data["n"], dict(data["target"]))
+            return cls(tuple(found), data["engine"], data["n"], dict(data["target"]), data.get("step", False))
         except (KeyError, TypeError) as e:
             raise InputError(f"not the margins of a plan ({type(e).__name__}); make them with 'jumplab margins'") from e
 
@@ -153,7 +156,7 @@ def margins(
     for number, (name, reaim) in enumerate(product(names, (False, True))):
         tell(f"margin of {name}", number, 2 * len(names))
         found.append(_bisected(name, reaim, steps, n, partial(probe, name, reaim)))
-    report = MarginReport(tuple(found), settings.engine, n, dict(summary["target"]))
+    report = MarginReport(tuple(found), settings.engine, n, dict(summary["target"]), settings.step)
     store.write_trials(folder, report.to_json(), summary, NAME)
     return report
 

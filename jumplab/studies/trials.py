@@ -88,6 +88,7 @@ class TrialSettings:
     noise: SensorNoise = field(default_factory=SensorNoise.typical)  # on what the controllers are told
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
+    step: bool = False  # allow one recovery step where the feet alone cannot catch the robot
 
     def __post_init__(self):
         if self.mode not in MODES:
@@ -105,6 +106,7 @@ class TrialSettings:
         return {
             "playback": f"{self.mode} mode in {engine_class(self.engine).title}",
             "re-aim": aim,
+            "recovery step": "one, if the robot would come to rest beyond its soles" if self.step else "none",
             "drawn uniformly, each link and joint by itself": str(self.ranges),
             "measured (one standard deviation)": str(self.noise),
             "known exactly": KNOWN,
@@ -179,7 +181,9 @@ def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, k
 
 def _how(robot: Robot, settings: TrialSettings, key: TrialKey) -> dict[str, Any]:
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    return dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, perturbation=drawn)
+    return dict(
+        mode=settings.mode, reaim=settings.reaim, step=settings.step, engine=settings.engine, perturbation=drawn
+    )
 
 
 def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None, tuple[Sign, ...]]:
@@ -231,7 +235,8 @@ class TrialReport(Shown):
     def line(self) -> str:
         """How many landed."""
         low, high = self.interval
-        return f"{self.landed} of {self.count} land, 95 % interval {low:.1%} ... {high:.1%}"
+        steps = f" ({self.stepped} with a recovery step)" if self.settings.step else ""
+        return f"{self.landed} of {self.count} land{steps}, 95 % interval {low:.1%} ... {high:.1%}"
 
     @property
     def conditions(self) -> dict[str, str]:
@@ -247,6 +252,11 @@ class TrialReport(Shown):
     def landed(self) -> int:
         """Number of those that landed."""
         return sum(t.landed for t in self.trials)
+
+    @property
+    def stepped(self) -> int:
+        """Number of those that landed with a recovery step."""
+        return sum(t.landed and t.metrics.recovery_step_s is not None for t in self.trials)
 
     @property
     def success_rate(self) -> float:
@@ -292,7 +302,8 @@ class TrialReport(Shown):
             "success_interval": self.interval,
             "confidence": CONFIDENCE,
             "method": "wilson",
-            "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed},
+            "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed}
+            | {"landed_with_a_step": self.stepped},
             "reasons": self.reasons,
             "causes": self.causes,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
