@@ -18,6 +18,7 @@ from test_store import make_tape, names
 
 from jumplab.errors import InputError, SolverError
 from jumplab.io import folder as store
+from jumplab.show import margin_radar
 from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
 from jumplab.studies import margins
 from jumplab.studies import trials as monte_carlo
@@ -351,6 +352,25 @@ def test_margins_are_bisected_and_resumed(folder, monkeypatch, most, shares):
     kept = margins.MarginReport.from_json(store.read_json(folder / "margins.json"))
     assert kept.margins == report.margins and "margins in bullet" in kept._repr_html_()
     assert 0.94 < 19 / 20 and margins.enough(19, 20) and not margins.enough(18, 20) and not margins.enough(3, 4)
+
+
+def test_margins_with_a_step_and_their_picture_beside_others(folder, monkeypatch):
+    seen = []
+
+    def trial(tape, robot, scene, settings, key):
+        seen.append(settings.step)
+        return replace(play(tape, robot, scene, settings, key), landed=True)
+
+    monkeypatch.setattr(monte_carlo, "run_trial", trial)
+    with_step = margins.margins(folder, ("payload_kg", "mass"), 2, settings=TrialSettings(step=True), jobs=1)
+    usual = margins.margins(folder, ("payload_kg",), 2, jobs=1)
+    assert set(seen[:4]) == {True} and not any(seen[-4:]) and "one recovery step allowed" in with_step.line()
+    assert margins.MarginReport.from_json(store.read_json(folder / "margins.json")).step is False
+    ax = margin_radar({"usual": usual, "one step": with_step}).axes[0]
+    assert [line.get_label() for line in ax.lines] == [
+        "usual, plain", "usual, re-aimed", "one step, plain", "one step, re-aimed",
+    ]  # fmt: skip
+    assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
 
 
 def test_margins_of_what_is_not_there(folder):

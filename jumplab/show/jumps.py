@@ -232,17 +232,27 @@ def _map_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: st
 
 
 @style.styled
-def margin_radar(report: MarginReport) -> Figure:
-    """How much of each disturbance a plan bears, as a share of the largest that is tried; dashed without re-aim."""
-    names = list(dict.fromkeys(m.names for m in report.margins))
+def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
+    """How much of each disturbance plans bear, as a share of the largest that is tried; dashed without re-aim.
+
+    Of several reports, by the names that the legend shall have, only the disturbances that all of them tell.
+    """
+    several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
+    told = [{m.names for m in report.margins} for report in several.values()]
+    names = [name for name in dict.fromkeys(m.names for r in several.values() for m in r.margins)
+             if all(name in known for known in told)]  # fmt: skip
     angles = 2 * np.pi * np.arange(len(names)) / len(names)
     fig = style.new_figure(style.PAGE_IN, 4.2)
     ax = fig.add_subplot(projection="polar")
-    for reaim, word, look in ((False, "plain", "--"), (True, "re-aimed", "-")):
-        shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
-        values = [shares.get(name, np.nan) for name in (*names, names[0])]
-        color = style.LANDING if reaim else style.LAUNCH
-        ax.plot([*angles, angles[0]], values, look, color=color, marker="o", markersize=3, label=word)
+    pairs = (style.LAUNCH, style.LANDING), (style.FLIGHT, style.VERMILION), (style.INK, style.INK)
+    widths = (4.0, 2.2, 1.0) if len(several) > 1 else (1.5,)  # equal lines show below each other
+    for (title, report), colors, width in zip(several.items(), pairs, widths, strict=False):
+        for reaim, word, look in ((False, "plain", "--"), (True, "re-aimed", "-")):
+            shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
+            values = [shares.get(name, np.nan) for name in (*names, names[0])]
+            label = f"{title}, {word}" if title else word
+            how = dict(color=colors[reaim], linewidth=width, marker="o", markersize=2 + width, label=label)
+            ax.plot([*angles, angles[0]], values, look, **how)
     words = [name.replace("+", " +\n") for name in names]
     ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
     ax.set_xticks(angles, words, fontsize=6.5)
@@ -251,6 +261,8 @@ def margin_radar(report: MarginReport) -> Figure:
         label.set_ha("center" if abs(side) < 0.1 else "left" if side > 0 else "right")
     ax.set_yticks([25, 50, 75, 100], ["25 %", "50 %", "75 %", "100 %"], fontsize=6)
     ax.set_rlabel_position(-180 / len(names))  # between the last and the first
+    for label in ax.get_yticklabels():
+        label.set(zorder=5, bbox=dict(facecolor="white", edgecolor="none", alpha=0.8, pad=0.5))
     ax.legend(loc="lower left", bbox_to_anchor=(1.05, 0.0), frameon=False)
     return fig
 

@@ -59,10 +59,36 @@ def stored(path: Path = LOG) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def margins() -> dict[str, MarginReport]:
-    """The kept margins of the default jump, by engine."""
+def margins() -> dict[str, dict[str, MarginReport]]:
+    """The kept margins of the default jump by engine, and by what was done: "usual", "robust", "one step"."""
     found = json.loads(Path(__file__).with_name("margins.json").read_text(encoding="utf-8"))
-    return {engine: MarginReport.from_json(told) for engine, told in found.items()}
+    return {engine: {way: MarginReport.from_json(x) for way, x in told.items()} for engine, told in found.items()}
+
+
+def side_by_side(ways: dict[str, MarginReport]) -> list[dict[str, Any]]:
+    """A line per disturbance: what each way bears of it, plain and re-aimed; empty where it was not tried."""
+    found = {
+        (m.names, f"{way}, {'re-aimed' if m.reaim else 'plain'}"): m.row()["bears"]
+        for way, told in ways.items()
+        for m in told.margins
+    }
+    names, columns = (list(dict.fromkeys(x)) for x in zip(*found, strict=True))
+    return [{"disturbance": name} | {c: found.get((name, c), "") for c in columns} for name in names]
+
+
+def moved(usual: MarginReport, other: MarginReport) -> list[dict[str, Any]]:
+    """A line per disturbance that the usual plan does not bear to its limit and both know: how far the margin moved.
+
+    Shares count from nothing to the limit; from a margin of nothing no gain is told.
+    """
+    known, rows = {(m.names, m.reaim): m.share for m in other.margins}, []
+    for m in usual.margins:
+        if m.share == 1 or (m.names, m.reaim) not in known:
+            continue
+        share = known[m.names, m.reaim]
+        gain = 100 * (share / m.share - 1) if m.share else None
+        rows.append({"disturbance": m.names, "re-aim": m.reaim, "usual": m.share, "other": share, "gain [%]": gain})
+    return rows
 
 
 def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
