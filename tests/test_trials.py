@@ -163,6 +163,7 @@ def test_report_counts(folder, coins):
     assert said["conditions"] == {
         "playback": "position mode in PyBullet",
         "re-aim": "the legs turn in the air against errors of trunk, speed and momentum, about all axes",
+        "recovery step": "none",
         "drawn uniformly, each link and joint by itself": str(Ranges()),
         "measured (one standard deviation)": str(SensorNoise.typical()),
         "known exactly": monte_carlo.KNOWN,

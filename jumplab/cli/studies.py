@@ -84,7 +84,7 @@ def trials(args: Namespace) -> None:
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine, args.step)
+    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine, bool(args.step))
     try:
         how = {"jobs": args.jobs, "progress": bars(args)}
         if args.basin:
@@ -132,7 +132,7 @@ def margins(args: Namespace) -> None:
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     settings, names = (
-        many.TrialSettings(args.mode, engine=args.engine, step=args.step),
+        many.TrialSettings(args.mode, engine=args.engine, step=bool(args.step)),
         args.disturb or (*bounds.SINGLE, *bounds.PAIRS),
     )
     try:

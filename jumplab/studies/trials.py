@@ -256,7 +256,7 @@ class TrialReport(Shown):
     @property
     def stepped(self) -> int:
         """Number of those that landed with a recovery step."""
-        return sum(t.landed and t.metrics.recovery_step_s is not None for t in self.trials)
+        return sum(t.landed and bool(t.metrics) and t.metrics.recovery_step_s is not None for t in self.trials)
 
     @property
     def success_rate(self) -> float:
@@ -303,7 +303,7 @@ class TrialReport(Shown):
             "confidence": CONFIDENCE,
             "method": "wilson",
             "counts": {"trials": self.count, "landed": self.landed, "failed": self.count - self.landed}
-            | {"landed_with_a_step": self.stepped},
+            | ({"landed_with_a_step": self.stepped} if self.settings.step else {}),
             "reasons": self.reasons,
             "causes": self.causes,
             "failed": {t.key.index: t.reason for t in self.trials if not t.landed},
