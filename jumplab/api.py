@@ -77,7 +77,8 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     Parameters
     ----------
     options : as of :func:`jumplab.sim.simulate_jump`: ``mode``, ``perturbation``, ``scene`` (by default the ground that
-        the plan was made for), ``reaim``, ``landing``, ``stand_s``, ``engine`` ("bullet" or "mujoco").
+        the plan was made for), ``feedback``, ``reaim``, ``step``, ``landing``, ``stand_s``, ``engine`` ("bullet" or
+        "mujoco").
 
     Returns
     -------

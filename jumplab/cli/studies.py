@@ -68,6 +68,7 @@ def bars(args: Namespace) -> bool | None:
     ENGINE,
     opt("--reaim", "put the legs in the air to where they can catch the robot", True),
     opt("--step", "allow one recovery step where the feet alone cannot catch the robot"),
+    opt("--feedback", "correct the launch, which is open loop otherwise"),
     opt("--noise", "sensors err; --no-noise tells the controllers the truth", True),
     DISTURB,
     opt("--keep-falls N", "run the first N failures again, each into falls/NUMBER, for 'view'", "0", whole(0, 100)),
@@ -80,11 +81,13 @@ def trials(args: Namespace) -> None:
         raise InputError("--seed says which robots are drawn, and --basin draws none; leave one of them away")
     if args.basin:
         without(args, "is for robots that are drawn, and --basin draws none", disturb=[], keep_falls=0)
+        without(args, "acts in launch, and the basin's states are those of a flight", feedback=None)
     ranges = sim.ranges_of(common.disturbances("--disturb", args.disturb), sim.Ranges())
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine, bool(args.step))
+    answers = bool(args.step), bool(args.feedback)
+    settings = many.TrialSettings(args.mode, args.reaim, noise, ranges, args.engine, *answers)
     try:
         how = {"jobs": args.jobs, "progress": bars(args)}
         if args.basin:
@@ -120,6 +123,7 @@ def trials(args: Namespace) -> None:
     opt("--disturb NAME...", "only these; A+B for two together; a wrong name shows all; may be repeated", []),
     opt("--n N", "number of robots at each size (default 20)", "20", whole(1, MOST)),
     opt("--step", "allow one recovery step where the feet alone cannot catch the robot"),
+    opt("--feedback", "correct the launch, which is open loop otherwise"),
     opt("--steps N", "of the bisection (default 4, to a sixteenth of the limit)", "4", whole(0, 20)),
     SEED,
     MODE,
@@ -132,7 +136,7 @@ def margins(args: Namespace) -> None:
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
     settings, names = (
-        many.TrialSettings(args.mode, engine=args.engine, step=bool(args.step)),
+        many.TrialSettings(args.mode, engine=args.engine, step=bool(args.step), feedback=bool(args.feedback)),
         args.disturb or (*bounds.SINGLE, *bounds.PAIRS),
     )
     try:

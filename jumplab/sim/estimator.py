@@ -27,7 +27,7 @@ class Reading:
     rates: np.ndarray  # (nv - 6,) [rad/s]
     gyro: np.ndarray  # (3,) angular velocity of the trunk [rad/s]
     specific_force: np.ndarray  # (3,) acceleration of the base's origin minus gravity, mean of the last step [m/s^2]
-    foot_force: np.ndarray  # (2,) vertical force under each foot [N]
+    foot_wrench: np.ndarray  # (2, 6) force and moment on each foot, world axes, at the origin of its link [N, N m]
 
 
 class Sensors:
@@ -39,6 +39,7 @@ class Sensors:
 
     def __init__(self, noise: SensorNoise, seed: int, gravity: float = GRAVITY):
         self.noise, self._rng = noise, np.random.default_rng([seed, 1])  # a stream of its own beside the robot's draw
+        self._other = np.random.default_rng([seed, 3])
         self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
         self._accel_bias = noise.accel_bias * self._rng.standard_normal(3)
         self._last_velocity: np.ndarray | None = None
@@ -65,12 +66,20 @@ class Sensors:
             v[6:] + n.joint_rate * draw(len(v) - 6),
             v[3:6] + self._gyro_bias + n.gyro * draw(3),
             force + self._accel_bias + n.accel * draw(3),
-            wrench[:, 2] + n.force * draw(2),
+            self._felt(wrench, draw(2)),
         )
+
+    def _felt(self, wrench: np.ndarray, vertical: np.ndarray) -> np.ndarray:
+        """Foot wrenches (2, 6) as measured; ``vertical`` (2,) is what is drawn for the forces up."""
+        error = self._other.standard_normal((2, 6)) * np.repeat([1.0, LEVER_M], 3)
+        error[:, 2] = vertical
+        return wrench + self.noise.force * error
 
 
 # The papers print none of these numbers.
-LOADED_N = 30.0  # a foot with less may be sliding off the ground; ten times the sensor's noise
+LEVER_M = 0.05  # a moment of a foot's sensor is wrong by as much as a force at this distance
+LOADED_N = 30.0  # a foot with less may be sliding off the ground ...
+SURE = 6.0  # [1] ... or with less than so many standard deviations of a poor sensor
 TIPPED_M = 0.003  # the foot stands on the lower end of its sole, once the other is higher by this much
 FOOT_WALK = 0.01  # [m/s / sqrt(Hz)] a standing foot creeps 10 mm within a second
 SETTLE_S, SETTLE_WALK = 0.02, 0.3  # for so long after it met the ground a foot is free to settle by centimetres
@@ -98,6 +107,7 @@ class Estimator:
         self._foot, self._end, self._standing = np.zeros((2, 3)), [0, 0], [0, 0]  # toe or heel; for how many steps
         self._noise = SensorNoise(**{name: max(getattr(noise, name), floor) for name, floor in vars(FLOOR).items()})
         n = self._noise
+        self._loaded_n = max(LOADED_N, SURE * n.force)
         spread = np.repeat([n.tilt_rad, 1e-3, 1e-3, n.gyro_bias, n.accel_bias, 1e-3, 1e-3], 3)
         self._cov = np.diag(spread**2)
         self._step, self._drive = np.eye(SIZE), np.zeros(SIZE)
@@ -108,7 +118,7 @@ class Estimator:
         self._predict(rate, reading.specific_force - self._accel_bias)
         points = self._sole_ends(reading.joints)
         for side in (0, 1):
-            self._stand(side, points[side], reading.foot_force[side] > LOADED_N)
+            self._stand(side, points[side], reading.foot_wrench[side, 2] > self._loaded_n)
         quaternion = pin.Quaternion(self._attitude).coeffs()
         q = np.concatenate([self._place, quaternion, reading.joints])
         v = np.concatenate([self._attitude.T @ self._velocity, reading.gyro - self._gyro_bias, reading.rates])
@@ -186,14 +196,14 @@ class Perception:
         self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
 
     def __call__(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Configuration (nq,), velocity (nv,) and vertical foot forces (2,) as far as the robot knows them."""
+        """Configuration (nq,), velocity (nv,) and foot wrenches (2, 6) as far as the robot knows them."""
         if self._estimator is None:
-            return q, v, wrench[:, 2]
+            return q, v, wrench
         reading = self._sensors.read(q, v, wrench)
         believed_q, believed_v = self._estimator.update(reading)
         tilt, speed = estimation_error(q, v, believed_q, believed_v)
         self._tilt, self._speed = max(self._tilt, tilt), max(self._speed, speed)
-        return believed_q, believed_v, reading.foot_force
+        return believed_q, believed_v, reading.foot_wrench
 
     def to_json(self) -> dict:
         """What the settings of a result say."""

@@ -51,8 +51,11 @@ class BodyTerms:
         self.force_rows, self.momentum_rows = np.zeros((3, nx)), np.zeros((3, nx))
         self._dynamics, self._zero = np.zeros((nv, nx)), np.zeros(nv)
 
-    def update(self, q: np.ndarray, v: np.ndarray) -> None:
-        """Evaluate everything at (q, v), before :meth:`set_contact`."""
+    def update(self, q: np.ndarray, v: np.ndarray, point: np.ndarray | None = None) -> None:
+        """Evaluate everything at (q, v), before :meth:`set_contact`; the soles' at another ``point`` (3,) than their
+        middle, in the axes of the foot link.
+        """
+        point = self._gauge.robot.foot.center if point is None else point
         model, data = self._gauge.model, self._gauge.data
         pin.computeAllTerms(model, data, q, v)
         pin.forwardKinematics(model, data, q, v, self._zero)
@@ -62,7 +65,7 @@ class BodyTerms:
         self.base_rows, self.torque_rows = self._dynamics[:6], self._dynamics[6:]
         self.base_offset, self.torque_offset = data.nle[:6], data.nle[6:]
         for side, frame in enumerate(self._gauge.frames):
-            self._sole(side, frame)
+            self._sole(side, frame, point)
 
     def set_contact(self, contact: np.ndarray) -> None:
         """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
@@ -73,11 +76,11 @@ class BodyTerms:
             self.force_rows[:, at][:, :3] = on / self.mass * np.eye(3)
             self.momentum_rows[:, at] = on * np.hstack([pin.skew(self.soles[side] - self.com), np.eye(3)])
 
-    def _sole(self, side: int, frame: int) -> None:
-        """Kinematics of one sole's middle, world axes."""
+    def _sole(self, side: int, frame: int, point: np.ndarray) -> None:
+        """Kinematics of one sole's ``point``, world axes."""
         model, data, axes = self._gauge.model, self._gauge.data, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         place = pin.updateFramePlacement(model, data, frame)
-        arm = place.rotation @ self._gauge.robot.foot.center
+        arm = place.rotation @ point
         jacobian = pin.getFrameJacobian(model, data, frame, axes)
         jacobian[:3] -= pin.skew(arm) @ jacobian[3:]
         velocity = pin.getFrameVelocity(model, data, frame, axes)
@@ -313,10 +316,16 @@ class LandingController:
 
 
 def _corner_rows(robot: Robot) -> np.ndarray:
+    foot = robot.foot
+    return corner_rows(
+        robot, PLANNED_FRICTION, SOLE_SHARE[0] * (foot.toe - foot.heel) / 2, SOLE_SHARE[1] * foot.half_width
+    )
+
+
+def corner_rows(robot: Robot, friction: float, half_length: float, half_width: float) -> np.ndarray:
     """(20, nx) rows r with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
-    foot, mu = robot.foot, PLANNED_FRICTION / np.sqrt(2)
+    foot, mu = robot.foot, friction / np.sqrt(2)
     spin = SPIN_FRICTION * (1.0 if robot.planar else foot.half_width / SPIN_HALF_WIDTH_M)
-    half_length, half_width = SOLE_SHARE[0] * (foot.toe - foot.heel) / 2, SOLE_SHARE[1] * foot.half_width
     one, rows = np.zeros((10, 6)), np.zeros((20, robot.model.nv + 12))
     one[:, 2] = np.repeat([mu, mu, half_width, half_length, spin], 2)
     one[range(10), np.repeat([0, 1, 3, 4, 5], 2)] = np.tile([1.0, -1.0], 5)

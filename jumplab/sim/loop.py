@@ -34,8 +34,8 @@ class Commander(Protocol):
     part: int  # that the last command belongs to, from 0
     goal: np.ndarray  # (nq,) of this part
 
-    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
-        """Command at ``step`` from measured state and vertical foot forces (2,)."""
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Command:
+        """Command at ``step`` from measured state and foot wrenches (2, 6)."""
 
     def over(self, step: int, fallen_s: float) -> bool:
         """Whether ``step`` is beyond the end; the robot has lain on the ground for ``fallen_s`` [s]."""
@@ -140,6 +140,7 @@ def simulate_jump(
     scene: Scene | None = None,
     reaim: bool = False,
     step: bool = False,
+    feedback: bool = False,
     landing: str = "planned",
     reference: LandingSource | None = None,
     stand_s: float = STAND_S,
@@ -156,6 +157,9 @@ def simulate_jump(
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
     reaim : put the legs in the air to where they can catch the robot, see :class:`jumplab.sim.reaim.Reaim`.
+    feedback : let the joints leave the tape in launch, so that the body as a whole launches as planned in spite of
+        shoves, other masses and soft ground, see :class:`jumplab.sim.launch.LaunchFeedback`; open loop otherwise.
+        In mode "position" alone.
     step : allow one recovery step after touchdown, see :class:`jumplab.sim.step.RecoveryStep`; the metrics tell it.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state; "spring" leads to the
         stance by spring-dampers alone, and so does "planned" where stage 1 finds no landing. The result's
@@ -174,20 +178,24 @@ def simulate_jump(
     Raises
     ------
     InputError
-        If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, the engine is unknown or not there, or
-        the robot cannot stand on the ground at the start.
+        If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, the engine is unknown or not there, the
+        robot cannot stand on the ground at the start, or ``feedback`` is asked in mode "pd" or without a launch.
     """
     _check(tape, robot, perturbation, scene, reference, stand_s)
+    if feedback and disturbance is not None:
+        raise InputError("feedback acts in launch, and a run from the apex has none; leave one of them away")
     run = Run(robot, perturbation, scene, engine, tape)
     known_delay_s = run.perturbation.known_delay_s
-    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s, may_step=step)
+    options = dict(may_step=step, feedback=feedback, force_noise_n=run.perturbation.noise.force)
+    pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s, **options)
     if disturbance is None:
         first, q, v = 0, run.ground.seated(robot, run.perturbation.start(robot, tape.q[0])), tape.v[0]
     else:
         first, q, v = disturbance.apex(tape, robot)
     run.play(pilot, q, v, first)
     said = dict(mode=mode, reaim=reaim, step=step, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
-    result = run.result(0, pilot.solves, landing=pilot.landing_said(), **said)
+    said |= dict(feedback=pilot.feedback and pilot.feedback.to_json(), landing=pilot.landing_said())
+    result = run.result(0, pilot.solves, **said)
     return replace(result, metrics=replace(result.metrics, recovery_step_s=pilot.stepped_s))
 
 

@@ -11,8 +11,10 @@ from jumplab.errors import InputError, JumplabError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
+from jumplab.sim.estimator import SURE
 from jumplab.sim.kinematics import Gauge, headed, yaw_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
+from jumplab.sim.launch import LaunchFeedback
 from jumplab.sim.playback import Command, Playback
 from jumplab.sim.reaim import FROM_SHARE, Reaim, Tuck, is_flip
 from jumplab.sim.reference import LEAD_S, Forecast, LandingAhead, LandingSource, Replan, landing_planner
@@ -40,7 +42,7 @@ class Pilot:
     :func:`jumplab.sim.simulate_jump`. Until touchdown, commands are sent ``lead_s`` ahead. ``start_rad`` is the heading
     in which the robot stands at the start, where the tape begins with zero. ``leads_back`` is for a start at rest: a
     wrong posture is led back to the plan, see :meth:`Playback.approach`. With ``may_step`` the landing may take a
-    recovery step.
+    recovery step; with ``feedback`` the launch is corrected. Foot forces err by ``force_noise_n`` [N] each.
 
     Attributes
     ----------
@@ -67,12 +69,16 @@ class Pilot:
         start_rad: float = 0.0,
         leads_back: bool = True,
         may_step: bool = False,
+        feedback: bool = False,
+        force_noise_n: float = 0.0,
     ):
         if landing not in LANDINGS:
             raise InputError(f"landing {landing!r}: must be one of {', '.join(LANDINGS)}")
         self.goal, self._heading, self._start = tape.q[-1], Gauge(robot).heading(tape.q[-1]), start_rad
         self.looks_rad = start_rad + self._heading
         self._robot, self.playback = robot, Playback(tape, robot, mode, lead_s)
+        self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None
+        self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * force_noise_n)
         tape = replace(tape, q=headed(tape.q, self._heading))
         scene = scene.seen_along(self.looks_rad, robot, self.goal)
         self.forecast = Forecast(robot, tape, scene)
@@ -124,8 +130,8 @@ class Pilot:
             return step >= self.last_step
         return step >= self.touchdown + round((self._stand_s + EXTRA_S) / STEP_S) or fallen_s > AFTER_FALL_S
 
-    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
-        """Command at ``step`` from measured state and vertical foot forces.
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Command:
+        """Command at ``step`` from measured state and foot wrenches (2, 6).
 
         The tape is played in the axes of the start; all that looks ahead sees the robot along the heading in which it
         shall land.
@@ -133,11 +139,14 @@ class Pilot:
         played = headed(q, self._start)
         if step == 0 and self._leads_back:
             self.playback.approach(played)
+            if self.feedback is not None:
+                self.feedback.begin(played)
         if self.touchdown is None and step < self._tape_until:
-            return self.playback.command(step, played, v, self._none)
-        q = self.seen(q)
+            command = self.playback.command(step, played, v, self._none)
+            return command if self.feedback is None else self.feedback(step, command, played, v, wrench)
+        q, force = self.seen(q), wrench[:, 2]
         if self.touchdown is None:
-            if step < self._earliest or force.sum() <= TOUCHDOWN_FORCE_N:
+            if step < self._earliest or force.sum() <= self._touches_n:
                 return self._fly(step, played, q, v)
             q = self._touch(step, played, q, v)
         since = step - self.touchdown

@@ -207,11 +207,22 @@ class Playback:
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the plan smoothly."""
         off = q[7:] - self._q[0]
+        if np.abs(off).max() > WRONG_RAD:
+            for rows, share in zip((self._q, self._rate), self.way_back(), strict=False):
+                rows[: len(share)] += share[:, None] * off
+
+    def way_back(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Share (k,) of an error at the start that is left while the feet stand flat, and its first two derivatives."""
         steps = min(self._heel_off, self._takeoff)
-        if steps and np.abs(off).max() > WRONG_RAD:
-            share = np.arange(steps)[:, None] / steps
-            self._q[:steps] += (1 - share**3 * (10 - 15 * share + 6 * share**2)) * off
-            self._rate[:steps] -= 30 * share**2 * (1 - share) ** 2 / (steps * STEP_S) * off
+        share, lasts_s = np.arange(steps) / max(steps, 1), max(steps, 1) * STEP_S
+        left = 1 - share**3 * (10 - 15 * share + 6 * share**2)
+        rate = -30 * share**2 * (1 - share) ** 2 / lasts_s
+        return left, rate, -60 * share * (1 - share) * (1 - 2 * share) / lasts_s**2
+
+    def acceleration(self, step: int) -> np.ndarray:
+        """Joint accelerations (nv - 6,) of the tape [rad/s^2]."""
+        now = min(step, self.steps - 1)
+        return (self._rate[now + 1] - self._rate[now]) / STEP_S
 
     def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as now."""

@@ -89,6 +89,8 @@ def landing_basin(
     series.check_numbers(count, 0, jobs)
     if count > len(states):
         raise InputError(f"n = {count} is too large; the basin has {len(states)} states")
+    if settings.feedback:
+        raise InputError("feedback acts in launch, and the basin's states are those of a flight; leave it away")
     tape, robot, summary = store.read_plan(folder)
     scene, plan = Scene.of_plan(summary, robot), series.plan_hash(summary)
     keys = state_keys(states[:count], settings, plan)

@@ -91,18 +91,19 @@ class MarginReport(Shown):
     n: int  # robots per size
     target: dict[str, float]
     step: bool = False  # whether one recovery step was allowed
+    feedback: bool = False  # whether the launch was corrected
 
     def line(self) -> str:
         """How many disturbances are borne to their limits."""
         whole = sum(m.share == 1 for m in self.margins)
-        stepped = ", one recovery step allowed" * self.step
-        return f"{len(self.margins)} margins in {self.engine}{stepped}, {whole} of them at the limit of what is tried"
+        how = ", one recovery step allowed" * self.step + ", launch corrected" * self.feedback
+        return f"{len(self.margins)} margins in {self.engine}{how}, {whole} of them at the limit of what is tried"
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``margins.json``."""
         rows = [asdict(m) | {"sizes": m.sizes, "interval": m.interval} for m in self.margins]
-        said = dict(schema=SCHEMA, wanted=WANTED, engine=self.engine, n=self.n, step=self.step, target=self.target)
-        said["margins"] = rows
+        said = dict(schema=SCHEMA, wanted=WANTED, engine=self.engine, n=self.n, step=self.step, feedback=self.feedback)
+        said |= dict(target=self.target, margins=rows)
         return said | {"versions": store.versions()}
 
     @classmethod
@@ -111,7 +112,8 @@ class MarginReport(Shown):
         try:
             rows = [{f.name: row[f.name] for f in fields(Margin)} for row in data["margins"]]
             found = [Margin(**(row | {"probes": tuple(map(tuple, row["probes"]))})) for row in rows]
-            return cls(tuple(found), data["engine"], data["n"], dict(data["target"]), data.get("step", False))
+            answers = (data.get(name, False) for name in ("step", "feedback"))
+            return cls(tuple(found), data["engine"], data["n"], dict(data["target"]), *answers)
         except (KeyError, TypeError) as e:
             raise InputError(f"not the margins of a plan ({type(e).__name__}); make them with 'jumplab margins'") from e
 
@@ -156,7 +158,7 @@ def margins(
     for number, (name, reaim) in enumerate(product(names, (False, True))):
         tell(f"margin of {name}", number, 2 * len(names))
         found.append(_bisected(name, reaim, steps, n, partial(probe, name, reaim)))
-    report = MarginReport(tuple(found), settings.engine, n, dict(summary["target"]), settings.step)
+    report = MarginReport(tuple(found), settings.engine, n, dict(summary["target"]), settings.step, settings.feedback)
     store.write_trials(folder, report.to_json(), summary, NAME)
     return report
 

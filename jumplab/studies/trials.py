@@ -89,6 +89,7 @@ class TrialSettings:
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
     step: bool = False  # allow one recovery step where the feet alone cannot catch the robot
+    feedback: bool = False  # correct the launch; open loop otherwise
 
     def __post_init__(self):
         if self.mode not in MODES:
@@ -105,6 +106,7 @@ class TrialSettings:
         )
         return {
             "playback": f"{self.mode} mode in {engine_class(self.engine).title}",
+            "launch": "CoM and angular momentum are led back to the plan" if self.feedback else "open loop",
             "re-aim": aim,
             "recovery step": "one, if the robot would come to rest beyond its soles" if self.step else "none",
             "drawn uniformly, each link and joint by itself": str(self.ranges),
@@ -181,9 +183,8 @@ def run_trial(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, k
 
 def _how(robot: Robot, settings: TrialSettings, key: TrialKey) -> dict[str, Any]:
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    return dict(
-        mode=settings.mode, reaim=settings.reaim, step=settings.step, engine=settings.engine, perturbation=drawn
-    )
+    how = dict(mode=settings.mode, reaim=settings.reaim, step=settings.step, feedback=settings.feedback)
+    return how | dict(engine=settings.engine, perturbation=drawn)
 
 
 def judged(simulate: Callable[[], SimulationResult]) -> tuple[bool, str, Metrics | None, tuple[Sign, ...]]:

@@ -206,7 +206,9 @@ class ChainPilot:
         look_s: float,
         revise_s: float | None,
         lead_s: float = 0.0,
+        force_noise_n: float = 0.0,
     ):
+        self._force_noise_n = force_noise_n
         self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
         self._landing, self._look_s, self._revise_s, self._lead_s = landing, look_s, revise_s, lead_s
         self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
@@ -252,16 +254,16 @@ class ChainPilot:
             self.reason = f"the robot fell in jump {self.part + 1}"
         return bool(self.reason) or (not self._further and self.since_touchdown(step) >= STAND_S + EXTRA_S)
 
-    def command(self, step: int, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Command:
-        """Command at ``step`` of the chain from measured state and vertical foot forces."""
+    def command(self, step: int, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Command:
+        """Command at ``step`` of the chain from measured state and foot wrenches (2, 6)."""
         if self._further and not self.reason:
             self._think(step, q, v)
         if not self.pilots:
             if step % PERIOD_STEPS == 0:
-                self._tau = self._stand.torque(step * STEP_S, q, v, force)
+                self._tau = self._stand.torque(step * STEP_S, q, v, wrench[:, 2])
             return Command(tau=self._tau)
         now, pilot = step - self.began[-1], self.pilots[-1]
-        command = pilot.command(now, q, v, force)
+        command = pilot.command(now, q, v, wrench)
         if pilot.touchdown is None and now > pilot.last_step:
             self.reason = self.reason or f"jump {len(self.began)} never touched down"
         return command if command.q is None else self._blended(command, (now + pilot.playback.lead) * STEP_S)
@@ -348,7 +350,8 @@ class ChainPilot:
         self._from, self._uneven = pose, _over_feet(tape, self._robot, q)
         self._offset = q[7:] - tape.q[0, 7:] - self._uneven(0.0), v[6:].copy()
         self.used.append(ahead)
-        how = dict(lead_s=self._lead_s, start_rad=float(pose[2]), leads_back=False)  # :meth:`_blended` does
+        how = dict(lead_s=self._lead_s, start_rad=float(pose[2]), force_noise_n=self._force_noise_n)
+        how |= dict(leads_back=False)  # :meth:`_blended` does
         self.pilots.append(Pilot(tape, self._robot, self._scene, "position", self._landing, **how))
         self.began.append(step)
 

@@ -73,7 +73,8 @@ def run_chain(
         rehearsal = Rehearsal.of(course, planner, method)
     run = Run(waiting, perturbation, course.scene(waiting), engine)
     foresight = Foresight(course, waiting, planner, rehearsal, solve_s, method)
-    pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s, run.perturbation.known_delay_s)
+    known = run.perturbation.known_delay_s, run.perturbation.noise.force
+    pilot = ChainPilot(foresight, run.scene, landing, look_s, revise_s, *known)
     run.play(pilot, stance_configuration(waiting), np.zeros(waiting.model.nv))
     settings = dict(look_s=look_s, revise_s=revise_s, landing=landing, solve_s=solve_s, method=method)
     drawn, rehearsed = run.perturbation.to_json(), rehearsal is not None
