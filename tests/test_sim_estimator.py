@@ -6,7 +6,7 @@ import pytest
 
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Perturbation, SensorNoise, simulate_jump
-from jumplab.sim.estimator import Estimator, Perception, Sensors, estimation_error
+from jumplab.sim.estimator import LEVER_M, Estimator, Perception, Sensors, estimation_error
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
@@ -81,7 +81,17 @@ def test_readings_are_as_noisy_as_stated(bhr):
     assert gyro.std(axis=0) == pytest.approx(np.full(3, noise.gyro), rel=0.1)
     assert 0 < np.abs(gyro.mean(axis=0) - v[3:6]).max() < 5 * noise.gyro_bias  # what is left is the bias
     assert force.std(axis=0) == pytest.approx(np.full(3, noise.accel), rel=0.1)
-    assert (np.array([r.foot_force for r in rows]) - [2, 8]).std() == pytest.approx(noise.force, rel=0.1)
+    assert (np.array([r.foot_wrench[:, 2] for r in rows]) - [2, 8]).std() == pytest.approx(noise.force, rel=0.1)
+    moments = np.array([r.foot_wrench[:, 3:] for r in rows]) - wrench[:, 3:]
+    assert moments.std() == pytest.approx(LEVER_M * noise.force, rel=0.1)
+
+
+def test_poor_foot_sensors_find_no_ground_in_the_air(bhr, tape):
+    """Four times the typical error on each foot is half of what a good sensor takes for the ground."""
+    poor = Perturbation(seed=1, noise=SensorNoise.typical().times(4))
+    run = simulate_jump(tape, bhr, perturbation=poor, reaim=True)
+    assert run.landed and run.checks_passed, run.reason
+    assert run.settings["perception"]["worst_velocity_error"] < 0.5
 
 
 def test_exact_readings(bhr):
@@ -90,7 +100,7 @@ def test_exact_readings(bhr):
     attitude = pin.Quaternion(q[6], q[3], q[4], q[5]).toRotationMatrix()
     reading = sensors.read(q, v, np.arange(12.0).reshape(2, 6))
     assert attitude @ reading.specific_force == pytest.approx([0, 0, 9.8])
-    assert reading.foot_force.tolist() == [2, 8] and np.array_equal(reading.joints, q[7:])
+    assert np.array_equal(reading.foot_wrench, np.arange(12.0).reshape(2, 6)) and np.array_equal(reading.joints, q[7:])
     v[:3] = attitude.T @ [0.002, 0, -0.0098]
     assert attitude @ sensors.read(q, v, STILL).specific_force == pytest.approx([2, 0, 0], abs=1e-9)
 

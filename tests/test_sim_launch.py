@@ -1,0 +1,157 @@
+"""Launch feedback: what it follows, what it feels, and robots that launch better by it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from fixtures_core import jump
+
+from jumplab.errors import InputError
+from jumplab.sim import INSTALLED, STEP_S, Disturbance, Perturbation, Ranges, SensorNoise, Shove, simulate_jump
+from jumplab.sim.kinematics import Gauge
+from jumplab.sim.launch import LaunchFeedback
+from jumplab.sim.playback import Playback
+from jumplab.studies.basin import landing_basin
+from jumplab.studies.trials import TrialSettings
+
+NOISY = SensorNoise.typical()
+BRIEF_S = 0.05  # the landing is not asked about
+
+
+@pytest.fixture(scope="module")
+def tape():
+    return jump(1.0, 0.5, method="direct").tape
+
+
+@pytest.fixture(scope="module")
+def feedback(bhr, tape):
+    return LaunchFeedback(bhr, tape, Playback(tape, bhr))
+
+
+def wrong_start(bhr, tape):
+    """A start with joints off by up to three degrees, as it is drawn."""
+    return Perturbation.draw(bhr, 8, Ranges.none(posture_deg=3.0)).start(bhr, tape.q[0])
+
+
+def test_what_is_followed_obeys_newton_and_euler(feedback):
+    """The planned CoM's derivatives and L's rate come from the wrenches; differences say the same."""
+    com, speed, push, momentum, spin = np.moveaxis(feedback._rows, 1, 0)
+    assert np.diff(com, axis=0) / STEP_S == pytest.approx((speed[1:] + speed[:-1]) / 2, abs=2e-3)
+    assert np.diff(speed, axis=0) / STEP_S == pytest.approx(
+        (push[1:] + push[:-1]) / 2, abs=0.3
+    )  # phases end between rows
+    assert np.diff(momentum, axis=0) / STEP_S == pytest.approx((spin[1:] + spin[:-1]) / 2, abs=1.0)
+    assert np.abs(spin).max() > 20  # there is something to agree on
+
+
+def test_an_error_at_the_start_is_led_back_with_its_own_derivatives(bhr, tape):
+    left, rate, acceleration = Playback(tape, bhr).way_back()
+    assert left[0] == 1 and abs(left[-1]) < 1e-6 and rate[0] == rate[-1] * 0 == 0
+    assert np.gradient(left, STEP_S)[1:-1] == pytest.approx(rate[1:-1], abs=1e-4)
+    assert np.gradient(rate, STEP_S)[1:-1] == pytest.approx(acceleration[1:-1], abs=1e-3)
+
+
+def test_a_wrong_posture_moves_what_is_followed(bhr, tape):
+    """Where it begins the robot is on its way already; when the heels rise it is the plan's."""
+    plain, led = (LaunchFeedback(bhr, tape, Playback(tape, bhr)) for _ in range(2))
+    q = wrong_start(bhr, tape)
+    led.begin(q)
+    gauge = Gauge(bhr)
+    assert led._rows[0, 0] == pytest.approx(gauge.com(q), abs=2e-3)
+    assert np.linalg.norm(led._rows[0, 0] - plain._rows[0, 0]) > 0.005
+    moved = led._rows - plain._rows
+    assert np.abs(moved[-20:]).max() == 0
+    share, rate, _ = led._playback.way_back()
+    k = len(share) // 2
+    between = pin.interpolate(bhr.model, tape.q[0], q, float(share[k]))  # the error alone, half gone
+    v = pin.difference(bhr.model, tape.q[0], q) * rate[k]
+    data = bhr.model.createData()
+    pin.ccrba(bhr.model, data, between, v)
+    assert moved[k, 1] == pytest.approx(data.hg.linear / bhr.total_mass, abs=4e-3)  # to first order
+    assert moved[k, 3] == pytest.approx(data.hg.angular, abs=0.05)
+
+
+def test_the_planned_robot_launches_as_planned(bhr, tape):
+    plain, led = (simulate_jump(tape, bhr, feedback=on) for on in (False, True))
+    said = led.settings["feedback"]
+    assert plain.settings["feedback"] is None
+    assert led.landed and led.checks_passed and said["failures"] == 0 and said["solves"] > 400
+    assert said["farthest_rad"] < 0.005 and abs(said["com_ahead_m"]) < 0.001
+    for name in ("foot_distance_m", "com_rise_m"):
+        assert getattr(led.metrics, name) == pytest.approx(getattr(plain.metrics, name), abs=0.015)
+
+
+@pytest.mark.parametrize("place_m", [(0.09, 0.0, 0.1), (-0.09, 0.0, 0.2)])
+def test_feet_tell_where_the_com_is(bhr, tape, place_m):
+    """A payload before or behind the trunk: the true CoM, by Pinocchio, against the one that is felt."""
+    loaded = Perturbation(payload_kg=4.0, payload_m=place_m, noise=NOISY)
+    run = simulate_jump(tape, bhr, perturbation=loaded, feedback=True, stand_s=BRIEF_S)
+    real = loaded.robot(bhr)
+    last = round(0.75 * tape.takeoff_time / STEP_S)
+    model, truth = (Gauge(robot).com(run.q[last])[0] for robot in (bhr, real))
+    assert abs(truth - model) > 0.004
+    assert run.settings["feedback"]["com_ahead_m"] == pytest.approx(truth - model, abs=0.004)
+
+
+def pitch_at_takeoff(run, tape):
+    """How far the trunk is turned about the pitch axis beyond the plan, just after take-off [rad]."""
+    row = round(tape.takeoff_time / STEP_S)
+    planned = tape.q[np.searchsorted(tape.t, tape.takeoff_time), 3:7]
+    turn = pin.Quaternion(run.q[row, 3:7]).matrix() @ pin.Quaternion(planned).matrix().T
+    return float(pin.log3(turn)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_payload_tips_less(bhr, tape, engine):
+    """5 kg on the trunk's front: open loop the robot falls on over its toes."""
+    loaded = Perturbation(payload_kg=5.0, payload_m=(0.09, 0.0, 0.25), noise=NOISY)
+    tipped = {}
+    for on in (False, True):
+        run = simulate_jump(tape, bhr, perturbation=loaded, feedback=on, engine=engine, stand_s=BRIEF_S)
+        assert run.metrics.max_torque_ratio <= 1 + 1e-9
+        tipped[on] = abs(pitch_at_takeoff(run, tape))
+    assert run.checks_passed
+    assert tipped[True] < tipped[False] / 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_shove_in_launch_is_borne(bhr, tape, engine):
+    """10 N s forward in the middle of the crouch: open loop it misses or falls."""
+    shoved = Perturbation(noise=NOISY, shoves=(Shove("launch", 0.6, 10.0, 0.0),))
+    runs = [simulate_jump(tape, bhr, perturbation=shoved, feedback=on, engine=engine) for on in (False, True)]
+    assert runs[1].landed and runs[1].checks_passed, runs[1].reason
+    missed = [abs(run.metrics.foot_distance_m - 1.0) for run in runs]
+    assert missed[1] < 0.06 and (missed[0] > 1.5 * missed[1] or not runs[0].landed)
+
+
+@pytest.mark.slow
+def test_on_ground_that_gives_way_the_launch_tips_less(bhr, tape):
+    soft = Perturbation(noise=NOISY, soft_m=0.006)
+    led = dict(perturbation=soft, stand_s=BRIEF_S)
+    runs = [simulate_jump(tape, bhr, feedback=on, **led) for on in (False, True)]
+    tipped = [abs(pitch_at_takeoff(run, tape)) for run in runs]
+    assert tipped[1] < tipped[0] / 2 and runs[1].metrics.com_rise_m > runs[0].metrics.com_rise_m + 0.05
+
+
+def test_where_it_has_no_effect_it_is_refused(bhr, tape, tmp_path):
+    with pytest.raises(InputError) as refused:
+        simulate_jump(tape, bhr, feedback=True, mode="pd")
+    assert str(refused.value) == (
+        "feedback changes the angles that servos follow, and mode 'pd' sends torques; choose mode 'position'"
+    )
+    with pytest.raises(
+        InputError, match="feedback acts in launch, and a run from the apex has none; leave one of them"
+    ):
+        simulate_jump(tape, bhr, feedback=True, disturbance=Disturbance(pitch_rad=0.1))
+    with pytest.raises(InputError, match="feedback acts in launch, and the basin's states are those of a flight"):
+        landing_basin(tmp_path, 1, TrialSettings(feedback=True))
+
+
+def test_settings_tell_it():
+    plain = TrialSettings()
+    assert plain.conditions["launch"] == "open loop"
+    led = replace(plain, feedback=True)
+    assert "led back to the plan" in led.conditions["launch"] and led.hash != plain.hash
