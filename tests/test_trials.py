@@ -367,11 +367,26 @@ def test_margins_with_a_step_and_their_picture_beside_others(folder, monkeypatch
     usual = margins.margins(folder, ("payload_kg",), 2, jobs=1)
     assert set(seen[:4]) == {True} and not any(seen[-4:]) and "one recovery step allowed" in with_step.line()
     assert margins.MarginReport.from_json(store.read_json(folder / "margins.json")).step is False
-    ax = margin_radar({"usual": usual, "one step": with_step}).axes[0]
-    assert [line.get_label() for line in ax.lines] == [
-        "usual, plain", "usual, re-aimed", "one step, plain", "one step, re-aimed",
-    ]  # fmt: skip
-    assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
+    figure = margin_radar({"usual": usual, "one step": with_step})
+    assert [ax.get_title("left") for ax in figure.axes] == ["plain", "re-aimed"]
+    for ax in figure.axes:
+        assert [line.get_label() for line in ax.lines] == ["usual", "one step"]
+        assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
+    assert not margin_radar(usual).legends and len(figure.legends) == 1
+
+
+def test_margins_with_a_corrected_launch(folder, monkeypatch):
+    seen = []
+
+    def trial(tape, robot, scene, settings, key):
+        seen.append(settings.feedback)
+        return replace(play(tape, robot, scene, settings, key), landed=True)
+
+    monkeypatch.setattr(monte_carlo, "run_trial", trial)
+    report = margins.margins(folder, ("mass",), 2, settings=TrialSettings(feedback=True), jobs=1)
+    assert seen and all(seen) and "launch corrected" in report.line()
+    kept = margins.MarginReport.from_json(store.read_json(folder / "margins.json"))
+    assert kept.feedback and not kept.step
 
 
 def test_margins_of_what_is_not_there(folder):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -231,9 +231,13 @@ def _map_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: st
     ax.grid(False)
 
 
+RADAR_COLORS = style.LAUNCH, style.FLIGHT, style.INK, style.LANDING
+RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
+
+
 @style.styled
 def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
-    """How much of each disturbance plans bear, as a share of the largest that is tried; dashed without re-aim.
+    """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and re-aimed.
 
     Of several reports, by the names that the legend shall have, only the disturbances that all of them tell.
     """
@@ -242,20 +246,24 @@ def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     names = [name for name in dict.fromkeys(m.names for r in several.values() for m in r.margins)
              if all(name in known for known in told)]  # fmt: skip
     angles = 2 * np.pi * np.arange(len(names)) / len(names)
-    fig = style.new_figure(style.PAGE_IN, 4.2)
-    ax = fig.add_subplot(projection="polar")
-    pairs = (style.LAUNCH, style.LANDING), (style.FLIGHT, style.VERMILION), (style.INK, style.INK)
-    widths = (4.0, 2.2, 1.0) if len(several) > 1 else (1.5,)  # equal lines show below each other
-    for (title, report), colors, width in zip(several.items(), pairs, widths, strict=False):
-        for reaim, word, look in ((False, "plain", "--"), (True, "re-aimed", "-")):
+    fig = style.new_figure(style.PAGE_IN, 3.8)
+    for ax, reaim in zip(fig.subplots(1, 2, subplot_kw={"projection": "polar"}), (False, True), strict=True):
+        for (title, report), color, width in zip(several.items(), RADAR_COLORS, RADAR_WIDTHS, strict=False):
             shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
             values = [shares.get(name, np.nan) for name in (*names, names[0])]
-            label = f"{title}, {word}" if title else word
-            how = dict(color=colors[reaim], linewidth=width, marker="o", markersize=2 + width, label=label)
-            ax.plot([*angles, angles[0]], values, look, **how)
-    words = [name.replace("+", " +\n") for name in names]
+            how = dict(color=color, linewidth=width, marker="o", markersize=2 + width, label=title)
+            ax.plot([*angles, angles[0]], values, **how)
+        _radar_axes(ax, "re-aimed" if reaim else "plain", names, angles)
+    if "" not in several:
+        fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=len(several), frameon=False)
+    return fig
+
+
+def _radar_axes(ax: Axes, title: str, names: Sequence[str], angles: np.ndarray) -> None:
     ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
-    ax.set_xticks(angles, words, fontsize=6.5)
+    ax.set_title(title, fontsize=8, pad=14)
+    words = [name.replace("+", " +\n").replace("shove_", "shove_\n") for name in names]
+    ax.set_xticks(angles, words, fontsize=6)
     for label, angle in zip(ax.get_xticklabels(), angles, strict=True):  # clear of the circle
         side = np.sin(angle)
         label.set_ha("center" if abs(side) < 0.1 else "left" if side > 0 else "right")
@@ -263,8 +271,6 @@ def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     ax.set_rlabel_position(-180 / len(names))  # between the last and the first
     for label in ax.get_yticklabels():
         label.set(zorder=5, bbox=dict(facecolor="white", edgecolor="none", alpha=0.8, pad=0.5))
-    ax.legend(loc="lower left", bbox_to_anchor=(1.05, 0.0), frameon=False)
-    return fig
 
 
 # simulations ----------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def stored(path: Path = LOG) -> list[dict[str, Any]]:
 
 
 def margins() -> dict[str, dict[str, MarginReport]]:
-    """The kept margins of the default jump by engine, and by what was done: "usual", "robust", "one step"."""
+    """The kept margins of the default jump by engine and way: "usual", "robust", "one step", "feedback"."""
     found = json.loads(Path(__file__).with_name("margins.json").read_text(encoding="utf-8"))
     return {engine: {way: MarginReport.from_json(x) for way, x in told.items()} for engine, told in found.items()}
 
