@@ -18,7 +18,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, solved, turned, yaw_of
+from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, rotation, solved, turned, yaw_of
 from jumplab.sim.playback import Actuators
 from jumplab.sim.scene import Scene
 
@@ -254,25 +254,26 @@ class Tuck:
         self._model, self._data = robot.model, robot.model.createData()
         self._start, self._end = tape.takeoff_time, float(tape.t[-1])
         flight = slice(tape.takeoff_index, None)
-        self._t, (self._inertia, self._carried) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
-        self._pitch = planned_pitch(tape.q[flight])
+        self._t, (self._inertias, self._momenta) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
+        self._inertia, self._carried = self._inertias[:, 1, 1], self._momenta[:, 1]
+        self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
         self._size = self._shift = 0.0
         self._turned: float | None = None
         self.miss = 0.0
 
     def _along(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pitch inertia (N,) about the CoM, and angular momentum (N,) of the joints' rates alone."""
-        rows = []
+        """Inertia (N, 3, 3) about the CoM, and angular momentum (N, 3) of the joints' rates alone, in trunk axes."""
+        inertias, momenta = [], []
         for qk, vk in zip(q, v, strict=True):
-            pin.ccrba(self._model, self._data, qk, np.concatenate([np.zeros(6), vk[6:]]))
-            rows.append((self._data.Ig.inertia[1, 1], self._data.hg.angular[1]))
-        return tuple(np.array(rows).T)
+            level = np.concatenate([np.zeros(6), [1.0], qk[7:]])
+            pin.ccrba(self._model, self._data, level, np.concatenate([np.zeros(6), vk[6:]]))
+            inertias.append(self._data.Ig.inertia.copy())
+            momenta.append(self._data.hg.angular.copy())
+        return np.array(inertias), np.array(momenta)
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
-        now = step * STEP_S
-        if not np.isfinite(time_left):  # it will not rise to where it should land: by the clock
-            time_left = max(self._end - now, STEP_S)
+        now, time_left = self._clock(step, time_left)
         near = float(np.interp(now, self._t, self._pitch)) if self._turned is None else self._turned
         seen = float(pitch_of(q))
         self._turned = seen + 2 * np.pi * round((near - seen) / (2 * np.pi))  # whole turns counted
@@ -285,6 +286,32 @@ class Tuck:
             self.miss = self._turned + self._left(self._size, now, time_left, momentum) - self._pitch[-1]
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
         return self._shift, (self._shift - before) / STEP_S
+
+    def _clock(self, step: int, time_left: float) -> tuple[float, float]:
+        """Time [s] at ``step`` and until touchdown; by the tape if the robot will not rise to where it should land."""
+        now = step * STEP_S
+        return now, time_left if np.isfinite(time_left) else max(self._end - now, STEP_S)
+
+    def turn_ahead(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> np.ndarray:
+        """How far (3, 3) the trunk will be turned off its planned attitude at touchdown, about all axes.
+
+        As :meth:`shift`, which comes first, but of the whole attitude: it turns by I^-1 (L - h) in its own axes, with
+        the L that is measured, and I and h of the planned robot along the shifted tape.
+        """
+        attitude, (now, time_left) = rotation(q[3:7]), self._clock(step, time_left)
+        if time_left > STEP_S:
+            pin.ccrba(self._model, self._data, q, v)
+            momentum = self._data.hg.angular.copy()
+            middle, pace, dt = self._pieces(self._size, now, time_left)
+            at = np.interp(middle, self._t, np.arange(len(self._t)))
+            low = np.minimum(at.astype(int), len(self._t) - 2)
+            share = at - low
+            inertias = self._inertias[low] + share[:, None, None] * (self._inertias[low + 1] - self._inertias[low])
+            carried = self._momenta[low] + share[:, None] * (self._momenta[low + 1] - self._momenta[low])
+            for inertia, own in zip(inertias, pace[:, None] * carried, strict=True):
+                halfway = attitude @ pin.exp3(solved(inertia, attitude.T @ momentum - own) * dt / 2)
+                attitude = attitude @ pin.exp3(solved(inertia, halfway.T @ momentum - own) * dt)
+        return attitude @ self._landed.T
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
@@ -308,10 +335,13 @@ class Tuck:
 
     def _left(self, size: float, now: float, time_left: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
-        edges = now + time_left * np.linspace(0, 1, SAMPLES + 1)
-        place = self._place(size, edges, now, time_left)
-        middle, dt = (place[1:] + place[:-1]) / 2, time_left / SAMPLES
-        pace = np.diff(place) / dt
+        middle, pace, dt = self._pieces(size, now, time_left)
         inertia = np.interp(middle, self._t, self._inertia)
         carried = np.interp(middle, self._t, self._carried) * pace
         return float(np.sum((momentum - carried) / inertia) * dt)
+
+    def _pieces(self, size: float, now: float, time_left: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Times on the tape (:data:`SAMPLES`,) until touchdown, how fast it is read there, and how far apart they are."""
+        place = self._place(size, now + time_left * np.linspace(0, 1, SAMPLES + 1), now, time_left)
+        dt = time_left / SAMPLES
+        return (place[1:] + place[:-1]) / 2, np.diff(place) / dt, dt
