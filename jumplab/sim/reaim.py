@@ -42,8 +42,11 @@ ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
-SOONER_S, LATER_S = 0.09, 0.03  # the tuck opens at most; opened later, hips have to pass their speed limits
+SOONER_S = 0.09  # the tuck opens at most
+LATER_S = 0.03, 0.10  # the same: at least, and at most; with 0.127 the tape would stop in between
+OPENING_SHARE = 0.9  # of the speed limits, which joints that open later may reach; what is left is for corrections
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
+NOTHING = 1e-9  # [rad/s^2] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
 BISECTIONS = 8  # of the range of shifts: to half a millisecond, 3 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
@@ -246,8 +249,7 @@ class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
     The shift has the shape of sin^2, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
-    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum; ``miss``
-    is the forecast trunk pitch at touchdown, less the planned one [rad], whole turns counted.
+    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
@@ -257,9 +259,9 @@ class Tuck:
         self._t, (self._inertias, self._momenta) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
         self._inertia, self._carried = self._inertias[:, 1, 1], self._momenta[:, 1]
         self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
+        self._later = self._latest(np.abs(tape.v[flight, 6:]), Actuators(robot).speed)
         self._size = self._shift = 0.0
         self._turned: float | None = None
-        self.miss = 0.0
 
     def _along(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Inertia (N, 3, 3) about the CoM, and angular momentum (N, 3) of the joints' rates alone, in trunk axes."""
@@ -270,6 +272,14 @@ class Tuck:
             inertias.append(self._data.Ig.inertia.copy())
             momenta.append(self._data.hg.angular.copy())
         return np.array(inertias), np.array(momenta)
+
+    def _latest(self, rates: np.ndarray, limits: np.ndarray) -> float:
+        """How much later [s] the tuck may open: within the speed limits (k,) of joints at ``rates`` (N, k)."""
+        way = (1 - FROM_SHARE) * (self._end - self._start)
+        behind = self._t > self._end - way / 2  # what it holds up before, it has to make up for
+        slope = -np.pi / way * np.sin(2 * np.pi * (self._t[behind] - self._end) / way)
+        gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
+        return float(np.clip(np.min((OPENING_SHARE * limits - rates[behind]) / gained), *LATER_S))
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
@@ -283,7 +293,6 @@ class Tuck:
             want = self._best(now, time_left, momentum)
             most = SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
-            self.miss = self._turned + self._left(self._size, now, time_left, momentum) - self._pitch[-1]
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
         return self._shift, (self._shift - before) / STEP_S
 
@@ -315,7 +324,7 @@ class Tuck:
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -LATER_S, SOONER_S
+        low, high = -self._later, SOONER_S
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):
@@ -341,7 +350,7 @@ class Tuck:
         return float(np.sum((momentum - carried) / inertia) * dt)
 
     def _pieces(self, size: float, now: float, time_left: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Times on the tape (:data:`SAMPLES`,) until touchdown, how fast it is read there, and how far apart they are."""
+        """Places on the tape (:data:`SAMPLES`,) until touchdown [s], the pace there [1], and their distance [s]."""
         place = self._place(size, now + time_left * np.linspace(0, 1, SAMPLES + 1), now, time_left)
         dt = time_left / SAMPLES
         return (place[1:] + place[:-1]) / 2, np.diff(place) / dt, dt
