@@ -21,7 +21,7 @@ from jumplab.stages.planner import Planner
 from jumplab.stages.reconstruction import planar_quantities
 from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, Weights, WholeBodyPlan
 from jumplab.stages.whole_body.flips import CLIMB_M, EASY_M, climb
-from jumplab.stages.whole_body.settings import OPENING_SHARE, RESERVE_SHARE
+from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
 from jumplab.stages.whole_body.terms import relative
 from jumplab.studies import robust
 from jumplab.studies.trials import TrialKey
@@ -181,7 +181,7 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     task = JumpTask(0.0, 0.5, rotation_rad=-TURN)
     plan = planned(task, robust=Ranges())
     assert passport.audit(plan.tape, plan.robot, plan.task).passed
-    opening = plan.tape.t > plan.tape.t[-1] - 0.9 * OPENING_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
+    opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / Actuators(plan.robot).speed
     assert share.max() < robust.OPENING_SHARE + 0.05
     assert Tuck(plan.robot, plan.tape)._later == LATER_S[1] > Tuck(plan.robot, backflip().tape)._later >= LATER_S[0]

@@ -44,7 +44,7 @@ STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
 SOONER_S = 0.09  # the tuck opens at most
 LATER_S = 0.03, 0.10  # the same: at least, and at most; with 0.127 the tape would stop in between
-OPENING_SHARE = 0.9  # of the speed limits, which joints that open later may reach; what is left is for corrections
+SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
 NOTHING = 1e-9  # [rad/s^2] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
@@ -71,7 +71,8 @@ class Reaim:
     of the robot, not of the plan: the feet point where the trunk does.
 
     The posture at touchdown is predicted as the tape's last one, with the trunk off its planned attitude by what it is
-    now and by what it drifts until then, see :meth:`turn_ahead`. Without any error the correction is zero.
+    now and by what it drifts until then, see :meth:`turn_ahead`, and of a flip :meth:`Tuck.turn_ahead`. Without any
+    error the correction is zero.
 
     Once it will be off by :data:`FAR_RAD`, the shoulders swing as well, so that it arrives upright, and what the trunk
     turns while legs and arms are on their way is part of the prediction: with all momentum kept, joints that move by x
@@ -249,7 +250,8 @@ class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
     The shift has the shape of sin^2, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
-    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum.
+    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum. What
+    opens later has less time: how much later it may is a matter of the tape's speeds, see :data:`LATER_S`.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
@@ -279,7 +281,7 @@ class Tuck:
         behind = self._t > self._end - way / 2  # what it holds up before, it has to make up for
         slope = -np.pi / way * np.sin(2 * np.pi * (self._t[behind] - self._end) / way)
         gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
-        return float(np.clip(np.min((OPENING_SHARE * limits - rates[behind]) / gained), *LATER_S))
+        return float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""

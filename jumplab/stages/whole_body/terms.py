@@ -13,7 +13,7 @@ from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import stance_angles
-from jumplab.stages.whole_body.settings import JERK_SCALE, OPENING_SHARE, RESERVE_SHARE, Contact, Limits, Weights
+from jumplab.stages.whole_body.settings import JERK_SCALE, LATE_SHARE, RESERVE_SHARE, Contact, Limits, Weights
 from jumplab.task import GRAVITY
 
 POSITIVE = 0.0, np.inf
@@ -241,13 +241,13 @@ class WholeBodyTerms:
         ]
 
     def opening_rows(self) -> list[Term]:
-        """Joints open slowly enough to do so later and faster; what folds before is fading in over a tenth of it."""
+        """If asked, joints open a tuck so slowly that they could do so later and faster; it sets in gradually."""
         if self.limits.opening_speed_share >= self.limits.speed_share:
             return []
         most = self.limits.opening_speed_share * self.model.speed
 
         def rates(p):
-            begun = ca.fmax(0, ca.fmin(1, 10 * (p.s - 1 + OPENING_SHARE)))
+            begun = ca.fmax(0, ca.fmin(1, 10 * (p.s - 1 + LATE_SHARE)))
             return begun * self.state(p).joint_rates
 
         return [row("opening speed", "ours, for flips", "rad/s", rates, -most, most, scale=10.0, skip=(1, 0))]
