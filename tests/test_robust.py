@@ -89,7 +89,7 @@ def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
     assert found["off"] == ["jerk"] and "terms" not in found
     assert found["limits"]["opening_speed_share"] == robust.OPENING_SHARE < Limits().of_flip().opening_speed_share
     assert settled(Limits, found["limits"], flip=True) == replace(
-        Limits().of_flip(), hand_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
+        Limits().of_flip(), friction=0.38, hand_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
     )
     own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})
     assert own["limits"]["opening_speed_share"] == 0.5

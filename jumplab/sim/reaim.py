@@ -42,6 +42,7 @@ ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
+LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
 LATER_S = 0.03, 0.10  # the same: at least, and at most; with 0.127 the tape would stop in between
 SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
@@ -249,7 +250,7 @@ def _within(slope: np.ndarray, miss: np.ndarray, low: np.ndarray, high: np.ndarr
 class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
-    The shift has the shape of sin^2, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
+    The shift has the shape of sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
     is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum. What
     opens later has less time: how much later it may is a matter of the tape's speeds, see :data:`LATER_S`.
     """
@@ -278,8 +279,9 @@ class Tuck:
     def _latest(self, rates: np.ndarray, limits: np.ndarray) -> float:
         """How much later [s] the tuck may open: within the speed limits (k,) of joints at ``rates`` (N, k)."""
         way = (1 - FROM_SHARE) * (self._end - self._start)
-        behind = self._t > self._end - way / 2  # what it holds up before, it has to make up for
-        slope = -np.pi / way * np.sin(2 * np.pi * (self._t[behind] - self._end) / way)
+        behind = self._t > self._end - way * (1 - 0.5 ** (1 / LATE))  # what it holds up before, it has to make up for
+        u = 1 + (self._t[behind] - self._end) / way
+        slope = -np.pi * LATE / way * u ** (LATE - 1) * np.sin(2 * np.pi * u**LATE)
         gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
         return float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
 
@@ -342,7 +344,7 @@ class Tuck:
         due = now + time_left
         from_ = self._start + FROM_SHARE * (self._end - self._start)
         u = np.clip((t - from_) / max(due - from_, STEP_S), 0.0, 1.0)
-        return np.minimum(t + u * (self._end - due) + size * np.sin(np.pi * u) ** 2, self._end)
+        return np.minimum(t + u * (self._end - due) + size * np.sin(np.pi * u**LATE) ** 2, self._end)
 
     def _left(self, size: float, now: float, time_left: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""

@@ -31,6 +31,7 @@ WEIGHT = 500.0  # [1/m^2] robots that come to rest 4 cm off the middle of the so
 FRICTION_SHARE = 0.9  # of the least friction: the planner counts on 0.45, where robots have 0.5
 BRAKE_S = 0.035  # by which legs that give way take up the fall later than an impact would; shoves either way (measured)
 OPENING_SHARE = 0.4  # of the speed limits; with less, knees straighten to wind up for more momentum, and launches fail
+FLIP_FRICTION_SHARE = 0.76  # the same of a flip: toes that slip as they leave cost momentum, and with it the turn
 INSTEAD_OF = "capture window"  # of the planned robot alone
 MOVING = "mass", "com_m", "inertia", "payload_kg"  # what makes sampled robots differ
 LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may use less of
@@ -60,8 +61,9 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
         )
     usual, given = Limits(), changes.get("limits")
     given = settled(Limits, given)
+    share = FLIP_FRICTION_SHARE if task.rotation_rad else FRICTION_SHARE
     limits = {
-        "friction": min(usual.friction, FRICTION_SHARE * ranges.friction[0]),
+        "friction": min(usual.friction, share * ranges.friction[0]),
         "torque_share": usual.torque_share * (1 - ranges.torque_loss[1]),
         "speed_share": usual.speed_share * (1 - ranges.speed_loss[1]),
     }
