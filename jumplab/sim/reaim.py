@@ -250,9 +250,10 @@ def _within(slope: np.ndarray, miss: np.ndarray, low: np.ndarray, high: np.ndarr
 class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
-    The shift has the shape of sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
-    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum. What
-    opens later has less time: how much later it may is a matter of the tape's speeds, see :data:`LATER_S`.
+    The shift has the shape of sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at touchdown. The
+    turn that is left is forecast with the planned robot's inertia along the tape, from the measured pitch and angular
+    momentum. What opens later has less time: how much later it may is a matter of the tape's speeds, see
+    :data:`LATER_S`.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
