@@ -43,7 +43,8 @@ def plan(
         paper does). The default is "direct", but "three-step" for flips, and where stages 1 or 2 are changed, see
         :meth:`jumplab.Planner.plan`.
     robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come
-        to rest as near to the middle of their soles as can be, see :mod:`jumplab.studies.robust`.
+        to rest as near to the middle of their soles as can be, and a flip's tuck has time to open later, see
+        :mod:`jumplab.studies.robust`.
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
         :class:`jumplab.Planner`, which plans many targets with them.
 

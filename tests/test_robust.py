@@ -10,7 +10,9 @@ import pytest
 import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
+from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
+from jumplab.stages.whole_body import Limits
 from jumplab.studies import robust
 from jumplab.studies.margins import ranges_at
 
@@ -80,13 +82,26 @@ def test_limits_that_robots_lose_are_not_planned_with(bhr):
     assert Planner(bhr, **own).limits.torque_share == 0.8
 
 
+def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
+    """Its own rows say where the soles belong; what was asked for besides stays, and own limits win."""
+    flip, given = replace(TASK, rotation_rad=-2 * np.pi), {"limits": {"hand_clearance_m": 0.06}, "off": ["jerk"]}
+    found = robust.robust_changes(flip, bhr, Ranges(), given)
+    assert found["off"] == ["jerk"] and "terms" not in found
+    assert found["limits"]["opening_speed_share"] == robust.OPENING_SHARE < Limits().of_flip().opening_speed_share
+    assert settled(Limits, found["limits"], flip=True) == replace(
+        Limits().of_flip(), friction=0.38, hand_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
+    )
+    own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})
+    assert own["limits"]["opening_speed_share"] == 0.5
+    assert "opening_speed_share" not in robust.robust_changes(TASK, bhr, Ranges(), {})["limits"]
+
+
 @pytest.mark.parametrize(
     "task, ranges, words",
     [
         (TASK, "wide", "robust: how far robots differ must be a Ranges"),
         (TASK, Ranges.none(delay_s=(0.0, 0.004)), "robust: none of these ranges changes a plan; it allows for mass"),
-        (replace(TASK, rotation_rad=-2 * np.pi), Ranges(), "robust: only upright jumps straight ahead or back"),
-        (replace(TASK, side_m=0.2), Ranges(), "robust: only upright jumps straight ahead or back"),
+        (replace(TASK, side_m=0.2), Ranges(), "robust: only jumps and flips straight ahead or back"),
     ],
 )
 def test_what_no_plan_can_allow_for_is_refused(bhr, task, ranges, words):

@@ -193,10 +193,10 @@ class Pilot:
     def _turn(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """How far (3, 3) the trunk will be off its planned attitude at touchdown, in ``left`` seconds.
 
-        Of a flip only the pitch is told, as forecast; without re-aim only the pitch, as it is now.
+        Without re-aim only the pitch is told, as it is now.
         """
         if self._tuck is not None:
-            return pin.rpy.rpyToMatrix(0.0, _within_half_a_turn(self._tuck.miss), 0.0)
+            return self._tuck.turn_ahead(step, q, v, left)
         x, y, z = self.playback.attitude_error(step, played)
         if self._heading != 0:
             c, s = np.cos(self._heading), np.sin(self._heading)

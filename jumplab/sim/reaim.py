@@ -18,7 +18,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import knees
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, solved, turned, yaw_of
+from jumplab.sim.kinematics import Gauge, pitch_of, planned_pitch, rotation, solved, turned, yaw_of
 from jumplab.sim.playback import Actuators
 from jumplab.sim.scene import Scene
 
@@ -42,8 +42,12 @@ ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
-SOONER_S, LATER_S = 0.09, 0.03  # the tuck opens at most; opened later, hips have to pass their speed limits
+LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
+SOONER_S = 0.09  # the tuck opens at most
+LATER_S = 0.03, 0.10  # the same: at least, and at most; with 0.127 the tape would stop in between
+SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
+NOTHING = 1e-9  # [rad/s^2] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
 BISECTIONS = 8  # of the range of shifts: to half a millisecond, 3 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
@@ -68,7 +72,8 @@ class Reaim:
     of the robot, not of the plan: the feet point where the trunk does.
 
     The posture at touchdown is predicted as the tape's last one, with the trunk off its planned attitude by what it is
-    now and by what it drifts until then, see :meth:`turn_ahead`. Without any error the correction is zero.
+    now and by what it drifts until then, see :meth:`turn_ahead`, and of a flip :meth:`Tuck.turn_ahead`. Without any
+    error the correction is zero.
 
     Once it will be off by :data:`FAR_RAD`, the shoulders swing as well, so that it arrives upright, and what the trunk
     turns while legs and arms are on their way is part of the prediction: with all momentum kept, joints that move by x
@@ -245,34 +250,45 @@ def _within(slope: np.ndarray, miss: np.ndarray, low: np.ndarray, high: np.ndarr
 class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
-    The shift has the shape of sin^2, zero at :data:`FROM_SHARE` of the flight and at touchdown. The turn that is left
-    is forecast with the planned robot's inertia along the tape, from the measured pitch and angular momentum; ``miss``
-    is the forecast trunk pitch at touchdown, less the planned one [rad], whole turns counted.
+    The shift has the shape of sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at touchdown. The
+    turn that is left is forecast with the planned robot's inertia along the tape, from the measured pitch and angular
+    momentum. What opens later has less time: how much later it may is a matter of the tape's speeds, see
+    :data:`LATER_S`.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
         self._model, self._data = robot.model, robot.model.createData()
         self._start, self._end = tape.takeoff_time, float(tape.t[-1])
         flight = slice(tape.takeoff_index, None)
-        self._t, (self._inertia, self._carried) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
-        self._pitch = planned_pitch(tape.q[flight])
+        self._t, (self._inertias, self._momenta) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
+        self._inertia, self._carried = self._inertias[:, 1, 1], self._momenta[:, 1]
+        self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
+        self._later = self._latest(np.abs(tape.v[flight, 6:]), Actuators(robot).speed)
         self._size = self._shift = 0.0
         self._turned: float | None = None
-        self.miss = 0.0
 
     def _along(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pitch inertia (N,) about the CoM, and angular momentum (N,) of the joints' rates alone."""
-        rows = []
+        """Inertia (N, 3, 3) about the CoM, and angular momentum (N, 3) of the joints' rates alone, in trunk axes."""
+        inertias, momenta = [], []
         for qk, vk in zip(q, v, strict=True):
-            pin.ccrba(self._model, self._data, qk, np.concatenate([np.zeros(6), vk[6:]]))
-            rows.append((self._data.Ig.inertia[1, 1], self._data.hg.angular[1]))
-        return tuple(np.array(rows).T)
+            level = np.concatenate([np.zeros(6), [1.0], qk[7:]])
+            pin.ccrba(self._model, self._data, level, np.concatenate([np.zeros(6), vk[6:]]))
+            inertias.append(self._data.Ig.inertia.copy())
+            momenta.append(self._data.hg.angular.copy())
+        return np.array(inertias), np.array(momenta)
+
+    def _latest(self, rates: np.ndarray, limits: np.ndarray) -> float:
+        """How much later [s] the tuck may open: within the speed limits (k,) of joints at ``rates`` (N, k)."""
+        way = (1 - FROM_SHARE) * (self._end - self._start)
+        behind = self._t > self._end - way * (1 - 0.5 ** (1 / LATE))  # what it holds up before, it has to make up for
+        u = 1 + (self._t[behind] - self._end) / way
+        slope = -np.pi * LATE / way * u ** (LATE - 1) * np.sin(2 * np.pi * u**LATE)
+        gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
+        return float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
-        now = step * STEP_S
-        if not np.isfinite(time_left):  # it will not rise to where it should land: by the clock
-            time_left = max(self._end - now, STEP_S)
+        now, time_left = self._clock(step, time_left)
         near = float(np.interp(now, self._t, self._pitch)) if self._turned is None else self._turned
         seen = float(pitch_of(q))
         self._turned = seen + 2 * np.pi * round((near - seen) / (2 * np.pi))  # whole turns counted
@@ -282,13 +298,38 @@ class Tuck:
             want = self._best(now, time_left, momentum)
             most = SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
-            self.miss = self._turned + self._left(self._size, now, time_left, momentum) - self._pitch[-1]
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
         return self._shift, (self._shift - before) / STEP_S
 
+    def _clock(self, step: int, time_left: float) -> tuple[float, float]:
+        """Time [s] at ``step`` and until touchdown; by the tape if the robot will not rise to where it should land."""
+        now = step * STEP_S
+        return now, time_left if np.isfinite(time_left) else max(self._end - now, STEP_S)
+
+    def turn_ahead(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> np.ndarray:
+        """How far (3, 3) the trunk will be turned off its planned attitude at touchdown, about all axes.
+
+        As :meth:`shift`, which comes first, but of the whole attitude: it turns by I^-1 (L - h) in its own axes, with
+        the L that is measured, and I and h of the planned robot along the shifted tape.
+        """
+        attitude, (now, time_left) = rotation(q[3:7]), self._clock(step, time_left)
+        if time_left > STEP_S:
+            pin.ccrba(self._model, self._data, q, v)
+            momentum = self._data.hg.angular.copy()
+            middle, pace, dt = self._pieces(self._size, now, time_left)
+            at = np.interp(middle, self._t, np.arange(len(self._t)))
+            low = np.minimum(at.astype(int), len(self._t) - 2)
+            share = at - low
+            inertias = self._inertias[low] + share[:, None, None] * (self._inertias[low + 1] - self._inertias[low])
+            carried = self._momenta[low] + share[:, None] * (self._momenta[low + 1] - self._momenta[low])
+            for inertia, own in zip(inertias, pace[:, None] * carried, strict=True):
+                halfway = attitude @ pin.exp3(solved(inertia, attitude.T @ momentum - own) * dt / 2)
+                attitude = attitude @ pin.exp3(solved(inertia, halfway.T @ momentum - own) * dt)
+        return attitude @ self._landed.T
+
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -LATER_S, SOONER_S
+        low, high = -self._later, SOONER_S
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):
@@ -304,14 +345,17 @@ class Tuck:
         due = now + time_left
         from_ = self._start + FROM_SHARE * (self._end - self._start)
         u = np.clip((t - from_) / max(due - from_, STEP_S), 0.0, 1.0)
-        return np.minimum(t + u * (self._end - due) + size * np.sin(np.pi * u) ** 2, self._end)
+        return np.minimum(t + u * (self._end - due) + size * np.sin(np.pi * u**LATE) ** 2, self._end)
 
     def _left(self, size: float, now: float, time_left: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
-        edges = now + time_left * np.linspace(0, 1, SAMPLES + 1)
-        place = self._place(size, edges, now, time_left)
-        middle, dt = (place[1:] + place[:-1]) / 2, time_left / SAMPLES
-        pace = np.diff(place) / dt
+        middle, pace, dt = self._pieces(size, now, time_left)
         inertia = np.interp(middle, self._t, self._inertia)
         carried = np.interp(middle, self._t, self._carried) * pace
         return float(np.sum((momentum - carried) / inertia) * dt)
+
+    def _pieces(self, size: float, now: float, time_left: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Places on the tape (:data:`SAMPLES`,) until touchdown [s], the pace there [1], and their distance [s]."""
+        place = self._place(size, now + time_left * np.linspace(0, 1, SAMPLES + 1), now, time_left)
+        dt = time_left / SAMPLES
+        return (place[1:] + place[:-1]) / 2, np.diff(place) / dt, dt

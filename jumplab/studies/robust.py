@@ -2,6 +2,9 @@
 
 Each of them takes off with a momentum of its own and drifts in attitude until its soles meet the ground. Where it then
 comes to rest is its capture point; the further that is from the middle of the soles, the sooner it falls.
+
+A flip ends as the tuck lets it, which opens sooner or later in flight, see :class:`jumplab.sim.reaim.Tuck`. Its plan
+allows for other robots by an opening that may come later still.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ SAMPLES = 6  # draws, each with its opposite: to first order their mean is the p
 WEIGHT = 500.0  # [1/m^2] robots that come to rest 4 cm off the middle of the soles cost 3 % of a jump of 1 m
 FRICTION_SHARE = 0.9  # of the least friction: the planner counts on 0.45, where robots have 0.5
 BRAKE_S = 0.035  # by which legs that give way take up the fall later than an impact would; shoves either way (measured)
+OPENING_SHARE = 0.4  # of the speed limits; with less, knees straighten to wind up for more momentum, and launches fail
+FLIP_FRICTION_SHARE = 0.76  # the same of a flip: toes that slip as they leave cost momentum, and with it the turn
 INSTEAD_OF = "capture window"  # of the planned robot alone
 MOVING = "mass", "com_m", "inertia", "payload_kg"  # what makes sampled robots differ
 LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may use less of
@@ -35,17 +40,18 @@ LIMITING = "friction", "torque_loss", "speed_loss"  # what the planned one may u
 def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mapping[str, Any]) -> dict[str, Any]:
     """``changes`` of a :class:`jumplab.Planner` with those of a robust plan, which allow for ``ranges``.
 
-    In place of the capture window stands the cost of :func:`capture_term` over sampled robots. Friction, torque and
-    speed are used up to the least that ``ranges`` leave. What else differs (delay, motors, ground, shoves, sensors,
-    posture) is not seen: it does not depend on the plan's masses or limits. Own limits win.
+    In place of the capture window stands the cost of :func:`capture_term` over sampled robots; a flip keeps its own
+    rows for that, and opens its tuck with :data:`OPENING_SHARE` of the joints' speeds. Friction, torque and speed are
+    used up to the least that ``ranges`` leave. What else differs (delay, motors, ground, shoves, sensors, posture) is
+    not seen: it does not depend on the plan's masses or limits. Own limits win.
 
-    Raises :class:`InputError` if ``ranges`` are none, or have nothing that a plan can allow for, or if the jump turns
-    or leaves the plane: then other terms say where the soles belong.
+    Raises :class:`InputError` if ``ranges`` are none, or have nothing that a plan can allow for, or if the jump leaves
+    the plane: then other terms say where the soles belong.
     """
     require_type(ranges, Ranges, "robust: how far robots differ")
-    if task.rotation_rad or not (task.in_plane and robot.planar):
+    if not (task.in_plane and robot.planar):
         raise InputError(
-            "robust: only upright jumps straight ahead or back, of robots that a plane describes, allow for other "
+            "robust: only jumps and flips straight ahead or back, of robots that a plane describes, allow for other "
             "robots; leave robust away, and let the legs be re-aimed in flight"
         )
     nothing = Ranges.none()
@@ -55,12 +61,16 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
         )
     usual, given = Limits(), changes.get("limits")
     given = settled(Limits, given)
+    share = FLIP_FRICTION_SHARE if task.rotation_rad else FRICTION_SHARE
     limits = {
-        "friction": min(usual.friction, FRICTION_SHARE * ranges.friction[0]),
+        "friction": min(usual.friction, share * ranges.friction[0]),
         "torque_share": usual.torque_share * (1 - ranges.torque_loss[1]),
         "speed_share": usual.speed_share * (1 - ranges.speed_loss[1]),
     }
+    limits |= {"opening_speed_share": OPENING_SHARE} if task.rotation_rad else {}
     own = {name: value for name, value in asdict(given).items() if value != getattr(usual, name)}
+    if task.rotation_rad:
+        return {**changes, "limits": limits | own}
     terms = {name: _listed(extra) for name, extra in (changes.get("terms") or {}).items()}
     terms["whole body"] = [*terms.get("whole body", ()), capture_term(robot, ranges)]
     return {**changes, "terms": terms, "off": [*changes.get("off", ()), INSTEAD_OF], "limits": limits | own}

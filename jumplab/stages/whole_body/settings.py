@@ -12,6 +12,7 @@ from jumplab.task import FRICTION
 
 JERK_SCALE = 2000.0  # [rad/s^3] peaks of solutions, for conditioning
 RESERVE_SHARE = 0.1, 0.15  # of the flat-foot phase, over which the CoP's reserve comes and goes
+LATE_SHARE = 0.4  # of the flight, at its end: by then a flip has folded
 # [rad/s^3] by how much the jerk of a joint may jump from interval to interval: half a sample of 1 kHz later a tape then
 # misses the acceleration by 3.9 rad/s^2, and the audit allows 4
 FOLLOWED_JERK_STEP = 31_000.0
@@ -62,6 +63,7 @@ class Limits:
     jerk_step: float | None = None  # if set, most that the jerk of a joint or of the trunk jumps by [rad/s^3]
     flight_clear: tuple[str, ...] = ("hand", "mid-arm", "knee")  # points that stay clear in flight ...
     flight_clearance_m: float = 0.05  # ... by this much
+    opening_speed_share: float = 1.0  # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
     momentum_share: float = 0.01  # L at take-off within this share of stage 1's
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 

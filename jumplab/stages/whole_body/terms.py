@@ -13,7 +13,7 @@ from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import stance_angles
-from jumplab.stages.whole_body.settings import JERK_SCALE, RESERVE_SHARE, Contact, Limits, Weights
+from jumplab.stages.whole_body.settings import JERK_SCALE, LATE_SHARE, RESERVE_SHARE, Contact, Limits, Weights
 from jumplab.task import GRAVITY
 
 POSITIVE = 0.0, np.inf
@@ -235,9 +235,22 @@ class WholeBodyTerms:
             *everywhere(row("angular momentum", "WF-D1", "N m", momentum_rate, scale=20.0, skip=(1, 0))),
             row("sole clearance", "ours", "m", clearance, *POSITIVE, scale=0.1, skip=(1, 1)),
             self.body_clearance(),
+            *self.opening_rows(),
             *self.touchdown_rows(),
             *self.capture_rows(),
         ]
+
+    def opening_rows(self) -> list[Term]:
+        """If asked, joints open a tuck so slowly that they could do so later and faster; it sets in gradually."""
+        if self.limits.opening_speed_share >= self.limits.speed_share:
+            return []
+        most = self.limits.opening_speed_share * self.model.speed
+
+        def rates(p):
+            begun = ca.fmax(0, ca.fmin(1, 10 * (p.s - 1 + LATE_SHARE)))
+            return begun * self.state(p).joint_rates
+
+        return [row("opening speed", "ours, for flips", "rad/s", rates, -most, most, scale=10.0, skip=(1, 0))]
 
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: place, posture and rates of the landing."""
