@@ -17,6 +17,7 @@ from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
+FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 50}, 11  # the same
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
@@ -52,6 +53,20 @@ def study(folder: str | Path, robots: int = ROBOTS, path: Path = LOG, *, jobs: i
             row = {"world": world, "engine": engine, "re-aim": reaim, "number": trial.key.index, "landed": trial.landed}
             rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
         write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+
+
+def flips(folder: str | Path, path: Path = FLIPS, *, jobs: int | None = None) -> None:
+    """Let perturbed robots of the usual ranges do the flip in ``folder``, re-aimed, in every engine; one row each.
+
+    ``python -m paper.worlds --flips DIR`` calls it, for the plan of ``jumplab plan --robust --rotation-deg -360
+    --distance-m 0 --height-m 0.5 --out DIR``.
+    """
+    rows = []
+    for engine, robots in FLIP_ROBOTS.items():
+        for trial in run_trials(folder, robots, FLIP_SEED, TrialSettings(engine=engine), jobs=jobs).trials:
+            row = {"engine": engine, "number": trial.key.index, "landed": trial.landed}
+            rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
+    write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
 
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
@@ -104,14 +119,23 @@ def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         )
         if aimed.keys() != plain.keys():
             continue
-        landed, count = sum(r["landed"] for r in aimed.values()), len(aimed)
-        low, high = wilson(landed, count)
-        causes = Counter(r["cause"] for r in aimed.values() if not r["landed"]).most_common()
-        line = {"world": world, "engine": engine, "robots": count, "plain": sum(r["landed"] for r in plain.values())}
-        line |= {"re-aimed": landed, "re-aimed [%]": 100 * landed / count, "from [%]": 100 * low, "to [%]": 100 * high}
-        table.append(line | {"falls of the re-aimed": ", ".join(f"{cause} {n}" for cause, n in causes)})
+        line = {"world": world, "engine": engine, "robots": len(aimed)}
+        line["plain"] = sum(r["landed"] for r in plain.values())
+        table.append(line | share(list(aimed.values())))
     return table
 
 
+def share(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """How many of the re-aimed robots of ``rows`` land, with Wilson's 95 % interval, and what the falls begin with."""
+    landed = sum(r["landed"] for r in rows)
+    low, high = wilson(landed, len(rows))
+    causes = Counter(r["cause"] for r in rows if not r["landed"]).most_common()
+    line = {"re-aimed": landed, "re-aimed [%]": 100 * landed / len(rows), "from [%]": 100 * low, "to [%]": 100 * high}
+    return line | {"falls of the re-aimed": ", ".join(f"{cause} {n}" for cause, n in causes)}
+
+
 if __name__ == "__main__":
-    study(sys.argv[1], *map(int, sys.argv[2:3]), jobs=int(sys.argv[3]) if len(sys.argv) > 3 else None)
+    if sys.argv[1] == "--flips":
+        flips(sys.argv[2], jobs=int(sys.argv[3]) if len(sys.argv) > 3 else None)
+    else:
+        study(sys.argv[1], *map(int, sys.argv[2:3]), jobs=int(sys.argv[3]) if len(sys.argv) > 3 else None)
