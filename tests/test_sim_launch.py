@@ -142,9 +142,9 @@ def test_where_it_has_no_effect_it_is_refused(bhr, tape, tmp_path):
     assert str(refused.value) == (
         "feedback changes the angles that servos follow, and mode 'pd' sends torques; choose mode 'position'"
     )
-    with pytest.raises(
-        InputError, match="feedback acts in launch, and a run from the apex has none; leave one of them"
-    ):
+    with pytest.raises(InputError, match=r"^feedback changes the angles"):
+        TrialSettings(mode="pd", feedback=True)
+    with pytest.raises(InputError, match="feedback acts in launch, and a run from the apex has none; leave one"):
         simulate_jump(tape, bhr, feedback=True, disturbance=Disturbance(pitch_rad=0.1))
     with pytest.raises(InputError, match="feedback acts in launch, and the basin's states are those of a flight"):
         landing_basin(tmp_path, 1, TrialSettings(feedback=True))

@@ -55,6 +55,14 @@ class LaunchGains:
     drift_m: float = 0.005  # and of what it changes by within a second
 
 
+def check_mode(mode: str) -> None:
+    """Refuse (:class:`InputError`) a mode of playback in which the launch cannot be corrected."""
+    if mode != "position":
+        raise InputError(
+            f"feedback changes the angles that servos follow, and mode {mode!r} sends torques; choose mode 'position'"
+        )
+
+
 class LaunchFeedback:
     """Changes the commands of one launch; see the module's docstring.
 
@@ -65,10 +73,7 @@ class LaunchFeedback:
     """
 
     def __init__(self, robot: Robot, tape: Tape, playback: Playback, gains: LaunchGains = LaunchGains()):
-        if playback.mode != "position":
-            raise InputError(
-                "feedback changes the angles that servos follow, and mode 'pd' sends torques; choose mode 'position'"
-            )
+        check_mode(playback.mode)
         self._gains, self._robot, self._playback = gains, robot, playback
         self._terms, self._actuators, self._gauge = BodyTerms(robot, WRENCH_SCALE), Actuators(robot), Gauge(robot)
         self._weight_n = robot.total_mass * robot.gravity

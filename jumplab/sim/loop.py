@@ -57,6 +57,11 @@ class Run:
         self.scene, self.real = scene or Scene.flat(), self.perturbation.robot(robot)
         self.ground, self.pushes = self.perturbation.ground(self.scene, robot, tape), self.perturbation.pushes(tape)
 
+    def stance(self, tape: Tape) -> tuple[int, np.ndarray, np.ndarray]:
+        """First step of ``tape``, and the configuration (nq,) and velocity (nv,) in which the robot stands then."""
+        start = self.perturbation.start(self.robot, tape.q[0])
+        return 0, self.ground.seated(self.robot, start), tape.v[0]
+
     def play(self, pilot: Commander, q: np.ndarray, v: np.ndarray, step: int = 0) -> None:
         """Simulate from (q, v) at ``step`` until the pilot says that it is over."""
         how = self.perturbation
@@ -157,9 +162,8 @@ def simulate_jump(
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
     reaim : put the legs in the air to where they can catch the robot, see :class:`jumplab.sim.reaim.Reaim`.
-    feedback : let the joints leave the tape in launch, so that the body as a whole launches as planned in spite of
-        shoves, other masses and soft ground, see :class:`jumplab.sim.launch.LaunchFeedback`; open loop otherwise.
-        In mode "position" alone.
+    feedback : let the joints leave the tape in launch, so that the body as a whole launches as planned, see
+        :class:`jumplab.sim.launch.LaunchFeedback`; open loop otherwise. In mode "position" alone.
     step : allow one recovery step after touchdown, see :class:`jumplab.sim.step.RecoveryStep`; the metrics tell it.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state; "spring" leads to the
         stance by spring-dampers alone, and so does "planned" where stage 1 finds no landing. The result's
@@ -181,17 +185,12 @@ def simulate_jump(
         If the tape is not this robot's, ``mode`` or ``stand_s`` make no sense, the engine is unknown or not there, the
         robot cannot stand on the ground at the start, or ``feedback`` is asked in mode "pd" or without a launch.
     """
-    _check(tape, robot, perturbation, scene, reference, stand_s)
-    if feedback and disturbance is not None:
-        raise InputError("feedback acts in launch, and a run from the apex has none; leave one of them away")
+    _check(tape, robot, perturbation, scene, reference, stand_s, from_apex=feedback and disturbance is not None)
     run = Run(robot, perturbation, scene, engine, tape)
     known_delay_s = run.perturbation.known_delay_s
     options = dict(may_step=step, feedback=feedback, force_noise_n=run.perturbation.noise.force)
     pilot = Pilot(tape, robot, run.scene, mode, landing, reference, reaim, stand_s, known_delay_s, **options)
-    if disturbance is None:
-        first, q, v = 0, run.ground.seated(robot, run.perturbation.start(robot, tape.q[0])), tape.v[0]
-    else:
-        first, q, v = disturbance.apex(tape, robot)
+    first, q, v = run.stance(tape) if disturbance is None else disturbance.apex(tape, robot)
     run.play(pilot, q, v, first)
     said = dict(mode=mode, reaim=reaim, step=step, stand_s=stand_s, disturbance=disturbance and asdict(disturbance))
     said |= dict(feedback=pilot.feedback and pilot.feedback.to_json(), landing=pilot.landing_said())
@@ -204,7 +203,7 @@ def simulate_landing(tape: Tape, robot: Robot, disturbance: Disturbance, **optio
     return simulate_jump(tape, robot, disturbance=disturbance, **options)
 
 
-def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
+def _check(tape, robot, perturbation, scene, reference, stand_s, from_apex) -> None:
     require_type(tape, Tape, "the tape to play")
     require_type(robot, Robot, "the robot to simulate")
     for value, kind, what in ((perturbation, Perturbation, "the perturbation"), (scene, Scene, "the scene")):
@@ -214,6 +213,8 @@ def _check(tape, robot, perturbation, scene, reference, stand_s) -> None:
         raise InputError(f"the landing's reference must be one, or a function that plans one, got {quoted(reference)}")
     if not (isinstance(stand_s, int | float) and not isinstance(stand_s, bool) and 0 < stand_s <= 60):
         raise InputError(f"stand_s = {quoted(stand_s)} s is outside 0 ... 60 s")
+    if from_apex:
+        raise InputError("feedback acts in launch, and a run from the apex has none; leave one of them away")
     for name in ("t", "q", "v", "tau"):
         if not np.all(np.isfinite(getattr(tape, name))):
             raise InputError(f"the tape's {name} has entries that are no number; plan the jump again")

@@ -46,6 +46,7 @@ from jumplab.sim import (
     simulate_jump,
 )
 from jumplab.sim.engine import engine_class
+from jumplab.sim.launch import check_mode
 from jumplab.sim.playback import MODES
 from jumplab.task import JumpTask
 
@@ -94,6 +95,8 @@ class TrialSettings:
     def __post_init__(self):
         if self.mode not in MODES:
             raise InputError(f"mode {self.mode!r}: must be one of {', '.join(MODES)}")
+        if self.feedback:
+            check_mode(self.mode)
         engine_class(self.engine)
 
     @property
