@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -239,12 +240,11 @@ RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
 def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and re-aimed.
 
-    Of several reports, by the names that the legend shall have, only the disturbances that all of them tell.
+    Of several reports, by the names that the legend shall have, only the disturbances that two or more of them tell.
     """
     several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
-    told = [{m.names for m in report.margins} for report in several.values()]
-    names = [name for name in dict.fromkeys(m.names for r in several.values() for m in r.margins)
-             if all(name in known for known in told)]  # fmt: skip
+    told = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
+    names = [name for name, count in told.items() if count > 1 or len(several) == 1]
     angles = 2 * np.pi * np.arange(len(names)) / len(names)
     fig = style.new_figure(style.PAGE_IN, 3.8)
     for ax, reaim in zip(fig.subplots(1, 2, subplot_kw={"projection": "polar"}), (False, True), strict=True):
