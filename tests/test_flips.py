@@ -1,5 +1,6 @@
 """Flips: the guess turns, the plan turns, its physics is looked at by other code, and the robot lands it."""
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -15,7 +16,7 @@ from jumplab.robot import Robot
 from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
 from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.playback import Actuators
-from jumplab.sim.reaim import LATER_S, Tuck, is_flip
+from jumplab.sim.reaim import LATER_S, SOONER_S, Tuck, is_flip
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.planner import Planner
 from jumplab.stages.reconstruction import planar_quantities
@@ -145,6 +146,20 @@ def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
     assert longer > abs(tuck._left(0.0, now, left, L)) + 0.05 > shorter + 0.1
     shift, _ = tuck.shift(round(now * 1000), tape.q[at], tape.v[at], left)
     assert abs(shift) <= 1e-3  # nothing to mend
+
+
+@pytest.mark.parametrize("flight_s", [0.35, 0.5, 0.65, 0.9])
+def test_a_shifted_tape_never_runs_backwards(flight_s):
+    """However short the flight: at the largest shift either way, which grows meanwhile, too."""
+    plan = backflip()
+    tape, last = plan.tape, plan.tape.t[-1] - plan.tape.takeoff_time
+    t = tape.takeoff_time + (tape.t - tape.takeoff_time) * flight_s / last
+    tuck = Tuck(plan.robot, replace(tape, t=np.where(tape.t < tape.takeoff_time, tape.t, t)))
+    for size in (-tuck._later, tuck._sooner):
+        _, pace, _ = tuck._pieces(size, tuck._start, flight_s)
+        assert pace.min() > 0.03
+    if flight_s > 0.64:
+        assert tuck._sooner == SOONER_S
 
 
 @pytest.mark.slow

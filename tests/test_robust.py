@@ -109,6 +109,30 @@ def test_what_no_plan_can_allow_for_is_refused(bhr, task, ranges, words):
         jl.plan(task, bhr, robust=ranges)
 
 
+def test_own_limits_win_even_those_that_are_the_usual_ones(bhr):
+    weak = Ranges.none(torque_loss=(0.0, 0.1))
+    found = [
+        robust.robust_changes(TASK, bhr, weak, {"limits": own})["limits"]["torque_share"]
+        for own in ({}, {"torque_share": 0.85}, Limits(), replace(Limits(), torque_share=0.7))
+    ]
+    assert found == pytest.approx([0.765, 0.85, 0.765, 0.7])
+    flip = jl.JumpTask(0.0, 0.5, rotation_rad=-2 * np.pi)
+    own = {"friction": 0.45, "opening_speed_share": 1.0}
+    assert own.items() <= robust.robust_changes(flip, bhr, Ranges(), {"limits": own})["limits"].items()
+
+
+NO_CHANGES = (
+    ({"off": "jerk"}, "off must be a list of names, got 'jerk'"),
+    ({"terms": {"whole body": 3}}, "own terms of 'whole body' must be a list"),
+)
+
+
+@pytest.mark.parametrize("changes, words", NO_CHANGES)
+def test_what_is_no_change_is_refused(bhr, changes, words):
+    with pytest.raises(InputError, match=words):
+        robust.robust_changes(TASK, bhr, Ranges(), changes)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name, share, index", [("payload_kg", 0.5, 4), ("mass", 1.0, 1), ("com_m", 0.5, 3)])
 def test_robots_that_fall_with_the_plain_plan_stand_with_the_robust_one(bhr, plans, name, share, index):

@@ -164,6 +164,15 @@ def test_reports_an_unsolvable_problem(bhr):
     assert np.isfinite(tau).all() and (np.abs(tau) <= Actuators(bhr).effort).all()
 
 
+@pytest.mark.parametrize("noise_n, stands", [(0.0, True), (3.0, True), (12.0, False)])
+def test_a_foot_in_the_air_does_not_stand_by_what_its_sensor_errs(bhr, noise_n, stands):
+    """20 N are a load for a good sensor, and less than twice the error of a poor one."""
+    control, q = LandingController(bhr, force_noise_n=noise_n), stance_configuration(bhr)
+    q[7 + bhr.joint_names.index("left_knee")] += 0.5
+    control._terms.update(q, np.zeros(bhr.model.nv))
+    assert control._contact(0.0, np.array([20.0, 400.0])).tolist() == [stands, True]
+
+
 def test_a_joint_at_its_stop_is_led_away_from_it(bhr):
     """Arms that land overhead come back: at rest by the stop the wish is not to stay there."""
     control, q = LandingController(bhr), stance_configuration(bhr)

@@ -111,7 +111,7 @@ def test_trials_count_the_steps(bhr, tmp_path):
     assert 0 < report.stepped <= report.landed
     assert f"({report.stepped} with a recovery step)" in report.line()
     assert report.to_json()["counts"]["landed_with_a_step"] == report.stepped
-    assert "one" in report.conditions["recovery step"]
+    assert report.conditions["recovery step"] == "one, if the robot would come to rest beyond its soles"
     plain = TrialSettings(ranges=ranges)
     assert plain.hash != replace(plain, step=True).hash
     assert TrialKey(0, 0, plain.hash, "").robot_seed == TrialKey(0, 0, "", "").robot_seed

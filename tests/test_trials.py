@@ -162,6 +162,7 @@ def test_report_counts(folder, coins):
     assert said["settings"]["noise"] == vars(SensorNoise.typical())  # sensors err unless told otherwise
     assert said["conditions"] == {
         "playback": "position mode in PyBullet",
+        "launch": "open loop",
         "re-aim": "the legs turn in the air against errors of trunk, speed and momentum, about all axes",
         "recovery step": "none",
         "drawn uniformly, each link and joint by itself": str(Ranges()),
@@ -373,6 +374,8 @@ def test_margins_with_a_step_and_their_picture_beside_others(folder, monkeypatch
         assert [line.get_label() for line in ax.lines] == ["usual", "one step"]
         assert [text.get_text() for text in ax.get_xticklabels()] == ["payload_kg"]  # what both tell
     assert not margin_radar(usual).legends and len(figure.legends) == 1
+    with pytest.raises(InputError, match="up to 4 reports and what two of them tell, got 5 reports with 1 dist"):
+        margin_radar({str(k): usual for k in range(5)})
 
 
 def test_margins_with_a_corrected_launch(folder, monkeypatch):

@@ -135,10 +135,8 @@ def margins(args: Namespace) -> None:
     start = time.perf_counter()
     store.read_plan(args.dir)  # refuses a damaged folder
     store.ensure_writable(args.dir)
-    settings, names = (
-        many.TrialSettings(args.mode, engine=args.engine, step=bool(args.step), feedback=bool(args.feedback)),
-        args.disturb or (*bounds.SINGLE, *bounds.PAIRS),
-    )
+    settings = many.TrialSettings(args.mode, engine=args.engine, step=bool(args.step), feedback=bool(args.feedback))
+    names = args.disturb or (*bounds.SINGLE, *bounds.PAIRS)
     try:
         how = {"steps": args.steps, "jobs": args.jobs, "progress": bars(args)}
         report = bounds.margins(args.dir, names, args.n, args.seed or 0, settings, **how)

@@ -80,6 +80,11 @@ class Foot:
         """(3,) middle of the sole in the foot frame [m]."""
         return read_only([(self.heel + self.toe) / 2, 0.0, self.sole_z])
 
+    @property
+    def tip(self) -> np.ndarray:
+        """(3,) middle of the toes' edge in the foot frame [m], about which the foot tips."""
+        return read_only([self.toe, 0.0, self.sole_z])
+
 
 @dataclass(frozen=True, repr=False)
 class Robot(Shown):

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from jumplab.errors import InputError
 from jumplab.io.columns import com_height
 from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot
@@ -245,6 +246,9 @@ def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
     told = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
     names = [name for name, count in told.items() if count > 1 or len(several) == 1]
+    if not names or len(several) > len(RADAR_COLORS):
+        found = f"{len(several)} reports with {len(names)} disturbances that two of them tell"
+        raise InputError(f"the radar shows up to {len(RADAR_COLORS)} reports and what two of them tell, got {found}")
     angles = 2 * np.pi * np.arange(len(names)) / len(names)
     fig = style.new_figure(style.PAGE_IN, 3.8)
     for ax, reaim in zip(fig.subplots(1, 2, subplot_kw={"projection": "polar"}), (False, True), strict=True):

@@ -77,7 +77,7 @@ class Gauge:
 
     def toe(self, q: np.ndarray) -> np.ndarray:
         """Middle between the toes (3,) [m]."""
-        return self._on_feet(q, np.array([self.robot.foot.toe, 0.0, self.robot.foot.sole_z]))
+        return self._on_feet(q, self.robot.foot.tip)
 
     def places(self, q: np.ndarray) -> list[pin.SE3]:
         """Placements of both feet."""

@@ -109,6 +109,7 @@ class BodyTerms:
 PERIOD_STEPS = 2  # 500 Hz
 WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
 CONTACT_FORCE_N = 10.0  # a foot stands if it carries more than 2.5 % of the weight ...
+LIKELY = 3.0  # [1] ... and so many standard deviations of a poor sensor ...
 CONTACT_HOLD_S = 0.008  # ... and for so long after it last did; flicker of the flag makes robots fall
 NEAR_GROUND_M = 0.02  # a foot that bounced less than this is pressed down again, not swung
 SOLE_SHARE = 0.95, 0.5  # of the sole's length and width for the wished CoP; more width lets robots roll onto an edge
@@ -163,7 +164,7 @@ class LandingController:
     ``robot`` is as planned: the controller knows no perturbation. ``reference`` is followed if given; otherwise
     spring-dampers lead to the middle of the feet at standing height. ``solves`` and ``failures`` count the QPs posed,
     and those without a solution. With ``may_step`` it takes one step, ``step``, where its feet alone cannot catch the
-    robot; what was planned ends there.
+    robot; what was planned ends there. Forces of the feet err by ``force_noise_n`` [N] each.
     """
 
     def __init__(
@@ -173,9 +174,11 @@ class LandingController:
         reference: Reference | None = None,
         gains: LandingGains | None = None,
         may_step: bool = False,
+        force_noise_n: float = 0.0,
     ):
+        self._loaded_n = max(CONTACT_FORCE_N, LIKELY * force_noise_n)
         self.reference, self.gains = reference, gains or LandingGains()
-        self.step = RecoveryStep(robot, SOLE_SHARE) if may_step else None
+        self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n) if may_step else None
         self.solves = self.failures = 0
         self._terms, self._actuators = BodyTerms(robot, WRENCH_SCALE), Actuators(robot)
         self._posture_weight, self._corners = self._posture_weights(robot), _corner_rows(robot)
@@ -212,7 +215,7 @@ class LandingController:
 
     def _contact(self, time: float, foot_force: np.ndarray) -> np.ndarray:
         """Which feet (2,) may carry weight: those that did a moment ago, and any that hovers just beside one."""
-        self._last_contact[foot_force > CONTACT_FORCE_N] = time
+        self._last_contact[foot_force > self._loaded_n] = time
         if self.step is not None and self.step.side is not None:
             return np.arange(2) != self.step.side
         loaded = time - self._last_contact <= CONTACT_HOLD_S

@@ -23,17 +23,26 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, rotation
-from jumplab.sim.landing import MAX_ITERATIONS, PERIOD_STEPS, TOLERANCE, UNBOUNDED, WRENCH_SCALE, BodyTerms, corner_rows
+from jumplab.sim.landing import (
+    MAX_ITERATIONS,
+    NOMINAL_INERTIA,
+    PERIOD_STEPS,
+    TOLERANCE,
+    UNBOUNDED,
+    WRENCH_SCALE,
+    BodyTerms,
+    corner_rows,
+)
 from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Playback
 
 # The paper prints none of these numbers: it has no feedback.
 FRICTION = 0.6  # more than plans use, less than most floors have
-SOLE_SHARE = 0.95  # of the sole's length for the CoP
-NOMINAL_INERTIA = 5.0  # [kg m^2] pitch inertia, turns a momentum rate into rad/s^2
+LENGTH_SHARE = 0.95  # of the sole for the CoP
 LEAST_LOAD = 0.5  # [1] of the weight; with less on the feet nothing is changed any more
 FELT_LOAD = 0.7  # [1] of the weight, with which feet tell where the CoM is ...
 STILL_RAD = 0.01  # ... unless they are tilted by so much
 MOST_OFF_M = 0.025  # that the CoM is believed to be off
+FADE_SHARE, FADED = 0.4, 5.0  # of the flight, in which what was changed fades; natural times of that, to 4 %
 DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory lies
 
 
@@ -44,7 +53,7 @@ class LaunchGains:
     com_rate: float = 8.0  # twice the pendulum's own: the launch is over within a second
     momentum_rate: float = 10.0
     posture_rate: float = 4.0  # back to the tape, where nothing else is asked
-    fade_rate: float = 20.0  # back to the tape in the air, before the legs are re-aimed
+    fade_rate: float = 20.0  # back to the tape in the air, or faster in a short flight: before legs are re-aimed
     com_weight: tuple[float, float, float] = (1.0, 1.0, 3.0)
     momentum_weight: float = 1.0  # of L-rate over a nominal inertia
     foot_weight: float = 1e4
@@ -77,13 +86,14 @@ class LaunchFeedback:
         self._gains, self._robot, self._playback = gains, robot, playback
         self._terms, self._actuators, self._gauge = BodyTerms(robot, WRENCH_SCALE), Actuators(robot), Gauge(robot)
         self._weight_n = robot.total_mass * robot.gravity
+        self._fade_rate = max(gains.fade_rate, FADED / (FADE_SHARE * float(tape.t[-1] - tape.takeoff_time)))
         joints = len(robot.joint_names)
         self._angles, self._rates, self._changes, self._farthest = np.zeros((4, joints))
         self.off_m, self.solves, self.failures = 0.0, 0, 0
         self._place, self._spread = np.zeros(2), gains.prior_m**2 * np.eye(2)  # of the CoM's offset in trunk axes, x, z
         self._first, self._rows = tape.q[0], self._planned(tape)
         self._spin = self._rows[0, 4]  # rate of L that the last command takes
-        half = SOLE_SHARE * (robot.foot.toe - robot.foot.heel) / 2
+        half = LENGTH_SHARE * (robot.foot.toe - robot.foot.heel) / 2
         self._corners = {
             stand: corner_rows(robot, FRICTION, length, robot.foot.half_width)
             for stand, length in ((FLAT, half), (TOE, 0.0))
@@ -116,7 +126,7 @@ class LaunchFeedback:
         return sum(w[3:] + np.cross(foot - com, w[:3]) for foot, w in zip(feet, wrench, strict=True))
 
     def begin(self, q: np.ndarray) -> None:
-        """Start from ``q`` (nq,), whose CoM is led back to the plan as :meth:`Playback.approach` leads the joints."""
+        """Start from ``q`` (nq,), whose CoM is led back to the plan as :meth:`Playback.approach` leads wrong joints."""
         model, data, (left, rate, acceleration) = self._gauge.model, self._gauge.data, self._playback.way_back()
         moved = pin.computeCentroidalMap(model, data, self._first) @ pin.difference(model, self._first, q)
         com, turned = moved[:3] / self._robot.total_mass, moved[3:]
@@ -129,7 +139,7 @@ class LaunchFeedback:
         g, due = self._gains, step + self._playback.lead
         stand = self._playback.stands(due)
         if stand == AIR or due >= len(self._rows):
-            self._changes = -(g.fade_rate**2) * self._angles - 2 * g.fade_rate * self._rates
+            self._changes = -(self._fade_rate**2) * self._angles - 2 * self._fade_rate * self._rates
         elif step % PERIOD_STEPS == 0:
             if self._playback.stands(step) == FLAT:
                 self._feel(q, wrench)
@@ -159,7 +169,7 @@ class LaunchFeedback:
     def _solved(self, due: int, stand: str, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step ``due``."""
         g, body, foot, nv = self._gains, self._terms, self._robot.foot, self._terms.nv
-        point = foot.center if stand == FLAT else np.array([foot.toe, foot.center[1], foot.sole_z])
+        point = foot.center if stand == FLAT else foot.tip
         body.update(q, v, point)
         body.set_contact(np.ones(2, bool))
         com, speed, push, momentum, spin = self._rows[due]

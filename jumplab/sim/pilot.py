@@ -84,7 +84,7 @@ class Pilot:
         self.forecast = Forecast(robot, tape, scene)
         self._plan_landing = reference if callable(reference) else None
         given = None if callable(reference) else reference
-        self._landing = LandingController(robot, reference=given, may_step=may_step)
+        self._landing = LandingController(robot, reference=given, may_step=may_step, force_noise_n=force_noise_n)
         self.ahead = LandingAhead(landing if reference is None else "given")
         if self.ahead.source == "planned":
             self._prepare()
@@ -143,7 +143,10 @@ class Pilot:
                 self.feedback.begin(played)
         if self.touchdown is None and step < self._tape_until:
             command = self.playback.command(step, played, v, self._none)
-            return command if self.feedback is None else self.feedback(step, command, played, v, wrench)
+            if self.feedback is None:
+                return command
+            own = wrench.reshape(2, 2, 3) @ pin.rpy.rpyToMatrix(0.0, 0.0, self._start)
+            return self.feedback(step, command, played, v, own.reshape(2, 6))
         q, force = self.seen(q), wrench[:, 2]
         if self.touchdown is None:
             if step < self._earliest or force.sum() <= self._touches_n:

@@ -44,12 +44,14 @@ STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
-LATER_S = 0.03, 0.10  # the same: at least, and at most; with 0.127 the tape would stop in between
+LATER_S = 0.03, 0.10  # the same: at least, and at most
+STEEP = 3.97, 3.0  # slopes of the largest shift after its top and before it, times the length of its way
+FORWARD = 0.95  # [1] of the tape's pace that a shift takes at most: it shall not stop, nor run backwards
 SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
 NOTHING = 1e-9  # [rad/s^2] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
-BISECTIONS = 8  # of the range of shifts: to half a millisecond, 3 mrad
+BISECTIONS = 8  # of the range of shifts: to less than a millisecond, 5 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
 
 
@@ -264,6 +266,7 @@ class Tuck:
         self._inertia, self._carried = self._inertias[:, 1, 1], self._momenta[:, 1]
         self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
         self._later = self._latest(np.abs(tape.v[flight, 6:]), Actuators(robot).speed)
+        self._sooner = min(SOONER_S, FORWARD * (1 - FROM_SHARE) * (self._end - self._start) / STEEP[0])
         self._size = self._shift = 0.0
         self._turned: float | None = None
 
@@ -284,7 +287,8 @@ class Tuck:
         u = 1 + (self._t[behind] - self._end) / way
         slope = -np.pi * LATE / way * u ** (LATE - 1) * np.sin(2 * np.pi * u**LATE)
         gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
-        return float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
+        late = float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
+        return min(late, FORWARD * way / STEEP[1])
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
@@ -329,7 +333,7 @@ class Tuck:
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -self._later, SOONER_S
+        low, high = -self._later, self._sooner
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):

@@ -93,7 +93,8 @@ class Metrics:
     launch_impulse: tuple[float, float]  # of the ground until lift-off [N s]
     landing_impulse: tuple[float, float] | None = None  # of the ground in the 0.1 s after touchdown [N s]
     landing_force_n: float | None = None  # largest mean over 20 ms of what presses on both feet then [N]
-    recovery_step_s: float | None = None  # when, after touchdown, a foot left to catch the robot elsewhere
+    # when, after touchdown, a foot left to catch the robot elsewhere; where the feet end counts that step then
+    recovery_step_s: float | None = None
     qp_solves: int  # of the landing controller
     qp_failures: int
 

@@ -63,7 +63,7 @@ class Servo:
         self._gauge, self._motors, self._gains, foot = Gauge(robot), Actuators(robot), gains, robot.foot
         self._damping = gains.damping * self._motors.effort / self._motors.effort.max()
         self._robot = robot
-        self._pivot = {FLAT: foot.center, TOE: np.array([foot.toe, foot.center[1], foot.sole_z])}
+        self._pivot = {FLAT: foot.center, TOE: foot.tip}
 
     def torque(self, command: Command, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Torques (nv - 6,) for ``command`` at the measured (q, v) [N m]; those of the command, if it has any."""

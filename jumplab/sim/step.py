@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from jumplab.robot import Robot
+from jumplab.sim.estimator import SURE
 
 if TYPE_CHECKING:
     from jumplab.sim.landing import BodyTerms
@@ -33,7 +34,9 @@ LEAST_HEIGHT_M = 0.1  # of the pendulum
 class RecoveryStep:
     """Decides on the step, and where the foot is to be until it stands again; takes no second one.
 
-    ``usable`` is the share of the sole's length and width in which the pressure is wished.
+    ``usable`` is the share of the sole's length and width in which the pressure is wished: beyond that part of both
+    soles it steps. Forces of the feet err by ``force_noise_n`` [N] each. The ground is taken to be level where the
+    other foot stands: it knows neither edges nor stairs.
 
     Attributes
     ----------
@@ -41,8 +44,8 @@ class RecoveryStep:
     began_s : when it left, since touchdown; None before the step.
     """
 
-    def __init__(self, robot: Robot, usable: tuple[float, float]):
-        foot = robot.foot
+    def __init__(self, robot: Robot, usable: tuple[float, float], force_noise_n: float = 0.0):
+        foot, self._met_n = robot.foot, max(MET_N, SURE * force_noise_n)
         self.side: int | None = None
         self.began_s: float | None = None
         self._half = np.array([(foot.toe - foot.heel) / 2, foot.half_width]) * usable
@@ -57,7 +60,7 @@ class RecoveryStep:
         if self.side is None:
             return
         gone = time - self.began_s
-        if gone > SWING_S or (gone > SWING_S / 2 and foot_force[self.side] > MET_N):
+        if gone > SWING_S or (gone > SWING_S / 2 and foot_force[self.side] > self._met_n):
             self.side = None
         elif gone < SWING_S - LEAST_S:
             self._goal = self._foothold(body, self.side, SWING_S - gone)[0]

@@ -22,14 +22,14 @@ from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.robot.sagittal import SagittalModel
 from jumplab.sim import Perturbation, Ranges
-from jumplab.stages.changes import settled
+from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.whole_body import Limits
 from jumplab.task import JumpTask
 
 SAMPLES = 6  # draws, each with its opposite: to first order their mean is the planned robot
 WEIGHT = 500.0  # [1/m^2] robots that come to rest 4 cm off the middle of the soles cost 3 % of a jump of 1 m
 FRICTION_SHARE = 0.9  # of the least friction: the planner counts on 0.45, where robots have 0.5
-BRAKE_S = 0.035  # by which legs that give way take up the fall later than an impact would; shoves either way (measured)
+BRAKE_S = 0.035  # by which legs that give way take up the fall later than an impact would: pushed robots showed it
 OPENING_SHARE = 0.4  # of the speed limits; with less, knees straighten to wind up for more momentum, and launches fail
 FLIP_FRICTION_SHARE = 0.76  # the same of a flip: toes that slip as they leave cost momentum, and with it the turn
 INSTEAD_OF = "capture window"  # of the planned robot alone
@@ -59,8 +59,9 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
         raise InputError(
             f"robust: none of these ranges changes a plan; it allows for {', '.join((*MOVING, *LIMITING))}"
         )
-    usual, given = Limits(), changes.get("limits")
-    given = settled(Limits, given)
+    sorted_out(changes.get("terms"), changes.get("weights"), changes.get("off", ()))  # refuses what is no such thing
+    usual, asked = Limits(), changes.get("limits")
+    given = settled(Limits, asked)
     share = FLIP_FRICTION_SHARE if task.rotation_rad else FRICTION_SHARE
     limits = {
         "friction": min(usual.friction, share * ranges.friction[0]),
@@ -68,7 +69,8 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
         "speed_share": usual.speed_share * (1 - ranges.speed_loss[1]),
     }
     limits |= {"opening_speed_share": OPENING_SHARE} if task.rotation_rad else {}
-    own = {name: value for name, value in asdict(given).items() if value != getattr(usual, name)}
+    named = asked if isinstance(asked, Mapping) else [n for n, x in asdict(given).items() if x != getattr(usual, n)]
+    own = {name: getattr(given, name) for name in named}
     if task.rotation_rad:
         return {**changes, "limits": limits | own}
     terms = {name: _listed(extra) for name, extra in (changes.get("terms") or {}).items()}

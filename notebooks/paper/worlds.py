@@ -17,7 +17,7 @@ from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
-FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 50}, 11  # the same
+FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 50}, 11
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
@@ -92,15 +92,15 @@ def side_by_side(ways: dict[str, MarginReport]) -> list[dict[str, Any]]:
 
 
 def moved(usual: MarginReport, other: MarginReport) -> list[dict[str, Any]]:
-    """A line per disturbance that the usual plan does not bear to its limit and both know: how far the margin moved.
+    """A line per disturbance that both know and one of them does not bear to its limit: how far the margin moved.
 
     Shares count from nothing to the limit; from a margin of nothing no gain is told.
     """
     known, rows = {(m.names, m.reaim): m.share for m in other.margins}, []
     for m in usual.margins:
-        if m.share == 1 or (m.names, m.reaim) not in known:
+        share = known.get((m.names, m.reaim))
+        if share is None or m.share == share == 1:
             continue
-        share = known[m.names, m.reaim]
         gain = 100 * (share / m.share - 1) if m.share else None
         rows.append({"disturbance": m.names, "re-aim": m.reaim, "usual": m.share, "other": share, "gain [%]": gain})
     return rows

@@ -211,7 +211,7 @@ class ChainPilot:
         self._force_noise_n = force_noise_n
         self._foresight, self._robot, self._scene = foresight, foresight.robot, scene
         self._landing, self._look_s, self._revise_s, self._lead_s = landing, look_s, revise_s, lead_s
-        self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot)
+        self._gauge, self._stand = Gauge(self._robot), LandingController(self._robot, force_noise_n=force_noise_n)
         self._tau = np.zeros(len(self._robot.joint_names))
         self._legs = ~np.isin(self._robot.joint_names, self._robot.joints["shoulder_pitch"])
         self.plans: list[list[Ahead]] = []  # made for each jump, in their order
