@@ -59,9 +59,11 @@ class LaunchGains:
     foot_weight: float = 1e4
     posture_weight: float = 0.02
     most: float = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
-    prior_m: float = 0.008  # standard deviations: of that offset before anything is felt,
-    reading_m: float = 0.03  # of one reading of it,
-    drift_m: float = 0.005  # and of what it changes by within a second
+    # standard deviations of how far the CoM is off the model's: before anything is felt; of one reading, in which all
+    # that moves unlike the model errs too; of what it changes by within a second
+    prior_m: float = 0.008
+    reading_m: float = 0.03
+    drift_m: float = 0.005
 
 
 def check_mode(mode: str) -> None:
