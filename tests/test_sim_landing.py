@@ -104,21 +104,21 @@ def test_stands_quietly(bhr):
     assert run.stands and run.speed < 1e-3
     assert run.force == pytest.approx(42 * 9.8, rel=1e-3)
     assert run.worst_torque < 0.3
-    assert run.controller.failures == 0 and run.controller.solves > 1400
+    assert run.controller.qp.failures == 0 and run.controller.qp.solves > 1400
 
 
 def test_catches_a_drop(bhr):
     q = stance_configuration(bhr)
     q[2] += 0.2
     run = Catch(bhr, q, seconds=2.0)
-    assert run.stands and run.controller.failures == 0
+    assert run.stands and run.controller.qp.failures == 0
     assert run.com[:2] == pytest.approx([0, 0], abs=0.01)
 
 
 @pytest.mark.parametrize(("vx", "friction"), [(0.7, 0.5), (1.0, 0.8), (1.4, 1.0)])
 def test_catches_a_jump(bhr, vx, friction):
     run = Catch(bhr, *crouched(bhr, vx), seconds=2.0, friction=friction)
-    assert run.stands and run.controller.failures == 0
+    assert run.stands and run.controller.qp.failures == 0
     assert run.worst_torque <= 1.0
 
 
@@ -144,23 +144,23 @@ def test_survives_a_failing_solver(bhr):
         calls.append(1)
         if len(calls) % 10:
             return solve(*args)
-        controller.failures += 1
+        controller.qp.failures += 1
         return None
 
     controller._solve = flaky
     q = stance_configuration(bhr)
     q[2] += 0.05
     run = Catch(bhr, q, seconds=1.5, controller=controller)
-    assert run.stands and controller.failures == len(calls) // 10
+    assert run.stands and controller.qp.failures == len(calls) // 10
 
 
 def test_reports_an_unsolvable_problem(bhr):
     controller = LandingController(bhr)
     q, v = stance_configuration(bhr), np.zeros(20)
-    controller._solver.settings.max_iter = 1
+    controller.qp.solver.settings.max_iter = 1
     v[6:] = np.random.default_rng(0).normal(size=14) * 10
     tau = controller.torque(0.0, q, v, np.array([200.0, 200.0]))
-    assert controller.failures == 1
+    assert controller.qp.failures == 1
     assert np.isfinite(tau).all() and (np.abs(tau) <= Actuators(bhr).effort).all()
 
 

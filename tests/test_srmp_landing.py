@@ -203,6 +203,6 @@ def test_the_landing_controller_takes_the_plan_as_its_reference():
     controller = LandingController(robot, reference=fall())
     q = configuration(robot, stance_angles(robot), toe=-robot.sagittal.sole_center)
     torque = controller.torque(2.0, q, np.zeros(robot.model.nv), np.full(2, 206.0))
-    assert controller.failures == 0
+    assert controller.qp.failures == 0
     rest = LandingController(robot).torque(2.0, q, np.zeros(robot.model.nv), np.full(2, 206.0))
     np.testing.assert_allclose(torque, rest, atol=0.5)

@@ -105,6 +105,45 @@ class BodyTerms:
         return self.torque(x)
 
 
+class BodyQp:
+    """The QP over the unknowns x of :class:`BodyTerms`, posed anew at every state.
+
+    Equations are the dynamics of the base, bounds what the motors can give and what the soles can carry. ``solves`` and
+    ``failures`` count the QPs posed, and those without a solution.
+    """
+
+    def __init__(self, robot: Robot, body: BodyTerms):
+        self._body, self._actuators = body, Actuators(robot)
+        self.solves = self.failures = 0
+        self.solver = proxqp.dense.QP(body.nx, 6, len(robot.joint_names) + CORNER_ROWS)
+        self.solver.settings.eps_abs, self.solver.settings.max_iter = TOLERANCE, MAX_ITERATIONS
+
+    def solve(self, wishes, diagonal, linear, corners, v, *, offset=None, coupling=0.0) -> np.ndarray | None:
+        """The x (nx,) that comes closest to what is wished, or None if the solver does not report success.
+
+        ``wishes`` are rows (k, nx), targets (k,) and weights (k,) of squares; to these come the diagonal (nx,) of a
+        quadratic form and a linear form (nx,), and ``coupling`` (12, 12) of the wrenches. ``corners`` are the rows of
+        :func:`corner_rows`, ``v`` (nv,) is measured; ``offset`` (6,) is the body's, or that of one loaded otherwise.
+        """
+        body, (rows, targets, weights) = self._body, wishes
+        weighted = rows * weights[:, None]  # (k, nx)
+        hessian, linear = weighted.T @ rows, linear - weighted.T @ targets
+        hessian[np.diag_indices(body.nx)] += diagonal
+        hessian[body.nv :, body.nv :] += coupling
+        low, high = self._actuators.range(v[6:])
+        matrix = np.vstack([body.torque_rows, corners])
+        lower = np.concatenate([low - body.torque_offset, np.zeros(CORNER_ROWS)])
+        upper = np.concatenate([high - body.torque_offset, np.full(CORNER_ROWS, UNBOUNDED)])
+        pose = self.solver.update if self.solves else self.solver.init
+        pose(hessian, linear, body.base_rows, -(body.base_offset if offset is None else offset), matrix, lower, upper)
+        self.solves += 1
+        self.solver.solve()
+        if self.solver.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            self.failures += 1
+            return None
+        return self.solver.results.x
+
+
 # The paper prints none of these numbers.
 PERIOD_STEPS = 2  # 500 Hz
 WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
@@ -122,6 +161,7 @@ SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sol
 SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
 MAX_SHIFT, MAX_TURN = 60.0, 300.0  # [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
 MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
+CORNER_ROWS = 20  # of both feet
 UNBOUNDED = 1e20  # ProxQP's infinity
 TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
 MAX_ITERATIONS = 300  # ten times what the hardest recorded QP took
@@ -162,8 +202,8 @@ class LandingController:
     """Torques that catch and hold the robot; see the module's docstring.
 
     ``robot`` is as planned: the controller knows no perturbation. ``reference`` is followed if given; otherwise
-    spring-dampers lead to the middle of the feet at standing height. ``solves`` and ``failures`` count the QPs posed,
-    and those without a solution. With ``may_step`` it takes one step, ``step``, where its feet alone cannot catch the
+    spring-dampers lead to the middle of the feet at standing height. ``qp`` counts the QPs posed and those
+    without a solution. With ``may_step`` it takes one step, ``step``, where its feet alone cannot catch the
     robot; what was planned ends there. Forces of the feet err by ``force_noise_n`` [N] each.
     """
 
@@ -179,12 +219,10 @@ class LandingController:
         self._loaded_n = max(CONTACT_FORCE_N, LIKELY * force_noise_n)
         self.reference, self.gains = reference, gains or LandingGains()
         self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n) if may_step else None
-        self.solves = self.failures = 0
         self._terms, self._actuators = BodyTerms(robot, WRENCH_SCALE), Actuators(robot)
+        self.qp = BodyQp(robot, self._terms)
         self._posture_weight, self._corners = self._posture_weights(robot), _corner_rows(robot)
         self._last_contact = np.full(2, -np.inf)
-        self._solver = proxqp.dense.QP(self._terms.nx, 6, len(self._actuators.effort) + len(self._corners))
-        self._solver.settings.eps_abs, self._solver.settings.max_iter = TOLERANCE, MAX_ITERATIONS
 
     def _posture_weights(self, robot: Robot) -> np.ndarray:
         arms, pitch = robot.joints["shoulder_pitch"], {name for pair in robot.joints.values() for name in pair}
@@ -295,27 +333,13 @@ class LandingController:
 
     def _solve(self, rows, targets, weights, joint_wish, joint_weight, v):
         """Unknowns x (nx,) of the QP, or None if the solver does not report success."""
-        g, body, nv = self.gains, self._terms, self._terms.nv
-        weighted = rows * weights[:, None]  # (k, nx)
-        hessian, linear = weighted.T @ rows, -weighted.T @ targets
+        g, nv = self.gains, self._terms.nv
         diagonal = np.concatenate([np.full(nv, g.acceleration_weight), np.full(12, g.wrench_weight)])
         diagonal[6:nv] += joint_weight
+        linear = np.zeros(self._terms.nx)
         linear[6:nv] -= joint_weight * joint_wish
-        hessian[np.diag_indices(body.nx)] += diagonal
-        hessian[nv:, nv:] += g.uneven_weight * UNEVEN
-        low, high = self._actuators.range(v[6:])
-        matrix = np.vstack([body.torque_rows, self._corners])
-        lower = np.concatenate([low - body.torque_offset, np.zeros(len(self._corners))])
-        upper = np.concatenate([high - body.torque_offset, np.full(len(self._corners), UNBOUNDED)])
-        equations = (body.base_rows, -body.base_offset)
-        pose = self._solver.update if self.solves else self._solver.init
-        pose(hessian, linear, *equations, matrix, lower, upper)
-        self.solves += 1
-        self._solver.solve()
-        if self._solver.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
-            self.failures += 1
-            return None
-        return self._solver.results.x
+        wishes, coupling = (rows, targets, weights), g.uneven_weight * UNEVEN
+        return self.qp.solve(wishes, diagonal, linear, self._corners, v, coupling=coupling)
 
 
 def _corner_rows(robot: Robot) -> np.ndarray:
@@ -326,10 +350,10 @@ def _corner_rows(robot: Robot) -> np.ndarray:
 
 
 def corner_rows(robot: Robot, friction: float, half_length: float, half_width: float) -> np.ndarray:
-    """(20, nx) rows r with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
+    """Rows r (20, nx) with r @ x >= 0: friction, CoP inside the sole and turning friction of both wrenches."""
     foot, mu = robot.foot, friction / np.sqrt(2)
     spin = SPIN_FRICTION * (1.0 if robot.planar else foot.half_width / SPIN_HALF_WIDTH_M)
-    one, rows = np.zeros((10, 6)), np.zeros((20, robot.model.nv + 12))
+    one, rows = np.zeros((10, 6)), np.zeros((CORNER_ROWS, robot.model.nv + 12))
     one[:, 2] = np.repeat([mu, mu, half_width, half_length, spin], 2)
     one[range(10), np.repeat([0, 1, 3, 4, 5], 2)] = np.tile([1.0, -1.0], 5)
     rows[:10, -12:-6] = rows[10:, -6:] = one

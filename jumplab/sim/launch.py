@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
-from proxsuite import proxqp
 
 from jumplab.errors import InputError
 from jumplab.io.tape import Tape
@@ -24,16 +23,14 @@ from jumplab.robot import Robot
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, rotation
 from jumplab.sim.landing import (
-    MAX_ITERATIONS,
     NOMINAL_INERTIA,
     PERIOD_STEPS,
-    TOLERANCE,
-    UNBOUNDED,
     WRENCH_SCALE,
+    BodyQp,
     BodyTerms,
     corner_rows,
 )
-from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Playback
+from jumplab.sim.playback import AIR, FLAT, TOE, Command, Playback
 
 # The paper prints none of these numbers: it has no feedback.
 FRICTION = 0.6  # more than plans use, less than most floors have
@@ -43,6 +40,7 @@ FELT_LOAD = 0.7  # [1] of the weight, with which feet tell where the CoM is ...
 STILL_RAD = 0.01  # ... unless they are tilted by so much
 MOST_OFF_M = 0.025  # that the CoM is believed to be off
 FADE_SHARE, FADED = 0.4, 5.0  # of the flight, in which what was changed fades; natural times of that, to 4 %
+LEAST, LEAST_WRENCH = 1e-8, 1e-4  # weights of base accelerations and of wrenches / 100 N, so that the answer is one
 DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory lies
 
 
@@ -78,20 +76,19 @@ class LaunchFeedback:
     """Changes the commands of one launch; see the module's docstring.
 
     ``playback`` is in mode "position": in "pd", whose torques pass on what sensors err by, feet begin to rock. ``tape``
-    and what is measured are seen in the axes of the start. ``solves`` and ``failures`` count the QPs posed and
-    those without a solution, where the joints go back to the tape. ``off_m`` is how far the CoM is believed to be
+    and what is measured are seen in the axes of the start. ``qp`` counts the QPs posed and those without a solution,
+    where the joints go back to the tape. ``off_m`` is how far the CoM is believed to be
     ahead of where the robot's model has it [m]. Raises :class:`InputError` in the other mode.
     """
 
     def __init__(self, robot: Robot, tape: Tape, playback: Playback, gains: LaunchGains = LaunchGains()):
         check_mode(playback.mode)
         self._gains, self._robot, self._playback = gains, robot, playback
-        self._terms, self._actuators, self._gauge = BodyTerms(robot, WRENCH_SCALE), Actuators(robot), Gauge(robot)
+        self._terms, self._gauge = BodyTerms(robot, WRENCH_SCALE), Gauge(robot)
         self._weight_n = robot.total_mass * robot.gravity
         self._fade_rate = max(gains.fade_rate, FADED / (FADE_SHARE * float(tape.t[-1] - tape.takeoff_time)))
-        joints = len(robot.joint_names)
-        self._angles, self._rates, self._changes, self._farthest = np.zeros((4, joints))
-        self.off_m, self.solves, self.failures = 0.0, 0, 0
+        self._angles, self._rates, self._changes, self._farthest = np.zeros((4, len(robot.joint_names)))
+        self.off_m, self.qp = 0.0, BodyQp(robot, self._terms)
         self._place, self._spread = np.zeros(2), gains.prior_m**2 * np.eye(2)  # of the CoM's offset in trunk axes, x, z
         self._first, self._rows = tape.q[0], self._planned(tape)
         self._spin = self._rows[0, 4]  # rate of L that the last command takes
@@ -100,8 +97,6 @@ class LaunchFeedback:
             stand: corner_rows(robot, FRICTION, length, robot.foot.half_width)
             for stand, length in ((FLAT, half), (TOE, 0.0))
         }
-        self._solver = proxqp.dense.QP(self._terms.nx, 6, joints + len(self._corners[FLAT]))
-        self._solver.settings.eps_abs, self._solver.settings.max_iter = TOLERANCE, MAX_ITERATIONS
 
     def _planned(self, tape: Tape) -> np.ndarray:
         """CoM, its velocity and acceleration, L and its rate (steps, 5, 3) of the launch."""
@@ -120,7 +115,7 @@ class LaunchFeedback:
     def to_json(self) -> dict:
         """What the settings of a result say."""
         most = float(np.abs(self._farthest).max())
-        return {"solves": self.solves, "failures": self.failures, "farthest_rad": most, "com_ahead_m": self.off_m}
+        return {"solves": self.qp.solves, "failures": self.qp.failures, "farthest_rad": most, "com_ahead_m": self.off_m}
 
     @staticmethod
     def _moment(feet, com: np.ndarray, wrench: np.ndarray) -> np.ndarray:
@@ -185,30 +180,16 @@ class LaunchFeedback:
         weights = [g.com_weight, np.full(3, g.momentum_weight), *(g.foot_weight * tilting,) * 2]
         tape = self._playback.acceleration(due)
         back = -(g.posture_rate**2) * self._angles - 2 * g.posture_rate * self._rates
-        x = self._solve(rows, targets, np.concatenate(weights), tape + back, beyond, stand, v)
+        x = self._solve((rows, targets, np.concatenate(weights)), tape + back, beyond, stand, v)
         self._spin = spin if x is None else body.momentum_rows @ x - beyond
         return back if x is None else np.clip(np.round(x[6:nv], DIGITS) - tape, -g.most, g.most)
 
-    def _solve(self, rows, targets, weights, joint_wish, beyond, stand, v):
+    def _solve(self, wishes, joint_wish, beyond, stand, v):
         """Unknowns x (nx,) of the QP, or None if the solver does not report success."""
-        g, body, nv = self._gains, self._terms, self._terms.nv
-        weighted = rows * weights[:, None]  # (k, nx)
-        hessian, linear = weighted.T @ rows, -weighted.T @ targets
-        linear[6:nv] -= g.posture_weight * joint_wish
-        least = [np.full(6, 1e-8), np.full(nv - 6, g.posture_weight), np.full(12, 1e-4)]
-        hessian[np.diag_indices(body.nx)] += np.concatenate(least)
-        low, high = self._actuators.range(v[6:])
-        corners = self._corners[stand]
-        matrix = np.vstack([body.torque_rows, corners])
-        lower = np.concatenate([low - body.torque_offset, np.zeros(len(corners))])
-        upper = np.concatenate([high - body.torque_offset, np.full(len(corners), UNBOUNDED)])
+        body, nv, weight = self._terms, self._terms.nv, self._gains.posture_weight
+        linear = np.zeros(body.nx)
+        linear[6:nv] -= weight * joint_wish
+        diagonal = np.concatenate([np.full(6, LEAST), np.full(nv - 6, weight), np.full(12, LEAST_WRENCH)])
         offset = body.base_offset.copy()
         offset[3:] += body.trunk.T @ beyond
-        pose = self._solver.update if self.solves else self._solver.init
-        pose(hessian, linear, body.base_rows, -offset, matrix, lower, upper)
-        self.solves += 1
-        self._solver.solve()
-        if self._solver.results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
-            self.failures += 1
-            return None
-        return self._solver.results.x
+        return self.qp.solve(wishes, diagonal, linear, self._corners[stand], v, offset=offset)

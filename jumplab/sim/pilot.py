@@ -113,7 +113,7 @@ class Pilot:
     @property
     def solves(self) -> tuple[int, int]:
         """QPs posed by the landing controller, and how many of them failed."""
-        return self._landing.solves, self._landing.failures
+        return self._landing.qp.solves, self._landing.qp.failures
 
     def landing_said(self) -> dict:
         """What the settings of a result say about the landing, and how often that of a flip was planned anew."""
