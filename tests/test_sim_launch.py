@@ -38,9 +38,8 @@ def test_what_is_followed_obeys_newton_and_euler(feedback):
     """The planned CoM's derivatives and L's rate come from the wrenches; differences say the same."""
     com, speed, push, momentum, spin = np.moveaxis(feedback._rows, 1, 0)
     assert np.diff(com, axis=0) / STEP_S == pytest.approx((speed[1:] + speed[:-1]) / 2, abs=2e-3)
-    assert np.diff(speed, axis=0) / STEP_S == pytest.approx(
-        (push[1:] + push[:-1]) / 2, abs=0.3
-    )  # phases end between rows
+    between = (push[1:] + push[:-1]) / 2
+    assert np.diff(speed, axis=0) / STEP_S == pytest.approx(between, abs=0.3)  # phases end between rows
     assert np.diff(momentum, axis=0) / STEP_S == pytest.approx((spin[1:] + spin[:-1]) / 2, abs=1.0)
     assert np.abs(spin).max() > 20  # there is something to agree on
 
@@ -119,7 +118,7 @@ def test_a_payload_tips_less(bhr, tape, engine):
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", INSTALLED)
 def test_a_shove_in_launch_is_borne(bhr, tape, engine):
-    """10 N s forward in the middle of the crouch: open loop it misses or falls."""
+    """10 N s forward in the middle of the crouch; shoved back early, a robot falls with feedback too."""
     shoved = Perturbation(noise=NOISY, shoves=(Shove("launch", 0.6, 10.0, 0.0),))
     runs = [simulate_jump(tape, bhr, perturbation=shoved, feedback=on, engine=engine) for on in (False, True)]
     assert runs[1].landed and runs[1].checks_passed, runs[1].reason

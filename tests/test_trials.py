@@ -356,18 +356,27 @@ def test_margins_are_bisected_and_resumed(folder, monkeypatch, most, shares):
     assert 0.94 < 19 / 20 and margins.enough(19, 20) and not margins.enough(18, 20) and not margins.enough(3, 4)
 
 
-def test_margins_with_a_step_and_their_picture_beside_others(folder, monkeypatch):
+def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
     seen = []
 
     def trial(tape, robot, scene, settings, key):
-        seen.append(settings.step)
+        seen.append((settings.step, settings.feedback))
         return replace(play(tape, robot, scene, settings, key), landed=True)
 
+    def found(names, **how):
+        seen.clear()
+        report = margins.margins(folder, names, 2, settings=TrialSettings(**how), jobs=1)
+        asked = how.get("step", False), how.get("feedback", False)
+        assert set(seen) == {asked}
+        kept = margins.MarginReport.from_json(store.read_json(folder / "margins.json"))
+        assert (kept.step, kept.feedback) == (report.step, report.feedback) == asked
+        told = report.line()
+        assert ("one recovery step allowed" in told, "launch corrected" in told) == asked
+        return report
+
     monkeypatch.setattr(monte_carlo, "run_trial", trial)
-    with_step = margins.margins(folder, ("payload_kg", "mass"), 2, settings=TrialSettings(step=True), jobs=1)
-    usual = margins.margins(folder, ("payload_kg",), 2, jobs=1)
-    assert set(seen[:4]) == {True} and not any(seen[-4:]) and "one recovery step allowed" in with_step.line()
-    assert margins.MarginReport.from_json(store.read_json(folder / "margins.json")).step is False
+    with_step, usual = found(("payload_kg", "mass"), step=True), found(("payload_kg",))
+    found(("mass",), feedback=True)
     figure = margin_radar({"usual": usual, "one step": with_step})
     assert [ax.get_title("left") for ax in figure.axes] == ["plain", "re-aimed"]
     for ax in figure.axes:
@@ -376,20 +385,6 @@ def test_margins_with_a_step_and_their_picture_beside_others(folder, monkeypatch
     assert not margin_radar(usual).legends and len(figure.legends) == 1
     with pytest.raises(InputError, match="up to 4 reports and what two of them tell, got 5 reports with 1 dist"):
         margin_radar({str(k): usual for k in range(5)})
-
-
-def test_margins_with_a_corrected_launch(folder, monkeypatch):
-    seen = []
-
-    def trial(tape, robot, scene, settings, key):
-        seen.append(settings.feedback)
-        return replace(play(tape, robot, scene, settings, key), landed=True)
-
-    monkeypatch.setattr(monte_carlo, "run_trial", trial)
-    report = margins.margins(folder, ("mass",), 2, settings=TrialSettings(feedback=True), jobs=1)
-    assert seen and all(seen) and "launch corrected" in report.line()
-    kept = margins.MarginReport.from_json(store.read_json(folder / "margins.json"))
-    assert kept.feedback and not kept.step
 
 
 def test_margins_of_what_is_not_there(folder):

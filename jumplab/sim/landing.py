@@ -118,7 +118,17 @@ class BodyQp:
         self.solver = proxqp.dense.QP(body.nx, 6, len(robot.joint_names) + CORNER_ROWS)
         self.solver.settings.eps_abs, self.solver.settings.max_iter = TOLERANCE, MAX_ITERATIONS
 
-    def solve(self, wishes, diagonal, linear, corners, v, *, offset=None, coupling=0.0) -> np.ndarray | None:
+    def solve(
+        self,
+        wishes: tuple[np.ndarray, np.ndarray, np.ndarray],
+        diagonal: np.ndarray,
+        linear: np.ndarray,
+        corners: np.ndarray,
+        v: np.ndarray,
+        *,
+        offset: np.ndarray | None = None,
+        coupling: np.ndarray | float = 0.0,
+    ) -> np.ndarray | None:
         """The x (nx,) that comes closest to what is wished, or None if the solver does not report success.
 
         ``wishes`` are rows (k, nx), targets (k,) and weights (k,) of squares; to these come the diagonal (nx,) of a
