@@ -150,7 +150,7 @@ def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
 
 @pytest.mark.parametrize("flight_s", [0.35, 0.5, 0.65, 0.9])
 def test_a_shifted_tape_never_runs_backwards(flight_s):
-    """However short the flight: at the largest shift either way, which grows meanwhile, too."""
+    """However short the flight, at the largest shift either way, once it has grown."""
     plan = backflip()
     tape, last = plan.tape, plan.tape.t[-1] - plan.tape.takeoff_time
     t = tape.takeoff_time + (tape.t - tape.takeoff_time) * flight_s / last
