@@ -199,7 +199,7 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / Actuators(plan.robot).speed
     assert share.max() < robust.OPENING_SHARE + 0.05
-    assert Tuck(plan.robot, plan.tape)._later == LATER_S[1] > Tuck(plan.robot, backflip().tape)._later >= LATER_S[0]
+    assert Tuck(plan.robot, plan.tape)._later > 0.1 > Tuck(plan.robot, backflip().tape)._later >= LATER_S
     drawn = Perturbation.draw(plan.robot, TrialKey(1, 5, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, perturbation=drawn, reaim=True)
     assert result.landed and result.checks_passed, result.reason

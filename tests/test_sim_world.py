@@ -343,7 +343,6 @@ def test_motors_follow_their_torque_speed_line(bhr):
         assert high == pytest.approx(share * motors.effort)
         assert low == pytest.approx(-motors.effort)  # braking is free
         assert motors.range(-rate * corner)[0] == pytest.approx(-high)
-        assert motors.either_way(-rate * corner) == pytest.approx(high)
 
 
 def test_delay_line():

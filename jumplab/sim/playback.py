@@ -47,10 +47,6 @@ class Actuators:
         upper = self.effort * np.clip((self._free - rate) * self._slope, 0.0, 1.0)
         return lower, upper
 
-    def either_way(self, rate: np.ndarray) -> np.ndarray:
-        """Torque (nv - 6,) [N m] that is available in both directions: the limit of the servo law."""
-        return self.effort * np.clip((self._free - np.abs(rate)) * self._slope, 0.0, 1.0)
-
 
 @dataclass(frozen=True)
 class Command:

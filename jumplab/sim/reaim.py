@@ -44,7 +44,7 @@ STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
-LATER_S = 0.03, 0.10  # the same: at least, and at most
+LATER_S = 0.03  # the same, whatever the tape's speeds
 STEEP = 3.97, 3.0  # slopes of the largest shift after its top and before it, times the length of its way
 FORWARD = 0.95  # [1] of the tape's pace that a shift takes at most, once it has grown: it shall not run backwards
 SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
@@ -138,11 +138,12 @@ class Reaim:
         """
         middle = self._gauge.soles(q)
         near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
-        if not flip:
+        opens = near or left_s < FLIP_START_S
+        if opens or not flip:  # until then a flip's tuck may still mend it
             tilt = pin.log3(turn)[:2]
             self._far |= bool(tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD)
         if flip:
-            moving = np.full(len(self._now), near or left_s < FLIP_START_S)
+            moving = np.full(len(self._now), opens)
         else:
             moving = np.where(self._pitching, near, near or left_s < SIDE_START_S)
         if self._far:
@@ -287,8 +288,8 @@ class Tuck:
         u = 1 + (self._t[behind] - self._end) / way
         slope = -np.pi * LATE / way * u ** (LATE - 1) * np.sin(2 * np.pi * u**LATE)
         gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
-        late = float(np.clip(np.min((SPEED_SHARE * limits - rates[behind]) / gained), *LATER_S))
-        return min(late, FORWARD * way / STEEP[1])
+        late = float(np.min((SPEED_SHARE * limits - rates[behind]) / gained))
+        return min(max(late, LATER_S), FORWARD * way / STEEP[1])
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""

@@ -81,8 +81,8 @@ class Servo:
         tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
         if self._robot.lossy:  # at the due rate: a measured one would swing with its noise
             tau = tau + self._robot.lost_torque(command.rate)
-        most = command.share * self._motors.either_way(v[6:])
-        return np.clip(tau, -most, most)
+        low, high = self._motors.range(v[6:])  # a joint that was thrown beyond its no-load speed can still be braked
+        return np.clip(tau, command.share * low, command.share * high)
 
     def _feed_forward(
         self, joints: np.ndarray, feet: np.ndarray, drift: np.ndarray, push: np.ndarray, shared: np.ndarray | float
