@@ -44,12 +44,11 @@ STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes
 FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
-LATER_S = 0.03  # the same, whatever the tape's speeds
-STEEP = 3.97, 3.0  # slopes of the largest shift after its top and before it, times the length of its way
+LATER_S = 0.03  # it may wait, whatever the tape's speeds
+STEEP = 3.97  # slope of the largest shift after its top, times the length of its way
 FORWARD = 0.95  # [1] of the tape's pace that a shift takes at most, once it has grown: it shall not run backwards
-SPEED_SHARE = 0.9  # of the speed limits, which joints that open later may reach; the rest is for corrections
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
-NOTHING = 1e-9  # [rad/s^2] of a joint at rest
+NOTHING = 1e-9  # [rad/s] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
 BISECTIONS = 8  # of the range of shifts: to less than a millisecond, 5 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
@@ -138,12 +137,11 @@ class Reaim:
         """
         middle = self._gauge.soles(q)
         near = middle[2] - self._scene.top_at(middle[0]) < START_HEIGHT_M
-        opens = near or left_s < FLIP_START_S
-        if opens or not flip:  # until then a flip's tuck may still mend it
+        if not flip:
             tilt = pin.log3(turn)[:2]
             self._far |= bool(tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD)
         if flip:
-            moving = np.full(len(self._now), opens)
+            moving = np.full(len(self._now), near or left_s < FLIP_START_S)
         else:
             moving = np.where(self._pitching, near, near or left_s < SIDE_START_S)
         if self._far:
@@ -253,10 +251,10 @@ def _within(slope: np.ndarray, miss: np.ndarray, low: np.ndarray, high: np.ndarr
 class Tuck:
     """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as planned.
 
-    The shift has the shape of sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at touchdown. The
-    turn that is left is forecast with the planned robot's inertia along the tape, from the measured pitch and angular
-    momentum. What opens later has less time: how much later it may is a matter of the tape's speeds, see
-    :data:`LATER_S`.
+    A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at
+    touchdown. One that opens later waits where it is tightest, and has less time to open: how long it may wait is a
+    matter of the tape's speeds. The turn that is left is forecast with the planned robot's inertia along the tape, from
+    the measured pitch and angular momentum.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
@@ -266,8 +264,10 @@ class Tuck:
         self._t, (self._inertias, self._momenta) = tape.t[flight], self._along(tape.q[flight], tape.v[flight])
         self._inertia, self._carried = self._inertias[:, 1, 1], self._momenta[:, 1]
         self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
+        late = self._t >= self._start + FROM_SHARE * (self._end - self._start)
+        self._tight = float(self._t[late][np.argmin(self._inertia[late])])
         self._later = self._latest(np.abs(tape.v[flight, 6:]), Actuators(robot).speed)
-        self._sooner = min(SOONER_S, FORWARD * (1 - FROM_SHARE) * (self._end - self._start) / STEEP[0])
+        self._sooner = min(SOONER_S, FORWARD * (1 - FROM_SHARE) * (self._end - self._start) / STEEP)
         self._size = self._shift = 0.0
         self._turned: float | None = None
 
@@ -282,14 +282,10 @@ class Tuck:
         return np.array(inertias), np.array(momenta)
 
     def _latest(self, rates: np.ndarray, limits: np.ndarray) -> float:
-        """How much later [s] the tuck may open: within the speed limits (k,) of joints at ``rates`` (N, k)."""
-        way = (1 - FROM_SHARE) * (self._end - self._start)
-        behind = self._t > self._end - way * (1 - 0.5 ** (1 / LATE))  # what it holds up before, it has to make up for
-        u = 1 + (self._t[behind] - self._end) / way
-        slope = -np.pi * LATE / way * u ** (LATE - 1) * np.sin(2 * np.pi * u**LATE)
-        gained = np.maximum(slope[:, None] * rates[behind], NOTHING)
-        late = float(np.min((SPEED_SHARE * limits - rates[behind]) / gained))
-        return min(max(late, LATER_S), FORWARD * way / STEEP[1])
+        """How long [s] the tuck may wait, and still open within the ``limits`` (k,) of joints at ``rates`` (N, k)."""
+        opens = self._end - self._tight
+        fastest = float(np.min(limits / np.maximum(rates[self._t >= self._tight].max(axis=0), NOTHING)))
+        return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(fastest, 1.0)))
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
@@ -301,7 +297,8 @@ class Tuck:
         momentum = float(self._data.hg.angular[1])
         if time_left > STEP_S:
             want = self._best(now, time_left, momentum)
-            most = SHIFT_RATE * STEP_S
+            waits = max(want, self._size) <= 0 and now + self._shift <= self._tight  # which moves nothing yet
+            most = np.inf if waits else SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
         return self._shift, (self._shift - before) / STEP_S
@@ -346,11 +343,16 @@ class Tuck:
         return (low + high) / 2
 
     def _place(self, size: float, t, now: float, time_left: float):
-        """Time on the tape at real times ``t``: the rest of it in the time that is left, shifted by a bump."""
+        """Time on the tape at real times ``t``: the rest of it in the time that is left, shifted or held up."""
         due = now + time_left
         from_ = self._start + FROM_SHARE * (self._end - self._start)
         u = np.clip((t - from_) / max(due - from_, STEP_S), 0.0, 1.0)
-        return np.minimum(t + u * (self._end - due) + size * np.sin(np.pi * u**LATE) ** 2, self._end)
+        at = t + u * (self._end - due)
+        if size >= 0:
+            return np.minimum(at + size * np.sin(np.pi * u**LATE) ** 2, self._end)
+        opens = self._end - self._tight
+        held = np.maximum(self._tight, self._end - opens / (opens + size) * (self._end - at))
+        return np.where(at > self._tight, np.minimum(held, self._end), at)
 
     def _left(self, size: float, now: float, time_left: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
