@@ -150,14 +150,21 @@ def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
 
 @pytest.mark.parametrize("flight_s", [0.35, 0.5, 0.65, 0.9])
 def test_a_shifted_tape_never_runs_backwards(flight_s):
-    """However short the flight, at the largest shift either way, once it has grown."""
+    """However short the flight, at the largest shift either way, once it has grown; one that waits arrives in time."""
     plan = backflip()
     tape, last = plan.tape, plan.tape.t[-1] - plan.tape.takeoff_time
     t = tape.takeoff_time + (tape.t - tape.takeoff_time) * flight_s / last
     tuck = Tuck(plan.robot, replace(tape, t=np.where(tape.t < tape.takeoff_time, tape.t, t)))
-    for size in (-tuck._later, tuck._sooner):
-        _, pace, _ = tuck._pieces(size, tuck._start, flight_s)
-        assert pace.min() > 0.03
+    _, pace, _ = tuck._pieces(tuck._sooner, tuck._start, flight_s)
+    assert pace.min() > 0.03
+    t = np.linspace(tuck._start, tuck._end, 400)
+    there = tuck._place(-tuck._later, t, tuck._start, flight_s)
+    waits = (there == tuck._tight).sum() * (t[1] - t[0])
+    assert (
+        np.diff(there).min() >= 0
+        and there[-1] == pytest.approx(tuck._end)
+        and waits == pytest.approx(tuck._later, abs=4e-3)
+    )
     if flight_s > 0.64:
         assert tuck._sooner == SOONER_S
 
@@ -199,7 +206,7 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / Actuators(plan.robot).speed
     assert share.max() < robust.OPENING_SHARE + 0.05
-    assert Tuck(plan.robot, plan.tape)._later > 0.1 > Tuck(plan.robot, backflip().tape)._later >= LATER_S
+    assert Tuck(plan.robot, plan.tape)._later > 1.3 * Tuck(plan.robot, backflip().tape)._later > LATER_S
     drawn = Perturbation.draw(plan.robot, TrialKey(1, 5, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, perturbation=drawn, reaim=True)
     assert result.landed and result.checks_passed, result.reason
