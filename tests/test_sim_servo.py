@@ -107,6 +107,16 @@ def test_torques_keep_to_the_share_of_the_motors(bhr):
     assert np.array_equal(Servo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_joint_beyond_its_no_load_speed_is_braked_with_all_its_motor_has(bhr, way):
+    q, v, motors = stance_configuration(bhr), np.zeros(bhr.model.nv), Actuators(bhr)
+    hip = bhr.joint_names.index("left_hip_pitch")
+    v[6 + hip] = way * 1.2 * motors.speed[hip]
+    stop, on = (told(bhr, q, feet=AIR, rate=rate * way * 40.0) for rate in (np.zeros(14), np.ones(14)))
+    assert Servo(bhr).torque(stop, q, v)[hip] == pytest.approx(-way * motors.effort[hip])
+    assert Servo(bhr).torque(on, q, v)[hip] == 0.0  # it cannot be driven any faster
+
+
 def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
     """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
     q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
