@@ -17,7 +17,7 @@ from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
-FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 50}, 11
+FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 100}, 11
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
