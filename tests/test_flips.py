@@ -16,7 +16,7 @@ from jumplab.robot import Robot
 from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
 from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.playback import Actuators
-from jumplab.sim.reaim import LATER_S, SOONER_S, Tuck, is_flip
+from jumplab.sim.reaim import FROM_SHARE, LATER_S, SOONER_S, Tuck, is_flip
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.planner import Planner
 from jumplab.stages.reconstruction import planar_quantities
@@ -167,6 +167,41 @@ def test_a_shifted_tape_never_runs_backwards(flight_s):
     )
     if flight_s > 0.64:
         assert tuck._sooner == SOONER_S
+
+
+def flown(tuck, tape, share, closes):
+    """Error of the trunk at the end [rad], shifts (N,) and joint rates (N, k), with ``share`` of the planned L."""
+    momentum, pitch = share * float(np.ravel(tape.extra["planar_L"])[-1]), tuck._pitch[0]
+    from_ = tuck._start + FROM_SHARE * (tuck._end - tuck._start)
+    shifts, pace, q, rates = [0.0], 0.0, tape.q[tape.takeoff_index].copy(), []
+    for step in range(tape.takeoff_index, round(tuck._end / STEP_S)):
+        place = step * STEP_S + shifts[-1]
+        q[7:] = [np.interp(place, tape.t, x) for x in tape.q[:, 7:].T]
+        q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, pitch, 0.0)).coeffs()
+        joints = (1 + pace) * np.array([np.interp(place, tape.t, x) for x in tape.v[:, 6:].T])
+        carried, inertia = (np.interp(place, tuck._t, x) for x in (tuck._carried, tuck._inertia))
+        rate = (momentum - (1 + pace) * carried) / inertia
+        pitch += rate * STEP_S
+        moves = tuck.closing if step * STEP_S < from_ else tuck.shift
+        if closes or moves == tuck.shift:
+            v = np.concatenate([np.zeros(4), [rate, 0.0], joints])
+            shift, pace = moves(step, q, v, tuck._end - step * STEP_S)
+            shifts.append(shift)
+        rates.append(joints)
+    return pitch - tuck._pitch[-1], np.array(shifts), np.array(rates)
+
+
+def test_a_flip_that_lacks_momentum_closes_its_tuck_sooner():
+    """With 92 % of L a longer wait is not enough; its joints keep to their speeds, and no tape runs backwards."""
+    plan = backflip()
+    tape, speed = plan.tape, Actuators(plan.robot).speed
+    late, _, _ = flown(Tuck(plan.robot, tape), tape, 0.92, closes=False)
+    off, shifts, rates = flown(Tuck(plan.robot, tape), tape, 0.92, closes=True)
+    assert abs(off) < 0.03 < 0.1 < late
+    assert shifts.max() > 0.01 and np.diff(shifts).min() > -STEP_S - 1e-9
+    assert np.abs(rates / speed).max() < 1.05
+    _, shifts, _ = flown(Tuck(plan.robot, tape), tape, 1.0, closes=True)
+    assert not shifts[: round(FROM_SHARE * len(shifts))].any()
 
 
 @pytest.mark.slow

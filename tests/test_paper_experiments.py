@@ -193,13 +193,14 @@ def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
     def row(number, aimed, landed, engine="bullet", **more):
         return {"world": "gale", "engine": engine, "re-aim": aimed, "number": number, "landed": landed} | more
 
-    rows = [row(0, True, True), row(1, True, False, cause="tip"), row(0, False, False, cause="slip")]
-    assert worlds.shares(rows) == []  # robot 1 did not jump plain
-    rows += [row(1, False, False, cause="tip"), row(0, True, True, "mujoco")]
+    rows = [row(0, True, True), row(0, False, False, cause="slip"), row(1, False, True)]
+    assert worlds.shares(rows) == []  # robot 1 did not jump re-aimed
+    assert worlds.shares(rows[:1]) == []  # nor did any robot jump plain
+    rows += [row(1, True, False, cause="tip"), row(0, True, True, "mujoco")]
     (line,) = worlds.shares(rows)
     low, high = wilson(1, 2)
-    assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": 0, "re-aimed": 1, "re-aimed [%]": 50.0,
-                    "from [%]": 100 * low, "to [%]": 100 * high, "falls of the re-aimed": "tip 1"}  # fmt: skip
+    assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": "1 of 2", "re-aimed": 1,
+                    "re-aimed [%]": 50.0, "from [%]": 100 * low, "to [%]": 100 * high, "falls of the re-aimed": "tip 1"}  # fmt: skip
 
 
 def test_rows_of_harder_worlds_are_of_known_worlds():

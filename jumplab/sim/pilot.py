@@ -95,7 +95,7 @@ class Pilot:
         self._replan = Replan(robot) if flip else None
         self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + lead_s
         self._earliest = round((tape.takeoff_time + EARLIEST_TOUCHDOWN * flight) / STEP_S)
-        self._tape_until = self._earliest
+        self._tape_until, self._takeoff = self._earliest, tape.takeoff_index
         if self._tuck is not None:
             self._tape_until = min(self._earliest, round((tape.takeoff_time + FROM_SHARE * flight) / STEP_S))
         self._none = self._tau = np.zeros(len(robot.joint_names))
@@ -144,7 +144,7 @@ class Pilot:
         if self.touchdown is None and step < self._tape_until:
             command = self.playback.command(step, played, v, self._none)
             if self.feedback is None:
-                return command
+                return self._close(step, command, played, self.seen(q), v)
             own = wrench.reshape(2, 2, 3) @ pin.rpy.rpyToMatrix(0.0, 0.0, self._start)
             return self.feedback(step, command, played, v, own.reshape(2, 6))
         q, force = self.seen(q), wrench[:, 2]
@@ -166,6 +166,16 @@ class Pilot:
     def heading_error(self, step: int, seen: np.ndarray) -> float:
         """How far the trunk is turned about the vertical beyond the plan [rad]."""
         return float(self.playback.attitude_error(step, headed(seen, -self._heading))[2])
+
+    def _close(self, step: int, command: Command, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> Command:
+        """Early in flight: the tape's ``command``, or another one if the tuck of a flip has to close sooner.
+
+        ``played`` and ``q`` as of :meth:`_fly`.
+        """
+        if self._tuck is None or step < self._takeoff:
+            return command
+        shift = self._tuck.closing(step, q, v, self.forecast.time_left(q, v))
+        return command if shift == (0.0, 0.0) else self.playback.shifted(step, *shift, played, v, self._none)
 
     def _fly(self, step: int, played: np.ndarray, q: np.ndarray, v: np.ndarray) -> Command:
         """In flight: ``played`` is the configuration in the tape's axes, ``q`` in those of the landing."""

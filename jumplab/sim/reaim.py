@@ -45,12 +45,13 @@ FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at th
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
 LATER_S = 0.03  # it may wait, whatever the tape's speeds
+EASY = 0.6  # of the longest wait; forecasts from early flight are wrong by 0.2 rad, for which the rest is kept
 STEEP = 3.97  # slope of the largest shift after its top, times the length of its way
 FORWARD = 0.95  # [1] of the tape's pace that a shift takes at most, once it has grown: it shall not run backwards
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
 NOTHING = 1e-9  # [rad/s] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
-BISECTIONS = 8  # of the range of shifts: to less than a millisecond, 5 mrad
+BISECTIONS = 9  # of the range of shifts: to less than a millisecond, 5 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
 
 
@@ -253,8 +254,9 @@ class Tuck:
 
     A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at
     touchdown. One that opens later waits where it is tightest, and has less time to open: how long it may wait is a
-    matter of the tape's speeds. The turn that is left is forecast with the planned robot's inertia along the tape, from
-    the measured pitch and angular momentum.
+    matter of the tape's speeds. Where more than :data:`EASY` of that is needed it closes sooner as well, from where it
+    is widest on, as fast as its joints can; what it has closed stays closed. The turn that is left is forecast with the
+    planned robot's inertia along the tape, from the measured pitch and angular momentum.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
@@ -266,9 +268,13 @@ class Tuck:
         self._pitch, self._landed = planned_pitch(tape.q[flight]), rotation(tape.q[-1, 3:7])
         late = self._t >= self._start + FROM_SHARE * (self._end - self._start)
         self._tight = float(self._t[late][np.argmin(self._inertia[late])])
-        self._later = self._latest(np.abs(tape.v[flight, 6:]), Actuators(robot).speed)
+        fastest = Actuators(robot).speed / np.maximum(np.abs(tape.v[flight, 6:]), NOTHING)
+        self._later = self._latest(fastest)
+        self._easy = EASY * self._later
         self._sooner = min(SOONER_S, FORWARD * (1 - FROM_SHARE) * (self._end - self._start) / STEEP)
-        self._size = self._shift = 0.0
+        self._quick = self._quickest(fastest)
+        self._early = float(np.interp(self._tight, self._t, self._t - self._quick))
+        self._size = self._shift = self._gained = 0.0
         self._turned: float | None = None
 
     def _along(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -281,26 +287,50 @@ class Tuck:
             momenta.append(self._data.hg.angular.copy())
         return np.array(inertias), np.array(momenta)
 
-    def _latest(self, rates: np.ndarray, limits: np.ndarray) -> float:
-        """How long [s] the tuck may wait, and still open within the ``limits`` (k,) of joints at ``rates`` (N, k)."""
+    def _latest(self, fastest: np.ndarray) -> float:
+        """How long [s] the tuck may wait, and still open, joints moving ``fastest`` (N, k) times as fast."""
         opens = self._end - self._tight
-        fastest = float(np.min(limits / np.maximum(rates[self._t >= self._tight].max(axis=0), NOTHING)))
-        return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(fastest, 1.0)))
+        pace = float(np.min(fastest[self._t >= self._tight]))
+        return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(pace, 1.0)))
+
+    def _quickest(self, fastest: np.ndarray) -> np.ndarray:
+        """When [s] (N,) each place on the tape is reached, if the tuck closes ``fastest`` (N, k) times as fast."""
+        widest = self._t[np.argmax(np.where(self._t < self._tight, self._inertia, 0.0))]
+        closing = (self._t >= widest) & (self._t < self._tight)
+        pace = np.where(closing, np.clip(fastest.min(axis=1), 1.0, 1.0 + SHIFT_RATE), 1.0)
+        return self._t[0] + np.concatenate([[0.0], np.cumsum(np.diff(self._t) / pace[:-1])])
+
+    def closing(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
+        """As :meth:`shift`, before :data:`FROM_SHARE` of the flight: zero unless the tuck has to close sooner."""
+        now, time_left = self._clock(step, time_left)
+        want = self._best(now, time_left, self._turning(now, q, v))
+        self._size = want if want < -self._easy else 0.0
+        return self._moved(now, time_left)
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
         """Time [s] to add to the tape's at ``step``, and its rate [1]; call it once per step, measured state given."""
         now, time_left = self._clock(step, time_left)
-        near = float(np.interp(now, self._t, self._pitch)) if self._turned is None else self._turned
-        seen = float(pitch_of(q))
-        self._turned = seen + 2 * np.pi * round((near - seen) / (2 * np.pi))  # whole turns counted
-        pin.ccrba(self._model, self._data, q, v)
-        momentum = float(self._data.hg.angular[1])
+        momentum = self._turning(now, q, v)
         if time_left > STEP_S:
             want = self._best(now, time_left, momentum)
             waits = max(want, self._size) <= 0 and now + self._shift <= self._tight  # which moves nothing yet
             most = np.inf if waits else SHIFT_RATE * STEP_S
             self._size += float(np.clip(want - self._size, -most, most))
+        return self._moved(now, time_left)
+
+    def _turning(self, now: float, q: np.ndarray, v: np.ndarray) -> float:
+        """Angular momentum about +y [kg m^2/s]; whole turns of the trunk are counted on the way."""
+        near = float(np.interp(now, self._t, self._pitch)) if self._turned is None else self._turned
+        seen = float(pitch_of(q))
+        self._turned = seen + 2 * np.pi * round((near - seen) / (2 * np.pi))
+        pin.ccrba(self._model, self._data, q, v)
+        return float(self._data.hg.angular[1])
+
+    def _moved(self, now: float, time_left: float) -> tuple[float, float]:
+        """Shift [s] and its rate [1] with what is decided."""
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
+        if now <= self._tight:
+            self._gained = max(self._shift - self._due(now, now, time_left)[0] + now, 0.0)
         return self._shift, (self._shift - before) / STEP_S
 
     def _clock(self, step: int, time_left: float) -> tuple[float, float]:
@@ -331,7 +361,7 @@ class Tuck:
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -self._later, self._sooner
+        low, high = -self._later - (self._early if now + self._shift < self._tight else 0.0), self._sooner
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):
@@ -344,15 +374,24 @@ class Tuck:
 
     def _place(self, size: float, t, now: float, time_left: float):
         """Time on the tape at real times ``t``: the rest of it in the time that is left, shifted or held up."""
+        at, u = self._due(t, now, time_left)
+        lead = min(max(-size - self._easy, 0.0), self._early) if now + self._shift < self._tight else 0.0
+        wait = min(-size - lead, self._later)
+        begun = np.interp(now - STEP_S + self._gained, self._t, self._quick)
+        quick = np.interp(begun + t - now + STEP_S, self._quick, self._t)
+        closed = np.minimum(np.maximum(at + self._gained, np.minimum(at + lead, quick)), self._tight)
+        if size >= 0:
+            return np.minimum(np.maximum(closed, at + size * np.sin(np.pi * u**LATE) ** 2), self._end)
+        opens = self._end - self._tight
+        held = np.maximum(self._tight, self._end - opens / (opens - wait) * (self._end - at))
+        return np.where(at > self._tight, np.minimum(held, self._end), np.maximum(closed, at))
+
+    def _due(self, t, now: float, time_left: float) -> tuple:
+        """Time on the tape at real times ``t`` without any shift, and the share of the way from :data:`FROM_SHARE`."""
         due = now + time_left
         from_ = self._start + FROM_SHARE * (self._end - self._start)
         u = np.clip((t - from_) / max(due - from_, STEP_S), 0.0, 1.0)
-        at = t + u * (self._end - due)
-        if size >= 0:
-            return np.minimum(at + size * np.sin(np.pi * u**LATE) ** 2, self._end)
-        opens = self._end - self._tight
-        held = np.maximum(self._tight, self._end - opens / (opens + size) * (self._end - at))
-        return np.where(at > self._tight, np.minimum(held, self._end), at)
+        return t + u * (self._end - due), u
 
     def _left(self, size: float, now: float, time_left: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
