@@ -200,7 +200,8 @@ def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
     (line,) = worlds.shares(rows)
     low, high = wilson(1, 2)
     assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": "1 of 2", "re-aimed": 1,
-                    "re-aimed [%]": 50.0, "from [%]": 100 * low, "to [%]": 100 * high, "falls of the re-aimed": "tip 1"}  # fmt: skip
+                    "re-aimed [%]": 50.0, "from [%]": 100 * low, "to [%]": 100 * high,
+                    "falls of the re-aimed": "tip 1"}  # fmt: skip
 
 
 def test_rows_of_harder_worlds_are_of_known_worlds():
