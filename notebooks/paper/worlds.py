@@ -24,7 +24,8 @@ WORLDS = {
     "twice the usual ranges": Ranges(0.10, 0.03, 0.20, (0.3, 1.0), (0.0, 0.008), 0.10),  # friction: the least there is
     "the usual ranges": Ranges(),
 }
-MANY = {"twice the usual ranges": 250}  # robots that jump re-aimed there; the first ROBOTS of them also plain
+# robots that jump re-aimed there; the first ROBOTS of them also plain
+MANY = {"twice the usual ranges": 250, "shove of 15 N s in flight": 100}
 
 # what a fall of the default jump begins with: the robot's seed, and the disturbances that it meets at their limits
 FALLS = {
