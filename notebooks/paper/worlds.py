@@ -17,7 +17,7 @@ from jumplab.studies.margins import MarginReport, ranges_at
 from jumplab.studies.trials import TrialSettings, run_trials, wilson
 
 LOG, ROBOTS, SEED = Path(__file__).with_name("worlds.jsonl"), 30, 2  # draws that nothing was tuned on
-FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), {"bullet": 200, "mujoco": 100}, 11
+FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), 200, 11
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
@@ -65,8 +65,8 @@ def flips(folder: str | Path, path: Path = FLIPS, *, jobs: int | None = None) ->
     --distance-m 0 --height-m 0.5 --out DIR``.
     """
     rows = []
-    for engine, robots in FLIP_ROBOTS.items():
-        for trial in run_trials(folder, robots, FLIP_SEED, TrialSettings(engine=engine), jobs=jobs).trials:
+    for engine in ENGINES:
+        for trial in run_trials(folder, FLIP_ROBOTS, FLIP_SEED, TrialSettings(engine=engine), jobs=jobs).trials:
             row = {"engine": engine, "number": trial.key.index, "landed": trial.landed}
             rows.append(row | ({} if trial.landed else {"cause": trial.cause}))
     write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
