@@ -199,8 +199,8 @@ def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
     rows += [row(1, True, False, cause="tip"), row(0, True, True, "mujoco")]
     (line,) = worlds.shares(rows)
     low, high = wilson(1, 2)
-    assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": "1 of 2", "re-aimed": 1,
-                    "re-aimed [%]": 50.0, "from [%]": 100 * low, "to [%]": 100 * high,
+    assert line == {"world": "gale", "engine": "bullet", "robots": 2, "plain": "1 of 2", "plain [%]": 50.0,
+                    "re-aimed": 1, "re-aimed [%]": 50.0, "from [%]": 100 * low, "to [%]": 100 * high,
                     "falls of the re-aimed": "tip 1"}  # fmt: skip
 
 

@@ -123,7 +123,8 @@ def shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if not plain or not plain.keys() <= aimed.keys():
             continue
         line = {"world": world, "engine": engine, "robots": len(aimed)}
-        line["plain"] = f"{sum(r['landed'] for r in plain.values())} of {len(plain)}"
+        landed = sum(r["landed"] for r in plain.values())
+        line |= {"plain": f"{landed} of {len(plain)}", "plain [%]": 100 * landed / len(plain)}
         table.append(line | share(list(aimed.values())))
     return table
 
