@@ -1,6 +1,7 @@
 """Pictures of the experiments: what lies where in a scene, what sensors say, and what the maps count."""
 
 from dataclasses import asdict, replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from paper import worlds
 from paper.measurement import measure
 
 from jumplab.show.style import GROUND, LANDING, MIN_FONT_PT, PAGE_IN, VERMILION, tint
-from jumplab.sim import Engine, Scene, SensorNoise, simulate_jump
+from jumplab.sim import ENGINES, Engine, Scene, SensorNoise, simulate_jump
 from jumplab.studies.basin import BasinGrid, BasinReport
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
 
@@ -206,5 +207,10 @@ def test_harder_worlds_are_told_where_the_same_robots_jumped_both_ways():
 
 def test_rows_of_harder_worlds_are_of_known_worlds():
     rows = worlds.stored()
-    assert {r["world"] for r in rows} <= set(worlds.WORLDS) and worlds.shares(rows)
+    assert {r["world"] for r in rows} == set(worlds.WORLDS) and worlds.shares(rows)
+    for world, engine, aimed in product(worlds.WORLDS, ENGINES, (True, False)):
+        numbers = [r["number"] for r in rows if (r["world"], r["engine"], r["re-aim"]) == (world, engine, aimed)]
+        assert numbers == list(range(worlds.MANY.get(world, worlds.ROBOTS) if aimed else worlds.ROBOTS))
+    flips = worlds.stored(worlds.FLIPS)
+    assert [(r["engine"], r["number"]) for r in flips] == list(product(ENGINES, range(worlds.FLIP_ROBOTS)))
     assert all(r["landed"] != ("cause" in r) for r in rows)

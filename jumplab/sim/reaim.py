@@ -1,4 +1,4 @@
-"""Optional correction in flight: the legs are put where they can catch the robot, and a flip's tuck opens in time.
+"""Optional correction in flight: legs are put where they can catch the robot, a flip's tuck closes and opens in time.
 
 A shove, or a robot unlike its plan, leaves speed, momentum and attitude other than planned, about all axes. What flies
 can no longer change the first two; where the soles meet the ground it still can. Legs that swing forward turn the trunk
@@ -41,17 +41,17 @@ TRUNK_WEIGHT = 1.0  # [1/rad] on the trunk's pitch at touchdown, which the arms 
 ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
-FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding at their speed limits
+FROM_SHARE = 0.4  # of the flight; before, legs and arms are still folding, which can be hastened but not undone
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
 LATER_S = 0.03  # it may wait, whatever the tape's speeds
-EASY = 0.6  # of the longest wait; forecasts from early flight are wrong by 0.2 rad, for which the rest is kept
+WAIT_SHARE = 0.6  # of the longest wait; the rest is kept for early forecasts, which are wrong by 0.2 rad
 STEEP = 3.97  # slope of the largest shift after its top, times the length of its way
 FORWARD = 0.95  # [1] of the tape's pace that a shift takes at most, once it has grown: it shall not run backwards
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
 NOTHING = 1e-9  # [rad/s] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
-BISECTIONS = 9  # of the range of shifts: to less than a millisecond, 5 mrad
+BISECTIONS = 9  # of 0.35 s of shifts: to less than a millisecond, 5 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
 
 
@@ -254,9 +254,9 @@ class Tuck:
 
     A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at :data:`FROM_SHARE` of the flight and at
     touchdown. One that opens later waits where it is tightest, and has less time to open: how long it may wait is a
-    matter of the tape's speeds. Where more than :data:`EASY` of that is needed it closes sooner as well, from where it
-    is widest on, as fast as its joints can; what it has closed stays closed. The turn that is left is forecast with the
-    planned robot's inertia along the tape, from the measured pitch and angular momentum.
+    matter of the tape's speeds. Where more than :data:`WAIT_SHARE` of that is needed it closes sooner as well, from
+    where it is widest on, as fast as its joints can; what it has closed stays closed. The turn that is left is forecast
+    with the planned robot's inertia along the tape, from the measured pitch and angular momentum.
     """
 
     def __init__(self, robot: Robot, tape: Tape):
@@ -270,10 +270,10 @@ class Tuck:
         self._tight = float(self._t[late][np.argmin(self._inertia[late])])
         fastest = Actuators(robot).speed / np.maximum(np.abs(tape.v[flight, 6:]), NOTHING)
         self._later = self._latest(fastest)
-        self._easy = EASY * self._later
+        self._first = WAIT_SHARE * self._later  # waited, before it closes sooner as well
         self._sooner = min(SOONER_S, FORWARD * (1 - FROM_SHARE) * (self._end - self._start) / STEEP)
-        self._quick = self._quickest(fastest)
-        self._early = float(np.interp(self._tight, self._t, self._t - self._quick))
+        self._reached_s = self._soonest(fastest)
+        self._most_gained = float(np.interp(self._tight, self._t, self._t - self._reached_s))
         self._size = self._shift = self._gained = 0.0
         self._turned: float | None = None
 
@@ -293,7 +293,7 @@ class Tuck:
         pace = float(np.min(fastest[self._t >= self._tight]))
         return max(min(LATER_S, opens / 2), opens * (1 - 1 / max(pace, 1.0)))
 
-    def _quickest(self, fastest: np.ndarray) -> np.ndarray:
+    def _soonest(self, fastest: np.ndarray) -> np.ndarray:
         """When [s] (N,) each place on the tape is reached, if the tuck closes ``fastest`` (N, k) times as fast."""
         widest = self._t[np.argmax(np.where(self._t < self._tight, self._inertia, 0.0))]
         closing = (self._t >= widest) & (self._t < self._tight)
@@ -301,10 +301,13 @@ class Tuck:
         return self._t[0] + np.concatenate([[0.0], np.cumsum(np.diff(self._t) / pace[:-1])])
 
     def closing(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
-        """As :meth:`shift`, before :data:`FROM_SHARE` of the flight: zero unless the tuck has to close sooner."""
+        """As :meth:`shift`, before :data:`FROM_SHARE` of the flight: zero unless the tuck has to close sooner.
+
+        How it opens is not decided here.
+        """
         now, time_left = self._clock(step, time_left)
         want = self._best(now, time_left, self._turning(now, q, v))
-        self._size = want if want < -self._easy else 0.0
+        self._size = want if want < -self._first else 0.0
         return self._moved(now, time_left)
 
     def shift(self, step: int, q: np.ndarray, v: np.ndarray, time_left: float) -> tuple[float, float]:
@@ -327,7 +330,7 @@ class Tuck:
         return float(self._data.hg.angular[1])
 
     def _moved(self, now: float, time_left: float) -> tuple[float, float]:
-        """Shift [s] and its rate [1] with what is decided."""
+        """The shift [s] that its size gives now, and its rate [1]; what the tuck has closed sooner is kept."""
         before, self._shift = self._shift, float(self._place(self._size, now, now, time_left)) - now
         if now <= self._tight:
             self._gained = max(self._shift - self._due(now, now, time_left)[0] + now, 0.0)
@@ -361,7 +364,7 @@ class Tuck:
 
     def _best(self, now: float, time_left: float, momentum: float) -> float:
         """The shift whose turn ends as planned, or the nearest one."""
-        low, high = -self._later - (self._early if now + self._shift < self._tight else 0.0), self._sooner
+        low, high = -self._later - (self._most_gained if now + self._shift < self._tight else 0.0), self._sooner
         need = self._pitch[-1] - self._turned
         way = np.sign(self._left(low, now, time_left, momentum) - self._left(high, now, time_left, momentum))
         for _ in range(BISECTIONS):
@@ -375,18 +378,18 @@ class Tuck:
     def _place(self, size: float, t, now: float, time_left: float):
         """Time on the tape at real times ``t``: the rest of it in the time that is left, shifted or held up."""
         at, u = self._due(t, now, time_left)
-        lead = min(max(-size - self._easy, 0.0), self._early) if now + self._shift < self._tight else 0.0
+        lead = min(max(-size - self._first, 0.0), self._most_gained) if now + self._shift < self._tight else 0.0
         wait = min(-size - lead, self._later)
-        begun = np.interp(now - STEP_S + self._gained, self._t, self._quick)
-        quick = np.interp(begun + t - now + STEP_S, self._quick, self._t)
-        closed = np.minimum(np.maximum(at + self._gained, np.minimum(at + lead, quick)), self._tight)
+        begun = np.interp(now - STEP_S + self._gained, self._t, self._reached_s)
+        furthest = np.interp(begun + t - now + STEP_S, self._reached_s, self._t)
+        closed = np.minimum(np.maximum(at + self._gained, np.minimum(at + lead, furthest)), self._tight)
         if size >= 0:
             return np.minimum(np.maximum(closed, at + size * np.sin(np.pi * u**LATE) ** 2), self._end)
         opens = self._end - self._tight
         held = np.maximum(self._tight, self._end - opens / (opens - wait) * (self._end - at))
         return np.where(at > self._tight, np.minimum(held, self._end), np.maximum(closed, at))
 
-    def _due(self, t, now: float, time_left: float) -> tuple:
+    def _due(self, t, now: float, time_left: float) -> tuple[np.ndarray, np.ndarray]:
         """Time on the tape at real times ``t`` without any shift, and the share of the way from :data:`FROM_SHARE`."""
         due = now + time_left
         from_ = self._start + FROM_SHARE * (self._end - self._start)
