@@ -48,15 +48,23 @@ class InfeasibleError(JumplabError):
 class SolverError(JumplabError):
     """A solver stopped without an answer that passes its own re-evaluated residuals.
 
-    ``stage`` names the stage that failed, ``status`` is what the solver said, and ``violations`` are the worst violated
-    terms, each as "name: amount unit at node k, t = ... s".
+    ``stage`` names the stage that failed, ``status`` is what the solver said after how many ``iterations``, and
+    ``violations`` are the worst violated terms, each as "name: amount unit at node k, t = ... s".
     """
 
     exit_code = 3
 
-    def __init__(self, message: str, *, stage: str = "", status: str = "", violations: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        message: str,
+        *,
+        stage: str = "",
+        status: str = "",
+        violations: tuple[str, ...] = (),
+        iterations: int = 0,
+    ):
         super().__init__(message)
-        self.stage, self.status, self.violations = stage, status, violations
+        self.stage, self.status, self.violations, self.iterations = stage, status, violations, iterations
 
 
 def quoted(value: Any) -> str:

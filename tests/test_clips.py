@@ -97,6 +97,12 @@ def test_where_the_usual_plan_is_not_clean_three_steps_plan(world, monkeypatch, 
     assert [method for _, method in world.calls] == ["usual", "three-step"]
 
 
+def test_three_steps_plan_nothing_to_the_side(world, monkeypatch, bhr):
+    monkeypatch.setattr(clips, "audit", lambda tape, robot, task: SimpleNamespace(passed=False))
+    clips._planned(Planner(bhr), JumpTask(0.0, 0.3, side_m=0.2))
+    assert [method for _, method in world.calls] == ["usual"]
+
+
 def test_clips_that_failed_are_tried_again(world, tmp_path):
     robot = Robot.load()
     world.refuse = {task.distance_m for task in clips.targets(robot).values()}

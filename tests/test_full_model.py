@@ -155,7 +155,7 @@ def test_mirrored_axes_turn_sums_into_differences():
 
 def test_crooked_robots_are_named():
     with pytest.raises(RobotError, match=r"left_hip_pitch.*right_hip_pitch.*not mirror images"):
-        _ = FullBody(with_axis(Robot.load(), "right_hip_pitch", "0 1 0", "0.6 0.8 0")).pairs
+        FullBody(with_axis(Robot.load(), "right_hip_pitch", "0 1 0", "0.6 0.8 0"))
     straight = '<origin xyz="0 0 -0.35" rpy="0 0 0" />'  # of knees and ankles
     turned = Robot.load().urdf.replace(straight, straight.replace("0 0 0", "0 0 0.1"))
     with pytest.raises(RobotError, match=r"axes of 'left_foot' are not parallel"):

@@ -31,8 +31,7 @@ from jumplab.studies.chain.pilot import Foresight, Rehearsal
 SMALL = Mesh(6, 4, 6)
 STAGES = (
     "srmp/flat, srmp/toe, srmp/launch, srmp/flight, joint qp/launch, joint qp/flight, whole body/flat, whole body/toe, "
-    "whole body/launch, whole body/flight, spatial/flat, spatial/toe, spatial/launch, spatial/flight, "
-    "spatial srmp/flat, spatial srmp/toe, spatial srmp/launch, spatial srmp/flight"
+    "whole body/launch, whole body/flight, spatial/flat, spatial/toe, spatial/launch, spatial/flight"
 )
 
 

@@ -8,8 +8,7 @@ axes: F_ext^js = [f_left, n_left, f_right, n_right] (12,).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -18,7 +17,6 @@ from jumplab.errors import RobotError
 from jumplab.robot import Robot
 
 PARALLEL_TOLERANCE = 1e-6  # how far an axis may be off before a robot counts as crooked
-NUDGE_S = 1e-5  # to either side of an instant, between which slopes are compared
 CROSS = np.zeros((3, 9))  # x @ CROSS is the matrix of "x cross", row by row
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     CROSS[_k, 3 * _j + _i], CROSS[_k, 3 * _i + _j] = 1.0, -1.0
@@ -131,16 +129,7 @@ class FullBody:
         self.gravity = -float(self.model.gravity.linear[2])
         self._read_tree()
         self._read_feet()
-
-    @property
-    def pairs(self) -> list[tuple[int, int, float]]:
-        """(left column, right column, sign) of every joint pair; :class:`RobotError` if they are no mirror images."""
-        return self._paired[0]
-
-    @property
-    def groups(self) -> dict[str, list[int]]:
-        """Rows of :attr:`pairs` by role."""
-        return self._paired[1]
+        self.pairs, self.groups = self._pair_joints()
 
     def _read_tree(self):
         model, n = self.model, self.model.njoints - 1
@@ -181,10 +170,9 @@ class FullBody:
     def _chain(self, joint: int) -> list[int]:
         return [j for j in self.model.supports[joint] if j > 1]
 
-    @cached_property
-    def _paired(self) -> tuple[list[tuple[int, int, float]], dict[str, list[int]]]:
+    def _pair_joints(self) -> tuple[list[tuple[int, int, float]], dict[str, list[int]]]:
         """Pairs of joints, left and right, with the sign of a mirrored motion, and the pairs of each role."""
-        model, data, roles = self.model, self.model.createData(), self.robot.joints
+        model, data, roles = self.model, self.data, self.robot.joints
         pin.computeJointJacobians(model, data, pin.neutral(model))
         shoulders = [self._chain(model.getJointId(n)) for n in roles["shoulder_pitch"]] or [[], []]  # or arms held
         legs = [self._chain(j) for j in self.foot_joints]
@@ -197,13 +185,13 @@ class FullBody:
                 knee = model.names[left] == roles["knee"][0]
                 group = "shoulder" if arm else "hip" if left in hip else "knee" if knee else "ankle"
                 groups[group].append(len(pairs))
-                pairs.append((model.idx_vs[left], model.idx_vs[right], self._mirror_sign(data, left, right)))
+                pairs.append((model.idx_vs[left], model.idx_vs[right], self._mirror_sign(left, right)))
         return pairs, groups
 
-    def _mirror_sign(self, data: pin.Data, left: int, right: int) -> float:
+    def _mirror_sign(self, left: int, right: int) -> float:
         """+1 if equal angles mirror each other, -1 if opposite ones do: found by motion in the neutral pose."""
         model, frame = self.model, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        axes = [pin.getJointJacobian(model, data, j, frame)[3:, model.idx_vs[j]] for j in (left, right)]
+        axes = [pin.getJointJacobian(model, self.data, j, frame)[3:, model.idx_vs[j]] for j in (left, right)]
         mirrored = axes[0] * [-1.0, 1.0, -1.0]  # a rotation's mirror image in the x-z plane
         sign = float(np.sign(mirrored @ axes[1]))
         if np.abs(axes[1] - sign * mirrored).max() > PARALLEL_TOLERANCE:
@@ -307,43 +295,3 @@ def _half_second(D, twist) -> float:
     second += rate[..., :3] @ rate
     rate, second = rate[:, ::2], second[:, ::2]  # of x and z
     return ((rate @ D) * rate + D[:, :3:2] * second).sum()
-
-
-class TurningBody(FullBody):
-    """The same for motions that turn about the vertical: two inertias, each a column of two numbers.
-
-    ``rho`` and ``rho_rate`` are (2,), ``J_rho`` (2, nv), ``drift_rho`` (2,): about the level axis across the base's
-    heading, and about the vertical, both through the CoM.
-    """
-
-    def terms(self, q: np.ndarray, v: np.ndarray) -> FullTerms:
-        """All quantities at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
-        ahead, behind = (self._inertias(pin.integrate(self.model, q, way * v))[1] @ v for way in (NUDGE_S, -NUDGE_S))
-        found, (rho, J_rho) = super().terms(q, v), self._inertias(q)
-        drift = (ahead - behind) / (2 * NUDGE_S)
-        return replace(found, rho=rho, rho_rate=J_rho @ v, J_rho=J_rho, drift_rho=drift)
-
-    def motion(self, q: np.ndarray, v: np.ndarray) -> FullMotion:
-        """What feedback needs at configuration ``q`` (nq,) and rates ``v`` (nv,)."""
-        found, (rho, J_rho) = super().motion(q, v), self._inertias(q)
-        return replace(found, rho=rho, rho_rate=J_rho @ v)
-
-    def _inertias(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Both inertias (2,) and their Jacobian (2, nv)."""
-        data, mass = self.data, self.mass
-        pin.ccrba(self.model, data, q, np.zeros(self.nv))
-        place, com, A_c = self._placements(), data.com[0], data.Ag[:3].T / mass
-        D = place @ self._pseudo @ place.transpose(0, 2, 1)
-        carried = (self._above.T @ D.reshape(len(D), 16)).reshape(-1, 4, 4)
-        X = np.zeros((self.nv, 4, 4))  # d/dt [x; 1] = X [x; 1] on what a column moves
-        X[:, :3, :3], X[:, :3, 3] = skew(data.J[3:].T), data.J[:3].T
-        slope = (X @ carried[self._column_joint])[:, :3, :3] - mass * A_c[:, :, None] * com
-        S, slope = carried[0, :3, :3] - mass * np.outer(com, com), slope + slope.transpose(0, 2, 1)
-        turn = place[0, :3, :3]
-        left = turn[:2, 1] / (size := np.hypot(*turn[:2, 1]))
-        ahead = np.array([left[1], -left[0]])
-        J_heading = np.zeros(self.nv)  # the base's lateral axis moves with its own rates about x and z
-        J_heading[[3, 5]] = -(ahead @ turn[:2, 2]) / size, ahead @ turn[:2, 0] / size
-        pitch = slope[:, 2, 2] + slope[:, :2, :2] @ ahead @ ahead + 2 * (left @ S[:2, :2] @ ahead) * J_heading
-        rho = np.array([S[2, 2] + ahead @ S[:2, :2] @ ahead, S[0, 0] + S[1, 1]])
-        return rho, np.stack([pitch, slope[:, 0, 0] + slope[:, 1, 1]])

@@ -126,6 +126,20 @@ class SpatialModel:
         out_a[:, 3:6] = np.einsum("nij,nj->ni", slope, a[:, 3:6]) + drift
         return out_q, out_v, out_a
 
+    def charts(
+        self, q: np.ndarray, v: np.ndarray, a: np.ndarray, near: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Charts, rates and accelerations (n, 6 + joints) of a motion in Pinocchio's words: the inverse of
+        :meth:`to_pinocchio`. The first attitude is within half a turn of the angles ``near`` (3,)."""
+        chart = self.of_pinocchio(q, near)
+        turn, slope = self.rotations(chart), spin_slope(chart[:, 4], chart[:, 5])
+        rates = np.linalg.solve(slope, v[:, 3:6, None])[..., 0]
+        drift = _spin_drift(chart[:, 4], chart[:, 5], rates)
+        speeds = np.linalg.solve(slope, (a[:, 3:6] - drift)[..., None])[..., 0]
+        linear = np.einsum("nij,nj->ni", turn, v[:, :3])
+        gain = np.einsum("nij,nj->ni", turn, a[:, :3] + np.cross(v[:, 3:6], v[:, :3]))
+        return chart, np.hstack([linear, rates, v[:, 6:]]), np.hstack([gain, speeds, a[:, 6:]])
+
     def of_pinocchio(self, q: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Charts (n, 6 + joints) of configurations (n, nq), their angles continuous.
 
@@ -248,7 +262,7 @@ class SpatialState:
     def dynamics(self, wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = {}) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Inverse dynamics: (force, moment about the base's origin, joint torques) that the motion needs besides.
 
-        ``wrenches`` act from outside: body -> (force, moment about the body's origin), world axes.
+        ``wrenches`` act from outside: body -> (force, moment about the body's origin), in the body's axes.
         """
         parts = []
         for k, (b, spin, (linear, angular)) in enumerate(
@@ -258,8 +272,7 @@ class SpatialState:
             force = b.mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
             moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
             if k in wrenches:
-                outside = [self.rotation(k).T @ x for x in wrenches[k]]
-                force, moment = force - outside[0], moment - outside[1]
+                force, moment = force - wrenches[k][0], moment - wrenches[k][1]
             parts.append((force, moment))
         force, moment, torques = self._gathered(parts)
         return force, moment, ca.vertcat(ca.SX(0, 1), *torques) + self.model.armature * self.a[6:]
@@ -344,6 +357,39 @@ class SpatialState:
     def point(self, body: int, local: np.ndarray) -> ca.SX:
         """Place of a point of a body (3,) [m], in the world; see :meth:`SpatialModel.local`."""
         return self.q[:3] + self.origin(body) + self.rotation(body) @ ca.DM(local)
+
+    def from_base(self, body: int, local: np.ndarray) -> ca.SX:
+        """Place of a point of a body (3,) [m], seen from the base's origin in the base's axes."""
+        place = ca.SX(ca.DM(local))
+        while body:
+            place = self._turns[body].out(place) + ca.DM(self.model.bodies[body].place)
+            body = self.model.bodies[body].parent
+        return place
+
+    @cached_property
+    def _velocities(self) -> list[ca.SX]:
+        """Velocity of every body's origin, in its own axes."""
+        linear = self.v[:3]
+        for turn in self._base:
+            linear = turn.into(linear)
+        found = [linear]
+        for k, b in enumerate(self.model.bodies[1:], start=1):
+            linear = found[b.parent]
+            if np.any(b.place):
+                linear = linear + cross(self._spins[b.parent], b.place)
+            found.append(self._turns[k].into(linear))
+        return found
+
+    def own_rates(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
+        """Velocity of a point of a body, and angular velocity of the body (3,) each, in the body's axes."""
+        spin = self._spins[body]
+        return self._velocities[body] + cross(spin, ca.DM(local)), spin
+
+    def own_accelerations(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
+        """Acceleration of a point of a body, and angular acceleration of the body (3,) each, in the body's axes."""
+        spin, (linear, angular), arm = self._spins[body], self._accelerations[body], ca.DM(local)
+        fall = self.gravity * self.rotation(body)[2, :].T
+        return linear - fall + cross(angular, arm) + cross(spin, cross(spin, arm)), angular
 
     def point_velocity(self, body: int, local: np.ndarray) -> ca.SX:
         """Its velocity (3,) [m/s]."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from jumplab.errors import InputError
 from jumplab.ocp.derivatives import Block, Element, ElementBuilder, gather, scatter
-from jumplab.ocp.problem import PhaseLayout, Problem, Term
+from jumplab.ocp.problem import PhaseLayout, Problem, Term, layouts
 from jumplab.ocp.solution import Multipliers, PhaseGuess, PhaseSolution, resampled
 
 
@@ -43,10 +43,8 @@ class Assembled:
     def __init__(self, problem: Problem, elements: Sequence[Element] | None = None):
         """``elements`` are those of the same problem on any mesh; built anew if None."""
         self.problem = problem
-        self.layouts, self.size = {}, 0
-        for phase in problem.phases:
-            self.layouts[phase.name] = PhaseLayout.of(phase, self.size)
-            self.size += self.layouts[phase.name].size
+        self.layouts = layouts(problem)
+        self.size = sum(layout.size for layout in self.layouts.values())
         self.n_par = sum(problem.parameters.values())
         self.elements = elements or ElementBuilder(problem, self.layouts).elements
         self.cost_terms = [(e.owner, term) for e in self.elements for term in e.costs]
@@ -298,7 +296,8 @@ def pack(a: Assembled, guess: Mapping[str, PhaseGuess]) -> np.ndarray:
         v = np.gradient(g.q, t, axis=0) if g.v is None else g.v
         accel = np.gradient(v, t, axis=0) if g.a is None else g.a
         z = np.zeros((n + 1, len(phase.states))) if g.z is None else g.z
-        x[layout.jerks] = np.diff(accel, axis=0) / (g.duration / n) / phase.scale("j")
+        if layout.jerks.size:
+            x[layout.jerks] = np.diff(accel, axis=0) / (g.duration / n) / phase.scale("j")
         x[layout.nodes] = np.concatenate([g.q, v, accel, z], axis=1) / layout.node_scales
         constants = [g.duration, *(g.constants.get(c, 0.0) for c in phase.constants)]
         x[layout.constants] = np.array(constants) / layout.constant_scales
@@ -314,7 +313,8 @@ def unpack(a: Assembled, x: np.ndarray) -> dict[str, PhaseSolution]:
         duration, *values = (x[layout.constants] * layout.constant_scales).tolist()
         constants = dict(zip(phase.constants, values, strict=True))
         t = np.linspace(0, duration, phase.intervals + 1)
-        out[name] = PhaseSolution(t, q, v, accel, x[layout.jerks] * phase.scale("j"), z, duration, constants)
+        jerk = x[layout.jerks] * phase.scale("j") if layout.jerks.size else np.diff(accel, axis=0) / t[1]
+        out[name] = PhaseSolution(t, q, v, accel, jerk, z, duration, constants, phase.integrated is None)
     return out
 
 

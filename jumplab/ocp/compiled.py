@@ -56,14 +56,10 @@ def library(path: Path) -> Path | None:
     return None
 
 
-def function(code: Path, number: int, name: str) -> ca.Function:
-    """One of the functions in ``code``: ``name`` of element ``number``."""
+def function(code: Path, name: str) -> ca.Function:
+    """One of the functions in ``code``."""
     how = {"enable_fd": True}  # by differences, slopes that only the explanation of a failure asks for
-    return ca.external(_symbol(number, name), str(code), how)
-
-
-def _symbol(number: int, name: str) -> str:
-    return f"e{number}_{name}"
+    return ca.external(name, str(code), how)
 
 
 def _sum(content: bytes) -> str:
@@ -73,6 +69,8 @@ def _sum(content: bytes) -> str:
 def _begin(path: Path) -> None:
     """Start the compiler, unless it failed before or somebody has begun."""
     claim, failed = path.with_suffix(".working"), path.with_suffix(".failed")
+    if any(one.poll() is None for one in _working):
+        return  # one at a time
     with suppress(OSError):
         if failed.exists() or (claim.exists() and time.time() - claim.stat().st_mtime < LONGEST_S):
             return
@@ -98,9 +96,8 @@ def build(path: Path) -> None:
 
 def _compiled(path: Path, scratch: Path) -> bytes:
     """The code, after it has given the interpreter's numbers."""
-    elements = json.loads(path.read_bytes().partition(b"\n")[2])
-    told = {_symbol(k, name): f for k, element in enumerate(elements) for name, f, *_ in element[-1]}
-    known = {symbol: ca.Function.deserialize(f) for symbol, f in told.items()}
+    _, functions = json.loads(path.read_bytes().partition(b"\n")[2])
+    known = {name: ca.Function.deserialize(f) for name, f, *_ in functions}
     generator = ca.CodeGenerator("code.c", {"with_header": False})
     for symbol, f in known.items():
         generator.add(ca.Function(symbol, f.sx_in(), f.call(f.sx_in())))

@@ -104,6 +104,12 @@ class Element:
     formulas: Formulas | None = None  # None if all functions are already made
     made: dict = field(default_factory=dict)  # name -> (function, rows, columns), see :class:`Formulas`
 
+    def placed(self, part: Part) -> Element:
+        """The same functions for another part of the same words."""
+        constraints = [t for t in part.terms if not t.is_cost]
+        counts = [(t, n) for t, (_, n) in zip(constraints, self.rows, strict=True)]
+        return Element(part.owner, part.place, [t for t in part.terms if t.is_cost], counts, self.formulas, self.made)
+
     def function(self, name: str) -> tuple[ca.Function, np.ndarray, np.ndarray]:
         """One of :data:`FUNCTIONS`, made when it is first asked for."""
         if name not in self.made:
@@ -124,6 +130,38 @@ class Element:
         return nodes, np.concatenate(parts, axis=1)
 
 
+@dataclass
+class Part:
+    """One place of a problem with its terms: what an :class:`Element` is made of."""
+
+    owner: str  # phase, or the problem's name for terms that join phases
+    place: str
+    terms: list[Term]
+
+    def words(self, problem: Problem) -> list:
+        """What its functions depend on besides the expressions: equal words, equal functions.
+
+        The mesh and the values of bounds and weights are data. Phases of one kind may have the same words.
+        """
+        phases = [p for p in problem.phases if self.owner in (p.name, problem.name)]
+        said = [
+            (
+                p.kind or p.name,
+                p.coordinates,
+                p.states,
+                p.integrated,
+                {name: c[2] for name, c in p.constants.items()},
+                p.references,
+                p.scales,
+            )
+            for p in phases
+        ]
+        terms = [
+            (t.name, t.equation, t.at, t.is_cost, t.scale, problem.own.get((self.owner, t.name))) for t in self.terms
+        ]
+        return [problem.name, problem.parameters, self.place, said, terms]
+
+
 class ElementBuilder:
     """Makes the symbolic points of each phase and evaluates the terms on them; how many nodes there are is open."""
 
@@ -131,9 +169,41 @@ class ElementBuilder:
         self.problem, self.layouts = problem, layouts
         symbols = {name: ca.SX.sym(name, size) for name, size in problem.parameters.items()}
         self.parameters, self.parameter_vector = SimpleNamespace(**symbols), ca.vertcat(ca.SX(0, 1), *symbols.values())
-        self.elements = [e for layout in layouts.values() for e in self._phase(layout)]
-        if problem.joints:
-            self.elements.append(self._joints())
+        self._points: dict[str, tuple] = {}
+
+    @property
+    def parts(self) -> list[Part]:
+        """All places that have terms, in order."""
+        out = []
+        for phase in self.problem.phases:
+            for place in ("node", "start", "end"):
+                out += _grouped(phase.name, place, [t for t in phase.terms if t.at == place])
+            links = [] if phase.integrated == () else [chain_term(phase)]
+            between = [*links, *(t for t in phase.terms if t.at in ("mid", "interval"))]
+            out += _grouped(phase.name, "interval", between)
+        return out + _grouped(self.problem.name, "problem", list(self.problem.joints))
+
+    @property
+    def elements(self) -> list[Element]:
+        """The elements of all parts; parts of equal words share their functions."""
+        known: dict[str, Element] = {}
+        out = []
+        for part in self.parts:
+            words = repr(part.words(self.problem))
+            if words not in known:
+                known[words] = self.build(part)
+            out.append(known[words].placed(part))
+        return out
+
+    def build(self, part: Part) -> Element:
+        """The element of one part."""
+        if part.place == "problem":
+            return self._joints(part)
+        if part.owner not in self._points:
+            self._points[part.owner] = self._phase(self.layouts[part.owner])
+        node, span, data, seen, spans = self._points[part.owner]
+        local = span if part.place == "interval" else node
+        return self._element(part, local, data, seen, spans)
 
     def _point(self, layout, state, jerk, constants, s, refs):
         nq, phase = layout.nq, layout.phase
@@ -146,28 +216,26 @@ class ElementBuilder:
         return Point(q, v, a, j, z, const[0], s, names, self.parameters, ref, view=phase.view)
 
     def _phase(self, layout):
+        """Variables of a node and of a step, data, and what terms at each place see and span, of one phase."""
         phase, nx, nref = layout.phase, layout.nx, sum(layout.phase.references.values())
         constants, refs, s = ca.SX.sym("const", len(layout.constants)), ca.SX.sym("ref", nref), ca.SX.sym("s")
-        state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.nq)
+        state, right, jerk = ca.SX.sym("x", nx), ca.SX.sym("x_next", nx), ca.SX.sym("j", layout.jerks.shape[1])
         share = ca.SX.sym("share")  # of the phase, between two nodes
         step, data = constants[0] * share, ca.vertcat(s, refs, share)
         here = self._point(layout, state, None, constants, s, refs)
-        left = self._point(layout, state, jerk, constants, s, refs)
+        left = self._point(layout, state, None if phase.integrated is not None else jerk, constants, s, refs)
         after = self._point(layout, right, None, constants, s + share, refs)
+        if phase.integrated is not None:
+            left.j = (after.a - left.a) / step
         mid = replace(left, s=s + share / 2, memo={})
         mid.q, mid.v, mid.a = chain(left.q, left.v, left.a, left.j, step / 2)
         seen = {"node": (here,), "start": (here,), "end": (here,), "mid": (mid,), "interval": (left, after, step)}
         inner = 1 - 0.5 * ((s < END_OF_PHASE) + (s > 1 - END_OF_PHASE))  # trapezoid rule: both ends count half
         spans = {"node": step * inner, "mid": step}
         node, span = ca.vertcat(constants, state), ca.vertcat(constants, state, jerk, right)
-        for place in ("node", "start", "end"):
-            terms = [t for t in phase.terms if t.at == place]
-            if terms:
-                yield self._element(phase.name, place, node, data, terms, seen, spans)
-        terms = [chain_term(phase), *(t for t in phase.terms if t.at in ("mid", "interval"))]
-        yield self._element(phase.name, "interval", span, data, terms, seen, spans)
+        return node, span, data, seen, spans
 
-    def _joints(self):
+    def _joints(self, part: Part) -> Element:
         ends, symbols = {}, []
         for name, layout in self.layouts.items():
             nx, refs = layout.nx, ca.SX.zeros(sum(layout.phase.references.values()))
@@ -175,21 +243,26 @@ class ElementBuilder:
             start, end = (self._point(layout, x, None, constants, float(s), refs) for s, x in enumerate(nodes))
             ends[name] = SimpleNamespace(start=start, end=end)
             symbols += [constants, *nodes]
-        local, seen = ca.vertcat(*symbols), {"problem": (ends,)}
-        return self._element(self.problem.name, "problem", local, ca.SX(0, 1), self.problem.joints, seen, {})
+        return self._element(part, ca.vertcat(*symbols), ca.SX(0, 1), {"problem": (ends,)}, {})
 
-    def _element(self, owner, place, local, data, terms, seen, spans) -> Element:
+    def _element(self, part: Part, local, data, seen, spans) -> Element:
         """Terms evaluated on the points that they see; costs count for the share of the phase that they span."""
         costs, rows, counts = [], [], []
-        for t in terms:
-            y = _column(self.problem.place(owner), t, seen[t.at])
+        for t in part.terms:
+            y = _column(self.problem.place(part.owner), t, seen[t.at])
             if t.is_cost:
                 costs.append((spans.get(t.at, 1.0), y))
             else:
                 rows.append(y / t.scale)
                 counts.append((t, y.numel()))
         formulas = Formulas(local, data, self.parameter_vector, costs, rows)
-        return Element(owner, place, [t for t in terms if t.is_cost], counts, formulas)
+        return Element(part.owner, part.place, [t for t in part.terms if t.is_cost], counts, formulas)
+
+
+def _grouped(owner: str, place: str, terms: list[Term]) -> list[Part]:
+    """Terms of one place by their groups."""
+    groups = dict.fromkeys(t.group for t in terms)
+    return [Part(owner, place, [t for t in terms if t.group == group]) for group in groups]
 
 
 def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
@@ -207,7 +280,19 @@ def _column(place: str, term: Term, seen: Sequence) -> ca.SX:
 
 
 def chain_term(phase: Phase) -> Term:
-    """The exact step under constant jerk from node to node, as a term of every phase."""
+    """The exact step under constant jerk from node to node, as a term of every phase.
+
+    Without jerk variables it is a linear acceleration, of the integrated coordinates alone.
+    """
+    if phase.integrated is not None:
+        which = [phase.coordinates.index(name) for name in phase.integrated]
+
+        def linear(left, right, step):
+            rate = right.v - left.v - step * (left.a + right.a) / 2
+            place = right.q - left.q - step * left.v - step**2 * (2 * left.a + right.a) / 6
+            return ca.vertcat((rate / phase.scale("v"))[which], (place / phase.scale("q"))[which])
+
+        return Term(JERK_CHAIN, "state equation, Sec. III-A, V-A", "scaled", "interval", linear, identity=True)
 
     def defect(left, right, step):
         reached = chain(left.q, left.v, left.a, left.j, step)
@@ -272,4 +357,8 @@ class Block:
         """(values, rows, columns) of the upper triangle of a symmetric matrix, "hessian" or "gauss_newton"."""
         _, rows, cols = self.e.function(name)
         i, j = self.index[:, rows].ravel(), self.index[:, cols].ravel()
-        return ca.vec(self(name, *more)), np.minimum(i, j), np.maximum(i, j)
+        values = ca.vec(self(name, *more))
+        met = (i == j) & np.tile(rows != cols, self.n)  # two local variables that are one: both halves count
+        if met.any():
+            values = values * ca.DM(np.where(met, 2.0, 1.0))
+        return values, np.minimum(i, j), np.maximum(i, j)

@@ -248,7 +248,7 @@ def _failure(a: Assembled, posed: Posed, last: np.ndarray, status: str, iteratio
             said += "; they leave each other no room"
         else:
             said += ": a motion that meets every constraint exists, but the search did not settle; try another guess"
-    return SolverError(said, stage=name, status=status, violations=violations)
+    return SolverError(said, stage=name, status=status, violations=violations, iterations=iterations)
 
 
 def check_start(a: Assembled, posed: Posed) -> None:

@@ -98,6 +98,7 @@ class Term:
     scale : nominal size of a constraint's expression.
     skip : how many nodes to leave out at the start and at the end of the phase (constraints at "node" only).
     identity : it only says that the motion is one motion (links, integration); no limit that could give way.
+    group : terms of one group and place are differentiated as one function, which pays where they share much of it.
     """
 
     name: str
@@ -111,6 +112,7 @@ class Term:
     scale: float = 1.0
     skip: tuple[int, int] = (0, 0)
     identity: bool = False
+    group: str = ""
 
     def __post_init__(self):
         if self.skip != (0, 0) and (self.is_cost or self.at != "node"):
@@ -157,10 +159,16 @@ class Phase:
     duration : (lower, upper) [s]; numbers or functions of the parameter dict.
     terms, bounds : costs, constraints and boxes.
     states : names of further node variables, tied by "interval" terms.
-    constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration.
+    constants : name -> (lower, upper, scale), unknown constants of the phase besides its duration; with a fourth entry,
+        a key: constants of the same key are one unknown in all phases.
     references : name -> size, data given per node when solving.
     scales : nominal sizes of q, v, a, j and z; 1 where not given.
     view : makes of a :class:`Point` an object with the quantities that people think in, one attribute each.
+    integrated : names of the coordinates whose acceleration is linear from node to node; the others follow from terms
+        at every node. None: all, by exact steps with the jerk as a variable.
+    shared : which of "q", "v", "a", "z" the first node has in common with the last node of the phase before, by the
+        names of the variables; these are the same unknowns, so no row joins them.
+    kind : phases of one kind and with the same terms are made of the same functions, whatever their names.
     """
 
     name: str
@@ -174,6 +182,9 @@ class Phase:
     references: dict = field(default_factory=dict)
     scales: dict = field(default_factory=dict)
     view: Callable[[Point], Any] | None = None
+    integrated: tuple[str, ...] | None = None
+    shared: str = ""
+    kind: str = ""
 
     def __post_init__(self):
         names = [x.name for x in (*self.terms, *self.bounds)]
@@ -248,12 +259,14 @@ def _text(bound) -> str:
 class PhaseLayout:
     """Where the variables of a phase stand in the decision vector; the only place that knows their order.
 
-    First its duration and constants; then node by node q, v, a and z, and after each node but the last a jerk.
+    First its duration and constants; then node by node q, v, a and z, and after each node but the last a jerk, if
+    jerks are variables. Entries that the phase shares with others point at theirs.
 
     Attributes
     ----------
-    phase : the phase.  nq, nx : numbers of coordinates, and of variables of a node.  size : of all its variables.
-    constants, nodes, jerks : indices (1 + constants,), (N + 1, nx), (N, nq).
+    phase : the phase.  nq, nx : numbers of coordinates, and of variables of a node.
+    size : number of the variables that are new with this phase.
+    constants, nodes, jerks : indices (1 + constants,), (N + 1, nx), (N, nq) or (N, 0).
     constant_scales, node_scales : sizes by which constants and nodes are divided (1 + constants,), (nx,).
     """
 
@@ -268,11 +281,54 @@ class PhaseLayout:
     node_scales: np.ndarray
 
     @classmethod
-    def of(cls, phase: Phase, first: int) -> PhaseLayout:
-        """The layout of a phase whose duration has the index ``first``."""
-        nq, nc, steps = len(phase.coordinates), 1 + len(phase.constants), phase.intervals
+    def of(
+        cls, phase: Phase, first: int, before: PhaseLayout | None = None, known: dict[str, int] | None = None
+    ) -> PhaseLayout:
+        """The layout of a phase whose first new variable has the index ``first``.
+
+        ``before`` is the layout of the phase before; ``known`` maps keys of constants to indices and is added to.
+        """
+        known = {} if known is None else known
+        nq, steps = len(phase.coordinates), phase.intervals
         nx = 3 * nq + len(phase.states)
-        grid = first + nc + np.arange((steps + 1) * (nx + nq)).reshape(steps + 1, nx + nq)
-        size, constant_scales = nc + grid.size - nq, np.array([1.0, *(c[2] for c in phase.constants.values())])
-        places = first + np.arange(nc), grid[:, :nx], grid[:-1, nx:]
-        return cls(phase, nq, nx, size, *places, constant_scales, np.concatenate([phase.scale(k) for k in "qvaz"]))
+        constants, at = [first], first + 1
+        for entry in phase.constants.values():
+            key = entry[3] if len(entry) > 3 else None
+            if key in known:
+                constants.append(known[key])
+                continue
+            constants.append(at)
+            if key is not None:
+                known[key] = at
+            at += 1
+        start = np.full(nx, -1)
+        if before is not None and phase.shared:
+            place = {x: i for i, x in enumerate(_variables(before.phase))}
+            for column, x in enumerate(_variables(phase)):
+                if x[0] in phase.shared and x in place:
+                    start[column] = before.nodes[-1, place[x]]
+        own = start < 0
+        start[own] = at + np.arange(own.sum())
+        at += int(own.sum())
+        nj = nq if phase.integrated is None else 0
+        grid = at + np.arange(steps * (nj + nx)).reshape(steps, nj + nx)
+        nodes = np.vstack([start, grid[:, nj:]])
+        size = at + grid.size - first
+        constant_scales = np.array([1.0, *(c[2] for c in phase.constants.values())])
+        node_scales = np.concatenate([phase.scale(k) for k in "qvaz"])
+        return cls(phase, nq, nx, size, np.array(constants), nodes, grid[:, :nj], constant_scales, node_scales)
+
+
+def _variables(phase: Phase) -> list[tuple[str, str]]:
+    """(group, name) of the variables of a node, in their order."""
+    return [*((k, name) for k in "qva" for name in phase.coordinates), *(("z", name) for name in phase.states)]
+
+
+def layouts(problem: Problem) -> dict[str, PhaseLayout]:
+    """Phase name -> layout of all phases of a problem, one after the other."""
+    out: dict[str, PhaseLayout] = {}
+    first, before, known = 0, None, {}
+    for phase in problem.phases:
+        before = out[phase.name] = PhaseLayout.of(phase, first, before, known)
+        first += before.size
+    return out

@@ -19,6 +19,25 @@ def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarra
     return np.array([np.interp(new, old, column) for column in values.T]).reshape(-1, len(new)).T
 
 
+def quintic(ends: list[tuple[np.ndarray, np.ndarray]], step: float, h: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(q, v, a) of the polynomials of fifth degree through q, v, a at both ``ends`` of a step, ``h`` after its start.
+
+    ``ends`` are (left, right) of q, v, a, each (n, nq); ``step`` [s]; ``h`` (n, 1) [s].
+    """
+    (q0, q1), (v0, v1), (a0, a1) = ends
+    u = h / step
+    missing = q1 - q0 - step * v0 - step**2 * a0 / 2
+    rate = step * (v1 - v0) - step**2 * a0
+    bend = step**2 * (a1 - a0)
+    c3 = 10 * missing - 4 * rate + bend / 2
+    c4 = -15 * missing + 7 * rate - bend
+    c5 = 6 * missing - 3 * rate + bend / 2
+    q = q0 + h * v0 + h**2 * a0 / 2 + u**3 * (c3 + u * (c4 + u * c5))
+    v = v0 + h * a0 + u**2 * (3 * c3 + u * (4 * c4 + u * 5 * c5)) / step
+    a = a0 + u * (6 * c3 + u * (12 * c4 + u * 20 * c5)) / step**2
+    return q, v, a
+
+
 @dataclass(frozen=True, repr=False)
 class PhaseGuess(Shown):
     """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
@@ -59,14 +78,20 @@ class PhaseSolution(Shown):
     z: np.ndarray  # (N + 1, nz)
     duration: float  # [s]
     constants: dict  # the phase's further ones
+    exact: bool = True  # the jerks lead from node to node; else some coordinates follow from terms at the nodes
 
     def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised."""
+        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised.
+
+        Coordinates that follow from terms at the nodes pass through q, v, a of both neighbouring nodes.
+        """
         t = np.atleast_1d(np.asarray(t, float))
         n = len(self.j)
         k = np.clip((t / self.duration * n).astype(int), 0, n - 1)
         h = (t - self.t[k])[:, None]
-        return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
+        if self.exact:
+            return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
+        return quintic([(x[k], x[k + 1]) for x in (self.q, self.v, self.a)], self.duration / n, h)
 
     def guess(self, intervals: int | None = None) -> PhaseGuess:
         """This solution as the start of another solve, on another mesh if asked."""

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.robot.description import Robot
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, SagittalModel, rotated
-from jumplab.robot.stance import configuration, stance_angles
+from jumplab.robot.stance import stance_angles
 
 
 @dataclass(frozen=True)
@@ -230,44 +229,6 @@ def reach(robot: Robot, count: int = SETTINGS.samples) -> Reach:
         start=start,
         mass=mass,
         weakest=_weakest(m, p, phi),
-    )
-
-
-@dataclass(frozen=True)
-class YawReach:
-    """Inertia about the vertical over the CoM's distance phi; fits are polynomials, highest power first."""
-
-    low_fit: np.ndarray
-    high_fit: np.ndarray
-    usual_fit: np.ndarray  # with easy arms
-    range: tuple[float, float]  # lower, upper of any sampled posture, extremes cut off [kg m^2]
-    stance: float  # [kg m^2]
-    half_stance_m: float  # half of the distance between the soles
-
-
-def yaw_reach(robot: Robot, count: int = 2**12) -> YawReach:
-    """Inertia about the vertical through the CoM of the whole robot, in postures whose left and right are alike."""
-    model, s = robot.model, SETTINGS
-    p, data, still = postures(robot, count, strength=False), model.createData(), np.zeros(model.nv)
-    stance = configuration(robot, stance_angles(robot)[None], np.zeros((1, 2)))
-    inertia = []
-    for q in np.concatenate([configuration(robot, p["angles"], np.zeros((len(p["com"]), 2))), stance]):
-        pin.ccrba(model, data, q, still)
-        inertia.append(data.Ig.inertia[2, 2])
-    pin.updateFramePlacements(model, data)
-    left, right = (data.oMf[model.getFrameId(name)].act(robot.foot.center)[1] for name in robot.foot.frames)
-    *inertia, own = inertia
-    inertia, phi, easy = np.array(inertia), np.linalg.norm(p["com"], axis=1), np.abs(p["shoulder"]) < s.easy_arm_rad
-    ends = np.quantile(inertia, [s.edge, 1 - s.edge])
-    edges = np.quantile(phi, np.linspace(0, 1, s.com_bins + 1))
-    inside = [(phi >= a) & (phi < b) for a, b in pairwise(edges)]
-    low, high = (
-        np.polyfit((edges[1:] + edges[:-1]) / 2, [np.quantile(inertia[i], x) for i in inside], 2)
-        for x in (s.edge, 1 - s.edge)
-    )
-    low, high = _around_stance(low, high, float(_rod(robot.sagittal, stance_angles(robot))[0][1]), own)
-    return YawReach(
-        low, high, np.polyfit(phi[easy], inertia[easy], 1), tuple(map(float, ends)), float(own), abs(left - right) / 2
     )
 
 

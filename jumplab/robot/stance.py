@@ -113,6 +113,15 @@ def stance_configuration(robot: Robot) -> np.ndarray:
     return configuration(robot, stance_angles(robot), toe=-robot.sagittal.sole_center)
 
 
+def leg_length(robot: Robot) -> float:
+    """Height of the hip's pitch axis above the sole as the robot stands [m]."""
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, stance_configuration(robot))
+    hip = data.oMi[model.getJointId(robot.joints["hip_pitch"][0])].translation
+    sole = data.oMf[model.getFrameId(robot.foot.frames[0])].act(robot.foot.center)
+    return float(hip[2] - sole[2])
+
+
 # robots that need space ---------------------------------------------------------------------------------------------
 def knees(robot: Robot) -> list[tuple[int, float, float]]:
     """(index into q[7:], sign, angle) of both knees: flexion = sign * q + angle, zero where the leg is straight.

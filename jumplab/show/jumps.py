@@ -51,11 +51,11 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 
     Parameters
     ----------
-    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's; out of the
-        plane in the order of the robot's joints, one column per pair, the right side paler.
+    guess : time (n,), joint angles and rates (n, 4) in sagittal signs to draw dashed, such as stage 2's; of a jump in
+        the plane alone. Out of it there is a column per pair of joints, the right side paler.
     """
     if turning.leaves_plane(tape):
-        return turning.joint_trajectories(tape, robot, heel_up_time(tape), guess)
+        return turning.joint_trajectories(tape, robot, heel_up_time(tape))
     fig = style.new_figure(style.PAGE_IN, 3.1)
     axes = fig.subplots(2, 4, sharex=True)
     m, e = robot.sagittal, tape.extra
@@ -83,9 +83,12 @@ def joint_trajectories(tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...
 # Fig. 9 ---------------------------------------------------------------------------------------------------------
 @style.styled
 def inertia_and_momentum(tape: Tape) -> Figure:
-    """F-9: inertia, CoM velocity and angular momentum of the plan, and dashed what stage 1 asked for."""
+    """F-9: inertia, CoM velocity and angular momentum of the plan, and dashed what stage 1 asked for.
+
+    Out of the plane CoM velocity and angular momentum alone, in all three directions.
+    """
     if turning.leaves_plane(tape):
-        return turning.inertia_and_momentum(tape, heel_up_time(tape))
+        return turning.speed_and_momentum(tape, heel_up_time(tape))
     fig = style.new_figure(style.PAGE_IN, 3.3)
     axes = fig.subplots(2, 2, sharex=True)
     e, takeoff, known = tape.extra, tape.takeoff_time, "srmp_launch_t" in tape.extra

@@ -52,44 +52,38 @@ def motor(ax: Axes, speed: float, corner: float, free: float, effort: float, lim
     ax.set(xlabel="speed [rad/s]", xlim=(-1.08 * free, 1.08 * free), ylim=(-1.12 * effort, 1.12 * effort))
 
 
-def joint_trajectories(tape: Tape, robot: Robot, heel_up: float, guess: tuple[np.ndarray, ...] | None) -> Figure:
-    """Angles above, rates below, a column per pair of joints, the right side paler, ``guess`` dashed."""
+def joint_trajectories(tape: Tape, robot: Robot, heel_up: float) -> Figure:
+    """Angles above, rates below, a column per pair of joints, the right side paler."""
     joints = pairs(robot)
     fig = style.new_figure(style.PAGE_IN, 3.1)
     axes = fig.subplots(2, len(joints), sharex=True)
     for column, (name, sides) in zip(axes.T, joints.items(), strict=True):
         for k, (ax, values) in enumerate(zip(column, (tape.q[:, 7:], tape.v[:, 6:]), strict=True)):
             for i, alpha in zip(sides, (1.0, PALE), strict=False):
-                dashed = [] if guess is None else [(guess[0], guess[1 + k][:, i])]
-                style.compare(ax, (tape.t, values[:, i], tape.phase), *dashed, marks=[heel_up], alpha=alpha)
+                style.compare(ax, (tape.t, values[:, i], tape.phase), marks=[heel_up], alpha=alpha)
             a = robot.actuators[robot.joint_names[sides[0]]]
             style.limits(ax, *((a["lower"], a["upper"]) if k == 0 else (-a["speed"], a["speed"])))
         column[0].set_title(name.removesuffix(" pitch"), fontsize=7)
         column[1].set_xlabel("time [s]")
     for ax, label in zip(axes[:, 0], ("angle [rad]", "velocity [rad/s]"), strict=True):
         ax.set_ylabel(label)
-    dashed = "stage 2, the guess" if guess is not None else None
-    style.legend_above(fig, style.phase_handles("launch", "flight", limit="limit", reference=dashed))
+    style.legend_above(fig, style.phase_handles("launch", "flight", limit="limit"))
     return fig
 
 
-def inertia_and_momentum(tape: Tape, heel_up: float) -> Figure:
-    """Both inertias, speed to the left, and L about three axes; dashed what stage 1 asked for."""
-    fig, e, known = style.new_figure(style.PAGE_IN, 3.3), tape.extra, "srmp_launch_t" in tape.extra
-    rows, starts = e["inertia_rows"], {"launch": 0.0, "flight": tape.takeoff_time}
-    if known:
-        starts["launch"] = tape.takeoff_time - e["srmp_launch_t"][-1]
-    curves = [("rho", e["rho"], k, f"$\\rho$, {x} [kg m$^2$]", rows) for k, x in enumerate(("pitch", "yaw"))]
-    curves += [("com_velocity", e["com_velocity"], 1, "$v_y$ of the CoM [m/s]", slice(None))]
-    curves += [("L", e["angular_momentum"], k, f"$L_{x}$ [kg m$^2$/s]", slice(None)) for k, x in enumerate("xyz")]
-    for ax, (key, values, k, label, at) in zip(fig.subplots(2, 3, sharex=True).flat, curves, strict=True):
-        asked = [(e[f"srmp_{p}_t"] + t, e[f"srmp_{p}_{key}"][:, k]) for p, t in starts.items()] if known else []
-        curve = tape.t[at], values[:, k], tape.phase[at]
-        style.compare(ax, curve, *asked, label=label, marks=(heel_up, tape.takeoff_time))
-    for ax in fig.axes[3:]:
+def speed_and_momentum(tape: Tape, heel_up: float) -> Figure:
+    """Velocity of the CoM and L about it, in three directions."""
+    fig = style.new_figure(style.PAGE_IN, 3.3)
+    axes = fig.subplots(2, 3, sharex=True)
+    speed = tape.extra["com_velocity"], "$v_{}$ of the CoM [m/s]"
+    spin = tape.extra["angular_momentum"], "$L_{}$ [kg m$^2$/s]"
+    for row, (values, label) in zip(axes, (speed, spin), strict=True):
+        for ax, curve, axis in zip(row, values.T, "xyz", strict=True):
+            marks = heel_up, tape.takeoff_time
+            style.compare(ax, (tape.t, curve, tape.phase), label=label.format(axis), marks=marks)
+    for ax in axes[1]:
         ax.set_xlabel("time [s]")
-    reference = "stage 1, the reference" if known else None
-    style.legend_above(fig, style.phase_handles("launch", "flight", reference=reference))
+    style.legend_above(fig, style.phase_handles("launch", "flight"))
     return fig
 
 

@@ -22,10 +22,7 @@ from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
 from jumplab.task import JumpTask
 
-# what is compared -> stage 1's column, and which part of it
-TRACKED = {"rho": ("rho", ...), "rho_rate": ("rho_rate", ...), "velocity": ("com_velocity", ...), "L": ("L", ...)}
-TRACKED_IN_SPACE = TRACKED | {"rho": ("rho", 0), "rho_rate": ("rho_rate", 0)}
-TRACKED_IN_SPACE |= {"yaw_rho": ("rho", 1), "yaw_rho_rate": ("rho_rate", 1)}
+TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}  # names on the tape
 NO_SEEDS = "none: no stage draws a random number, and a plan made twice is the same"
 
 
@@ -48,8 +45,8 @@ class JumpPlan(Shown, Named):
     task, robot, method : what was asked, of whom (under the task's gravity), and how it was planned.
     tape : the 1 kHz tape of the full robot.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
-    whole_body : result of stage 3 or of the direct planner, out of the plane of the spatial program, which began with
-        their motion; None if the plan was read from a result folder.
+    whole_body : result of stage 3 or of the direct planner, out of the plane of the spatial program; None if the plan
+        was read from a result folder.
     statistics : one row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less closely.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
@@ -169,8 +166,7 @@ class JumpPlan(Shown, Named):
         -------
         phase ("launch", "flight") -> "rho" [kg m^2], "rho_rate" [kg m^2/s], "velocity" of the CoM [m/s], "L" [kg m^2/s]
         -> "rms" of the difference, and "relative_rms", its share of the reference's mean size (None where that is
-        zero). Out of the plane also "yaw_rho" and "yaw_rho_rate", and L has three components. None for a plan without
-        stage 1.
+        zero). None for a plan without stage 1.
         """
         if self.stored is not None:
             return self.stored.get("tracking")
@@ -204,30 +200,20 @@ class JumpPlan(Shown, Named):
 
 
 def _tracking(tape: Tape, srmp: SrmpPlan) -> dict[str, dict[str, dict[str, float | None]]]:
-    rows, toe, done = _moved(tape)
-    time, k = tape.t[rows], int(np.argmax(tape.phase[rows] == "flight"))
-    launch = np.interp(time[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
-    air, found = time[k:] - tape.takeoff_time, {}
-    for name, at, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
+    k = tape.takeoff_index
+    toe = float(tape.extra["planar_toe_phase_start"])
+    launch = np.interp(tape.t[:k], [0, toe, tape.takeoff_time], [0, srmp.launch_s - srmp.toe_s, srmp.launch_s])
+    air = tape.t[k:] - tape.takeoff_time
+    found = {}
+    for name, rows, t in (("launch", slice(k), launch), ("flight", slice(k, None), air * srmp.flight_s / air[-1])):
         part, found[name] = getattr(srmp, name), {}
-        for key, (column, i) in (TRACKED if "planar_rho" in tape.extra else TRACKED_IN_SPACE).items():
-            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column)[:, i].T)])
-            missed = np.atleast_2d(done[column][at, i].T) - asked
-            rms = float(np.sqrt(np.mean(np.sum(missed**2, axis=0))))
+        for key, column in TRACKED.items():
+            asked = np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
+            done = np.atleast_2d(tape.extra[f"planar_{column}"][rows].T)
+            rms = float(np.sqrt(np.mean(np.sum((done - asked) ** 2, axis=0))))
             size = float(np.mean(np.linalg.norm(asked, axis=0)))
             found[name][key] = {"rms": rms, "relative_rms": rms / size if size else None}
     return found
-
-
-def _moved(tape: Tape) -> tuple[np.ndarray | slice, float, dict[str, np.ndarray]]:
-    """Rows of the tape, when its heels rise [s], and what the robot does there by stage 1's names."""
-    e = tape.extra
-    if "planar_rho" in e:
-        columns = {column: e[f"planar_{column}"] for column, _ in TRACKED.values()}
-        return slice(None), float(e["planar_toe_phase_start"]), columns
-    rows, columns = e["inertia_rows"], {column: e[column] for column in ("rho", "rho_rate")}
-    columns |= {"com_velocity": e["com_velocity"][rows], "L": e["angular_momentum"][rows]}
-    return rows, float(e["toe_phase_start"]), columns
 
 
 def _solver(s: Statistics) -> dict:

@@ -24,26 +24,24 @@ from jumplab.stages.changes import LAST, StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
-from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities, turning_inertias
+from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
 from jumplab.stages.spatial import SpatialLimits, SpatialPlan, SpatialPlanner
 from jumplab.stages.spatial.settings import FLIP_MESH
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
-from jumplab.stages.srmp.settings import SpatialSrmpSettings, SrmpSettings
-from jumplab.stages.srmp.spatial import SpatialSrmpPlan, SpatialSrmpPlanner
+from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.planner import check_platform
 from jumplab.task import JumpTask
 
 METHODS, USUAL = ("three-step", "direct"), "usual"
-FIRST_STAGES = "srmp", "spatial srmp", "joint qp"  # those that the direct method leaves out ...
+FIRST_STAGES = "srmp", "joint qp"  # those that the direct method leaves out ...
 FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 _COUNT = count()
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
-AHEAD = "stage 3 began from a jump ahead with ramps of side and yaw instead"  # the same out of the plane
 
 
 class Planner:
@@ -56,13 +54,13 @@ class Planner:
     ----------
     robot : who jumps.
     terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body",
-        out of the plane "spatial srmp" and "spatial", have phases flat, toe, launch (both) and flight, "joint qp" has
-        launch and flight; "srmp" or "whole body" alone takes those at "problem". An expression sees a point with
-        joints, joint_rates, torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
+        out of the plane "spatial", have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight;
+        "srmp" or "whole body" alone takes those at "problem". An expression sees a point with joints, joint_rates,
+        torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
         :class:`jumplab.stages.whole_body.view.BodyView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
         posture, time, see :class:`jumplab.stages.srmp.view.RodView`; out of the plane
-        :class:`jumplab.stages.spatial.view.SpatialView` and :class:`jumplab.stages.srmp.spatial.Pendulum`. The direct
-        planner takes those of "whole body", out of the plane of "spatial".
+        :class:`jumplab.stages.spatial.view.SpatialView`. The direct planner takes those of "whole body", out of the
+        plane of "spatial".
     weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's. For
         "joint qp" it is a factor on the block's own weights.
     off : names of the same sort: terms and bounds to leave out.
@@ -112,28 +110,20 @@ class Planner:
         return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
     def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "spatial", "spatial srmp", "srmp", "whole body", "direct".
+        """A stage's planner: "reach", "spatial", "srmp", "whole body", "direct".
 
-        The last three as "... flip" too.
+        The last four as "... flip" too.
         """
         if name not in self._stages:
             kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
             build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
-            build |= {"spatial srmp": self._spatial_srmp, "spatial": self._away}
+            build["spatial"] = self._away
             self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
         return self._stages[name]
 
     def _srmp(self, flip: bool) -> SrmpPlanner:
         settings = settled(SrmpSettings, self._given[1], flip)
         return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
-
-    def _spatial_srmp(self, flip: bool) -> SpatialSrmpPlanner:
-        given = self._given[1]
-        if isinstance(given, SrmpSettings):
-            usual = vars(SrmpSettings())
-            given = {name: x for name, x in vars(given).items() if name in usual and x != usual[name]}
-        settings = replace(SpatialSrmpSettings(), **(given or {}))
-        return SpatialSrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["spatial srmp"])
 
     def _away(self, flip: bool) -> SpatialPlanner:
         how = dict(mesh=FLIP_MESH, limits=SpatialLimits().of_flip()) if flip else {}
@@ -244,9 +234,9 @@ class Planner:
         ----------
         task : the target.
         method : "direct" (the whole body alone, from a crouch; with side or yaw the spatial program, begun from a jump
-            ahead with ramps) or "three-step" (SRMP, joint-space QPs, whole body; what the paper does). "usual" is
-            "direct", which takes less time and finds a plan at least as often (``notebooks/10_benchmark``,
-            ``13_three_dimensions``), but "three-step" for flips in the plane, of which the direct one leaves more
+            ahead with ramps) or "three-step" (SRMP, joint-space QPs, whole body; what the paper does), for targets in
+            the plane. "usual" is "direct", which takes less time and finds a plan at least as often
+            (``notebooks/10_benchmark``), but "three-step" for flips in the plane, of which the direct one leaves more
             outside the audit's limits (``10_benchmark``), and where something of stages 1 and 2, or of stage 3's
             tracking, is changed.
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
@@ -262,7 +252,12 @@ class Planner:
         require_type(task, JumpTask, "the target")
         method = self.chosen(method, weights, flip=bool(task.rotation_rad) and task.in_plane)
         if not (task.in_plane and self.robot.planar):
-            return self._spatial(task, method, weights, start)
+            if method != "direct":
+                raise InputError(
+                    f"method {quoted(method)}: stages 1 and 2 are planar, and this target goes to the "
+                    f"side or turns; choose 'direct'"
+                )
+            return self._spatial(task, weights, start)
         check_platform(task, self.robot, self.limits)
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
@@ -317,66 +312,31 @@ class Planner:
             body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
         )
 
-    def _spatial(self, task: JumpTask, method: str, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
-        """A jump out of the plane, or of a robot that no plane describes: three steps, or the spatial program alone,
-        begun from the planar jump of the same distance and rise where there is one.
-        """
+    def _spatial(self, task: JumpTask, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
+        """A jump out of the plane, or of a robot that no plane describes: the spatial program."""
         if start is not None and not self.robot.planar:
             raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
         last, asked = self.stage(_away(task)), sorted_out(weights=weights)
         last.parameters(task)  # refuses what cannot be before anything is solved
+        if others := [stage for stage, x in asked.items() if stage != "spatial" and x]:
+            raise InputError(
+                f"weights of {others[0]!r}: jumps to the side, with a turn or of robot {self.robot.name} have the one "
+                f"stage 'spatial'; write 'spatial/{next(iter(asked[others[0]].weights))}'"
+            )
         if asked["spatial"]:
             asked["spatial"].applied(last.nlp.problem)
-        rest = {
-            f"{stage}/{name}": w for stage, x in asked.items() if stage != "spatial" for name, w in x.weights.items()
-        }
-        now, skipped = asked["spatial"].weights, None
-        if method == "three-step":
-            self._refuse_planar(asked)
-            try:
-                if start is not None:
-                    raise SolverError("stages 1 and 2 out of the plane begin in the stance")
-                return self._three_spatial(task, asked)
-            except SolverError as e:
-                skipped, rest = f"{e}; {AHEAD}", {}
-        begun, rows, stance = (), (), None if start is None else self._standing(start)
-        if self.robot.planar:
-            planar = replace(task, side_m=0.0, yaw_rad=0.0, platform_m=0.0)
-            first = self.plan(planar, "direct", weights=rest, start=start)
-            begun, rows = (first.tape, first.toe_phase_s), first.statistics
-        body = last.plan(task, *begun, weights=now, stance=stance)
-        return self._placed(method, body, (*rows, _row("spatial", body.solution.statistics)), skipped=skipped)
+        stance = None if start is None else self._standing(start)
+        return self._placed(last.plan(task, weights=asked["spatial"].weights, stance=stance))
 
-    def _refuse_planar(self, asked: Mapping[str, StageChanges]) -> None:
-        ignored = [f"{stage!r}" for stage in ("srmp", "whole body") if self.changes[stage] or asked[stage]]
-        if ignored:
-            raise InputError(
-                f"three steps to the side or with a turn have no place for {' and '.join(ignored)}: their stages are "
-                f"'spatial srmp', 'joint qp' and 'spatial'; leave that out, or choose the method 'direct'"
-            )
-
-    def _three_spatial(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
-        """Stages 1 and 2 without a plane, then the spatial program from their motion."""
-        srmp = self.stage("spatial srmp").plan(task, weights=asked["spatial srmp"].weights)
-        joints, heels = self._joints(srmp, asked, step_s=STEPS_S), srmp.launch_s - srmp.toe_s
-        weights = asked["spatial"].weights
-        body = self.stage(_away(task)).plan(task, joints.tape(self.robot), heels, ramps=False, weights=weights)
-        rows = _row("1 SRMP", srmp.solution.statistics), _joint_row(joints), _row("3 spatial", body.solution.statistics)
-        return self._placed("three-step", body, rows, srmp, joints)
-
-    def _placed(
-        self,
-        method: str,
-        body: SpatialPlan,
-        rows: tuple[StageRow, ...],
-        srmp: SpatialSrmpPlan | None = None,
-        joints: JointPlan | None = None,
-        skipped: str | None = None,
-    ) -> JumpPlan:
-        """The plan of a spatial solution; ``rows`` are its stages', the first two those of three steps."""
-        tape, robot = self.stage(_away(body.task)).tape(body), self.robot.under_gravity(body.task.gravity)
-        tape = replace(tape, extra=tape.extra | turning_inertias(robot, tape) | _of_stage1(srmp))
-        return JumpPlan(body.task, robot, method, tape, srmp, joints, body, rows, skipped)
+    def _placed(self, body: SpatialPlan) -> JumpPlan:
+        """The plan of a spatial solution, one row of statistics for each attempt."""
+        last = self.stage(_away(body.task))
+        robot, build_s = self.robot.under_gravity(body.task.gravity), last.nlp.build_s
+        rows = tuple(
+            StageRow(f"spatial, {x.start}, {x.hessian}", x.iterations, 0.0 if k else build_s, x.cpu_s)
+            for k, x in enumerate(body.attempts)
+        )
+        return JumpPlan(body.task, robot, "direct", last.tape(body), None, None, body, rows)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
@@ -449,7 +409,7 @@ class Planner:
                 body = self.stage(_away(task)).plan(task, near=near, stance=stance)
             except SolverError:
                 return self.plan(task, previous.method, start=start)
-            return self._placed(previous.method, body, (_row("spatial", body.solution.statistics),))
+            return self._placed(body)
         if task.rotation_rad or isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
             return self.plan(task, previous.method, start=start)
         check_platform(task, self.robot, self.limits)

@@ -6,14 +6,12 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.io.tape import RATE_HZ, Tape
-from jumplab.models.full import TurningBody
 from jumplab.models.planar import evaluator
 from jumplab.ocp import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
 
 SHORTEST_STEP = 0.05  # share of a sample; a shorter last step is joined to the one before
-SPARSE = 5  # out of the plane inertias are told for every so manieth row
 COM = ("com", "com_velocity", "com_acceleration")
 _EVALUATORS: dict = {}
 
@@ -38,14 +36,6 @@ def planar_quantities(
         known[names] = known[whole].factory("some", known[whole].name_in(), list(names))
     out = known[names].map(len(angles))(angles=angles.T, rates=rates.T, accels=accels.T, toe=toe_acceleration.T)
     return {k: v.full().T.squeeze() for k, v in out.items()}
-
-
-def turning_inertias(robot: Robot, tape: Tape) -> dict[str, np.ndarray]:
-    """Inertia across the heading and about the vertical, and their rates (m, 2), at some ``inertia_rows`` of a tape."""
-    last, k, body = len(tape.t) - 1, tape.takeoff_index, TurningBody(robot)
-    rows = np.unique([*range(0, last, SPARSE), k - 1, k, last])
-    seen = [body.motion(tape.q[i], tape.v[i]) for i in rows]
-    return {"inertia_rows": rows} | {x: np.array([getattr(m, x) for m in seen]) for x in ("rho", "rho_rate")}
 
 
 def planar_motion(phases: dict[str, PhaseSolution], gravity: float, robot: Robot) -> dict[str, np.ndarray]:

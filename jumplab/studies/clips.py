@@ -149,12 +149,13 @@ def _clip(
 
 
 def _planned(planner: Planner, task: JumpTask) -> tuple[JumpPlan | None, str]:
-    """A plan by the usual method or, where that is not clean, in three steps: the first clean one, else the last.
+    """A plan by the usual method or, where that is not clean, in the plane in three steps.
 
-    If there is none, the reason why the last method found none.
+    The first clean one, else the last. If there is none, the reason why the last method found none.
     """
     found, reason = None, ""
-    for method in (USUAL, "three-step") if planner.robot.planar else (USUAL,):
+    by_steps = planner.robot.planar and task.in_plane
+    for method in (USUAL, "three-step") if by_steps else (USUAL,):
         try:
             found = planner.plan(task, method)
         except JumplabError as e:

@@ -1,4 +1,4 @@
-"""Jumps in three dimensions, by the dozen: which start pays, which targets are planned, and how they land.
+"""Jumps in three dimensions, by the dozen: which targets are planned, and how they land.
 
 ``python -m paper.three_dimensions`` in the folder of the notebooks does what :data:`LOG` lacks, one line per target,
 and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file.
@@ -25,22 +25,27 @@ from jumplab.errors import JumplabError
 from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.show.style import FLIGHT, LANDING, LAUNCH, LIMIT, PAGE_IN, REFERENCE_STYLE, VERMILION, new_figure, tint
+from jumplab.show.style import (
+    FLIGHT,
+    LANDING,
+    LAUNCH,
+    LIMIT,
+    PAGE_IN,
+    REFERENCE_STYLE,
+    VERMILION,
+    by_phase,
+    new_figure,
+    tint,
+)
 from jumplab.sim.playback import MODES
-from jumplab.stages.planner import METHODS, JumpPlan, Planner
-from jumplab.stages.srmp.spatial import SpatialSrmpPlan
+from jumplab.stages.planner import JumpPlan, Planner
 from jumplab.studies.envelope import most_used
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial, wilson
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("three_dimensions.jsonl")
 AHEAD, SIDE, YAW_DEG, RISE = (0.0, 0.3, 0.6, 0.9), (0.15, 0.3, 0.45, 0.6), (45, 90, 135, 180), (0.2, 0.3, 0.4, 0.5)
-STARTS = (  # ahead [m], to the left [m], rise [m], turn [deg]: a fair share of sides, turns and both
-    *((0.0, 0.2, 0.3, 0), (0.0, 0.3, 0.4, 0), (0.0, -0.3, 0.4, 0), (0.0, 0.6, 0.5, 0), (0.0, 0.0, 0.3, 45)),
-    *((0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.4, -45), (0.0, 0.0, 0.5, 150), (0.0, 0.0, 0.5, 180), (0.3, 0.3, 0.4, 0)),
-    *((0.8, 0.3, 0.5, 0), (0.5, 0.3, 0.4, 45), (0.6, 0.0, 0.4, 45), (0.3, 0.3, 0.4, 90)),
-)
-LANDED = {  # the same four numbers
+LANDED = {  # ahead [m], to the left [m], rise [m], turn [deg]
     "side": (
         *((0.0, y, 0.4, 0) for y in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.3)),
         *((0.0, -0.6, 0.5, 0), (0.0, 0.2, 0.3, 0), (0.0, 0.4, 0.5, 0), (0.0, 0.3, 0.3, 0), (0.0, 0.6, 0.5, 0)),
@@ -60,29 +65,27 @@ LANDED = {  # the same four numbers
 PERTURBED = ((0.0, 0.3, 0.4, 0), (0.0, 0.0, 0.4, 90), (0.0, 0.0, 0.5, 180), (0.5, 0.3, 0.4, 0))
 HEADING_DEG = 3.0  # that a playback may miss
 ROBOTS = 100  # that differ from their model, for each of those targets
-MEASURED = ("iterations", "cpu_s", "cost")
-KINDS = {  # name -> targets, methods
-    "starts": (STARTS, METHODS),
-    "side": ([(x, y, 0.4, 0) for y in SIDE for x in AHEAD], METHODS[1:]),
-    "turn": ([(0.0, 0.0, h, yaw) for h in RISE for yaw in YAW_DEG], METHODS[1:]),
-    "landed": ([target for group in LANDED.values() for target in group], METHODS[1:]),
-    "perturbed": (PERTURBED, METHODS[1:]),
+KINDS = {  # name -> targets
+    "side": [(x, y, 0.4, 0) for y in SIDE for x in AHEAD],
+    "turn": [(0.0, 0.0, h, yaw) for h in RISE for yaw in YAW_DEG],
+    "landed": [target for group in LANDED.values() for target in group],
+    "perturbed": PERTURBED,
 }
 
 
-def solve(planner: Planner, kind: str, target: Sequence[float], method: str) -> dict[str, Any]:
+def solve(planner: Planner, kind: str, target: Sequence[float]) -> dict[str, Any]:
     """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most.
 
     ``runs`` of the landed are its playbacks, see :func:`played`; ``robots`` of the perturbed whether each one landed.
     """
     ahead, side, rise, turn = target
     task, began = JumpTask(ahead, rise, side_m=side, yaw_rad=np.radians(turn)), time.process_time()
-    row = {"kind": kind, "target": list(target), "method": method, "planned": False, "clean": False}
+    row = {"kind": kind, "target": list(target), "planned": False, "clean": False}
     try:
-        plan = planner.plan(task, method)
+        plan = planner.plan(task)
     except JumplabError as e:
         return row | {"cpu_s": time.process_time() - began, "reason": str(e)[:160]}
-    row |= {"planned": True, "cpu_s": time.process_time() - began, "skipped": (plan.skipped or "")[:160]}
+    row |= {"planned": True, "cpu_s": time.process_time() - began}
     s, report = plan.whole_body.solution.statistics, audit(plan.tape, plan.robot, task)
     most, share = most_used(report, plan.robot)
     row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
@@ -113,18 +116,15 @@ def run(path: str | Path = LOG, kinds: Iterable[str] = tuple(KINDS)) -> None:
     """Solve what the file lacks."""
 
     def entry(line: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return (line["kind"], *line["target"], line["method"]), line
+        return (line["kind"], *line["target"]), line
 
     planner = Planner(Robot.load(), keep=True)
-    for method in METHODS:
-        planner.plan(JumpTask(0.0, 0.3, side_m=0.1), method)  # the first call of anything is not timed
+    planner.plan(JumpTask(0.0, 0.3, side_m=0.1))  # the first call of anything is not timed
     with open_log(path, "study", entry) as log:
         for kind in kinds:
-            targets, methods = KINDS[kind]
-            for target in targets:
-                for method in methods:
-                    if (kind, *target, method) not in log.done:
-                        log.add(solve(planner, kind, target, method))
+            for target in KINDS[kind]:
+                if (kind, *target) not in log.done:
+                    log.add(solve(planner, kind, target))
 
 
 def read(path: str | Path = LOG) -> dict[str, list[dict[str, Any]]]:
@@ -133,19 +133,6 @@ def read(path: str | Path = LOG) -> dict[str, list[dict[str, Any]]]:
     out: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     for row in rows:
         out[row["kind"]].append(row)
-    return out
-
-
-def compared(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row per target of the starts, (three steps, direct) side by side, of clean plans alone."""
-    by, out = {(*r["target"], r["method"]): r for r in rows}, []
-    for ahead, side, rise, turn in STARTS:
-        row: dict[str, Any] = {"ahead [m]": ahead, "side [m]": side, "rise [m]": rise, "turn [deg]": turn}
-        for name, method in (("three", METHODS[0]), ("ramps", METHODS[1])):
-            r = by[ahead, side, rise, turn, method]
-            good = r["clean"] and not r.get("skipped")
-            row |= {f"{name}, clean": good, **{f"{name}, {k}": r[k] if good else None for k in MEASURED}}
-        out.append(row)
     return out
 
 
@@ -175,12 +162,6 @@ def perturbed(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         row |= {"robots": len(r["robots"]), "land": sum(r["robots"])}
         out.append(row | {"95 % interval": f"{low:.1%} ... {high:.1%}"})
     return out
-
-
-def ratio(table: Sequence[Mapping[str, Any]], key: str) -> float:
-    """Median of three steps over ramps where both are clean."""
-    pairs = [(r[f"three, {key}"], r[f"ramps, {key}"]) for r in table if r["three, clean"] and r["ramps, clean"]]
-    return float(np.median([a / b for a, b in pairs]))
 
 
 def maps(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
@@ -270,26 +251,41 @@ def yaw_momentum(tape: Tape, sources: Mapping[str, Mapping[str, np.ndarray]]) ->
     return fig
 
 
-def turning_pendulum(plan: SpatialSrmpPlan) -> Figure:
-    """Stage 1 out of the plane: L_z and L_y, both inertias, how far the body has turned, spin torque."""
-    fig, up, air = new_figure(PAGE_IN, 3.3), plan.launch, plan.flight
-    axes, start = fig.subplots(2, 2, sharex=True).ravel(), up.t[-1]
-    for part, shift, color in ((up, 0.0, LAUNCH), (air, start, FLIGHT)):
-        for ax, values, pale in (
-            (axes[0], part.L[:, 2], part.L[:, 1]),
-            (axes[1], part.rho[:, 1], part.rho[:, 0]),
-            (axes[2], np.degrees(part.yaw), None),
-        ):
-            ax.plot(part.t + shift, values, color=color)
-            if pale is not None:
-                ax.plot(part.t + shift, pale, color=color, alpha=0.4)
-    axes[3].plot(up.t, up.spin_torque, color=LAUNCH)
-    labels = "$L_z$, pale $L_y$ [kg m$^2$/s]", "$\\rho$ yaw, pale pitch [kg m$^2$]"
-    for ax, label in zip(axes, (*labels, "turned [deg]", "spin torque [N m]"), strict=True):
-        ax.set_ylabel(label)
-        ax.axvline(start, color=LIMIT, linewidth=0.6)
-    for ax in axes[2:]:
+def turned(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
+    """How far a robot has turned about the vertical, as a whole and by its base.
+
+    Returns
+    -------
+    "inertia" : about the vertical through the CoM (n,) [kg m^2].
+    "turned_deg" : by its mean angular velocity, inertia^-1 L, about the vertical (n,) [deg].
+    "base_deg" : heading of the base (n,) [deg].
+    """
+    model = robot.model
+    data = model.createData()
+    still = np.zeros(model.nv)
+    inertia, rate, heading = (np.empty(len(tape.t)) for _ in range(3))
+    for k, (q, L) in enumerate(zip(tape.q, tape.extra["angular_momentum"], strict=True)):
+        pin.ccrba(model, data, q, still)
+        inertia[k] = data.Ig.inertia[2, 2]
+        rate[k] = np.linalg.solve(data.Ig.inertia, L)[2]
+        ahead = data.oMi[1].rotation[:, 0]
+        heading[k] = np.arctan2(ahead[1], ahead[0])
+    total = cumulative_trapezoid(rate, tape.t, initial=0.0)
+    found = {"turned_deg": np.degrees(total), "base_deg": np.degrees(np.unwrap(heading))}
+    return {"inertia": inertia} | found
+
+
+def yaw_turn(tape: Tape, whole: Mapping[str, np.ndarray]) -> Figure:
+    """The inertia about the vertical, and the turn of the whole robot beside its base's."""
+    fig = new_figure(PAGE_IN, 2.3)
+    axes = fig.subplots(1, 2)
+    for ax, name in zip(axes, ("inertia", "turned_deg"), strict=True):
+        by_phase(ax, tape.t, whole[name], tape.phase)
+        ax.axvline(tape.takeoff_time, color=LIMIT, linewidth=0.6)
         ax.set_xlabel("time [s]")
+    axes[1].plot(tape.t, whole["base_deg"], **REFERENCE_STYLE)
+    axes[0].set(title="(a) inertia about the vertical", ylabel="[kg m$^2$]")
+    axes[1].set(title="(b) turn", ylabel="[deg]")
     return fig
 
 

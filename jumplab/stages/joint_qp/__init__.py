@@ -7,7 +7,7 @@ both; :func:`terms_table` lists all blocks.
 
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.joint_qp.own import Affine, StepPoint
-from jumplab.stages.joint_qp.rollout import JointMapper, JointPlan, SpatialMapper, map_to_joints
+from jumplab.stages.joint_qp.rollout import JointMapper, JointPlan, map_to_joints
 from jumplab.stages.joint_qp.settings import Limits, Options
 from jumplab.stages.joint_qp.solve import CvxpySolver, DirectSolver
 
@@ -19,7 +19,6 @@ __all__ = [
     "JointPlan",
     "Limits",
     "Options",
-    "SpatialMapper",
     "StepPoint",
     "changed",
     "map_to_joints",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,7 @@ class FlightTarget:
     foot_accel: np.ndarray  # p''_rd of the soles relative to the CoM (2, 3), feed-forward + PD
     inertia_accel: float  # rho''_ref [kg m^2/s^2], feed-forward + PD
     base_force: np.ndarray  # on the base (6,), cancels numerical drift of the momentum [N, N m]; physically zero
-    foot_pitch: np.ndarray  # of the feet towards level (2,); out of the plane about all axes (6,)
+    foot_pitch: np.ndarray  # of the feet towards level (2,)
     floor: np.ndarray  # least vertical acceleration of left toe, left heel, right toe, right heel (4,); -inf where off
     joints: np.ndarray  # towards the posture (nv - 6,)
     trunk: np.ndarray  # the same (3,)
@@ -40,14 +39,13 @@ class FlightQp(PhaseQp):
     """
 
     name, first, pairs = "flight", 0, ("hip", "knee", "ankle", "shoulder")
-    foot_axes = slice(4, 5)  # rows of a tiptoe's Jacobian that turn a foot: about +y
 
     def __init__(
         self, body: FullBody, nominal, start: FullMotion, reference: FlightReference, options: Options, ground: float
     ):
-        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", self._axes_of_feet())]
+        cost = [("foot", [f"{s} {a}" for s in SIDES for a in "xyz"]), ("foot level", SIDES)]
         cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
-        cost += [("acceleration", map(str, range(body.nv))), ("inertia", self.inertias)]
+        cost += [("acceleration", map(str, range(body.nv))), ("inertia", ["rho"])]
         points = [("ground", [f"{s} {p}" for s in SIDES for p in ("toe", "heel")])]
         rows = {"A": cost, "E": [("base dynamics", AXES)], "G": points}
         self._set_up(body, reference, options, nominal, options.flight, **rows)
@@ -55,36 +53,24 @@ class FlightQp(PhaseQp):
         self.step = float(self.steps[0])  # all alike
         self.com0, self.momentum0 = start.com, start.momentum
         self.inertia = reference.inertia.from_state(self.t, start.rho, start.rho_rate, INERTIA_BLEND_S)
-        self.foot = self._feet(start).from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
-
-    def _axes_of_feet(self) -> Sequence[str]:
-        """Names of the rows that turn the feet."""
-        return SIDES
-
-    def _feet(self, start: FullMotion) -> Track:
-        """Soles relative to the CoM (n, 2, 3)."""
         wide = np.zeros((2, 3))
         wide[:, 1] = start.foot_com[:, 1]  # the feet keep their distance
-        foot = self.reference.foot
-        return Track(foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (foot.rate, foot.feed)))
+        foot = reference.foot
+        both = Track(foot.value[:, None] + wide, *(x[:, None].repeat(2, 1) for x in (foot.rate, foot.feed)))
+        self.foot = both.from_state(self.t, start.foot_com, start.foot_com_rate, FOOT_BLEND_S)
 
     def target(self, k: int, terms: FullMotion) -> FlightTarget:
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
         gain = self.options.gains
         foot = self.foot.command(k, terms.foot_com, terms.foot_com_rate, gain.foot)
         rho = self.inertia.command(k, terms.rho, terms.rho_rate, gain.inertia)
-        own = foot, rho, self._drift(k, terms), *self._turning(k, terms)
-        return FlightTarget(*own, self._mirror(terms), float(self.t[k]))
-
-    def _turning(self, k: int, terms: FullMotion) -> tuple[np.ndarray, ...]:
-        """Of a target: ``foot_pitch``, ``floor``, ``joints`` and ``trunk``."""
-        gain = self.options.gains
         turn, turn_rate = self.reference.turn[k], (self.reference.turn[k + 1] - self.reference.turn[k]) / self.step
         off_level = np.angle(np.exp(1j * (turn - terms.foot_pitch)))  # the short way round
         level = gain.foot_level.stiffness * off_level + gain.foot_level.damping * (turn_rate - terms.foot_spin[:, 1])
         joints, trunk = self._towards(terms, turned(self.nominal, turn))
         trunk[1] += gain.trunk.damping * turn_rate
-        return level, self._floor(k, terms), joints, trunk
+        own = foot, rho, self._drift(k, terms), level, self._floor(k, terms)
+        return FlightTarget(*own, joints, trunk, self._mirror(terms), float(self.t[k]))
 
     def _drift(self, k: int, terms: FullMotion) -> np.ndarray:
         """Force on the base that pulls CoM and momentum back to their ballistic values: what integration lost."""
@@ -115,9 +101,8 @@ class FlightQp(PhaseQp):
         A[:6] = root * terms.J_rd.reshape(6, -1)
         b[:6] = root * (target.foot_accel - terms.drift_rd).ravel()
         root = np.sqrt(w.foot_level)
-        at, axes = lay.at("foot level"), self.foot_axes
-        A[at] = root * terms.J_toe[:, axes].reshape(-1, len(terms.v))
-        b[at] = root * (target.foot_pitch - terms.drift_toe[:, axes].ravel())
+        A[6:8] = root * terms.J_toe[:, 4]
+        b[6:8] = root * (target.foot_pitch - terms.drift_toe[:, 4])
         root, at = np.sqrt(w.inertia), lay.at("inertia")
         A[at], b[at] = root * terms.J_rho, root * (target.inertia_accel - terms.drift_rho)
         E[:6], e[:6] = terms.M[:6], target.base_force - terms.H[:6]

@@ -52,7 +52,6 @@ class LaunchQp(PhaseQp):
     """
 
     name, first = "launch", WRENCH
-    more: tuple[tuple[str, tuple[str, ...]], ...] = ()  # further costs
     pairs = ("hip", "shoulder")  # mirrored hips leave flat feet's knees and ankles no choice: more would be dependent
 
     def __init__(self, body: FullBody, q0, reference: LaunchReference, options: Options, toe_s: float | None):
@@ -60,10 +59,9 @@ class LaunchQp(PhaseQp):
             return [f"{side} {row}" for side in SIDES for row in rows]
 
         w, foot = options.launch, body.robot.foot
-        cost = [(name, "xyz") for name in ("com", "force", "moment")] + [("inertia", self.inertias)]
+        cost = [(name, "xyz") for name in ("com", "force", "moment")] + [("inertia", ["rho"])]
         cost += [("joints", body.robot.joint_names), ("trunk turn", "xyz")]
         cost += [("wrench", both(["fx", "fy", "fz", "mx", "my", "mz"])), ("acceleration", map(str, range(body.nv)))]
-        cost += self.more
         rows = [("base dynamics", AXES), ("tiptoe", both(["x", "y", "z", "rx", "rz"]))]
         rows += [("foot pitch or toe moment", SIDES)]
         ground = [("ground", both(FOOT_ROWS)), ("heel", SIDES)]
@@ -108,6 +106,8 @@ class LaunchQp(PhaseQp):
         """Feed-forward + PD of step ``k`` from the quantities at its start."""
         ref, gain = self.reference, self.options.gains
         com = ref.com.command(k, terms.com - self.pivot, terms.com_velocity, gain.com)
+        turn = -gain.momentum.damping * terms.momentum[3:]
+        turn[1] = ref.momentum.command(k, 0.0, terms.momentum[4], gain.momentum)
         rho = ref.inertia.command(k, terms.rho, terms.rho_rate, gain.inertia)
         error = np.zeros((2, 6))  # of the tiptoes
         error[:, :3] = terms.toe - self.toe0
@@ -115,21 +115,10 @@ class LaunchQp(PhaseQp):
         error[:, 3], error[:, 4], error[:, 5] = side[:, 2], terms.foot_pitch, -side[:, 0]
         speed = np.concatenate([terms.toe_velocity, terms.foot_spin], 1)
         contact = -gain.contact.stiffness * error - gain.contact.damping * speed
-        turn, posture = self._turning(k, terms), self._towards(terms, self._nominal(k))
-        on_toes, floor = bool(self.on_toes[k]), self._heel_floor(terms, k)
-        now = on_toes, float(self.inertia_weights[k]), float(self.steps[k]), float(self.t[k])
+        posture = self._towards(terms, self.nominal)
+        floor = self._heel_floor(terms, k)
+        now = bool(self.on_toes[k]), float(self.inertia_weights[k]), float(self.steps[k]), float(self.t[k])
         return LaunchTarget(com, turn, rho, contact, floor, *posture, self._mirror(terms), *now)
-
-    def _turning(self, k: int, terms: FullMotion) -> np.ndarray:
-        """Rate of the angular momentum to ask for (3,) [N m]: none but about +y."""
-        gain = self.options.gains.momentum
-        turn = -gain.damping * terms.momentum[3:]
-        turn[1] = self.reference.momentum.command(k, 0.0, terms.momentum[4], gain)
-        return turn
-
-    def _nominal(self, k: int) -> np.ndarray:
-        """Posture (nq,) to lean towards."""
-        return self.nominal
 
     def _heel_floor(self, terms: FullMotion, k: int) -> np.ndarray:
         """Least vertical acceleration of the heels (2,) [m/s^2]; on flat feet the foot's own row holds them."""
@@ -148,9 +137,9 @@ class LaunchQp(PhaseQp):
         b[:3] = com * (target.com_acceleration - terms.B_c)
         A[3:9, :WRENCH] = force[:, None] * terms.A_f
         b[3:9] = force * force_target(self.body.mass, self.body.gravity, target.com_acceleration, target.momentum_rate)
-        root, at = np.sqrt(target.inertia_weight), self.layout.at("inertia")
-        A[at, WRENCH:] = root * terms.J_rho
-        b[at] = root * (target.inertia_accel - terms.drift_rho)
+        root = np.sqrt(target.inertia_weight)
+        A[9, WRENCH:] = root * terms.J_rho
+        b[9] = root * (target.inertia_accel - terms.drift_rho)
         E[:6, :WRENCH], E[:6, WRENCH:], e[:6] = -terms.J[:, :6].T, terms.M[:6], -terms.H[:6]  # base dynamics
         self._contact(E, e, terms, target)
         G[: 2 * len(FOOT_ROWS), :WRENCH] = self._ground[target.on_toes]

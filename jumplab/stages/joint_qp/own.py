@@ -192,18 +192,18 @@ class StepPoint:
         return self._of(self._terms.A_h[4], self._terms.B_h[4])
 
     @property
-    def inertia(self) -> float | np.ndarray:
-        """Pitch inertia about the CoM, rho [kg m^2]; out of the plane also that about the vertical (2,)."""
-        return self._terms.rho
+    def inertia(self) -> float:
+        """Pitch inertia about the CoM, rho [kg m^2]."""
+        return float(self._terms.rho)
 
     @property
-    def inertia_rate(self) -> float | np.ndarray:
+    def inertia_rate(self) -> float:
         """Its rate [kg m^2/s]."""
-        return self._terms.rho_rate
+        return float(self._terms.rho_rate)
 
     @property
     def inertia_acceleration(self) -> Affine:
-        """Its second derivative, J_rho theta'' + drift (as many rows) [kg m^2/s^2]."""
+        """Its second derivative, J_rho theta'' + drift (1 row) [kg m^2/s^2]."""
         return self._of(self._terms.J_rho, self._terms.drift_rho)
 
     @property

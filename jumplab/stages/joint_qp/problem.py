@@ -154,7 +154,6 @@ class PhaseQp:
     name: str
     first: int  # column of x at which theta'' begins
     pairs: tuple[str, ...]  # groups of joints that are mirrored
-    inertias: tuple[str, ...] = ("rho",)  # that are followed
 
     def _set_up(self, body: FullBody, reference, options: Options, nominal: np.ndarray, weights, **rows: list):
         """Take over what is given; ``rows`` are A, E and G as in :meth:`Layout.of`, E without the symmetry."""

@@ -20,7 +20,6 @@ NEEDED = {  # array -> columns
     "launch": {**COM, "L": 1, "L_rate": 1, **INERTIA, "cop_x": 1},
     "flight": {**COM, "L": 1, **INERTIA, "foot_com": 2, "foot_com_rate": 2, "foot_com_accel": 2},
 }
-IN_SPACE = {"L": 3, "L_rate": 3, **dict.fromkeys(INERTIA, 2), "cop_x": 1}  # other arrays have three columns
 
 
 def checked(srmp: Any, phase: str) -> dict[str, np.ndarray]:
@@ -38,10 +37,8 @@ def checked(srmp: Any, phase: str) -> dict[str, np.ndarray]:
     if usual <= 0 or len(odd):
         k = int(odd[0]) if len(odd) else 0
         raise InputError(f"{where}: gap after t = {t[k]:.4f} s, the step there is {steps[k]:.4g} s, not {usual:.4g} s")
-    out, needed = {"t": t - t[0]}, NEEDED[phase]
-    if is_spatial(srmp):
-        needed = {name: IN_SPACE.get(name, 3) for name in needed} | {"yaw": 1}
-    for name, columns in needed.items():
+    out = {"t": t - t[0]}
+    for name, columns in NEEDED[phase].items():
         if not hasattr(source, name):
             raise InputError(f"{where}: the array {name!r} is missing")
         x = np.asarray(getattr(source, name), float)
@@ -53,11 +50,6 @@ def checked(srmp: Any, phase: str) -> dict[str, np.ndarray]:
             raise InputError(f"{where}: {name} is not finite at t = {t[bad[0]]:.4f} s")
         out[name] = x
     return out
-
-
-def is_spatial(srmp: Any) -> bool:
-    """Whether stage 1's result leaves the plane: three columns of its CoM."""
-    return np.shape(getattr(getattr(srmp, "launch", None), "com", ()))[1:] == (3,)
 
 
 def hermite(
@@ -124,9 +116,7 @@ def nodes(duration: float, step_s: float) -> np.ndarray:
 
 
 def planar(x: np.ndarray) -> np.ndarray:
-    """(N, 2) x, z as (N, 3) with y = 0; what has three columns stays."""
-    if x.shape[1] == 3:
-        return x
+    """(N, 2) x, z as (N, 3) with y = 0."""
     return np.stack([x[:, 0], np.zeros(len(x)), x[:, 1]], 1)
 
 
@@ -145,7 +135,6 @@ class LaunchReference:
     momentum: Track
     inertia: Track
     cop_x: np.ndarray
-    yaw: np.ndarray  # that the body has turned about the vertical by [rad]; zero in the plane
 
     @classmethod
     def sample(cls, srmp: Any, step_s: float, toe: tuple[float, float] | None = None) -> LaunchReference:
@@ -158,9 +147,8 @@ class LaunchReference:
             t = np.concatenate([nodes(split, step_s), split + nodes(*toe)[1:]])
         com, inertia = followed(r, t)
         # L is a rate of nothing that is followed: its "value" has no gain
-        L = hermite(grid, r["L"], r["L_rate"], None, t)[0]
-        momentum, yaw = Track.of(t, np.zeros_like(L), L), np.interp(t, grid, r.get("yaw", 0 * grid))
-        return cls(t, com, momentum, inertia, np.interp(t, grid, r["cop_x"]), yaw)
+        momentum = Track.of(t, np.zeros_like(t), hermite(grid, r["L"], r["L_rate"], None, t)[0])
+        return cls(t, com, momentum, inertia, np.interp(t, grid, r["cop_x"]))
 
     def toe_steps(self, toe_x: float, toe_s: float | None) -> np.ndarray:
         """(n,) True for steps on the toes: the last ``toe_s`` seconds, or from where the CoP stays at the toe."""
@@ -180,9 +168,8 @@ class FlightReference:
     com: Track  # the parabola (3,)
     inertia: Track
     foot: Track  # sole relative to the CoM (3,)
-    L: float | np.ndarray  # (3,) out of the plane
+    L: float
     turn: np.ndarray  # how far trunk and feet shall have rotated about +y [rad]: zero, or a share of the flip's 2 pi
-    yaw: np.ndarray  # as in launch
 
     @classmethod
     def sample(cls, srmp: Any, step_s: float) -> FlightReference:
@@ -194,5 +181,4 @@ class FlightReference:
         lean = np.asarray(getattr(srmp.flight, "lean", np.zeros_like(grid)), float)
         whole = np.round((lean[-1] - lean[0]) / (2 * np.pi)) * 2 * np.pi  # full turns only; leaning is no flip
         turn = whole * (lean - lean[0]) / (lean[-1] - lean[0]) if whole else np.zeros_like(grid)
-        yaw = np.interp(t, grid, r.get("yaw", 0 * grid))
-        return cls(t, com, inertia, foot, r["L"][0], np.interp(t, grid, turn), yaw)
+        return cls(t, com, inertia, foot, float(r["L"][0]), np.interp(t, grid, turn))

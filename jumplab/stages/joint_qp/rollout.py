@@ -11,8 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import InputError, Shown, SolverError
-from jumplab.io.tape import Tape
-from jumplab.models.full import FullBody, FullMotion, FullTerms, TurningBody
+from jumplab.models.full import FullBody, FullMotion, FullTerms
 from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
@@ -20,10 +19,9 @@ from jumplab.stages.joint_qp.changes import changed
 from jumplab.stages.joint_qp.flight import FlightQp
 from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
 from jumplab.stages.joint_qp.problem import State, StepQp
-from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference, is_spatial
-from jumplab.stages.joint_qp.settings import GENTLE, Options, in_space
+from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference
+from jumplab.stages.joint_qp.settings import GENTLE, Options
 from jumplab.stages.joint_qp.solve import SOLVERS, Answer
-from jumplab.stages.joint_qp.space import SpatialFlightQp, SpatialLaunchQp
 
 CORRECTIONS = (1.0, 0.5, 0.0)  # shares of a misprediction that the next guess takes over; the second one is damped
 PREDICTED_RATE = 0.4  # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
@@ -36,22 +34,21 @@ def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
 
     Keys: ``takeoff_velocity`` (share of the take-off speed), ``takeoff_momentum`` and ``launch_momentum`` (share of the
     peak of L in the launch; at take-off, and the largest), ``launch_inertia_rms``, ``flight_inertia_rms`` (share of the
-    mean of rho, of the worse one of two), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and
-    ``touchdown_foot`` [m].
+    mean of rho), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and ``touchdown_foot`` [m].
     """
     off = {k: x - reference[k] for k, x in actual.items()}
     speed, foot = reference["com_velocity"][n - 1], np.linalg.norm(off["foot_com"], axis=1)
-    momentum = np.abs(off["L"][:n]).reshape(n, -1).max(axis=1) / max(np.abs(reference["L"][:n]).max(), 1e-9)
+    momentum = np.abs(off["L"][:n]) / max(np.abs(reference["L"][:n]).max(), 1e-9)
 
     def rms(x, size):
-        return np.max(np.sqrt(np.mean(x**2, axis=0)) / size)
+        return np.sqrt(np.mean(x**2)) / size
 
     found = {
         "takeoff_velocity": np.linalg.norm(off["com_velocity"][n - 1]) / np.linalg.norm(speed),
         "takeoff_momentum": momentum[-1],
         "launch_momentum": momentum.max(),
-        "launch_inertia_rms": rms(off["rho"][:n], reference["rho"][:n].mean(axis=0)),
-        "flight_inertia_rms": rms(off["rho"][n:], reference["rho"][n:].mean(axis=0)),
+        "launch_inertia_rms": rms(off["rho"][:n], reference["rho"][:n].mean()),
+        "flight_inertia_rms": rms(off["rho"][n:], reference["rho"][n:].mean()),
         "launch_com": np.linalg.norm(off["com"][:n], axis=1).max(),
         "flight_foot_rms": rms(foot, 1.0),
         "touchdown_foot": foot[-1],
@@ -101,11 +98,6 @@ class JointPlan(Shown):
         inside = np.flatnonzero(self.phase == phase)
         return slice(int(inside[0]), int(inside[-1]) + 1)
 
-    def tape(self, robot: Robot) -> Tape:
-        """The motion as a tape, at its own nodes."""
-        frames, names = np.array(robot.foot.frames), np.array(robot.joint_names)
-        return Tape(self.t, self.q, self.v, self.a, self.tau, self.phase, frames, self.f, names)
-
     def state(self, k: int) -> State:
         """State at row ``k``, as :meth:`JointMapper.problem` wants it."""
         return State(self.q[k], self.v[k], self.a[k])
@@ -136,8 +128,6 @@ class JointMapper:
 
     launch_qp: Callable[..., LaunchQp] = LaunchQp
     flight_qp: Callable[..., FlightQp] = FlightQp
-    body_of: Callable[..., FullBody] = FullBody
-    about: int | slice = 4  # rows of the momentum that stage 1 speaks of
 
     def __init__(
         self,
@@ -156,11 +146,11 @@ class JointMapper:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
-        self.body = self.body_of(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
+        self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
             raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.options = options or self.usual()[0]
+        self.options = options or Options()
         if terms or weights or off:
             self.options = changed(self.options, self.body, self.q0, terms, weights, off)
         self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
@@ -168,11 +158,6 @@ class JointMapper:
         toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
         launch = LaunchReference.sample(srmp_plan, parts[0], toe)
         self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)
-
-    @staticmethod
-    def usual() -> tuple[Options, Options]:
-        """Options if none are given, and those for where these find no way."""
-        return Options(), GENTLE
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
@@ -278,29 +263,18 @@ class JointMapper:
         actual = {
             "com": np.array([x.com - pivot for x in terms]),
             "com_velocity": np.array([x.com_velocity for x in terms]),
-            "L": np.array([x.momentum[self.about] for x in terms]),
+            "L": np.array([x.momentum[4] for x in terms]),
             "rho": np.array([x.rho for x in terms]),
             "foot_com": np.array([x.foot_com.mean(0) for x in terms[n:]]),
         }
         reference = {
             "com": np.concatenate([launch.com.value, flight.com.value]),
             "com_velocity": np.concatenate([launch.com.rate, flight.com.rate]),
-            "L": np.concatenate([launch.momentum.rate, np.repeat(np.array([flight.L]), len(terms) - n, axis=0)]),
+            "L": np.concatenate([launch.momentum.rate, np.full(len(terms) - n, flight.L)]),
             "rho": np.concatenate([launch.inertia.value, flight.inertia.value]),
             "foot_com": flight.foot.value,
         }
         return actual, reference
-
-
-class SpatialMapper(JointMapper):
-    """The same out of the plane: no mirror rows, three momenta, two inertias."""
-
-    launch_qp, flight_qp, body_of, about = SpatialLaunchQp, SpatialFlightQp, TurningBody, slice(3, 6)
-
-    @staticmethod
-    def usual() -> tuple[Options, Options]:
-        """Options if none are given, and those for where these find no way."""
-        return in_space(Options()), in_space(GENTLE)
 
 
 def map_to_joints(
@@ -333,16 +307,14 @@ def map_to_joints(
     InputError : the reference has gaps, NaN or wrong lengths, an option is unknown, or a term does not fit.
     SolverError : a QP has no trustworthy answer; names phase, time and the rows that conflict.
     """
-    mapper = SpatialMapper if is_spatial(srmp_plan) else JointMapper
     changes: dict[str, Any] = {"q0": q0, "terms": terms, "weights": weights, "off": off}
     if options is not None:
-        return mapper(srmp_plan, robot, step_s, options, **changes).run(method)
-    usual, gentle = mapper.usual()
+        return JointMapper(srmp_plan, robot, step_s, options, **changes).run(method)
     try:
-        return mapper(srmp_plan, robot, step_s, usual, **changes).run(method)
+        return JointMapper(srmp_plan, robot, step_s, Options(), **changes).run(method)
     except SolverError as firm:
         try:
-            plan = mapper(srmp_plan, robot, step_s, gentle, **changes).run(method)
+            plan = JointMapper(srmp_plan, robot, step_s, GENTLE, **changes).run(method)
         except SolverError:
             raise firm from None
         return replace(plan, gentle=str(firm))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jumplab.ocp import Term
 from jumplab.task import FRICTION
@@ -107,8 +107,3 @@ GENTLE = Options(
         com=3.0, force=3e-3, com_x=3.0, force_x=3e-3, moment=1.0, inertia=3e-3, inertia_toe=6e-5, inertia_fade_s=0.01
     ),
 )
-
-
-def in_space(o: Options) -> Options:
-    """The same out of the plane: without mirror rows, posture and trunk keep arms and pelvis from swinging idly."""
-    return replace(o, launch=replace(o.launch, posture=1e-3, trunk=2e-2))

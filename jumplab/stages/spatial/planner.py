@@ -1,67 +1,127 @@
-"""Solving the spatial program for a target: cold from a planar plan, or from a neighbour's plan; and the result."""
+"""Solving the whole-body program: a list of starts, each with its patience, one after the other; and the result."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, SolverError
+from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
-from jumplab.stages.spatial.generic import generic
-from jumplab.stages.spatial.problem import build_problem
+from jumplab.stages.spatial import starts
+from jumplab.stages.spatial.apart import Apart, merged, too_close
+from jumplab.stages.spatial.contacts import SIDES, ContactPhase, Contacts
+from jumplab.stages.spatial.problem import Schedule
 from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.start import from_tape
 from jumplab.stages.spatial.tape import holds_between, make_tape
-from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.spatial.terms import Body
 from jumplab.stages.whole_body.planner import BodyPlan
-from jumplab.stages.whole_body.settings import Contact, Mesh
+from jumplab.stages.whole_body.settings import Mesh
 from jumplab.task import JumpTask
 
-# beyond, the cost moves by less than one in a million; a solve that needs more time is lost
-IPOPT = {"tol": 1e-3, "compl_inf_tol": 1e-4, "max_iter": 250, "max_cpu_time": 40.0}  # [s]
-SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal ...
-QUICK = {"max_iter": 80, "max_cpu_time": 15.0}  # [s] ... with so much patience each
-# The exact Hessian is bent the wrong way nearly everywhere; the Gauss-Newton one, held by so much [1] up to a turn
-# [deg], leads there in half the time, first from afar, then from a plan close by, for a cost some percent higher; with
-# more than that to turn only the exact one settles
-HOLDS = (75, 0.1, 1.0), (100, 3.0, 3.0), (300, 10.0, 30.0)
-HELD = {"max_iter": 250, "max_cpu_time": 20.0}  # [s]; the exact Hessian has its turn after that
-NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4, "max_iter": 60}
-# where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
-PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4, "max_iter": 120, "max_cpu_time": 20.0}  # [s]
-FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
+# beyond, the cost moves by less than one in a million
+IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4, "max_iter": 250}
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
 # by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
 IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3, "acceptable_iter": 2}
-# the Hessian is bent the wrong way nearly everywhere: what is added to it should be close to what the last step needed
+# where the Hessian is bent the wrong way, what is added to it should be close to what the last step needed
 IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
+NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
+# where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
+PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
+HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
+FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
+ROUNDS = 4  # of rows for links that met
+SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal
 
-Begin = tuple[Tape | None, float, bool]  # a tape or none, when its heels rise [s], whether side and yaw are added
+
+@dataclass(frozen=True)
+class Start:
+    """One way to begin a solve: a motion to begin with, the Hessian, and how long it may take.
+
+    Attributes
+    ----------
+    name : of the motion: "schedule" (inverse kinematics along it), "stance" (carried along), "neighbour" (a plan for a
+        target close by).
+    held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
+    patience_s : processor time after which it is given up [s].
+    options : of ipopt besides the usual ones.
+    """
+
+    name: str
+    held: bool
+    patience_s: float
+    options: Mapping[str, Any]
+
+
+COLD = (
+    Start("schedule", True, 7.0, {}),
+    Start("schedule", False, 8.0, {}),
+    Start("stance", False, 5.0, {}),
+)
+FROM_NEIGHBOUR = (Start("neighbour", True, 4.0, NEAR), Start("neighbour", False, 6.0, WARM | {"acceptable_iter": 1}))
+QUICK = Start("schedule", True, 5.0, {"max_iter": 80})
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of one start."""
+
+    start: str
+    hessian: str
+    iterations: int
+    cpu_s: float
+    status: str
 
 
 @dataclass(frozen=True, repr=False)
 class SpatialPlan(BodyPlan):
-    """Result of the spatial program."""
+    """Result of the whole-body program."""
 
+    schedule: Schedule
     edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
     limits: SpatialLimits = SpatialLimits()  # that it was made with
+    attempts: tuple[Attempt, ...] = ()  # that were made, the last one with success
+
+    @property
+    def launch_s(self) -> float:
+        """Time until the feet first leave the ground [s]."""
+        durations = [p.duration for p in self.solution.phases.values()]
+        flying = [p.flying for p in self.schedule.contacts.phases]
+        return float(sum(durations[: flying.index(True)])) if any(flying) else float(sum(durations))
+
+    @property
+    def flight_s(self) -> float:
+        """Duration of the first flight [s]; 0 if there is none."""
+        pairs = zip(self.solution.phases.values(), self.schedule.contacts.phases, strict=True)
+        return next((x.duration for x, p in pairs if p.flying), 0.0)
+
+
+def jump_contacts(limits: SpatialLimits, mesh: Mesh) -> Contacts:
+    """The schedule of a standing jump, which ends at touchdown."""
+    phases = (
+        ContactPhase("LR", limits.flat_s, 0.6, mesh.flat, "flat"),
+        ContactPhase("lr", limits.toe_s, 0.12, mesh.toe, "toe"),
+        ContactPhase("-", limits.flight_s, 0.5, mesh.flight, "flight"),
+    )
+    return Contacts(phases, ends="touchdown")
 
 
 class SpatialPlanner:
-    """The spatial program of one robot: built once, solved for any target.
+    """The whole-body program of one robot and one schedule: built once, solved for any target.
 
-    ``keep`` keeps what was built for later processes; ``changes`` are own terms, weights and switches.
+    ``contacts`` are by default those of a standing jump. ``keep`` keeps what was built for later processes; ``changes``
+    are own terms, weights and switches.
     """
 
     def __init__(
@@ -71,33 +131,49 @@ class SpatialPlanner:
         limits: SpatialLimits = SpatialLimits(),
         weights: SpatialWeights = SpatialWeights(),
         *,
+        contacts: Contacts | None = None,
         options: Mapping | None = None,
         keep: bool = False,
         changes: StageChanges = StageChanges(),
+        body: Body | None = None,
     ):
         self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
         self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
+        self.body = body or Body(robot)
+        self.contacts = contacts or jump_contacts(limits, self.mesh)
+        if self.body.short and any(len(p.modes) == 1 for p in self.contacts.phases):
+            raise InputError(
+                f"robot {robot.name}: a leg has fewer than six joints, so it cannot be planned to stand on one foot"
+            )
         self._taped: tuple[SpatialPlan, Tape] | None = None
         self._stood: dict[tuple, tuple[float, str, float] | None] = {}
-        self.terms = {c.value: SpatialTerms(robot, limits, weights, c) for c in Contact}
-        self._options = options = dict(options or {})
-        problem = changes.applied(build_problem(robot, self.mesh, limits, weights))
-        key = f"{robot.hash} {limits} {weights}" if keep else None
-        self.nlp = Nlp(problem, {**IPOPT, **options}, key)
-        self._warm = self.nlp.with_options({**IPOPT, **WARM, "acceptable_iter": 1, **options})
-        self._quick = self.nlp.with_options({**IPOPT, **QUICK, **options})
-        self._patient = self.nlp.with_options({**IPOPT, **WARM, **PATIENT, **options})
-        holds = HOLDS if robot.planar else ()  # of others, what it leads to passes limits between the nodes
-        self._held = {deg: self.nlp.with_options({**IPOPT, **HELD, **options}, hold) for deg, hold, _ in holds}
-        self._near = {deg: self.nlp.with_options({**IPOPT, **NEAR, **options}, hold) for deg, _, hold in holds}
+        self._options = dict(options or {})
+        self._key = f"{robot.hash} {limits} {weights}" if keep else None
+        self._apart: dict[tuple, Nlp] = {}
+        self.nlp = self._nlp(())
+
+    def _schedule(self, apart: tuple[Apart, ...]) -> Schedule:
+        return Schedule(self.body, self.contacts, self.limits, self.weights, apart)
+
+    def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
+        """The program with rows for links that met."""
+        key = tuple((x.phase, x.first, x.last, x.pair.key) for x in apart)
+        if key not in self._apart:
+            if len(self._apart) > 8:
+                self._apart = {(): self._apart[()]}
+            problem = self.changes.applied(self._schedule(apart).problem())
+            self._apart[key] = Nlp(problem, {**IPOPT, **self._options}, self._key)
+        return self._apart[key]
+
+    @cached_property
+    def terms(self) -> dict:
+        """Mode -> its terms."""
+        return self._schedule(()).terms
 
     def plan(
         self,
         task: JumpTask,
-        start: Tape | None = None,
-        toe_phase_s: float = 0.0,
         *,
-        ramps: bool = True,
         weights: Mapping[str, float] | None = None,
         near: SpatialPlan | None = None,
         stance: np.ndarray | None = None,
@@ -106,8 +182,6 @@ class SpatialPlanner:
 
         Parameters
         ----------
-        start : tape of the same rise whose heels rise at ``toe_phase_s`` [s]; a generic jump if None.
-        ramps : the tape is one straight ahead; side and yaw are added to its flight.
         weights : of cost terms, instead of their own.
         near : this planner's plan for a target close by, to begin with.
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's places; it if None.
@@ -118,72 +192,126 @@ class SpatialPlanner:
             If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
-        how = {"weights": self.changes.spread(self.nlp.problem, weights or {}), "stance": stance}
-        found = first = self._planned(task, (start, toe_phase_s, ramps), how, near)
-        for again in (lambda: (self, self._patient), lambda: (self._finer, self._finer._warm)):
+        weights = self.changes.spread(self.nlp.problem, weights or {})
+        parameters = self.parameters(task, stance)
+        attempts: list[Attempt] = []
+        begun = (*FROM_NEIGHBOUR, *COLD) if near is not None else COLD
+        if not EXPLAINED.get():
+            begun = begun[:-2] if near is None else begun[:-1]
+        found, failure = None, None
+        for start in begun:
+            try:
+                found = self._tried(start, task, parameters, weights, attempts, near)
+                break
+            except SolverError as e:
+                failure = e
+        if found is None:
+            raise self._explained(failure, task, parameters, weights)
+        return replace(self._settled(found, parameters, weights, attempts), attempts=tuple(attempts))
+
+    def _tried(self, start: Start, task, parameters, weights, attempts: list, near: SpatialPlan | None) -> SpatialPlan:
+        """A plan from one start, with rows for whatever links meet on its tape."""
+        apart = near.schedule.apart if near is not None and start.name == "neighbour" else ()
+        begin = near if near is not None and start.name == "neighbour" else self._motion(start, task)
+        found = self._solved(start, task, parameters, weights, begin, apart, attempts)
+        for _ in range(ROUNDS):
+            new = self._too_close(found)
+            if not new:
+                break
+            apart = merged(apart, new)
+            again = replace(start, name="links apart", options=WARM | {"acceptable_iter": 1, "mu_init": 1e-3})
+            found = self._solved(again, task, parameters, weights, found, apart, attempts)
+        return found
+
+    def _too_close(self, found: SpatialPlan) -> list[Apart]:
+        phases = list(found.solution.phases.values())
+        return too_close(
+            self.body, self.tape(found), [p.duration for p in phases], [len(p.j) for p in phases]
+        )
+
+    def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
+        schedule = self._schedule(())
+        if start.name == "stance":
+            return starts.still(schedule, task)
+        motion = starts.along(schedule, task)
+        return motion if motion.missed < starts.REACHED else starts.still(schedule, task)
+
+    def _solved(self, start: Start, task, parameters, weights, begin, apart, attempts: list, **how) -> SpatialPlan:
+        """One solve; what came of it is added to ``attempts``."""
+        schedule, nlp = self._schedule(apart), self._nlp(apart)
+        options = {**IPOPT, **start.options, "max_cpu_time": start.patience_s, **self._options}
+        nlp = nlp.with_options(options, HOLD if start.held else None)
+        if isinstance(begin, SpatialPlan):
+            guess = begin.solution.guess({p.name: p.intervals for p in self.contacts.phases})
+            how["multipliers"] = begin.solution.multipliers
+        else:
+            guess = starts.guess(schedule, begin)
+        began, words = time.process_time(), "held Gauss-Newton" if start.held else "exact"
+        how = {"explain": False, "weights": weights, "references": self._references()} | how
+        try:
+            solution = nlp.solve(parameters, guess, **how)
+        except SolverError as e:
+            attempts.append(Attempt(start.name, words, e.iterations, time.process_time() - began, str(e.status)))
+            raise
+        s = solution.statistics
+        attempts.append(Attempt(start.name, words, s.iterations, time.process_time() - began, s.status))
+        edge = self._edge(task)[0] - self.robot.foot.toe + float(self.robot.foot.center[0])
+        return SpatialPlan(task, solution, schedule, edge, self.limits)
+
+    def _settled(self, found: SpatialPlan, parameters, weights, attempts: list) -> SpatialPlan:
+        """The plan, solved on where it passes limits between the nodes, first to the end, then on a finer mesh."""
+        first = found
+        patient = Start("settled", False, 8.0, WARM | PATIENT)
+        finer = Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1})
+        for start, planner in ((patient, lambda: self), (finer, lambda: self._finer)):
             if holds_between(self.tape(found), self.robot):
                 return found
-            planner, nlp = again()
-            with suppress(SolverError):
-                found = planner._solved(nlp, task, found, how)
+            p = planner()
+            apart = p._scaled(found)
+            try:
+                found = p._solved(start, found.task, parameters, weights, found, apart, attempts)
+            except SolverError:
+                continue
         return found if holds_between(self.tape(found), self.robot) else first
+
+    def _scaled(self, found: SpatialPlan) -> tuple[Apart, ...]:
+        """Rows for links that met, at the nodes of this planner's mesh."""
+        out = []
+        for x in found.schedule.apart:
+            ratio = self.contacts.phases[x.phase].intervals / found.schedule.contacts.phases[x.phase].intervals
+            last = min(self.contacts.phases[x.phase].intervals, math.ceil(ratio * x.last))
+            out.append(replace(x, first=max(1, int(ratio * x.first)), last=last))
+        return tuple(out)
 
     @cached_property
     def _finer(self) -> SpatialPlanner:
         """The same program on half as many nodes again."""
-        mesh = Mesh(*(math.ceil(FINER * n) for n in self.mesh.intervals().values()))
-        options = {"options": self._options, "keep": self._keep, "changes": self.changes}
-        return SpatialPlanner(self.robot, mesh, self.limits, self.weights, **options)
+        phases = tuple(replace(p, intervals=math.ceil(FINER * p.intervals)) for p in self.contacts.phases)
+        contacts = replace(self.contacts, phases=phases)
+        how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        return SpatialPlanner(self.robot, self.mesh, self.limits, self.weights, contacts=contacts, **how)
 
-    def _planned(self, task: JumpTask, begin: Begin, how: dict, near: SpatialPlan | None) -> SpatialPlan:
-        turn = next((t for t in self._held if abs(np.degrees(task.yaw_rad)) <= t and not task.rotation_rad), None)
-        if near is not None:
-            if turn is not None:
-                with suppress(SolverError):
-                    return self._solved(self._near[turn], task, near, how)
-            try:
-                return self._solved(self._warm, task, near, how)
-            except SolverError:
-                if begin[0] is None:
-                    raise
-        if turn is not None:
-            with suppress(SolverError):
-                return self._solved(self._held[turn], task, begin, how)
+    def _explained(self, failure: SolverError, task: JumpTask, parameters, weights) -> SolverError:
+        """Why there is no plan: the terms in conflict, and a smaller target that has one."""
         if not EXPLAINED.get():
-            return self._solved(self._quick, task, begin, how)
+            return failure
+        start = replace(COLD[1], patience_s=2.0)
         try:
-            return self._solved(self.nlp, task, begin, how | {"explain": True})
+            motion = self._motion(start, task)
+            self._solved(start, task, parameters, weights, motion, (), [], explain=True)
         except SolverError as e:
-            less = self._smaller(task, begin, how)
-            if less is not None and not e.violations:  # there is a motion: perhaps from here
-                try:
-                    return self._solved(self._warm, task, less, how)
-                except SolverError:
-                    pass
-            words = "" if less is None else f"; at this height, {said(less.task)} is planned"
-            raise SolverError(f"{e}{words}", stage=e.stage, status=e.status, violations=e.violations) from e
+            failure = e
+        less = self._smaller(task, weights)
+        words = "" if less is None else f"; at this height, {said(less.task)} is planned"
+        return SolverError(f"{failure}{words}", stage=failure.stage, status=failure.status, violations=failure.violations)
 
-    def _solved(self, nlp: Nlp, task: JumpTask, begin: SpatialPlan | Begin, how: dict) -> SpatialPlan:
-        """A plan that begins with another one, or with a tape, when its heels rise, and whether it needs ramps."""
-        asked, how = self.parameters(task, how["stance"]), {"explain": False} | how
-        del how["stance"]
-        if isinstance(begin, SpatialPlan):
-            guess, how = begin.solution.guess(self.mesh.intervals()), how | {"multipliers": begin.solution.multipliers}
-        else:
-            tape, toe_phase_s, ramps = begin
-            if tape is None:
-                tape = generic(self.terms["flat"], task)
-                toe_phase_s = float(tape.extra["toe_phase_start"])
-            guess = from_tape(self.terms, tape, toe_phase_s, self.mesh, task, ramps)
-        edge = self._edge(task)[0] - self.robot.foot.toe + float(self.robot.foot.center[0])
-        return SpatialPlan(task, nlp.solve(asked, guess, **how), edge, self.limits)
-
-    def _smaller(self, task: JumpTask, begin: Begin, how: dict) -> SpatialPlan | None:
+    def _smaller(self, task: JumpTask, weights) -> SpatialPlan | None:
         """The plan of the largest of a few targets with less way and less turn."""
         for share in SHORTER:
             less = {name: round(share * getattr(task, name), 3) for name in ("distance_m", "side_m", "yaw_rad")}
+            easier = replace(task, **less)
             try:
-                return self._solved(self._quick, replace(task, **less), begin, how)
+                return self._tried(QUICK, easier, self.parameters(easier), weights, [], None)
             except (InfeasibleError, SolverError):
                 continue
         return None
@@ -191,22 +319,36 @@ class SpatialPlanner:
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan; that of the last one is kept."""
         if self._taped is None or self._taped[0] is not plan:
-            self._taped = plan, make_tape(self.terms, plan.solution.phases, plan.task.gravity)
+            self._taped = plan, make_tape(plan.schedule, plan.solution.phases, plan.task.gravity)
         return self._taped[1]
+
+    def _references(self) -> dict[str, dict[str, np.ndarray]]:
+        """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and foot."""
+        phases = self.contacts.phases
+        out = {p.name: {} for p in phases}
+        for side in (0, 1):
+            for run in _runs([side not in p.modes for p in phases]):
+                count, at, last = sum(phases[k].intervals for k in run), 0, run[-1] == len(phases) - 1
+                for k in run:
+                    u = (at + np.arange(phases[k].intervals + 1)) / count
+                    at += phases[k].intervals
+                    shape = 4 * u * (1 - u)
+                    # in a jump the soles come down steeply, in a step they hardly leave the ground else
+                    height = self.limits.clearance_m * (shape**3 if last else shape)
+                    out[phases[k].name][f"{SIDES[side]}_clearance"] = height[None]
+        return out
 
     def parameters(self, task: JumpTask, stance: np.ndarray | None = None) -> dict[str, Any]:
         """Parameter values of the problem for a target.
 
         Raises :class:`InfeasibleError` for an impossible platform, and if the robot cannot even stand as it begins.
         """
-        flat = self.terms["flat"]
-        start = flat.stance if stance is None else flat.model.of_pinocchio(stance[None])[0]
+        start = self.body.stance if stance is None else self.body.model.of_pinocchio(stance[None])[0]
         if not self.robot.planar:  # of others stage 1's closed forms tell
             self._check_standing(start, task.gravity)
         values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
-        if not self.robot.planar:
-            values["straight"] = float(task.in_plane)
+        values["straight"] = float(task.in_plane and self.contacts.ends == "touchdown")
         ways = np.cos(task.along_rad), np.sin(task.along_rad)
         edge, room = self._edge(task)
         # for clearance, also between the nodes, a platform counts as reaching further
@@ -216,7 +358,7 @@ class SpatialPlanner:
     def _check_standing(self, start: np.ndarray, gravity: float) -> None:
         """Refuse a robot whose motors cannot hold the posture in which it waits."""
         if (key := (gravity, start.tobytes())) not in self._stood:
-            q = self.terms["flat"].model.to_pinocchio(start[None], *np.zeros((2, 1, len(start))))[0][0]
+            q = self.body.model.to_pinocchio(start[None], *np.zeros((2, 1, len(start))))[0][0]
             self._stood[key] = holding(self.robot.under_gravity(gravity), q, self.limits.friction)
         share, joint, torque = self._stood[key] or (0.0, "", 0.0)
         if share > 1:
@@ -234,8 +376,8 @@ class SpatialPlanner:
         """
         along = np.array([np.cos(task.along_rad), np.sin(task.along_rad)])
         c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
-        soles = self.robot.foot.corners - self.robot.foot.center
-        corners = (self.terms["flat"].places[:, None] + soles).reshape(-1, 3)[:, :2]
+        soles = self.robot.foot.corners - self.robot.foot.tip
+        corners = (self.body.places[:, None] + soles).reshape(-1, 3)[:, :2]
         landed = ([task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])) @ along
         room, first = self.limits.edge_before_heel_m, float((corners @ along).max())
         up, down = float(landed.min()) - room, first + room
@@ -251,6 +393,17 @@ class SpatialPlanner:
                 bound=float(least),
             )
         return edge, max(0.0, apart)
+
+
+def _runs(flags: list[bool]) -> Iterator[list[int]]:
+    """Runs of consecutive indices whose flag is set."""
+    run: list[int] = []
+    for k, flag in enumerate([*flags, False]):
+        if flag:
+            run.append(k)
+        elif run:
+            yield run
+            run = []
 
 
 def said(task: JumpTask) -> str:

@@ -1,148 +1,215 @@
-"""The spatial program as a problem: flat foot, toes and flight of the whole robot, joined."""
+"""A contact schedule as a problem: one phase after the other, with shared nodes where nothing jumps."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
 from functools import partial
 
-import casadi as ca
 import numpy as np
 
 from jumplab.models.spatial import CHART
-from jumplab.ocp.problem import Bound, Phase, Problem, Term
-from jumplab.robot import Robot
-from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.ocp.problem import Bound, Phase, Problem
+from jumplab.stages.spatial.apart import Apart
+from jumplab.stages.spatial.contacts import SIDES, Contacts
+from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.terms import BASE, EDGES, Body, SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
-from jumplab.stages.whole_body.problem import COM_BOX_M, FLIGHT_S, SCALES, SPEED_BOX_M_S
-from jumplab.stages.whole_body.settings import Contact, Mesh
 
+SCALES = {"q": 1.0, "v": 10.0, "a": 100.0}  # peaks of solutions, for conditioning
 ANGLE_BOX_RAD = 15.0  # beyond two full turns
-RATE_BOX = 30.0  # [rad/s, m/s] of the base
-TORQUE_SCALE, FALL_SCALE = 100.0, 10.0  # [N m], [m/s^2] for conditioning
-JOINED_SCALE = 0.01  # a jump of 5 um between two phases would be a centimetre a second on the tape
-SPIN_BOX = (-100.0, 100.0, 1.0)  # [kg m^2/s] angular momentum in flight; scale
+RATE_BOX = 60.0  # [rad/s, m/s] of the base
+PLACE_BOX = (-10.0, 10.0, 1.0)  # [m] the CoM at take-off; scale
+SPEED_BOX = (-8.0, 8.0, 1.0)  # [m/s] its velocity there; scale
+SPIN_BOX = (-200.0, 200.0, 10.0)  # [kg m^2/s] angular momentum in flight; scale
+FORCE_SHARE = 1.0
 
 
-def _boxes(b: SpatialTerms) -> tuple[Bound, ...]:
-    """Ranges, speeds and torques of the joints; forces that only push."""
-    lim, m, base = b.limits, b.motors, len(b.coordinates) - b.model.joints
-    wide = np.full(base, ANGLE_BOX_RAD)
-    wide[-2] = lim.roll_rad
-    low, high = m["lower"] + lim.range_margin_rad, m["upper"] - lim.range_margin_rad
-    least = -np.inf if b.flying or b.robot.planar else lim.straight_knee_rad
-    for k, sign, angle in b.knees:
-        bent = sorted((sign * (least - angle), sign * (lim.knee_rad - angle)))
-        low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
-    rates = np.concatenate([np.full(base, RATE_BOX), lim.speed_share * m["speed"]])
-    torques, free = lim.torque_share * m["effort"], np.full(b.n_forces or 3, np.inf)
-    least = np.zeros(b.n_forces) if b.n_forces else -free
-    return (
-        Bound("joint range", "ours: stops", "rad", "q", np.concatenate([-wide, low]), np.concatenate([wide, high])),
-        Bound("joint speed", "ours: limit", "rad/s", "v", -rates, rates),
-        Bound(
-            "forces and torques",
-            "ours: limit",
-            "N, N m",
-            "z",
-            np.concatenate([least, -torques]),
-            np.concatenate([free, torques]),
-        ),
-    )
+def mode_key(modes: dict[int, str]) -> tuple:
+    """A mode of contact as a key."""
+    return tuple(sorted(modes.items()))
 
 
-def _scales(b: SpatialTerms) -> dict:
-    free = np.full(3, FALL_SCALE) if b.flying else np.full(b.n_forces, b.mg / 8)
-    return SCALES | {"z": np.concatenate([free, np.full(b.model.joints, TORQUE_SCALE)])}
+class Schedule:
+    """A schedule for one robot: the terms of each mode, and the problem that they make."""
+
+    def __init__(
+        self,
+        body: Body,
+        contacts: Contacts,
+        limits: SpatialLimits,
+        weights: SpatialWeights,
+        apart: Iterable[Apart] = (),
+        name: str = "spatial",
+    ):
+        self.body, self.contacts, self.limits, self.weights, self.name = body, contacts, limits, weights, name
+        self.apart = tuple(apart)
+        self.terms = {}
+        for phase in contacts.phases:
+            key = mode_key(phase.modes)
+            if key not in self.terms:
+                self.terms[key] = SpatialTerms(body, limits, weights, phase.modes)
+
+    def of(self, k: int) -> SpatialTerms:
+        """Terms of a phase."""
+        return self.terms[mode_key(self.contacts.phases[k].modes)]
+
+    def landed(self, k: int) -> list[int]:
+        """Sides of the feet that come down at the start of a phase; none at that of the first."""
+        before = self.contacts.phases[k - 1].modes if k else self.contacts.phases[0].modes
+        return [side for side in self.contacts.phases[k].modes if side not in before]
+
+    def problem(self) -> Problem:
+        """All phases in one problem."""
+        phases = tuple(self._phase(k) for k in range(len(self.contacts.phases)))
+        parameters = dict(stance=self.of(0).nv, distance=1, side=1, yaw=1, platform=1, edge=1, along=2)
+        parameters |= dict(takeoff_speed=1, rotation=1, gravity=1, straight=1)
+        return Problem(self.name, phases, (), parameters)
+
+    def _phase(self, k: int) -> Phase:
+        b, given, last = self.of(k), self.contacts.phases[k], k == len(self.contacts.phases) - 1
+        landed = self.landed(k)
+        joined = bool(k) and not landed
+        terms = [*b.smoothness(), *b.dynamics(joined), b.motor_lines(joined), b.body_clearance(), b.sides_apart()]
+        terms += [b.link_distance(x, given.intervals) for x in self.apart if x.phase == k]
+        for side in b.modes:
+            # the first node is given, so it needs no rows
+            terms += b.foot_rows(side, joined or k == 0, side in landed)
+        terms += [b.swing_rows(side) for side in (0, 1) if side not in b.modes]
+        if given.feet == "LR":
+            terms.append(b.loads())
+        if b.flying:
+            terms += b.flight_rows()
+        if last and self.contacts.ends == "touchdown":
+            terms += b.touchdown_rows()
+        return Phase(
+            given.name,
+            b.coordinates,
+            given.intervals,
+            given.time_s,
+            tuple(terms),
+            (*self._boxes(b), *self._ends(k)),
+            b.states,
+            self._constants(k),
+            {f"{SIDES[side]}_clearance": 1 for side in (0, 1) if side not in b.modes},
+            SCALES | {"z": self._sizes(b)},
+            partial(SpatialView, b),
+            b.integrated,
+            "" if not k else "qv" if landed else "qvaz",
+            b.kind,
+        )
+
+    def _sizes(self, b: SpatialTerms) -> np.ndarray:
+        effort = np.maximum(self.body.motors["effort"], 1.0)
+        return np.concatenate([np.full(b.n_forces, self.body.mg / FORCE_SHARE), effort])
+
+    def _constants(self, k: int) -> dict:
+        """Footholds of the feet that carry, by contact; in flight the CoM's parabola and L."""
+        b, out = self.of(k), {}
+        if b.flying:
+            for kind, box in (("com", PLACE_BOX), ("vel", SPEED_BOX), ("L", SPIN_BOX)):
+                out |= {f"{kind}_{x}": box for x in "xyz"}
+            if self.contacts.ends == "touchdown" and k == len(self.contacts.phases) - 1:
+                out["vel_z"] = (_takeoff_speed, _takeoff_speed, 1.0)
+        for side in b.modes:
+            contact = self.contacts.contact_of(k, side)
+            for x, (low, high) in zip(("x", "y", "z", "yaw"), self.foothold(contact), strict=True):
+                out[f"{SIDES[side]}_{x}"] = (low, high, 1.0, f"contact {contact} {x}")
+        return out
+
+    def foothold(self, contact: int) -> list[tuple[float, float]]:
+        """Bounds of x, y, z [m] and yaw [rad] of the middle of the toe edge in one contact."""
+        _, side = self.contacts.landings[contact]
+        first = self.body.places[side]
+        number = contact - len(self.contacts.phases[0].modes)
+        if number < 0:
+            return [(x, x) for x in (*first, 0.0)]
+        p = self.contacts.places[number]
+        middle = (first[0] + p.ahead_m, first[1] + p.left_m, first[2] + p.up_m, p.turn_rad)
+        free = (*p.free_m, 0.0, p.free_rad)
+        return [(x - y, x + y) for x, y in zip(middle, free, strict=True)]
+
+    def _boxes(self, b: SpatialTerms) -> tuple[Bound, ...]:
+        """Ranges, speeds and torques of the joints; forces that only push; feet that tip only forward."""
+        lim, m, raised = b.limits, b.body.motors, len(b.raised)
+        wide = np.full(BASE, ANGLE_BOX_RAD)
+        wide[CHART.index("roll")] = lim.roll_rad
+        low, high = m["lower"] + lim.range_margin_rad, m["upper"] - lim.range_margin_rad
+        least = -np.inf if b.flying else lim.straight_knee_rad
+        for k, sign, angle in b.body.knees:
+            bent = sorted((sign * (least - angle), sign * (lim.knee_rad - angle)))
+            low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
+        rates = np.concatenate([np.full(BASE, RATE_BOX), lim.speed_share * m["speed"], np.full(raised, np.inf)])
+        torques = lim.torque_share * m["effort"] - m["friction"]
+        q_low, q_high = np.concatenate([-wide, low, np.zeros(raised)]), np.concatenate([wide, high])
+        q_high = np.concatenate([q_high, np.full(raised, lim.heel_up_rad)])
+        none, push = np.zeros(b.n_forces), np.full(b.n_forces, np.inf)
+        return (
+            Bound("joint range", "ours: stops; WL-K2", "rad", "q", q_low, q_high),
+            Bound("joint speed", "ours: limit", "rad/s", "v", -rates, rates),
+            Bound(
+                "forces and torques",
+                "ours: limit",
+                "N, N m",
+                "z",
+                np.concatenate([none, -torques]),
+                np.concatenate([push, torques]),
+            ),
+        )
+
+    def _ends(self, k: int) -> list[Bound]:
+        """The first node of the schedule and of heels that rise; forces that vanish; the last node, at rest."""
+        b, phases = self.of(k), self.contacts.phases
+        out, size, free = [], len(b.coordinates), np.full(len(b.coordinates), np.inf)
+        if k == 0:
+            out += [
+                Bound("stance", "ours: the paper prints no start", "rad", "q", _stance, _stance, "start"),
+                Bound("at rest", "ours", "rad/s", "v", 0.0, 0.0, "start"),
+                Bound("at rest (acceleration)", "ours", "rad/s^2", "a", 0.0, 0.0, "start"),
+            ]
+        before = phases[k - 1].modes if k else {}
+        rising = [side for side in b.raised if before.get(side) == "flat"]
+        if rising:
+            for on in "qva":
+                most = free.copy()
+                most[[b.nv + b.raised.index(side) for side in rising]] = 0.0
+                out.append(Bound(f"heels rise from rest ({on})", "ours", "rad, rad/s, rad/s^2", on, -most, most, "start"))
+        after = phases[k + 1].modes if k + 1 < len(phases) else b.modes
+        if gone := self._leaving(b, after):
+            most = np.full(len(b.states), np.inf)
+            most[gone] = 0.0
+            words = "SL-E3, E4, E6 for the whole body", "N"
+            out.append(Bound("no force where contact ends", *words, "z", -most, most, "end"))
+        lowered = [side for side in b.raised if after.get(side) == "flat"]
+        if lowered:
+            for on in "qv":
+                most = free.copy()
+                most[[b.nv + b.raised.index(side) for side in lowered]] = 0.0
+                out.append(Bound(f"heels come down ({on})", "ours", "rad, rad/s", on, -most, most, "end"))
+        if k == len(phases) - 1 and self.contacts.ends == "rest":
+            still = np.array([0.0 if name in b.integrated else np.inf for name in b.coordinates])
+            out += [
+                Bound("at rest in the end", "ours", "rad/s", "v", -still, still, "end"),
+                Bound("at rest in the end (acceleration)", "ours", "rad/s^2", "a", -still, still, "end"),
+            ]
+        return out
+
+    def _leaving(self, b: SpatialTerms, after: dict[int, str]) -> list[int]:
+        """Columns of the forces that the phase ``after`` no longer has: those of feet in the air, of heels that rise."""
+        gone, first = [], 0
+        for side, points in b.points.items():
+            count = len(EDGES) * len(points)
+            toes = len(EDGES) * 2
+            if side not in after:
+                gone += range(first, first + count)
+            elif b.modes[side] == "flat" and after[side] == "toe":
+                gone += range(first + toes, first + count)
+            first += count
+        return gone
 
 
-def _flat_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
-    def stance(parameters):
-        return parameters["stance"]
-
-    legs = {j for k in b.feet for j in b.chain(k)}
-    rest = np.array([np.inf if k - len(CHART) + 1 in legs else 0.0 for k in range(len(b.coordinates))])
-    start = (
-        Bound("stance", "ours: the paper prints no start", "rad", "q", stance, stance, "start"),
-        Bound("at rest", "ours", "rad/s", "v", 0.0, 0.0, "start"),
-        # where the legs' accelerations follow from feet in place, no second condition is wanted at this end
-        Bound("at rest (acceleration)", "ours", "rad/s^2", "a", -rest, rest, "start"),
-    )
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
-    return Phase(
-        b.contact.value,
-        b.coordinates,
-        mesh.flat,
-        b.limits.flat_s,
-        terms,
-        (*_boxes(b), *start),
-        b.states,
-        scales=_scales(b),
-    )
+def _stance(parameters):
+    return parameters["stance"]
 
 
-def _toe_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
-    gone = np.concatenate([np.zeros(b.n_forces), np.full(b.model.joints, np.inf)])
-    off = Bound("no force at take-off", "SL-E3, E4, E6 for the whole body", "N", "z", -gone, gone, "end")
-    terms = (*b.smoothness(), *b.dynamics(), b.motor_lines(), *b.launch_rows(), b.body_clearance(), *b.link_distances())
-    return Phase(
-        b.contact.value, b.coordinates, mesh.toe, b.limits.toe_s, terms, (*_boxes(b), off), b.states, scales=_scales(b)
-    )
-
-
-def _flight_phase(b: SpatialTerms, mesh: Mesh) -> Phase:
-    constants = {
-        f"{kind}_{x}": box for kind, box in (("com", COM_BOX_M), ("vel", SPEED_BOX_M_S), ("L", SPIN_BOX)) for x in "xyz"
-    }
-    terms = (
-        *b.smoothness(),
-        *b.dynamics(),
-        b.motor_lines(),
-        *b.flight_rows(),
-        b.body_clearance(),
-        *b.link_distances(),
-        *b.touchdown_rows(),
-    )
-    return Phase(
-        b.contact.value, b.coordinates, mesh.flight, FLIGHT_S, terms, _boxes(b), b.states, constants, scales=_scales(b)
-    )
-
-
-def _joined() -> Term:
-    def jump(ends):
-        a, b = ends["flat"].end, ends["toe"].start
-        return ca.vertcat(*((getattr(a, k) - getattr(b, k)) / SCALES[k] for k in "qva"))
-
-    return Term("flat to toe", "WF-L1..L3", "scaled", "problem", jump, scale=JOINED_SCALE, identity=True)
-
-
-def _released(toe: SpatialTerms) -> tuple[Term, Term]:
-    def jump(ends):
-        a, b = ends["toe"].end, ends["flight"].start
-        rows = [(getattr(a, k)[3:] - getattr(b, k)) / SCALES[k] for k in "qv"]
-        return ca.vertcat(*rows, (a.a[len(CHART) :] - b.a[3:]) / SCALES["a"])
-
-    def takeoff(ends):
-        s, c = toe.state(ends["toe"].end), ends["flight"].start.c
-        place, speed = ca.vertcat(c.com_x, c.com_y, c.com_z), ca.vertcat(c.vel_x, c.vel_y, c.vel_z)
-        return ca.vertcat(s.com - place, s.com_velocity - speed)
-
-    return (
-        Term("toe to flight", "WF-L1..L3", "scaled", "problem", jump, scale=JOINED_SCALE, identity=True),
-        Term("ballistic CoM", "WF-D1", "m, m/s", "problem", takeoff, identity=True),
-    )
-
-
-def build_problem(
-    robot: Robot,
-    mesh: Mesh = SPATIAL_MESH,
-    limits: SpatialLimits = SpatialLimits(),
-    weights: SpatialWeights = SpatialWeights(),
-) -> Problem:
-    """Flat foot, toes and flight in one problem."""
-    flat, toe, flight = (SpatialTerms(robot, limits, weights, contact) for contact in Contact)
-    made = (flat, _flat_phase(flat, mesh)), (toe, _toe_phase(toe, mesh)), (flight, _flight_phase(flight, mesh))
-    phases = tuple(replace(phase, view=partial(SpatialView, b)) for b, phase in made)
-    parameters = dict(stance=len(flat.coordinates), distance=1, side=1, yaw=1, platform=1, edge=1, along=2)
-    parameters |= dict(takeoff_speed=1, rotation=1, gravity=1, **({} if robot.planar else {"straight": 1}))
-    return Problem("spatial", phases, (_joined(), *_released(toe)), parameters)
+def _takeoff_speed(parameters):
+    return parameters["takeoff_speed"]

@@ -25,9 +25,12 @@ class SpatialLimits:
     roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn
     flat_s: tuple[float, float] = (0.25, 0.70)  # duration of the flat-foot phase
     toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
+    flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
     clearance_m: float = 0.035  # of the soles over the ground in mid-flight
     body_clearance_m: float = 0.05  # of knees and hands over the ground
-    link_distance_m: float = 0.003  # between links of legs and trunk
+    sides_share: float = 0.45  # of the stance's distance between left and right leg, seen from the trunk
+    hands_inward_m: float = 0.05  # by which hands may be further in than in the stance
+    link_distance_m: float = 0.003  # between links that came too close without it
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
@@ -39,6 +42,7 @@ class SpatialLimits:
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
     touchdown_roll: float = 0.10  # [rad] of the base, either way
     touchdown_yaw: float = 0.20  # [rad] of the base against the feet, either way
+    edge_smoothing_m: float = 0.015  # a platform's edge is a step smoothed over about twice this
     edge_before_heel_m: float = 0.05  # a platform begins this far before the landing soles
     edge_step_m: float = 0.08  # and for clearance its upper surface counts as reaching this much further
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)

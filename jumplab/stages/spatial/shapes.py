@@ -12,9 +12,6 @@ import pinocchio as pin
 from jumplab.models.spatial import SpatialModel, SpatialState
 from jumplab.robot import Robot
 
-SAMPLES = 400  # postures within the joints' ranges, in which every pair that can meet is seen to
-NEAR_M = 0.01  # so close they count as meeting there
-STANDING_M = 0.005  # that a face keeps two links apart in the stance, to be of use
 ROUNDED_M = 1e-3  # by which the corner of a box gives way, so that the distance has a slope everywhere
 
 
@@ -37,6 +34,17 @@ class Pair:
     second: Box
     way: np.ndarray  # in the frame of the first one's body
     reach: float
+    face: int  # which of the first one's six
+
+    @property
+    def name(self) -> str:
+        """Both links."""
+        return f"{self.first.name} and {self.second.name}"
+
+    @property
+    def key(self) -> str:
+        """Both links, and the face."""
+        return f"{self.name} apart, face {self.face}"
 
     def gap(self, s: SpatialState) -> ca.SX:
         """Distance of the second box from the plane of that face [m]; negative behind it."""
@@ -61,59 +69,24 @@ def boxes(robot: Robot, model: SpatialModel) -> tuple[list[Box], pin.GeometryMod
     return out, geometry
 
 
-def pairs(robot: Robot, model: SpatialModel, bodies: set[int], stance: np.ndarray) -> list[Pair]:
-    """Pairs of links among ``bodies`` that can meet, each with the face that rules out the fewest postures.
-
-    A pair that no face keeps apart in the ``stance`` (nq,) is left out.
-    """
-    found, geometry = boxes(robot, model)
+def candidates(robot: Robot, model: SpatialModel, found: list[Box]) -> list[tuple[int, int]]:
+    """Pairs of links (indices of their boxes) that are no neighbours."""
     above = [b.parent for b in model.bodies]
+    out = []
     for i, k in combinations(range(len(found)), 2):
         a, b = found[i].body, found[k].body
-        neighbours = a == b or (b and above[b] == a) or (a and above[a] == b)
-        if not neighbours and {a, b} <= bodies:
-            geometry.addCollisionPair(pin.CollisionPair(i, k))
-    if not len(geometry.collisionPairs):
-        return []
-    apart, turns, places = _postures(model, geometry, stance)
-    out = []
-    for (i, k), distance in zip(((p.first, p.second) for p in geometry.collisionPairs), apart.T, strict=True):
-        if distance.min() < NEAR_M:
-            free = distance > NEAR_M
-            ways = [w for w in _faces(found[i], found[k]) + _faces(found[k], found[i]) if _open(w, turns, places)[0]]
-            kept = [np.sum(_open(way, turns[free], places[free])) for way in ways]
-            out += [ways[int(np.argmax(kept))]] if ways else []
+        if not (a == b or (b and above[b] == a) or (a and above[a] == b)):
+            out.append((i, k))
     return out
 
 
-def _postures(model: SpatialModel, geometry: pin.GeometryModel, stance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of the stance and of postures all over the joints' ranges: distances of the pairs (n, k), attitudes of the bodies
-    (n, bodies, 3, 3) and their places (n, bodies, 3)."""
-    tree = model.model
-    data, shapes, q = tree.createData(), geometry.createData(), np.array(stance)
-    low, high = tree.lowerPositionLimit[7:], tree.upperPositionLimit[7:]
-    primes = [n for n in range(2, 20 * len(low) + 10) if all(n % d for d in range(2, n))][: len(low)]
-    apart, turns, places = [], [], []
-    for k in range(SAMPLES):  # multiples of irrational numbers fill the box evenly
-        if k:
-            q[7:] = low + (high - low) * ((k * np.sqrt(primes)) % 1.0)
-        pin.computeDistances(tree, data, geometry, shapes, q)
-        apart.append([d.min_distance for d in shapes.distanceResults])
-        turns.append([data.oMi[j].rotation @ b.own for j, b in enumerate(model.bodies, start=1)])
-        places.append([data.oMi[j].translation.copy() for j in range(1, tree.njoints)])
-    return np.array(apart), np.array(turns), np.array(places)
+def faces(a: Box, b: Box) -> list[Pair]:
+    """What each face of the first box makes of the pair."""
+    ways = [(i, sign) for i in range(3) for sign in (-1.0, 1.0)]
+    return [Pair(a, b, sign * a.axes[:, i], a.half[i], n) for n, (i, sign) in enumerate(ways)]
 
 
-def _faces(a: Box, b: Box) -> list[Pair]:
-    return [Pair(a, b, sign * a.axes[:, i], a.half[i]) for i in range(3) for sign in (-1.0, 1.0)]
-
-
-def _open(pair: Pair, turns: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Whether the face keeps the pair apart in each posture (n,)."""
-    return _gaps(pair, turns, places) > STANDING_M
-
-
-def _gaps(pair: Pair, turns: np.ndarray, places: np.ndarray) -> np.ndarray:
+def gaps(pair: Pair, turns: np.ndarray, places: np.ndarray) -> np.ndarray:
     """:meth:`Pair.gap` in postures (n, bodies, 3, 3), (n, bodies, 3), with sharp corners (n,)."""
     a, b = pair.first, pair.second
     way = turns[:, a.body] @ pair.way

@@ -1,6 +1,6 @@
-"""The 1 kHz tape of a spatial plan, exact between the nodes: feet do not slip, momentum is kept, no wrench is missing.
+"""The 1 kHz tape of a plan, exact between the nodes: feet do not slip, momentum is kept, no wrench is missing.
 
-Between nodes the plan's polynomials miss the contact by fractions of a millimetre. In launch the legs follow from base,
+Between nodes the plan's polynomials miss the contact by fractions of a millimetre. Legs that carry follow from base,
 arms and the feet's pitch by inverse kinematics on all three levels, and the ground's wrenches take up what inverse
 dynamics still misses. In flight the joints' polynomials stand; the base follows from L and the CoM's parabola.
 """
@@ -8,53 +8,94 @@ dynamics still misses. In flight the joints' polynomials stand; the base follows
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 
 from jumplab.io.tape import RATE_HZ, Tape
-from jumplab.models.spatial import CHART, SpatialModel
+from jumplab.models.spatial import SpatialModel, SpatialState
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.stages.reconstruction import SHORTEST_STEP
-from jumplab.stages.spatial.start import generators
-from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.spatial.contacts import SIDES
+from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.spatial.terms import BASE, EDGES, Body, SpatialTerms
 
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
-JOINING_S = 0.05  # after take-off, over which joints pass from the launch as held by the ground to the planned flight
+JOINING_S = 0.05  # over which a phase passes from where the one before ended on the tape to its own plan
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
+LANDINGS = 2  # corrections of a flight's end, each a hundred times smaller than the one before
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
 FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
+AIR, TOE, FLAT = 0, 1, 2  # codes of a foot in the tape's ``contacts``
+CODES = {"toe": TOE, "flat": FLAT}
+
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]  # charts, rates, accelerations, each (n, 6 + joints)
 
 
-def make_tape(terms: Mapping[str, SpatialTerms], phases: Mapping[str, PhaseSolution], gravity: float) -> Tape:
-    """The tape of a solution; ``terms`` are those of its phases, by name."""
-    b, flat, toe, flight = terms["flat"], phases["flat"], phases["toe"], phases["flight"]
-    robot = b.robot.under_gravity(gravity)
-    launch_s = flat.duration + toe.duration
-    t = launch_s - np.arange(int(np.ceil(launch_s * RATE_HZ - 1e-9)), -1, -1) / RATE_HZ
-    legs = Legs(b)
-    q, v, a, w = _launch(terms, phases, legs, np.maximum(t, 0.0), gravity)
-    late = np.append(np.arange(0, flight.duration - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), flight.duration)
-    stood = b.model.to_pinocchio(q, v, a)
-    start = [stood, _flight(terms["flight"], flight, (q[-1], v[-1], a[-1]), [x[-1] for x in stood], late, gravity)]
-    q, v, a = (np.concatenate(x) for x in zip(*start, strict=True))
-    wrench = np.concatenate([w, np.zeros((len(late), 2, 6))])
-    f, tau, com, spin = forces(robot, q, v, a, wrench, len(t))
-    phase = np.repeat(["launch", "flight"], [len(t), len(late)])
+@dataclass(frozen=True)
+class Piece:
+    """Some consecutive phases without a jump of accelerations: times, motion, wrenches and contacts on the tape."""
+
+    t: np.ndarray  # (n,) [s]
+    motion: Motion
+    wrench: np.ndarray  # (n, 2, 6) of the feet about the world's origin, as planned
+    contacts: np.ndarray  # (n, 2) codes
+
+
+def make_tape(schedule: Schedule, phases: Mapping[str, PhaseSolution], gravity: float) -> Tape:
+    """The tape of a solution of a schedule."""
+    body, robot = schedule.body, schedule.body.robot.under_gravity(gravity)
+    solved = list(phases.values())
+    starts = np.concatenate([[0.0], np.cumsum([p.duration for p in solved])])
+    pieces: list[Piece] = []
+    for first, last in _pieces(schedule):
+        before = pieces[-1] if pieces else None
+        t = _times(starts[first], starts[last + 1], first == 0)
+        if schedule.of(first).flying:
+            ends = schedule.landed(last + 1) if last + 1 < len(solved) else [0, 1]
+            pieces.append(_flight(body, solved[first], before, t, starts[first], ends, gravity))
+        else:
+            pieces.append(_ground(schedule, solved, range(first, last + 1), before, t, starts, gravity))
+    t = np.concatenate([p.t for p in pieces])
+    chart = [np.concatenate(x) for x in zip(*(p.motion for p in pieces), strict=True)]
+    q, v, a = body.model.to_pinocchio(*chart)
+    wrench, contacts = (np.concatenate([getattr(p, k) for p in pieces]) for k in ("wrench", "contacts"))
+    f, tau, com, spin = forces(robot, q, v, a, wrench, contacts)
+    phase = np.where(contacts.any(axis=1), "launch", "flight")
+    toes = np.flatnonzero((contacts == TOE).any(axis=1))
     extra = {
         "com": com[:, :3],
         "com_velocity": com[:, 3:],
         "angular_momentum": spin,
-        "toe_phase_start": flat.duration - t[0],
+        "contacts": contacts,
+        "toe_phase_start": t[toes[0]] - t[0] if len(toes) else t[0],
     }
-    extra |= _travel(b.robot, q)
-    times = np.concatenate([t - t[0], launch_s - t[0] + late])
+    extra |= _travel(robot, q)
     names = np.array(robot.foot.frames), np.array(robot.joint_names)
-    return Tape(times, q, v, a, tau, phase, names[0], f, names[1], extra)
+    return Tape(t - t[0], q, v, a, tau, phase, names[0], f, names[1], extra)
+
+
+def _pieces(schedule: Schedule) -> list[tuple[int, int]]:
+    """(first, last) phase of each stretch whose accelerations do not jump: up to take-off, and to each landing."""
+    count, out, first = len(schedule.contacts.phases), [], 0
+    for k in range(1, count):
+        flying = schedule.of(k).flying or schedule.of(k - 1).flying
+        if flying or schedule.landed(k):
+            out.append((first, k - 1))
+            first = k
+    return [*out, (first, count - 1)]
+
+
+def _times(start: float, end: float, first: bool) -> np.ndarray:
+    """Instants of a piece: milliseconds up to its end if it is the ``first``, else from its start, and its end."""
+    if first:
+        return end - np.arange(int(np.ceil((end - start) * RATE_HZ - 1e-9)), -1, -1) / RATE_HZ
+    return np.append(np.arange(start, end - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), end)
 
 
 def holds_between(tape: Tape, robot: Robot) -> bool:
@@ -94,37 +135,46 @@ def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
     return {"soles_travel": ends[-1] - ends[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
+# on the ground ------------------------------------------------------------------------------------------------------
 class Legs:
-    """Contact as functions of the chart, mapped over many instants."""
+    """Feet that carry as functions of the chart, mapped over many instants."""
 
-    def __init__(self, b: SpatialTerms):
-        self.b, n = b, len(b.model.names)
+    def __init__(self, b: SpatialTerms, holds: Mapping[int, np.ndarray]):
+        """``holds`` are x, y, z [m] and yaw [rad] of the middle of the toe edge, by side."""
+        self.b, body, n = b, b.body, b.nv
         q, v, a = (ca.SX.sym(k, n) for k in "qva")
-        rows = b.contact_rows(q)
+        state, rows, self.pitches = SpatialState(b.model, q, q, q), [], {}
+        for side, hold in holds.items():
+            turn = state.rotation(body.feet[side]) @ ca.DM(body.axes[side])
+            place = state.point(body.feet[side], body.tips[side]) - ca.DM(hold[:3])
+            short = body.short and side == 1
+            rows.append(place[[0, 2]] if short else place)
+            rows.append(ca.vertcat(np.cos(hold[3]) * turn[1, 0] - np.sin(hold[3]) * turn[0, 0], turn[2, 1], turn[2, 0]))
+            self.pitches[side] = sum(x.numel() for x in rows) - 1
+            if short:
+                rows.append(q[[3, 4]])
+        rows = ca.vertcat(*rows)
         slope = ca.jtimes(rows, q, v)
         drift = ca.jtimes(slope, ca.vertcat(q, v), ca.vertcat(v, a))
         self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
         self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
-        bodies = sorted({j for k in b.feet for j in b.chain(k)})
-        self.columns = np.array([1, 3, 4] * b.short + [len(CHART) - 1 + j for j in bodies])
-        self.pitches = np.cumsum([len(held) + 3 for held in b.held]) - 1  # rows that say how the feet pitch
+        self.columns = np.array([1, 3, 4] * body.short + [k for side in holds for k in body.legs[side]])
 
-    def held(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Charts, rates and accelerations (n, .) with the legs moved so that the feet stay in their places.
+    def held(self, motion: Motion, pitch: Mapping[int, Motion]) -> Motion:
+        """The motion with the legs moved so that the feet stay in their places.
 
-        Where not ``flat`` (n,) the feet pitch as they did.
+        ``pitch`` are angle, rate and acceleration (n,) of each foot on its toes, by side.
         """
-        n, (q, v, a) = len(q), (x.copy() for x in (q, v, a))
-        goals = [x.full().T.copy() for x in self._levels.map(n)(q.T, v.T, a.T)]
-        for goal in goals:
-            pitch = np.where(flat[:, None], 0.0, goal[:, self.pitches])
-            goal[:] = 0.0
-            goal[:, self.pitches] = pitch
+        n, (q, v, a) = len(motion[0]), (x.copy() for x in motion)
+        goals = np.zeros((3, n, self._levels.size1_out(0)))
+        for side, (angle, rate, gain) in pitch.items():
+            s, c, at = np.sin(angle), np.cos(angle), self.pitches[side]
+            goals[0, :, at], goals[1, :, at], goals[2, :, at] = -s, -c * rate, s * rate**2 - c * gain
         for _ in range(LEG_STEPS):
             rows, slope = (x.full() for x in self._slope.map(n)(q.T))
             slope = slope.reshape(rows.shape[0], n, -1).transpose(1, 0, 2)
             q[:, self.columns] += self._solved(slope, goals[0] - rows.T)
-        slope = self._slope.map(n)(q.T)[1].full().reshape(goals[0].shape[1], n, -1).transpose(1, 0, 2)
+        slope = self._slope.map(n)(q.T)[1].full().reshape(goals.shape[2], n, -1).transpose(1, 0, 2)
         v[:, self.columns] += self._solved(slope, goals[1] - self._levels.map(n)(q.T, v.T, a.T)[1].full().T)
         a[:, self.columns] += self._solved(slope, goals[2] - self._levels.map(n)(q.T, v.T, a.T)[2].full().T)
         return q, v, a
@@ -136,47 +186,110 @@ class Legs:
         return (across @ np.linalg.solve(rows @ across, off[..., None]))[..., 0]
 
 
-def _launch(terms, phases, legs: Legs, t: np.ndarray, gravity: float):
-    """Charts, rates, accelerations (n, .) and the feet's wrenches (n, 2, 6) about the world's origin at times ``t``."""
-    flat, toe = phases["flat"], phases["toe"]
-    first = t < flat.duration
-    times = t[first], np.minimum(t[~first] - flat.duration, toe.duration)
-    sampled = [np.concatenate(x) for x in zip(flat.sample(times[0]), toe.sample(times[1]), strict=True)]
-    q, v, a = _balanced(legs, sampled, first, t, gravity)
-    wrench = []
-    for name, phase, at in (("flat", flat, times[0]), ("toe", toe, times[1])):
-        b = terms[name]
-        edges = [generators(b, side) for side in (0, 1)]
-        z = np.stack([np.interp(at, phase.t, x) for x in phase.z[:, : b.n_forces].T], -1)
-        wrench.append(np.stack([x @ e.T for x, e in zip(np.hsplit(z, 2), edges, strict=True)], 1))
-    return q, v, a, np.concatenate(wrench)
+def holds_of(phase: PhaseSolution, b: SpatialTerms) -> dict[int, np.ndarray]:
+    """x, y, z [m] and yaw [rad] of the middle of the toe edge of each foot that carries, by side."""
+    return {
+        side: np.array([phase.constants[f"{SIDES[side]}_{x}"] for x in ("x", "y", "z", "yaw")]) for side in b.modes
+    }
 
 
-def _balanced(legs: Legs, motion, flat: np.ndarray, t: np.ndarray, gravity: float):
+def edges(b: SpatialTerms, side: int, hold: np.ndarray) -> np.ndarray:
+    """(6, 4 k): force and moment about the world's origin per unit of each edge of one foot's friction pyramids."""
+    turn, columns = pin.rpy.rpyToMatrix(0.0, 0.0, hold[3]), []
+    for point in b.points[side]:
+        place = hold[:3] + turn @ point
+        for x, y in b.limits.friction * EDGES:
+            force = turn @ np.array([x, y, 1.0])
+            columns.append(np.concatenate([force, np.cross(place, force)]))
+    return np.array(columns).T
+
+
+def _ground(schedule, solved, numbers: range, before: Piece | None, t, starts, gravity: float) -> Piece:
+    """A stretch on the ground, phase by phase."""
+    fading = _offset(before, solved[numbers[0]]) if before is not None else None
+    parts = []
+    for k in numbers:
+        b, phase = schedule.of(k), solved[k]
+        own = (t >= starts[k]) & (t < starts[k + 1])
+        if k == numbers[0]:
+            own |= t < starts[k + 1]
+        if k == numbers[-1]:
+            own |= t >= starts[k]
+        if not own.any():
+            continue
+        at = np.clip(t[own] - starts[k], 0.0, phase.duration)
+        sampled = phase.sample(at)
+        motion = [x[:, : b.nv] for x in sampled]
+        if fading is not None:
+            gone = _fading(fading, t[own] - t[0])
+            motion = [x + y for x, y in zip(motion, gone, strict=True)]
+        pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
+        holds = holds_of(phase, b)
+        legs = Legs(b, holds)
+        motion = _balanced(legs, motion, pitch, holds, t[own], gravity)
+        parts.append((motion, *_planned(b, phase, holds, at)))
+    motions, wrenches, codes = zip(*parts, strict=True)
+    motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
+    return Piece(t, motion, np.concatenate(wrenches), np.concatenate(codes))
+
+
+def _offset(before: Piece, phase: PhaseSolution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By what the tape so far ends away from where a phase begins: charts and rates; accelerations may jump."""
+    n = before.motion[0].shape[1]
+    q, v = (x[-1] - y[0, :n] for x, y in zip(before.motion[:2], (phase.q, phase.v), strict=True))
+    return q, v, np.zeros(n)
+
+
+def _planned(b: SpatialTerms, phase: PhaseSolution, holds, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Wrenches (n, 2, 6) about the world's origin as planned, and codes of the contacts (n, 2)."""
+    wrench, codes, first = np.zeros((len(at), 2, 6)), np.zeros((len(at), 2), np.int8), 0
+    for side, hold in holds.items():
+        made = edges(b, side, hold)
+        z = np.stack([np.interp(at, phase.t, x) for x in phase.z[:, first : first + made.shape[1]].T], -1)
+        wrench[:, side], codes[:, side] = z @ made.T, CODES[b.modes[side]]
+        first += made.shape[1]
+    return wrench, codes
+
+
+def _balanced(legs: Legs, motion: Motion, pitch, holds, t: np.ndarray, gravity: float) -> Motion:
     """The motion with feet held, its base moved by some micrometres so that the ground's force stays on the toes.
 
-    Heels up, no ground force has a moment about the line of the toes: what the motion between nodes needs of it goes.
+    Where all feet that carry are on their toes, in one line, no ground force has a moment about that line: what the
+    motion between nodes needs of it goes.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
-    up, model = np.flatnonzero(~flat), legs.b.model
-    x = float(legs.b.places[:, 0].mean() + (legs.b.robot.foot.toe - legs.b.robot.foot.heel) / 2)
+    b = legs.b
+    if len(b.raised) < len(b.modes) or not _in_line(list(holds.values())) or len(t) < 2:
+        return legs.held(motion, pitch)
     q, v, a = (y.copy() for y in motion)
-    push = np.eye(q.shape[1])[0]
+    edge = np.mean(list(holds.values()), axis=0)
+    across, ahead = (pin.rpy.rpyToMatrix(0.0, 0.0, edge[3])[:, k] for k in (1, 0))
+    push = np.zeros(q.shape[1])
+    push[:3] = ahead
 
     def moment(change: np.ndarray | float = 0.0):
-        held = legs.held(q[up], v[up], a[up] + change, flat[up])
-        need = np.array(list(_needed(model, *held, gravity)))
-        return need[:, 4] + x * need[:, 2]
+        need = np.array(list(_needed(b.model, *legs.held((q, v, a + change), pitch), gravity)))
+        return (need[:, 3:] - np.cross(edge[:3], need[:, :3])) @ across
 
     missing = moment()
     gained = moment(push) - missing  # hardly changed by the corrections
     for k in range(BALANCING):
         more = -(moment() if k else missing) / gained
-        rate = cumulative_trapezoid(more, t[up], initial=0.0)
-        for y, change in ((q, cumulative_trapezoid(rate, t[up], initial=0.0)), (v, rate), (a, more)):
-            y[up, 0] += change
-    return legs.held(q, v, a, flat)
+        rate = cumulative_trapezoid(more, t, initial=0.0)
+        for y, change in ((q, cumulative_trapezoid(rate, t, initial=0.0)), (v, rate), (a, more)):
+            y += change[:, None] * push
+    return legs.held((q, v, a), pitch)
+
+
+def _in_line(holds: list[np.ndarray]) -> bool:
+    """Whether toe edges at x, y, z, yaw are parts of one level line."""
+    first = holds[0]
+    across = np.array([np.cos(first[3]), np.sin(first[3])])
+    return all(
+        abs(h[3] - first[3]) < 1e-6 and abs((h[:2] - first[:2]) @ across) < 1e-4 and abs(h[2] - first[2]) < 1e-6
+        for h in holds
+    )
 
 
 def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gravity: float):
@@ -191,34 +304,46 @@ def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gr
         yield np.concatenate([force, base @ need[3:] + np.cross(motion[0][:3], force)])
 
 
-def _flight(b: SpatialTerms, flight: PhaseSolution, chart0, stood, t: np.ndarray, gravity: float):
-    """Configurations (n, nq), twists and accelerations (n, nv): joints as planned, the base as momentum demands.
+# in flight ----------------------------------------------------------------------------------------------------------
+def _flight(body: Body, flight: PhaseSolution, before: Piece, t, start: float, ends: list[int], gravity: float) -> Piece:
+    """A flight: joints as planned, the base as momentum demands.
 
-    It begins where the launch ends, as charts and as Pinocchio has it; the joints are as planned a little later, and
-    legs end where the feet meet their places, whatever the base has drifted by.
+    It begins where the tape so far ends; the joints are as planned a little later, and the legs of the feet that come
+    down (``ends``) arrive as planned, whatever the base has drifted by.
     """
-    model, data = b.model, b.model.model.createData()
-    pin.computeCentroidalMomentum(model.model, data, *stood[:2])
-    pin.centerOfMass(model.model, data, *stood[:2])
+    model, since = body.model, t - start
+    tree, data = model.model, model.model.createData()
+    chart0 = [x[-1] for x in before.motion]
+    stood = [x[0] for x in model.to_pinocchio(*(x[None] for x in chart0))]
+    pin.computeCentroidalMomentum(tree, data, *stood[:2])
+    pin.centerOfMass(tree, data, *stood[:2])
     spin, com = data.hg.angular.copy(), (data.com[0].copy(), data.vcom[0].copy())
-    halves = np.concatenate([t, (t[1:] + t[:-1]) / 2])
-    planned = [x[:, 3:] for x in flight.sample(halves)]
-    off = [x[len(CHART) :] - y[0] for x, y in zip(chart0, planned, strict=True)]
+    halves = np.concatenate([since, (since[1:] + since[:-1]) / 2])
+    planned = [x[:, BASE:] for x in flight.sample(halves)]
+    off = [x[BASE:] - y[0] for x, y in zip(chart0, planned, strict=True)]
     joints = [x + y for x, y in zip(planned, _fading(off, halves), strict=True)]
-    s = halves / t[-1]
-    bends = (
-        s**3 * (10 - 15 * s + 6 * s**2),
-        30 * s**2 * (1 - s) ** 2 / t[-1],
-        60 * s * (1 - s) * (1 - 2 * s) / t[-1] ** 2,
-    )
 
     def moved():
-        chart, rates = _turning(model, joints, chart0[0][3:6], spin, t)
-        return _falling(model, [x[: len(t)] for x in joints], chart, rates, com, t, gravity)
+        chart, rates = _turning(model, joints, chart0[0][3:6], spin, since)
+        return _falling(model, [x[: len(t)] for x in joints], chart, rates, com, since, gravity)
 
-    missed = _missed(b, flight, moved()[0][-1], gravity)
-    joints = [x + missed * y[:, None] for x, y in zip(joints, bends, strict=True)]
-    return moved()
+    for _ in range(LANDINGS):
+        shift, rate = _missed(body, flight, [x[-1] for x in moved()[:2]], ends)
+        bends = _arriving(halves, since[-1], shift, rate)
+        joints = [x + y for x, y in zip(joints, bends, strict=True)]
+    q, v, a = model.charts(*moved(), near=chart0[0][3:6])
+    return Piece(t, (q, v, a), np.zeros((len(t), 2, 6)), np.zeros((len(t), 2), np.int8))
+
+
+def _arriving(t: np.ndarray, end: float, shift: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
+    """A motion (n, k) on three levels, at rest in zero at first, that ends at ``shift`` with ``rate``, unaccelerated."""
+    s = (t / end)[:, None]
+    x, y = shift, rate * end
+    c3, c4, c5 = 10 * x - 4 * y, -15 * x + 7 * y, 6 * x - 3 * y
+    value = s**3 * (c3 + s * (c4 + s * c5))
+    slope = s**2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / end
+    bend = s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / end**2
+    return [value, slope, bend]
 
 
 def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, t: np.ndarray):
@@ -250,22 +375,29 @@ def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, 
     return chart, np.array([rate(angles, k) for k, angles in enumerate(chart)])
 
 
-def _missed(b: SpatialTerms, flight: PhaseSolution, q: np.ndarray, gravity: float) -> np.ndarray:
-    """By what joints (nj,) of the last configuration ``q`` (nq,) have to change for the feet to stand as planned."""
-    tree, c, t, still = b.model.model, flight.constants, flight.duration, np.zeros((1, b.model.model.nv))
-    data, q = tree.createData(), q.copy()
-    planned = b.model.to_pinocchio(np.concatenate([np.zeros(3), flight.q[-1]])[None], still, still)[0][0]
-    com = np.array([c[f"com_{x}"] + c[f"vel_{x}"] * t for x in "xyz"]) - [0.0, 0.0, gravity * t**2 / 2]
-    planned[:3] = com - pin.centerOfMass(tree, data, planned)
-    pin.forwardKinematics(tree, data, planned)
-    goals, first = [data.oMi[body + 1].copy() for body in b.feet], q[7:].copy()
+def _missed(body: Body, flight: PhaseSolution, last, sides: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """By what joints (nj,) and their rates have to change at the end for feet to arrive as planned.
+
+    ``last`` are configuration (nq,) and twist (nv,) there.
+    """
+    tree, still = body.model.model, np.zeros((1, body.model.model.nv))
+    data, (q, v) = tree.createData(), (x.copy() for x in last)
+    planned = body.model.to_pinocchio(flight.q[-1:, : tree.nv], flight.v[-1:, : tree.nv], still)
+    pin.forwardKinematics(tree, data, planned[0][0], planned[1][0])
+    goals = {side: (data.oMi[k + 1].copy(), data.v[k + 1].vector.copy()) for side, k in enumerate(body.feet)}
+    first, rate = q[7:].copy(), v[6:].copy()
     for _ in range(LEG_STEPS):
         pin.computeJointJacobians(tree, data, q)
-        for body, goal in zip(b.feet, goals, strict=True):
-            legs = 5 + np.array(b.chain(body))
-            slope = pin.getJointJacobian(tree, data, body + 1, pin.ReferenceFrame.LOCAL)[:, legs]
-            q[1 + legs] += np.linalg.pinv(slope) @ pin.log6(data.oMi[body + 1].inverse() * goal).vector
-    return q[7:] - first
+        for side in sides:
+            k, legs = body.feet[side], np.array(body.legs[side])
+            slope = pin.getJointJacobian(tree, data, k + 1, pin.ReferenceFrame.LOCAL)[:, legs]
+            q[1 + legs] += np.linalg.pinv(slope) @ pin.log6(data.oMi[k + 1].inverse() * goals[side][0]).vector
+    pin.computeJointJacobians(tree, data, q)
+    for side in sides:
+        k, legs = body.feet[side], np.array(body.legs[side])
+        slope = pin.getJointJacobian(tree, data, k + 1, pin.ReferenceFrame.LOCAL)
+        v[legs] += np.linalg.pinv(slope[:, legs]) @ (goals[side][1] - slope @ v)
+    return q[7:] - first, v[6:] - rate
 
 
 def _fading(off, t: np.ndarray) -> list[np.ndarray]:
@@ -283,7 +415,7 @@ def _fading(off, t: np.ndarray) -> list[np.ndarray]:
 
 
 def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
-    """The base's place and accelerations where nothing but gravity acts."""
+    """Configurations, twists and accelerations in which nothing but gravity acts on the base."""
     tree, n = model.model.copy(), len(t)
     tree.gravity.linear = np.array([0.0, 0.0, -gravity])
     data, (qj, vj, aj) = tree.createData(), joints
@@ -299,49 +431,51 @@ def _falling(model: SpatialModel, joints, chart, rates, com, t, gravity):
         v[k, :3] = turn.T @ (com[1] + fall * t[k] - data.vcom[0])
         a[k, :6] = 0.0
         missing = pin.rnea(tree, data, q[k], v[k], a[k])[:6]
-        inertia = np.triu(pin.crba(tree, data, q[k]))[:6, :6]
-        a[k, :6] = -np.linalg.solve(inertia + np.triu(inertia, 1).T, missing)
+        a[k, :6] = -np.linalg.solve(pin.crba(tree, data, q[k])[:6, :6], missing)
     return q, v, a
 
 
+# forces -------------------------------------------------------------------------------------------------------------
 def forces(
-    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, standing: int
+    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, wrench: np.ndarray, contacts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Wrenches at the feet's frames (n, 2, 6), motor torques, CoM with velocity (n, 6), L about the CoM (n, 3).
 
-    What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out among the feet by load.
+    What inverse dynamics misses of the ``wrench`` (n, 2, 6) about the origin is shared out by load among the feet that
+    carry, by ``contacts`` (n, 2).
     """
     model, data, n, world = robot.model, robot.model.createData(), len(q), pin.ReferenceFrame.WORLD
     frames = [model.getFrameId(name) for name in robot.foot.frames]
     joints = [model.frames[frame].parentJoint for frame in frames]
+    standing = np.flatnonzero(contacts.any(axis=1))
     need, com, spin = np.empty((n, model.nv)), np.empty((n, 6)), np.empty((n, 3))
-    places, soles, slopes = np.zeros((standing, 2, 3)), np.zeros((standing, 2, 3)), np.zeros((standing, 2, 6, model.nv))
-    base, turn = np.zeros((standing, 3)), np.zeros((standing, 3, 3))
+    places, soles, slopes = np.zeros((n, 2, 3)), np.zeros((n, 2, 3)), np.zeros((n, 2, 6, model.nv))
+    base, turn = np.zeros((n, 3)), np.zeros((n, 3, 3))
     for k in range(n):
         need[k] = pin.rnea(model, data, q[k], v[k], a[k])
         pin.computeCentroidalMomentum(model, data, q[k], v[k])
         com[k, :3], com[k, 3:], spin[k] = data.com[0], data.hg.linear / robot.total_mass, data.hg.angular
-        if k < standing:
+        if contacts[k].any():
             pin.computeJointJacobians(model, data, q[k])
             pin.updateFramePlacements(model, data)
             base[k], turn[k] = data.oMi[1].translation, data.oMi[1].rotation
             for i, (frame, joint) in enumerate(zip(frames, joints, strict=True)):
                 places[k, i], soles[k, i] = data.oMf[frame].translation, data.oMf[frame].act(robot.foot.center)
                 slopes[k, i] = pin.getJointJacobian(model, data, joint, world)
-    force, moment = (np.einsum("nij,nj->ni", turn, need[:standing, at : at + 3]) for at in (0, 3))
-    missing = np.concatenate([force, moment + np.cross(base, force)], axis=1) - wrench[:standing].sum(1)
-    total = wrench[:standing] + _shared(
-        wrench[:standing], soles, missing, LEAST_LOAD * robot.total_mass * robot.gravity
-    )
+    s = standing
+    force, moment = (np.einsum("nij,nj->ni", turn[s], need[s, at : at + 3]) for at in (0, 3))
+    missing = np.concatenate([force, moment + np.cross(base[s], force)], axis=1) - wrench[s].sum(1)
+    least = LEAST_LOAD * robot.total_mass * robot.gravity
+    total = wrench[s] + _shared(wrench[s], soles[s], contacts[s], missing, least)
     f = np.zeros((n, 2, 6))
-    f[:standing] = total
-    f[:standing, :, 3:] -= np.cross(places, total[..., :3])
-    need[:standing] -= np.einsum("nkij,nki->nj", slopes, total)
+    f[s] = total
+    f[s, :, 3:] -= np.cross(places[s], total[..., :3])
+    need[s] -= np.einsum("nkij,nki->nj", slopes[s], total)
     tau = need[:, 6:] + robot.lost_torque(v[:, 6:]) if robot.lossy else need[:, 6:]
     return f, tau, com, spin
 
 
-def _shared(wrench: np.ndarray, soles: np.ndarray, missing: np.ndarray, least: float) -> np.ndarray:
+def _shared(wrench: np.ndarray, soles: np.ndarray, contacts: np.ndarray, missing: np.ndarray, least: float):
     """What each foot (n, 2, 6) adds of ``missing`` (n, 6) about the origin: by its load, at its centre of pressure."""
     loaded = wrench[..., 2] > 0  # else in the middle of the sole (n, 2, 3)
     up = np.where(loaded, wrench[..., 2], 1.0)
@@ -350,7 +484,8 @@ def _shared(wrench: np.ndarray, soles: np.ndarray, missing: np.ndarray, least: f
     column, zero = np.tile(np.eye(6), (*wrench.shape[:2], 1, 1)), np.zeros_like(x)
     arm = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
     column[..., 3:, :3] = arm.reshape(*x.shape, 3, 3)
-    share = np.maximum(wrench[..., 2], least)[..., None] * np.repeat([1.0, WRENCH_ARM_M**2], 3)
+    load = np.maximum(wrench[..., 2], least) * (contacts > 0)
+    share = load[..., None] * np.repeat([1.0, WRENCH_ARM_M**2], 3)
     weighted = share[..., None] * np.swapaxes(column, -1, -2)  # (n, 2, 6, 6)
     whole = np.einsum("nkij,nkjl->nil", column, weighted)
     given = weighted @ np.linalg.solve(whole, missing[..., None])[:, None]

@@ -1,75 +1,81 @@
-"""The named costs and constraints of the spatial program, as functions of one instant; nothing here solves."""
+"""The named costs and constraints of the whole-body program, as functions of one instant; nothing here solves."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from jumplab.models.spatial import CHART, SpatialModel, SpatialState, rates
+from jumplab.models.spatial import CHART, SpatialModel, SpatialState, cross
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
-from jumplab.robot.description import SLIDING_RATE
 from jumplab.robot.reduction import mirror
 from jumplab.robot.stance import knees, stance_configuration
+from jumplab.stages.spatial.contacts import SIDES
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.shapes import boxes, pairs
-from jumplab.stages.whole_body.settings import Contact
+from jumplab.stages.spatial.shapes import Box, boxes, candidates
 from jumplab.stages.whole_body.terms import POSITIVE, cost, row
 from jumplab.task import GRAVITY
 
-PYRAMID = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # directions of the friction cone's edges
-MOMENT_ARM_M = 0.1  # nominal size of moments over that of forces
+if TYPE_CHECKING:
+    from jumplab.stages.spatial.apart import Apart
+
+EDGES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # directions of the friction pyramid's edges
+BASE = len(CHART)
+MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
+SPIN_SCALE, ACCELERATION_SCALE = 10.0, 10.0  # [kg m^2/s], [m/s^2, rad/s^2] for conditioning
+PLACE_SCALE = 0.1  # [m]
 
 
-class SpatialTerms:
-    """Terms of one phase, which is a mode of contact, and the expressions that they share.
+class Body:
+    """A robot as the program sees it: its tree, soles, knees, motors and shapes; the same in every phase.
 
     The world's origin lies in the middle of the soles in their first place, x forward, z up.
 
     Attributes
     ----------
-    coordinates : of the phase: the chart with the base's place, in flight without it, then the joints.
-    states : further variables: force along each edge of each corner's friction cone, in flight the acceleration of
-        the base against free fall; then the joint torques.
-    corners : (2, k, 3) places on the ground where forces act.
+    model : the tree.  mg : weight on Earth [N].  stance : chart (6 + joints,) in which the robot waits.
+    feet : bodies of the left and the right foot.  tips, middles : middle of the toe edge and of the sole, in them.
+    corners : (2, 4, 3) of the soles, in them: toe left, toe right, heel left, heel right.
+    places : (2, 3) middles of the toe edges in the stance [m].
+    legs : columns of the chart that follow from a foot that stands: six joints of each leg, or all it has.
+    motors : key of :attr:`.Robot.actuators` -> (joints,).
     """
 
-    def __init__(self, robot: Robot, limits: SpatialLimits, weights: SpatialWeights, contact: Contact):
-        self.robot, self.limits, self.weights, self.contact = robot, limits, weights, contact
-        self.model, self.flying = SpatialModel(robot.model), contact is Contact.FLIGHT
-        self.mg, foot = self.model.mass * GRAVITY, robot.foot
-        frames = [self.model.model.frames[self.model.model.getFrameId(name)] for name in foot.frames]
+    def __init__(self, robot: Robot):
+        self.robot, self.model = robot, SpatialModel(robot.model)
+        self.mg, foot, tree = self.model.mass * GRAVITY, robot.foot, self.model.model
+        frames = [tree.frames[tree.getFrameId(name)] for name in foot.frames]
         self.feet = [f.parentJoint - 1 for f in frames]
-        self._foot_axes = [
-            self.model.bodies[k].own.T @ f.placement.rotation for k, f in zip(self.feet, frames, strict=True)
-        ]
+        self.axes = [self.model.bodies[k].own.T @ f.placement.rotation for k, f in zip(self.feet, frames, strict=True)]
 
         def on_foot(x):
             return [self.model.local(f.parentJoint, f.placement.act(np.array(x))) for f in frames]
 
-        self.toes, self.soles = on_foot([foot.toe, 0.0, foot.sole_z]), on_foot(foot.center)
-        self.sole_corners = np.array([on_foot(x) for x in foot.corners]).transpose(1, 0, 2)  # (2, 4, 3)
-        self.stance = self.model.of_pinocchio(stance_configuration(robot)[None])[0]
-        meeting = {0, *(j for k in self.feet for j in self.chain(k))} if robot.planar else range(len(self.model.bodies))
-        self.pairs = pairs(robot, self.model, set(meeting), stance_configuration(robot))
+        w, z = foot.half_width, foot.sole_z
+        self.tips, self.middles = on_foot([foot.toe, 0.0, z]), on_foot(foot.center)
+        corners = [[x, y, z] for x in (foot.toe, foot.heel) for y in (w, -w)]
+        self.corners = np.array([on_foot(x) for x in corners]).transpose(1, 0, 2)
+        self.half_m = (foot.toe - foot.heel) / 2
+        configuration = stance_configuration(robot)
+        self.stance = self.model.of_pinocchio(configuration[None])[0]
         self.knees = knees(robot)
-        self.places = self._first_places(frames)
-        self.corners = self._ground_corners()
-        first = 3 if self.flying else 0
-        self.coordinates = self.model.names[first:]
-        n = self.corners.shape[1] * len(PYRAMID)
-        forces = [f"force {k} of {side} foot" for side in ("left", "right") for k in range(n)]
-        falling = [f"acceleration {x} against free fall" for x in "xyz"]
-        self.n_forces = 0 if self.flying else len(forces)
-        self.states = (*(falling if self.flying else forces), *(f"torque of {name}" for name in self.joint_names))
+        data = tree.createData()
+        pin.framesForwardKinematics(tree, data, configuration)
+        ids = [tree.getFrameId(name) for name in foot.frames]
+        self.places = np.array([data.oMf[i].act(foot.tip) for i in ids])
         rows = [robot.actuators[name] for name in self.joint_names]
         self.motors = {key: np.array([r[key] for r in rows]) for key in rows[0]}
+        self.legs = [self._leg(side, configuration) for side in (0, 1)]
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints."""
-        return self.model.names[len(CHART) :]
+        return self.model.names[BASE:]
 
     def chain(self, body: int) -> list[int]:
         """Bodies from one up to the base, which is left out."""
@@ -79,98 +85,171 @@ class SpatialTerms:
             body = self.model.bodies[body].parent
         return found
 
+    def _leg(self, side: int, q: np.ndarray) -> list[int]:
+        """Columns of the chart that follow from a foot that stands; of longer legs the six that move it best."""
+        from scipy.linalg import qr  # slow to import
+
+        tree, data = self.model.model, self.model.model.createData()
+        columns = [BASE - 1 + j for j in self.chain(self.feet[side])]
+        pin.computeJointJacobians(tree, data, q)
+        slope = pin.getJointJacobian(tree, data, self.feet[side] + 1, pin.ReferenceFrame.LOCAL)[:, columns]
+        best = qr(slope, pivoting=True)[2][:6]
+        return sorted(columns[k] for k in best)
+
     @property
     def short(self) -> bool:
-        """Whether a leg has fewer than six joints: feet that stand then hold yaw and roll of the base."""
-        return min(len(self.chain(k)) for k in self.feet) < 6
+        """Whether a leg has fewer than six joints: both feet on the ground then hold yaw and roll of the base."""
+        return min(len(x) for x in self.legs) < 6
+
+    @cached_property
+    def _boxes(self) -> tuple[list[Box], pin.GeometryModel]:
+        return boxes(self.robot, self.model)
 
     @property
-    def held(self) -> tuple[list[int], list[int]]:
-        """Which components of their feet's places are told to the legs: of short ones, the second's side follows."""
-        return [0, 1, 2], [0, 2] if self.short else [0, 1, 2]
+    def shapes(self) -> list[Box]:
+        """Boxes of the links."""
+        return self._boxes[0]
 
-    def _first_places(self, frames) -> np.ndarray:
-        """Middles of both soles (2, 3) as the robot stands [m]."""
-        model, data = self.model.model, self.model.model.createData()
-        pin.framesForwardKinematics(model, data, stance_configuration(self.robot))
-        ids = [model.getFrameId(name) for name in self.robot.foot.frames]
-        return np.array([data.oMf[i].act(self.robot.foot.center) for i in ids])
+    @property
+    def geometry(self) -> pin.GeometryModel:
+        """Their collision shapes, in the same order."""
+        return self._boxes[1]
 
-    def _ground_corners(self) -> np.ndarray:
+    @cached_property
+    def candidates(self) -> list[tuple[int, int]]:
+        """Pairs of links that are no neighbours, as indices of :attr:`shapes`."""
+        return candidates(self.robot, self.model, self.shapes)
+
+    @cached_property
+    def limb_points(self) -> list[tuple[int, np.ndarray]]:
+        """Knees, and the far ends of the bodies that end a limb but are no feet: (body, place in it)."""
+        points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
+        carrying = {b.parent for b in self.model.bodies} | set(self.feet)
+        for box in self.shapes:
+            if box.body not in carrying:
+                along = box.axes[:, np.argmax(box.half)] * box.half.max()
+                points.append((box.body, box.centre + along * (1.0 if along @ box.centre > 0 else -1.0)))
+        return points
+
+
+class SpatialTerms:
+    """Terms of one mode of contact, and the expressions that they share.
+
+    Attributes
+    ----------
+    modes : side -> "flat" or "toe", of the feet that carry; none in flight.
+    coordinates : of a phase in this mode: the chart, then the pitch of each foot on its toes.
+    states : force along each edge of each sole point's friction pyramid in the axes of the foothold, then torques.
+    integrated : coordinates that do not follow from feet in place or from flight.
+    """
+
+    def __init__(self, body: Body, limits: SpatialLimits, weights: SpatialWeights, modes: Mapping[int, str]):
+        self.body, self.limits, self.weights, self.modes = body, limits, weights, dict(modes)
+        self.robot, self.model, self.mg = body.robot, body.model, body.mg
+        self.flying = not self.modes
+        self.nv = len(self.model.names)
+        self.raised = [side for side, mode in self.modes.items() if mode == "toe"]
+        self.coordinates = (*self.model.names, *(f"pitch of {SIDES[side]} foot" for side in self.raised))
+        self.points = {side: self._sole_points(mode) for side, mode in self.modes.items()}
+        names = [
+            f"force {k} of {SIDES[side]} foot" for side in self.modes for k in range(len(EDGES) * len(self.points[side]))
+        ]
+        self.n_forces = len(names)
+        self.states = (*names, *(f"torque of {name}" for name in body.joint_names))
+        follows = set(range(BASE)) if self.flying else {k for side in self.modes for k in body.legs[side]}
+        if body.short and len(self.modes) == 2:
+            follows |= {1, 3, 4}
+        self.integrated = tuple(x for k, x in enumerate(self.coordinates) if k not in follows)
+
+    @property
+    def kind(self) -> str:
+        """The mode in a word."""
+        letters = {0: "L", 1: "R"}
+        return "".join(letters[s] if m == "flat" else letters[s].lower() for s, m in self.modes.items()) or "-"
+
+    def _sole_points(self, mode: str) -> np.ndarray:
+        """Points of the sole where forces act (k, 3), seen from the middle of the toe edge [m]; the toes' first."""
         lim, foot = self.limits, self.robot.foot
-        half, wide = (foot.toe - foot.heel) / 2, foot.half_width - min(lim.side_margin_m, 0.4 * foot.half_width)
-        xs = {Contact.FLAT: (lim.heel_margin_m - half, half), Contact.TOE: (half,), Contact.FLIGHT: ()}[self.contact]
-        local = np.array([[x, y, 0.0] for x in xs for y in (-wide, wide)]).reshape(-1, 3)
-        return self.places[:, None] + local
+        wide = foot.half_width - min(lim.side_margin_m, 0.4 * foot.half_width)
+        length = 2 * self.body.half_m - min(lim.heel_margin_m, 0.4 * self.body.half_m)
+        back = (0.0, -length) if mode == "flat" else (0.0,)
+        return np.array([[x, y, 0.0] for x in back for y in (wide, -wide)])
 
     # model on a point -------------------------------------------------------------------------------------------
+    def chart(self, x: ca.SX) -> ca.SX:
+        """The chart (6 + joints,) of a phase's coordinates, or its rates of theirs."""
+        return x[: self.nv]
+
     def state(self, p: Point) -> SpatialState:
-        """The robot at this point; in flight its base rests at the origin and is accelerated against free fall."""
+        """The robot at this point; made once."""
         if "state" not in p.memo:
-            q, v, a = p.q, p.v, p.a
-            if self.flying:
-                q, v, a = ca.vertcat(ca.SX.zeros(3), q), ca.vertcat(ca.SX.zeros(3), v), ca.vertcat(p.z[:3], a)
-            p.memo["state"] = SpatialState(self.model, q, v, a, 0.0 if self.flying else p.p.gravity)
+            p.memo["state"] = SpatialState(self.model, *(self.chart(x) for x in (p.q, p.v, p.a)), p.p.gravity)
         return p.memo["state"]
 
     def torques(self, p: Point) -> ca.SX:
-        """Motor torques [N m]."""
-        return p.z[self.n_forces or 3 :]
+        """Motor torques (joints,) less the motors' dry friction, whose kink at rest no solver likes [N m].
 
-    def base(self, p: Point) -> ca.SX:
-        """Place of the base (3,) [m]: in flight the CoM's parabola less the CoM seen from the base."""
-        if not self.flying:
-            return ca.SX.zeros(3)  # the state knows it
-        return self.com(p) - self.state(p).com_from_base
+        The limits are lowered by that friction instead: joints that move have it, others need less.
+        """
+        return p.z[self.n_forces :]
 
-    def com(self, p: Point) -> ca.SX:
-        """Centre of mass (3,) [m]."""
-        if not self.flying:
-            return self.state(p).com
-        t, c = p.time, p.c
-        place = c.com_x + c.vel_x * t, c.com_y + c.vel_y * t, c.com_z + c.vel_z * t - p.p.gravity * t * t / 2
-        return ca.vertcat(*place)
+    def pitch(self, side: int, x: ca.SX) -> ca.SX | float:
+        """Pitch of a foot that carries [rad], heel up positive, from a phase's coordinates; or its rate of theirs."""
+        return x[self.nv + self.raised.index(side)] if side in self.raised else ca.SX(0)
 
-    def at(self, p: Point, body: int, local: np.ndarray) -> ca.SX:
-        """Place of a point of a body (3,) [m]."""
-        return self.base(p) + self.state(p).point(body, local)
+    def point_forces(self, p: Point, side: int) -> list[ca.SX]:
+        """Forces (3,) at the points of one sole, in the axes of its foothold [N]."""
+        first = sum(len(EDGES) * len(x) for s, x in self.points.items() if s < side)
+        found = []
+        for k in range(len(self.points[side])):
+            f = p.z[first + 4 * k : first + 4 * (k + 1)]
+            mu = self.limits.friction
+            found.append(ca.vertcat(mu * (f[0] - f[1]), mu * (f[2] - f[3]), f[0] + f[1] + f[2] + f[3]))
+        return found
 
-    def foot_axes(self, p: Point, side: int) -> ca.SX:
-        """Attitude (3, 3) of a foot."""
-        return self.state(p).rotation(self.feet[side]) @ ca.DM(self._foot_axes[side])
+    def wrench(self, p: Point, side: int) -> tuple[ca.SX, ca.SX]:
+        """Force and moment about the origin of the foot's body (3,) each, in its axes [N, N m]."""
+        phi = self.pitch(side, p.q)
+        c, s = ca.cos(phi), ca.sin(phi)
+        force, moment = ca.SX.zeros(3), ca.SX.zeros(3)
+        for place, f in zip(self.points[side], self.point_forces(p, side), strict=True):
+            own = ca.vertcat(c * f[0] - s * f[2], f[1], s * f[0] + c * f[2])
+            force += own
+            moment += cross(ca.DM(place), own)
+        turn = ca.DM(self.body.axes[side])
+        force = turn @ force
+        return force, turn @ moment + cross(ca.DM(self.body.tips[side]), force)
 
-    def foot_force(self, p: Point, side: int) -> list[ca.SX]:
-        """Forces (3,) at the corners of one foot [N]."""
-        k = self.corners.shape[1]
-        f = ca.reshape(p.z[side * 4 * k : (side + 1) * 4 * k], 4, k)
-        return [ca.vertcat(self.limits.friction * (PYRAMID.T @ f[:, i]), ca.sum1(f[:, i])) for i in range(k)]
+    def foot_force(self, p: Point, side: int) -> ca.SX:
+        """Force (3,) of the ground on one foot, in the axes of its foothold [N]; zero in the air."""
+        return sum(self.point_forces(p, side), ca.SX.zeros(3)) if side in self.modes else ca.SX.zeros(3)
 
     def needed(self, p: Point) -> tuple[ca.SX, ca.SX, ca.SX]:
         """(force, moment about the base, torques of the motors) that the motion needs besides the ground's forces; made
         once."""
         if "needed" not in p.memo:
-            s, wrenches = self.state(p), {}
-            for side, body in enumerate(self.feet if not self.flying else ()):
-                origin, forces = p.q[:3] + s.origin(body), self.foot_force(p, side)
-                arms = [ca.DM(c) - origin for c in self.corners[side]]
-                moment = sum(ca.cross(arm, f) for arm, f in zip(arms, forces, strict=True))
-                wrenches[body] = sum(forces), moment
-            force, moment, torques = s.dynamics(wrenches)
-            p.memo["needed"] = force, moment, torques + self.lost(p) if self.robot.lossy else torques
+            wrenches = {self.body.feet[side]: self.wrench(p, side) for side in self.modes}
+            force, moment, torques = self.state(p).dynamics(wrenches)
+            rates = p.v[BASE : self.nv]
+            p.memo["needed"] = force, moment, torques + ca.DM(self.body.motors["damping"]) * rates
         return p.memo["needed"]
 
-    def lost(self, p: Point) -> ca.SX:
-        """Torques that the motors lose to their own friction, as :meth:`.Robot.lost_torque` [N m]."""
-        m, rates = self.motors, p.v[len(self.coordinates) - self.model.joints :]
-        return ca.DM(m["friction"]) * ca.tanh(rates / SLIDING_RATE) + ca.DM(m["damping"]) * rates
+    def foot_axes(self, p: Point, side: int) -> ca.SX:
+        """Attitude (3, 3) of a foot."""
+        return self.state(p).rotation(self.body.feet[side]) @ ca.DM(self.body.axes[side])
+
+    def foothold(self, p: Point, side: int) -> tuple[ca.SX, ca.SX]:
+        """Place (3,) of the middle of the toe edge of a foot that carries [m], and its heading [rad]."""
+        x, y, z, yaw = (getattr(p.c, f"{SIDES[side]}_{k}") for k in ("x", "y", "z", "yaw"))
+        return ca.vertcat(x, y, z), yaw
 
     # all phases -------------------------------------------------------------------------------------------------
     def smoothness(self) -> list[Term]:
         """Costs on accelerations, jerk, torques and forces."""
-        w, first = self.weights, len(self.coordinates) - self.model.joints - 3
+        w = self.weights
         terms = [
-            cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: p.a[first:], w.acceleration),
-            cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: p.j, w.jerk, "mid"),
+            cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: p.a[3 : self.nv], w.acceleration),
+            cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: p.j[3 : self.nv], w.jerk, "mid"),
             cost("torque", "ours: effort", "N m", self.torques, w.torque),
         ]
         if not self.flying:
@@ -181,214 +260,234 @@ class SpatialTerms:
 
     def uneven(self, p: Point) -> ca.SX:
         """How far left and right are from mirror images in a jump straight ahead; yaw and roll of the base."""
-        first = len(self.coordinates) - self.model.joints
-        rows = [p.q[first + k] - sign * p.q[first + i] for i, k, sign in mirror(self.model.model)]
-        return p.p.straight * ca.vertcat(p.q[first - 3 : first - 1], *rows)
+        rows = [p.q[BASE + k] - sign * p.q[BASE + i] for i, k, sign in mirror(self.model.model)]
+        return p.p.straight * ca.vertcat(p.q[3:5], *rows)
 
-    def dynamics(self) -> list[Term]:
-        """Newton and Euler: nothing but the ground moves the base; joint torques go with the motion."""
+    def dynamics(self, joined: bool) -> list[Term]:
+        """Newton and Euler: nothing but the ground moves the base; joint torques go with the motion.
+
+        Where a phase shares its first node with the one before (``joined``), that one has these rows.
+        """
 
         def torques(p):
-            return self.needed(p)[2] - self.torques(p)
+            return (self.needed(p)[2] - self.torques(p)) / ca.DM(self.body.motors["effort"])
 
-        rows = [row("joint dynamics", "ours", "N m", torques, scale=MOMENT_ARM_M * self.mg, identity=True)]
-        rows.append(row("base forces", "ours", "N", lambda p: self.needed(p)[0], scale=self.mg, identity=True))
-        if not self.flying:
-            turn = row("base moments", "ours", "N m", lambda p: self.needed(p)[1], scale=MOMENT_ARM_M * self.mg)
-            rows.append(turn)
-        return rows
-
-    def motor_lines(self) -> Term:
-        """Torque against speed of every joint."""
-        m, first = self.motors, len(self.coordinates) - self.model.joints
-        slope = m["effort"] / (m["no_load_speed"] - m["corner_speed"]) * self.limits.torque_share
-        top = slope * m["no_load_speed"]
-        return row(
-            "torque-speed",
-            "ours: motor line",
-            "N m",
-            lambda p: self.torques(p) + slope * p.v[first:],
-            -top,
-            top,
-            scale=100.0,
-        )
-
-    # launch -----------------------------------------------------------------------------------------------------
-    def contact_rows(self, q: ca.SX) -> ca.SX:
-        """What the ground holds of both feet: place of the toe, its edge level and straight; flat feet do not pitch.
-
-        Short legs leave the base no roll and no yaw.
-        """
-        s, rows, half = SpatialState(self.model, q, q, q), [], (self.robot.foot.toe - self.robot.foot.heel) / 2
-        for side, (body, own) in enumerate(zip(self.feet, self._foot_axes, strict=True)):
-            axes = s.rotation(body) @ ca.DM(own)
-            place = s.point(body, self.toes[side]) - ca.DM(self.places[side] + np.array([half, 0.0, 0.0]))
-            rows += [place[self.held[side]], axes[2, 1], axes[0, 1]]
-            if self.contact is Contact.FLAT:
-                rows.append(axes[2, 0])
-        return ca.vertcat(*rows, *([q[3], q[4]] if self.short else []))
-
-    def pitches(self, q: ca.SX) -> ca.SX:
-        """Sines of the feet's pitch (2,); positive is heel up."""
-        s = SpatialState(self.model, q, q, q)
-        return ca.vertcat(
-            *(-(s.rotation(k) @ ca.DM(own))[2, 0] for k, own in zip(self.feet, self._foot_axes, strict=True))
-        )
-
-    def launch_rows(self) -> list[Term]:
-        """Feet in their places; loads of the feet; take-off."""
-        lim = self.limits
-        rows = [row("feet in place", "ours", "m, 1", lambda p: self.contact_rows(p.q), scale=0.1, skip=(1, 0))]
-        if self.contact is Contact.FLAT:
-
-            def loads(p):
-                return ca.vertcat(*(sum(self.foot_force(p, side))[2] for side in (0, 1)))
-
-            def heels(p):
-                return rates(self.pitches, p.q, p.v)[0]
-
-            least = lim.foot_share * self.mg
-            rows.append(row("load of each foot", "ours", "N", loads, least, np.inf, scale=self.mg))
-            rows.append(row("heels still at rest", "ours", "rad/s", heels, at="end"))
-            return rows
-
-        def accelerations(p):
-            return rates(self.contact_rows, p.q, p.v, p.a)[1]
-
-        heel = row(
-            "heels not below ground",
-            "WL-K2",
-            "1",
-            lambda p: self.pitches(p.q),
-            0.0,
-            np.sin(lim.heel_up_rad),
-            skip=(1, 0),
-        )
-        speed = row(
-            "vertical take-off speed",
-            "SL-E2, WL-E1",
-            "m/s",
-            lambda p: self.state(p).com_velocity[2] - p.p.takeoff_speed,
-            at="end",
-        )
-        still = row("toes still at take-off", "ours", "m/s^2, 1/s^2", accelerations, scale=10.0, at="end")
-        return [*rows, heel, speed, still]
-
-    # flight -----------------------------------------------------------------------------------------------------
-    def flight_rows(self) -> list[Term]:
-        """Flight: all three components of L stay, soles and body clear the ground."""
-        lim = self.limits
-
-        def kept(p):
-            return self.state(p).angular_momentum - ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
-
-        def rate(p):
-            return self.needed(p)[1] - ca.cross(self.state(p).com_from_base, self.needed(p)[0])
-
-        def clearance(p):
-            shape, places = (4 * p.s * (1 - p.s)) ** 3, []
-            for body, corners in zip(self.feet, self.sole_corners, strict=True):
-                places += [self.at(p, body, c) for c in corners]
-            return ca.vertcat(*(x[2] - self.ground(p, x) - lim.clearance_m * shape for x in places))
-
+        how = {"identity": True, "skip": (int(joined), 0), "group": "dynamics"}
         return [
-            row("angular momentum", "WF-D1, three components", "kg m^2/s", kept),
-            row("moment at take-off", "WF-D1", "N m", rate, scale=20.0, at="start"),
-            cost("momentum rate", "WF-D1, between the nodes", "N m", rate, self.weights.momentum_rate),
-            row("sole clearance", "ours", "m", clearance, *POSITIVE, scale=0.1, skip=(1, 1)),
+            row("joint dynamics", "ours", "of the effort", torques, **how),
+            row("base forces", "ours", "N", lambda p: self.needed(p)[0], scale=self.mg, **how),
+            row("base moments", "ours", "N m", lambda p: self.needed(p)[1], scale=MOMENT_ARM_M * self.mg, **how),
         ]
 
-    def ground(self, p: Point, x: ca.SX) -> ca.SX:
-        """Height of the surface below a point."""
-        return p.p.platform * (1 + ca.tanh((ca.dot(p.p.along, x[:2]) - p.p.edge) / 0.015)) / 2
+    def motor_lines(self, joined: bool) -> Term:
+        """Torque against speed of every joint."""
+        m = self.body.motors
+        slope = m["effort"] / (m["no_load_speed"] - m["corner_speed"]) * self.limits.torque_share
+        top = slope * m["no_load_speed"] - m["friction"]
+
+        def line(p):
+            return (self.torques(p) + ca.DM(slope) * p.v[BASE : self.nv]) / ca.DM(m["effort"])
+
+        high = top / m["effort"]
+        return row("torque-speed", "ours: motor line", "of the effort", line, -high, high, skip=(int(joined), 0))
 
     def body_clearance(self) -> Term:
         """Knees and hands stay away from the ground."""
 
         def heights(p):
-            places = [self.at(p, body, local) for body, local in self.limb_points]
+            places = [self.state(p).point(body, local) for body, local in self.body.limb_points]
             return ca.vertcat(*(x[2] - self.ground(p, x) for x in places))
 
-        return row("body clearance", "ours", "m", heights, self.limits.body_clearance_m, np.inf, scale=0.1)
+        how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
+        return row("body clearance", "ours", "m", heights, self.limits.body_clearance_m, np.inf, **how)
 
-    def link_distances(self) -> list[Term]:
-        """Legs and trunk stay apart from each other wherever they can meet."""
-        if not self.pairs:
-            return []
+    def sides_apart(self) -> Term:
+        """Left and right knees, ankles, toes and heels keep a share of their distance in the stance, seen from the
+        trunk; hands stay outside. Cheap rows, which hold for most motions what distances of links would."""
+        body, lim = self.body, self.limits
+        pairs = [[(1 + k, np.zeros(3)) for k, _, _ in body.knees], [(k, np.zeros(3)) for k in body.feet]]
+        pairs += [list(zip(body.feet, places, strict=True)) for places in (body.tips, body.corners[:, 2:].mean(axis=1))]
+        hands = body.limb_points[2:]
+        legs = range(len(pairs))
 
-        def gaps(p):
-            return ca.vertcat(*(pair.gap(self.state(p)) for pair in self.pairs))
+        def across(s):
+            y = [s.from_base(*left)[1] - s.from_base(*right)[1] for left, right in pairs]
+            return ca.vertcat(*y, *(s.from_base(*hand)[1] for hand in hands))
 
-        return [row("distances between links", "ours", "m", gaps, self.limits.link_distance_m, np.inf, scale=0.1)]
+        chart = ca.SX(ca.DM(body.stance))
+        stood = ca.evalf(across(SpatialState(self.model, chart, 0 * chart, 0 * chart))).full().ravel()
+        way = np.sign(stood)
+        least = [lim.sides_share * abs(stood[k]) for k in legs]
+        least += [abs(x) - lim.hands_inward_m for x in stood[len(pairs) :]]
 
-    @property
-    def limb_points(self) -> list[tuple[int, np.ndarray]]:
-        """Knees, and the far ends of the bodies that end a limb but are no feet: (body, place in it)."""
-        points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
-        carrying = {b.parent for b in self.model.bodies} | set(self.feet)
-        for box in boxes(self.robot, self.model)[0]:
-            if box.body not in carrying:
-                along = box.axes[:, np.argmax(box.half)] * box.half.max()
-                points.append((box.body, box.centre + along * (1.0 if along @ box.centre > 0 else -1.0)))
-        return points
+        def rows(p):
+            return ca.DM(way) * across(self.state(p))
 
+        how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
+        return row("sides apart", "ours", "m", rows, np.array(least), np.inf, **how)
+
+    def link_distance(self, kept: Apart, intervals: int) -> Term:
+        """Two links stay apart at the nodes for which it is asked."""
+        pair, skip = kept.pair, (kept.first, intervals - kept.last)
+
+        def gap(p):
+            return pair.gap(self.state(p))
+
+        return row(pair.key, "ours", "m", gap, self.limits.link_distance_m, np.inf, scale=PLACE_SCALE, skip=skip, group=pair.key)
+
+    def ground(self, p: Point, x: ca.SX) -> ca.SX:
+        """Height of the surface below a point."""
+        return p.p.platform * (1 + ca.tanh((ca.dot(p.p.along, x[:2]) - p.p.edge) / self.limits.edge_smoothing_m)) / 2
+
+    # feet on the ground -----------------------------------------------------------------------------------------
+    def foot_rows(self, side: int, joined: bool, landed: bool) -> list[Term]:
+        """A foot that carries is in its place, still, and stays so, on its toes about their edge: all three levels.
+
+        At a node that is ``joined`` to the phase before these rows stand there; where another foot lands, place and
+        velocity are shared, so one that stood before has only the last level; one that has ``landed`` has all.
+        """
+        name, k = SIDES[side], self.body.feet[side]
+        axes, tip = self.body.axes[side], self.body.tips[side]
+
+        def place(p):
+            at, yaw = self.foothold(p, side)
+            s, turn = self.state(p), self.foot_axes(p, side)
+            heading = ca.cos(yaw) * turn[1, 0] - ca.sin(yaw) * turn[0, 0]
+            pitch = turn[2, 0] + ca.sin(self.pitch(side, p.q))
+            return self._without_side(side, s.point(k, tip) - at, [heading, turn[2, 1], pitch], p.q)
+
+        def rates(p):
+            speed, spin = self.state(p).own_rates(k, tip)
+            spin = ca.DM(axes).T @ spin
+            spin[1] -= self.pitch(side, p.v)
+            return self._without_side(side, ca.DM(axes).T @ speed, [spin[2], spin[0], spin[1]], p.v)
+
+        def accelerations(p):
+            gain, spin = self.state(p).own_accelerations(k, tip)
+            spin = ca.DM(axes).T @ spin
+            spin[1] -= self.pitch(side, p.a)
+            return self._without_side(side, ca.DM(axes).T @ gain, [spin[2], spin[0], spin[1]], p.a)
+
+        first = 1 if joined or not landed else 0
+        levels = ("in place", "m, 1", place, 1.0, first), ("still", "m/s, rad/s", rates, 1.0, first)
+        levels += (("held", "m/s^2, rad/s^2", accelerations, ACCELERATION_SCALE, int(joined)),)
+        return [
+            row(f"{name} foot {said}", "ours: contact", unit, of, scale=scale, skip=(skip, 0), group=name)
+            for said, unit, of, scale, skip in levels
+        ]
+
+    def _without_side(self, side: int, place: ca.SX, turn: list[ca.SX], chart: ca.SX) -> ca.SX:
+        """The rows of a foot; short legs leave the base no yaw and no roll, and the right foot's side follows."""
+        if not self.body.short:
+            return ca.vertcat(place, *turn)
+        return ca.vertcat(place, *turn) if side == 0 else ca.vertcat(place[[0, 2]], *turn, chart[3], chart[4])
+
+    def loads(self) -> Term:
+        """Both flat feet carry."""
+
+        def forces(p):
+            return ca.vertcat(*(self.foot_force(p, side)[2] for side in self.modes))
+
+        least = self.limits.foot_share * self.mg
+        return row("load of each foot", "ours", "N", forces, least, np.inf, scale=self.mg, skip=(0, 0))
+
+    def swing_rows(self, side: int) -> Term:
+        """A foot in the air keeps its sole's corners off the ground, by as much as the references ask for."""
+
+        def heights(p):
+            places = [self.state(p).point(self.body.feet[side], c) for c in self.body.corners[side]]
+            asked = getattr(p.ref, f"{SIDES[side]}_clearance")
+            return ca.vertcat(*(x[2] - self.ground(p, x) - asked for x in places))
+
+        how = {"scale": PLACE_SCALE, "skip": (1, 1), "group": "clearance"}
+        return row(f"clearance of {SIDES[side]} sole", "ours", "m", heights, *POSITIVE, **how)
+
+    # flight -----------------------------------------------------------------------------------------------------
+    def flight_rows(self) -> list[Term]:
+        """Flight: the CoM's parabola and all three components of L, at every node, the one of take-off included."""
+
+        def com(p):
+            t, c = p.time, p.c
+            fall = ca.vertcat(0, 0, p.p.gravity * t * t / 2)
+            start, speed = (ca.vertcat(*(getattr(c, f"{k}_{x}") for x in "xyz")) for k in ("com", "vel"))
+            return self.state(p).com - (start + speed * t - fall)
+
+        def speed(p):
+            fall = ca.vertcat(0, 0, p.p.gravity * p.time)
+            return self.state(p).com_velocity - (ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z) - fall)
+
+        def kept(p):
+            return self.state(p).angular_momentum - ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
+
+        def angles(left, right, step):
+            """Of the base: places alone, rates come from L and accelerations from the moments."""
+            turned = right.q[3:6] - left.q[3:6] - step * (left.v[3:6] + right.v[3:6]) / 2
+            return turned - step**2 * (left.a[3:6] - right.a[3:6]) / 12
+
+        return [
+            row("ballistic CoM", "WF-D1", "m", com, identity=True, group="flight"),
+            row("ballistic CoM velocity", "WF-D1", "m/s", speed, identity=True, group="flight"),
+            row("angular momentum", "WF-D1, three components", "kg m^2/s", kept, scale=SPIN_SCALE, group="flight"),
+            row("base turns", "state equation", "rad", angles, at="interval", identity=True),
+        ]
+
+    # touchdown at the end of the schedule -----------------------------------------------------------------------
     def bend(self, p: Point) -> ca.SX:
         """Flexion of both knees (2,) [rad]."""
-        first = len(self.coordinates) - self.model.joints
-        return ca.vertcat(*(sign * p.q[first + k] + angle for k, sign, angle in self.knees))
+        return ca.vertcat(*(sign * p.q[BASE + k] + angle for k, sign, angle in self.body.knees))
 
     def turned(self, p: Point, x: ca.SX | np.ndarray, way: int = 1) -> ca.SX:
         """A vector (3,) turned by the asked yaw, or back."""
         c, s = ca.cos(p.p.yaw), way * ca.sin(p.p.yaw)
         return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
 
+    def soles(self, p: Point) -> list[ca.SX]:
+        """Middles of both soles (3,) [m]."""
+        return [self.state(p).point(k, x) for k, x in zip(self.body.feet, self.body.middles, strict=True)]
+
     def feet_at_goal(self, p: Point) -> ca.SX:
         """What is left between both feet and their new places: place (3,), pitch, roll, heading of each."""
-        rows = []
-        for side, body in enumerate(self.feet):
-            goal = self.turned(p, self.places[side]) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
+        rows, short = [], self.body.short
+        for side, sole in enumerate(self.soles(p)):
+            first = self.body.places[side] - np.array([self.body.half_m, 0.0, 0.0])
+            goal = self.turned(p, first) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
             axes, ahead = self.foot_axes(p, side), self.turned(p, np.array([1.0, 0.0, 0.0]))
-            off = self.at(p, body, self.soles[side]) - goal
-            if self.short:
-                off = self.turned(p, off, -1)[self.held[side]]
+            off = sole - goal
+            if short:
+                off = self.turned(p, off, -1)[[0, 1, 2] if side == 0 else [0, 2]]
             rows += [off, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
-        return ca.vertcat(*rows, *([p.q[0] - p.p.yaw, p.q[1]] if self.short else []))
+        return ca.vertcat(*rows, *([p.q[3] - p.p.yaw, p.q[4]] if short else []))
 
     def capture(self, p: Point) -> ca.SX:
         """How far the middle between the soles is off the place (2,) where it catches the robot [m]."""
         lim = self.limits
-        middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
         ahead = self.turned(p, np.array([lim.capture_offset_m, 0.0, 0.0]))
         speed = ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
-        return (middle - self.com(p) - ahead - lim.capture_slope_s * speed)[:2]
-
-    def sole_speeds(self, p: Point) -> ca.SX:
-        """Velocity (3, 2) of the middle of each sole in flight [m/s]."""
-        state, gone = self.state(p), p.p.gravity * p.time
-        base = ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z - gone) - state.com_velocity
-        return ca.horzcat(*(base + state.point_velocity(*sole) for sole in zip(self.feet, self.soles, strict=True)))
+        return (sum(self.soles(p)) / 2 - self.state(p).com - ahead - lim.capture_slope_s * speed)[:2]
 
     def sliding(self, p: Point) -> ca.SX:
         """By how much (8,) soles come down steeply enough to stick, each way along x and y [m/s]."""
-        speeds = self.sole_speeds(p)
-        return ca.vec(ca.mtimes(PYRAMID, speeds[:2, :]) - self.limits.touchdown_slope * ca.repmat(speeds[2, :], 4, 1))
+        state, found = self.state(p), []
+        for k, x in zip(self.body.feet, self.body.middles, strict=True):
+            speed = state.rotation(k) @ state.own_rates(k, x)[0]
+            found.append(EDGES @ speed[:2] - self.limits.touchdown_slope * speed[2])
+        return ca.vertcat(*found)
 
     def capture_rows(self) -> Term:
         """Where the soles meet the ground, so that the robot can be caught."""
         lim, moment, window = self.limits, self.limits.capture_moment, self.limits.capture_window_m
         if moment is None:
-            return row(
-                "capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, at="end", scale=0.1
-            )
+            how = {"at": "end", "scale": PLACE_SCALE}
+            return row("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, **how)
 
         def about_soles(p):
-            middle = sum(self.at(p, body, x) for body, x in zip(self.feet, self.soles, strict=True)) / 2
             speed = ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z - p.p.gravity * p.time)
             spin = ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
-            return (spin + self.model.mass * ca.cross(self.com(p) - middle, speed))[:2]
+            arm = self.state(p).com - sum(self.soles(p)) / 2
+            return (spin + self.model.mass * ca.cross(arm, speed))[:2]
 
         words = "capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s"
-        return row(*words, about_soles, -lim.capture_moment, lim.capture_moment, at="end", scale=10.0)
+        return row(*words, about_soles, -moment, moment, at="end", scale=SPIN_SCALE)
 
     def touchdown_rows(self) -> list[Term]:
         """Touchdown: both feet in their new places, flat; posture, rates, and where the soles are against the CoM."""
@@ -405,10 +504,10 @@ class SpatialTerms:
             return (lambda parameters: -most(parameters)), most
 
         def spins(p):
-            return ca.vertcat(*(self.state(p).spin(body) for body in self.feet))
+            return ca.vertcat(*(self.state(p).spin(k) for k in self.body.feet))
 
         def attitude(p):
-            return p.q[:3] - ca.vertcat(p.p.yaw, 0, p.p.rotation)
+            return p.q[3:6] - ca.vertcat(p.p.yaw, 0, p.p.rotation)
 
         def end(name, equation, unit, of, lower=0.0, upper=0.0, **how):
             return row(name, equation, unit, of, lower, upper, at="end", **how)
@@ -416,12 +515,12 @@ class SpatialTerms:
         low = -lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]
         high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
         return [
-            end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal, scale=0.1),
+            end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal),
             end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, [0, 0, 1, 0, 0, 1])),
             end("soles that stick at touchdown", "ours: friction", "m/s", self.sliding, *POSITIVE),
             end("attitude at touchdown", "ours", "rad", attitude, low, high),
             end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
-            end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[3:], -rate, rate),
-            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[:3], *within(trunk, [1, 0, 0])),
+            end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[BASE : self.nv], -rate, rate),
+            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[3:6], *within(trunk, [1, 0, 0])),
             self.capture_rows(),
         ]

@@ -1,8 +1,7 @@
 """Stage 1: momentum, inertia and CoP trajectories of the reaction mass pendulum (Sec. III of the paper).
 
 In: a target. Out: a :class:`SrmpPlan` of launch and flight, one nonlinear program joined at take-off, because nothing
-printed ties the launch's final angular momentum to the rotation that the flight needs. Begin with :mod:`problem`. Jumps
-to the side and with turns have a pendulum of their own, :mod:`spatial`.
+printed ties the launch's final angular momentum to the rotation that the flight needs. Begin with :mod:`problem`.
 """
 
 from jumplab.stages.srmp.landing import LandingPlanner

@@ -260,9 +260,9 @@ def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float)
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
     c, ones = flight.constants, np.ones_like(t)
     # theta between nodes: the cubic through the node values with the exact rates L / rho
-    theta = cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
+    theta = _cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
     rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
-    leg, leg1, leg2 = leg_between(takeoff_length, c["leg"], t)
+    leg, leg1, leg2 = _leg_between(takeoff_length, c["leg"], t)
     along = -np.stack([np.sin(theta), np.cos(theta)], -1)
     across = np.stack([along[:, 1], -along[:, 0]], -1)
     foot = leg[:, None] * along
@@ -274,7 +274,7 @@ def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float)
     return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)
 
 
-def leg_between(first: float, last: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _leg_between(first: float, last: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Leg length from take-off to touchdown with two derivatives: smooth, only the ends matter, the rod has no mass."""
     s, d = t / t[-1], last - first
     leg = first + d * (10 * s**3 - 15 * s**4 + 6 * s**5)
@@ -282,7 +282,7 @@ def leg_between(first: float, last: float, t: np.ndarray) -> tuple[np.ndarray, n
     return leg, leg1, d * ((60 * s - 180 * s**2 + 120 * s**3) / t[-1] ** 2)
 
 
-def cubic(nodes: np.ndarray, values: np.ndarray, rates: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _cubic(nodes: np.ndarray, values: np.ndarray, rates: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The cubic pieces through values and rates at nodes, at times ``t``."""
     k = np.clip(np.searchsorted(nodes, t, side="right") - 1, 0, len(nodes) - 2)
     h = nodes[k + 1] - nodes[k]

@@ -62,20 +62,3 @@ class SrmpSettings:
         the turn is had by folding, not by more momentum in an open body.
         """
         return replace(self, speed_share=1.05, corner_speed=0.7, momentum=(-32.0, 32.0), flight_inertia=1.0)
-
-
-@dataclass(frozen=True)
-class SpatialSrmpSettings(SrmpSettings):
-    """The same out of the plane, and what only matters there."""
-
-    spatial_intervals: tuple[int, int, int] = (12, 4, 10)  # flat feet, toes, flight
-    friction: float = 0.42  # as in the spatial program
-    foot_share: float = 0.15  # of the weight, on each foot at least, as there
-    roll_rad: float = 0.3  # of the body in launch, either way
-    yaw_rad: float = 0.25  # of the body over the standing feet, either way: hips have more, but not in a deep crouch
-    side_window_m: float = 0.02  # at touchdown, ahead and aside of the place that catches the robot
-    w_turn: float = 60.0  # SL-J4 [1 / rad^2 / s], of roll and pitch: bodies that bow drive the hips into their stops
-    crouch_room_m: float = 0.04  # above the plane's deepest crouch: hips at their stops could not turn or roll
-    w_level_jerk: float = 2e-4  # SL-J1, of x and y: that of the lean, told at the usual leg length
-    w_inertia_jerk_launch: float = 1e-6  # SL-J1, of both inertias: the barbell's radius, told in inertia
-    w_usual_yaw_inertia: float = 8.0  # [1 / (kg m^2)^2 / s] arms say more about it than the leg length does

@@ -1,0 +1,263 @@
+"""Where a solve begins: a motion along the schedule by inverse kinematics, or one that is known already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.ocp.solution import PhaseGuess
+from jumplab.robot.stance import leg_length
+from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.spatial.terms import BASE, EDGES, Body
+from jumplab.task import JumpTask
+
+# of the base, as shares of the leg's length; angles [rad]
+CROUCH, LANDED, TUCK = 0.20, 0.12, 0.15
+BOW, PITCH, HEEL_UP = 0.35, 0.12, 0.4
+CROUCH_S = 0.35  # before and after a flight
+SWING = 0.1  # of the leg, by which a foot that steps is lifted
+REACHED = 0.3  # [m, rad] a start whose feet are farther off their places is none
+IK_STEPS, DAMPING, IK_STEP_RAD = 10, 1e-4, 0.3
+RATE_BOX, ACCELERATION_BOX = 15.0, 150.0  # of differences, where the start is rough
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion along a schedule, to begin with: per phase its duration [s] and charts (N + 1, 6 + joints).
+
+    ``missed`` is by how much feet are off their places at worst [m, rad].
+    """
+
+    durations: np.ndarray
+    charts: list[np.ndarray]
+    missed: float = 0.0
+
+
+class Reach:
+    """Charts in which the legs bring the feet to where they are asked for, as near as they reach."""
+
+    def __init__(self, body: Body, margin_rad: float):
+        self.body, self.tree = body, body.model.model
+        self.data = self.tree.createData()
+        self.frames = [self.tree.getFrameId(name) for name in body.robot.foot.frames]
+        self.columns = [np.array(x) for x in body.legs]
+        low, high = self.tree.lowerPositionLimit[7:] + margin_rad, self.tree.upperPositionLimit[7:] - margin_rad
+        for k, sign, angle in body.knees:  # never bent the other way
+            end = sign * (0.1 - angle)
+            if sign > 0:
+                low[k] = max(low[k], end)
+            else:
+                high[k] = min(high[k], end)
+        self.low, self.high = np.minimum(low, body.stance[BASE:]), np.maximum(high, body.stance[BASE:])
+        self.tip = pin.SE3(np.eye(3), np.array(body.robot.foot.tip))
+
+    def __call__(self, chart: np.ndarray, goals: Mapping[int, pin.SE3]) -> tuple[np.ndarray, float]:
+        """The chart with its legs moved so that the middles of the toe edges are at ``goals``; what is left [m, rad]."""
+        chart, left = chart.copy(), 0.0
+        for _ in range(IK_STEPS):
+            q = self.body.model.to_pinocchio(chart[None], *np.zeros((2, 1, len(chart))))[0][0]
+            pin.computeJointJacobians(self.tree, self.data, q)
+            pin.updateFramePlacements(self.tree, self.data)
+            left = 0.0
+            for side, goal in goals.items():
+                at = self.data.oMf[self.frames[side]] * self.tip
+                off = pin.log6(at.actInv(goal)).vector
+                frame = self.tip.toActionMatrixInverse() @ pin.getFrameJacobian(
+                    self.tree, self.data, self.frames[side], pin.ReferenceFrame.LOCAL
+                )
+                slope = frame[:, self.columns[side]]
+                step = slope.T @ np.linalg.solve(slope @ slope.T + DAMPING * np.eye(6), off)
+                chart[self.columns[side]] += np.clip(step, -IK_STEP_RAD, IK_STEP_RAD)
+                left = max(left, float(np.abs(off).max()))
+            chart[BASE:] = np.clip(chart[BASE:], self.low, self.high)
+            if left < 1e-6:
+                break
+        return chart, left
+
+
+def along(schedule: Schedule, task: JumpTask) -> Motion:
+    """A motion along the schedule: the base above the feet that carry, down before and after a flight, a parabola in it;
+    feet on their places, and between them on bumps; legs by inverse kinematics."""
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
+    contacts, body, gravity = schedule.contacts, schedule.body, task.gravity
+    leg, count = leg_length(body.robot), len(contacts.phases)
+    times = np.array([p.guess_s for p in contacts.phases])
+    last = count - 1
+    if contacts.ends == "touchdown":
+        drop = max(task.takeoff_speed**2 - 2 * gravity * (task.platform_m - LANDED * leg), (0.3 * task.takeoff_speed) ** 2)
+        times[last] = (task.takeoff_speed + np.sqrt(drop)) / gravity
+    starts = np.concatenate([[0.0], np.cumsum(times)])
+    holds = _footholds(schedule, task)
+    fine = np.linspace(0, starts[-1], 500)
+    base = body.stance[:BASE]
+    ahead = base[0] - body.places[:, 0].mean()
+    keys = [(0.0, np.array([base[0], base[1], 0.0, 0.0]))]
+    for k, p in enumerate(contacts.phases):
+        if not p.flying:
+            keys.append(((starts[k] + starts[k + 1]) / 2, _over([holds[contacts.contact_of(k, s)] for s in p.modes], ahead)))
+    if contacts.ends == "touchdown":
+        keys.append((starts[-1], _over(_goal(schedule, task), ahead)))
+        keys.insert(-1, (starts[last] - 0.05, keys[-2][1]))
+    at, path = np.array([t for t, _ in keys]), np.array([x for _, x in keys])
+    width = 12 if contacts.ends == "rest" else 4
+    smooth = [gaussian_filter1d(np.interp(fine, at, path[:, i]), width, mode="nearest") for i in range(4)]
+    height, pitch = base[2] + smooth[3], np.full_like(fine, base[5])
+    for k, p in enumerate(contacts.phases):
+        if p.flying:
+            _flown(fine, starts[k], starts[k + 1], leg, gravity, height, pitch)
+    turned = np.interp(fine, [starts[last], starts[-1]], [0.0, task.rotation_rad])
+    curves = [*smooth[:2], height, smooth[2], pitch + turned]
+    reach, chart, missed, charts = Reach(body, schedule.limits.range_margin_rad), body.stance.copy(), 0.0, []
+    for k, p in enumerate(contacts.phases):
+        rows = []
+        for t in np.linspace(starts[k], starts[k + 1], p.intervals + 1):
+            x, y, z, yaw, lean = (np.interp(t, fine, c) for c in curves)
+            chart[:BASE] = [x, y, z, yaw, base[4], lean]
+            goals = {
+                side: _foot(schedule, holds, task, k, side, t, starts, leg, lean - base[5]) for side in (0, 1)
+            }
+            chart, left = reach(chart, goals)
+            missed = max(missed, left if not p.flying else 0.0)
+            rows.append(chart.copy())
+        charts.append(np.array(rows))
+    charts[0][0] = body.stance
+    return Motion(times, charts, missed)
+
+
+def _over(holds: list[np.ndarray], ahead: float) -> np.ndarray:
+    """Place and heading of the base above feet at x, y, z, yaw: x, y, yaw, and how much higher."""
+    x, y, z, yaw = np.mean(holds, axis=0)
+    return np.array([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw, z])
+
+
+def _goal(schedule: Schedule, task: JumpTask) -> list[np.ndarray]:
+    """x, y, z, yaw of the middles of both toe edges where a jump that ends at touchdown comes down."""
+    body, (c, s) = schedule.body, (np.cos(task.yaw_rad), np.sin(task.yaw_rad))
+    centre = body.places.mean(axis=0) - [body.half_m, 0.0, 0.0]
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    places = centre + [task.distance_m, task.side_m, task.platform_m] + (body.places - centre) @ turn.T
+    return [np.append(place, task.yaw_rad) for place in places]
+
+
+def _footholds(schedule: Schedule, task: JumpTask) -> list[np.ndarray]:
+    """x, y, z, yaw of the middle of the toe edge in each contact."""
+    count = len(schedule.contacts.landings)
+    return [np.array([np.mean(box) for box in schedule.foothold(i)]) for i in range(count)]
+
+
+def _flown(t, start: float, end: float, leg: float, gravity: float, height: np.ndarray, pitch: np.ndarray) -> None:
+    """Adds a flight to the curves of height and pitch: down and up before it, a parabola, down after it."""
+    u = np.clip((t - start) / (end - start), 0, 1)
+    height += gravity * (end - start) ** 2 / 2 * u * (1 - u)
+    before, after = np.clip((t - start) / CROUCH_S + 1, 0, 1), np.clip((t - end) / CROUCH_S, 0, 1)
+    height -= leg * CROUCH * np.sin(np.pi * before) * (before < 1)
+    height -= leg * LANDED * np.minimum(2 * u, 1) * (1 - np.sin(np.pi * after / 2))
+    pitch += (BOW - pitch[0]) * np.sin(np.pi * before) + (PITCH - pitch[0]) * (u > 0) * (1 - after)
+
+
+def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray, leg: float, lean: float) -> pin.SE3:
+    """Where the middle of a toe edge is at one instant."""
+    contacts = schedule.contacts
+    phases = contacts.phases
+    if side in phases[k].modes:
+        x, y, z, yaw = holds[contacts.contact_of(k, side)]
+        share = np.clip((t - starts[k]) / (starts[k + 1] - starts[k]), 0, 1)
+        tip = HEEL_UP * share**2 if phases[k].modes[side] == "toe" else 0.0
+        return pin.SE3(pin.rpy.rpyToMatrix(0.0, tip, yaw), np.array([x, y, z]))
+    left = max(i for i in range(k) if side in phases[i].modes)
+    down = next((i for i in range(k, len(phases)) if side in phases[i].modes), None)
+    begin, end = starts[left + 1], starts[-1] if down is None else starts[down]
+    a = holds[contacts.contact_of(left, side)]
+    if down is not None:
+        b = holds[contacts.contact_of(down, side)]
+    else:
+        b = _goal(schedule, task)[side] if contacts.ends == "touchdown" else a
+    u = (t - begin) / (end - begin)
+    x, y, z, yaw = a + (b - a) * u**3 * (10 - 15 * u + 6 * u * u)
+    lift = SWING * leg * np.sin(np.pi * u)
+    if phases[k].flying:
+        s = (t - starts[k]) / (starts[k + 1] - starts[k])
+        rise = task.gravity * (starts[k + 1] - starts[k]) ** 2 / 2 * s * (1 - s)
+        lift = max(lift, rise + leg * TUCK * 4 * s * (1 - s))
+    tip = HEEL_UP * (1 - u) ** 2 if phases[left].modes[side] == "toe" else 0.0
+    way = pin.rpy.rpyToMatrix(0.0, tip, yaw)
+    place = np.array([x, y, z + lift])
+    if task.rotation_rad and phases[k].flying:  # legs turn with the body
+        s = (t - starts[k]) / (starts[k + 1] - starts[k])
+        way = way @ pin.rpy.rpyToMatrix(0.0, task.rotation_rad * s, 0.0)
+    return pin.SE3(way, place)
+
+
+def still(schedule: Schedule, task: JumpTask) -> Motion:
+    """The stance, carried along above the feet; for schedules whose feet the legs do not reach."""
+    motion = along(schedule, task)
+    charts = []
+    for rows in motion.charts:
+        same = np.tile(schedule.body.stance, (len(rows), 1))
+        same[:, [0, 1, 3]] = rows[:, [0, 1, 3]]
+        charts.append(same)
+    return Motion(motion.durations, charts)
+
+
+def guess(schedule: Schedule, motion: Motion) -> dict[str, PhaseGuess]:
+    """Phase name -> start values of a motion: rates by differences, even forces, no torques."""
+    contacts, body, out = schedule.contacts, schedule.body, {}
+    starts = np.concatenate([[0.0], np.cumsum(motion.durations)])
+    times = [np.linspace(starts[k], starts[k + 1], len(q)) for k, q in enumerate(motion.charts)]
+    first = [0, *[1] * (len(times) - 1)]
+    t = np.concatenate([x[i:] for x, i in zip(times, first, strict=True)])
+    q = np.concatenate([x[i:] for x, i in zip(motion.charts, first, strict=True)])
+    v = np.clip(np.gradient(q, t, axis=0), -RATE_BOX, RATE_BOX)
+    a = np.clip(np.gradient(v, t, axis=0), -ACCELERATION_BOX, ACCELERATION_BOX)
+    pitch = _pitches(body, q)
+    for k, (phase, at) in enumerate(zip(contacts.phases, times, strict=True)):
+        b, rows = schedule.of(k), np.searchsorted(t, at - 1e-9)
+        heels = [np.maximum(pitch[rows, side], 0.0) for side in b.raised]
+        level = np.zeros((len(rows), len(heels)))
+        z = np.zeros((len(rows), len(b.states)))
+        for side in b.modes:
+            own = [i for i, name in enumerate(b.states[: b.n_forces]) if name.endswith(f"of {('left', 'right')[side]} foot")]
+            z[:, own] = body.mg / len(b.modes) / len(own)
+        constants = {}
+        for side in b.modes:
+            contact = contacts.contact_of(k, side)
+            for name, box in zip(("x", "y", "z", "yaw"), schedule.foothold(contact), strict=True):
+                constants[f"{('left', 'right')[side]}_{name}"] = float(np.mean(box))
+        if b.flying:
+            constants |= _flight_constants(body, q[rows], v[rows], motion.durations[k], schedule)
+        out[phase.name] = PhaseGuess(
+            float(motion.durations[k]),
+            np.column_stack([motion.charts[k], *heels]),
+            np.column_stack([v[rows], level]),
+            np.column_stack([a[rows], level]),
+            z,
+            constants,
+        )
+    return out
+
+
+def _pitches(body: Body, q: np.ndarray) -> np.ndarray:
+    """Pitch of both feet (n, 2) in charts (n, .) [rad], heel up positive."""
+    tree, data = body.model.model, body.model.model.createData()
+    frames = [tree.getFrameId(name) for name in body.robot.foot.frames]
+    out = []
+    for x in body.model.to_pinocchio(q, 0 * q, 0 * q)[0]:
+        pin.framesForwardKinematics(tree, data, x)
+        turns = [data.oMf[f].rotation for f in frames]
+        out.append([np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0])) for r in turns])
+    return np.array(out)
+
+
+def _flight_constants(body: Body, q, v, duration: float, schedule: Schedule) -> dict[str, float]:
+    """CoM at take-off, its velocity by where it comes down, no angular momentum."""
+    tree, data = body.model.model, body.model.model.createData()
+    ends = body.model.to_pinocchio(q[[0, -1]], 0 * q[[0, -1]], 0 * q[[0, -1]])[0]
+    first, last = (pin.centerOfMass(tree, data, x).copy() for x in ends)
+    speed = (last - first) / duration
+    speed[2] += body.robot.gravity * duration / 2
+    values = {"com": first, "vel": speed, "L": np.zeros(3)}
+    return {f"{kind}_{x}": float(y) for kind, column in values.items() for x, y in zip("xyz", column, strict=True)}
