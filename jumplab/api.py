@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jumplab.errors import require_type
+from jumplab.errors import InputError, require_type
 from jumplab.io import folder as folders
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
+from jumplab.stages.spatial import Contacts
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
@@ -26,9 +27,10 @@ class Saved(NamedTuple):
 
 
 def plan(
-    task: JumpTask,
+    task: JumpTask | None = None,
     robot: Robot | str | Path = "bhr",
     *,
+    contacts: Contacts | None = None,
     method: str = USUAL,
     robust: Ranges | None = None,
     **changes: Any,
@@ -37,7 +39,9 @@ def plan(
 
     Parameters
     ----------
-    task : what to reach.
+    task : what to reach, in a jump from a stand; or else
+    contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of your own. It is
+        planned by the whole-body program, audited foot by foot, and not yet played on a simulated robot.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone, from a crouch) or, for targets in the plane, "three-step" (SRMP,
         joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step" for flips, and
@@ -57,6 +61,12 @@ def plan(
     from jumplab.studies.advice import plan_or_advise
 
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    if (task is None) == (contacts is None):
+        raise InputError("give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)")
+    if contacts is not None:
+        if robust is not None or method != USUAL:
+            raise InputError("a contact schedule is planned by the whole-body program; leave method and robust out")
+        return Planner(robot, keep=True, **changes).follow(contacts)
     if robust is not None:
         from jumplab.studies.robust import robust_changes
 
@@ -89,6 +99,11 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     from jumplab.sim import Scene, simulate_jump
 
     require_type(plan, JumpPlan, "the plan to simulate")
+    if plan.schedule:
+        raise InputError(
+            f"the plan follows the contacts {' '.join(plan.schedule)}: only standing jumps can be simulated; its tape "
+            f"can be audited, viewed and saved"
+        )
     options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
     return simulate_jump(plan.tape, plan.robot, **options)
 

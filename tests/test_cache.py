@@ -12,43 +12,54 @@ from fixtures_core import import_graph
 from test_solver import flat_guess, move
 from test_transcription import random_point, toy
 
-from jumplab.ocp import cache, compiled
+from jumplab.ocp import assembly, cache, compiled
 from jumplab.ocp.assembly import Assembled
+from jumplab.ocp.derivatives import ElementBuilder
 from jumplab.ocp.nlp import Nlp
+from jumplab.ocp.problem import Problem, layouts
 from jumplab.robot.reach import reach, shipped_reach
+from jumplab.stages.spatial.problem import Schedule
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp import planner as srmp_planner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 
 BEGIN = compiled._begin
+PARTS = len(ElementBuilder(toy(), layouts(toy())).parts)  # of the toy: each has its own file
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("JUMPLAB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cache, "HOME", (*cache.HOME, "test_"))
+    monkeypatch.setattr(cache, "KNOWN", {})
     return tmp_path / "cache"
 
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How often a problem was assembled anew."""
+    """(owner, place) of every part that was made anew."""
     fresh = []
 
-    class Counting(Assembled):
-        def __init__(self, problem, elements=None):
-            if elements is None:
-                fresh.append(problem.name)
-            super().__init__(problem, elements)
+    class Counting(ElementBuilder):
+        def build(self, part):
+            fresh.append((part.owner, part.place))
+            return super().build(part)
 
-    monkeypatch.setattr(cache, "Assembled", Counting)
+    for module in (cache, assembly):
+        monkeypatch.setattr(module, "ElementBuilder", Counting)
     return fresh
 
 
+def later(problem: Problem, key: str | None = "a") -> Assembled:
+    """The problem as a process assembles it that has not seen any part of it."""
+    cache.KNOWN.clear()
+    return cache.assembled(problem, key)
+
+
 def test_what_is_kept_is_the_same(place, counted):
-    first, again = (cache.assembled(toy(), "a") for _ in range(2))
-    assert counted == ["toy"] and len(list(place.iterdir())) == 1
+    first, again = (later(toy()) for _ in range(2))
+    assert len(counted) == len(set(counted)) == len(list(place.iterdir())) == PARTS
     x, p, rng = random_point(first, 3)
     lam = rng.normal(size=first.n_rows)
     functions = dict.fromkeys(("nlp", "grad_f", "jac_g", "cost_parts", "gauss_newton"), (x, p))
@@ -62,16 +73,43 @@ def test_what_is_kept_is_the_same(place, counted):
     assert (first.size, first.n_rows, first.p_size) == (again.size, again.n_rows, again.p_size)
 
 
+def test_one_process_makes_and_reads_a_part_once(place, counted):
+    first = cache.assembled(toy(), "a")
+    for path in place.iterdir():
+        path.unlink()
+    again = cache.assembled(toy(), "a")
+    assert len(counted) == PARTS and not list(place.iterdir())
+    pairs = zip(first.elements, again.elements, strict=True)
+    assert all(one.function("rows")[0] is other.function("rows")[0] for one, other in pairs)
+
+
+def test_problems_that_share_a_part_share_its_file(place, counted):
+    """Another phase, on another mesh, adds but its own part; the numbers of the old ones stay."""
+    problem = toy()
+    short = replace(problem.phases[0], intervals=7)
+    longer = replace(problem.phases[1], name="three")
+    later(problem)
+    other = later(replace(problem, phases=(short, problem.phases[1], longer), joints=()))
+    assert counted[PARTS:] == [("three", "interval")]
+    assert len(list(place.iterdir())) == PARTS + 1
+    assert other.layouts["one"].nodes.shape[0] == 8
+
+
 def test_solves_alike(place):
-    one, two = (Nlp(move(), key="k").solve({"goal": 2.0}, flat_guess()) for _ in range(2))
+    one, two = (_solved() for _ in range(2))
     assert one.statistics.objective == pytest.approx(two.statistics.objective, rel=1e-12)
     assert one.constraint_report[0]["name"] == two.constraint_report[0]["name"]
 
 
+def _solved():
+    cache.KNOWN.clear()
+    return Nlp(move(), key="k").solve({"goal": 2.0}, flat_guess())
+
+
 @pytest.mark.parametrize("damage", ["empty", "cut", "bit", "words", "folder"])
 def test_a_damaged_file_is_passed_over_and_replaced(place, counted, damage):
-    cache.assembled(toy(), "a")
-    (path,) = place.iterdir()
+    later(toy())
+    path, *others = sorted(place.iterdir(), key=lambda path: -path.stat().st_size)
     data = path.read_bytes()
     if damage == "folder":
         path.unlink()
@@ -79,16 +117,16 @@ def test_a_damaged_file_is_passed_over_and_replaced(place, counted, damage):
     else:
         flipped = data[:5000] + bytes([data[5000] ^ 1]) + data[5001:]
         path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "bit": flipped, "words": b"good\nday\n"}[damage])
-    assert cache.assembled(toy(), "a").n_rows > 0
-    assert len(counted) == 2
+    assert later(toy()).n_rows > 0
+    assert len(counted) == PARTS + 1 and counted[-1] in counted[:-1]
     if damage != "folder":
-        assert path.read_bytes() == data and [p.name for p in place.iterdir()] == [path.name]
+        assert path.read_bytes() == data and set(place.iterdir()) == {path, *others}
 
 
 def test_other_keys_are_other_files(place, counted):
     for key in ("a", "b", "a"):
-        cache.assembled(toy(), key)
-    assert len(counted) == 2 and len(list(place.iterdir())) == 2
+        later(toy(), key)
+    assert len(counted) == len(list(place.iterdir())) == 2 * PARTS
 
 
 def test_other_words_are_other_files(place, counted):
@@ -98,17 +136,20 @@ def test_other_words_are_other_files(place, counted):
     for other in (replace(jerk, equation="ours"), replace(jerk, at="interval"), replace(jerk, name="push")):
         if other.at == "interval":
             other = replace(other, expression=lambda left, right, step: left.j)
-        cache.assembled(replace(problem, phases=(problem.phases[0], replace(phase, terms=(other,)))), "a")
-    cache.assembled(problem, "a")
-    assert len(counted) == len(list(place.iterdir())) == 4
+        later(replace(problem, phases=(problem.phases[0], replace(phase, terms=(other,)))))
+    later(problem)
+    # that phase has another part each time; the terms that join phases do not depend on its terms
+    assert [part for part in counted if part == ("two", "interval")] == [("two", "interval")] * 4
+    assert len(counted) == len(list(place.iterdir())) == PARTS + 3
 
 
 def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
     """Whatever the modules of the problems import, at any depth, is in the key; and every name listed is there."""
     graph, package = import_graph(), Path(cache.__file__).parent.parent
     planners = SrmpPlanner(bhr, keep=True), WholeBodyPlanner(bhr, Mesh(3, 2, 4), refine=False, keep=True)
-    assert len(list(place.glob("*.casadi"))) == 2
-    roots = {Assembled.__module__} | {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}
+    assert len(list(place.glob("*.casadi"))) == sum(len(p.nlp.assembled.elements) for p in planners)
+    roots = {Assembled.__module__, Schedule.__module__}
+    roots |= {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}
     roots |= {t.expression.__module__ for p in planners for _, t in p.nlp.problem.terms()}
     found = roots.union(*(graph.find_upstream_modules(root) for root in roots))
     listed = tuple(f"jumplab.{name}" for name in cache.BUILT_BY)
@@ -130,20 +171,20 @@ def test_nothing_is_kept_unasked(place, counted, monkeypatch):
     cache.assembled(toy())
     assert not place.exists()
     monkeypatch.setenv("JUMPLAB_CACHE", "")
-    assert cache.folder() is None and cache.assembled(toy(), "a").n_rows > 0
-    assert len(counted) == 2
+    assert cache.folder() is None and later(toy()).n_rows > 0
+    assert len(counted) == 2 * PARTS
 
 
 def test_terms_from_elsewhere_are_not_kept(place, counted, monkeypatch):
     """A lambda of a notebook may change under the same name: then the file would be another problem's."""
     monkeypatch.setattr(cache, "HOME", ("jumplab.",))
     assert [cache.assembled(toy(), "a").n_rows > 0 for _ in range(2)] == [True, True]
-    assert len(counted) == 2 and not place.exists()
+    assert len(counted) == 2 * PARTS and not place.exists()
 
 
 def test_a_folder_that_cannot_be_written_is_no_failure(place, monkeypatch, counted):
     monkeypatch.setenv("JUMPLAB_CACHE", "/dev/null/x")
-    assert cache.assembled(toy(), "a").n_rows > 0 and counted == ["toy"]
+    assert later(toy()).n_rows > 0 and len(counted) == PARTS
 
 
 def test_reach_comes_back_to_the_last_bit(bhr, place, monkeypatch):
@@ -187,10 +228,11 @@ def kept(place, ending):
 
 
 def test_machine_code_gives_the_same_numbers(place, by_compiler):
-    first = cache.assembled(toy(), "a")
-    cache.assembled(toy(), "a")  # finds the file, and compiles it
-    again = cache.assembled(toy(), "a")
-    assert len(kept(place, ".so")) == len(kept(place, ".sum")) == 1 and not kept(place, ".working")
+    first = later(toy())
+    later(toy())  # finds the files, and compiles them
+    again = later(toy())
+    assert len(kept(place, ".so")) == len(kept(place, ".sum")) == PARTS
+    assert not kept(place, ".working")
     assert all(f.is_a("External") for e in again.elements for f, *_ in e.made.values())
     x, p, rng = random_point(first, 3)
     lam = rng.normal(size=first.n_rows)
@@ -202,12 +244,13 @@ def test_machine_code_gives_the_same_numbers(place, by_compiler):
 
 def test_code_that_was_touched_is_not_loaded(place, by_compiler):
     for _ in range(2):
-        cache.assembled(toy(), "a")
+        later(toy())
     code = kept(place, ".so")[0]
     sound = code.read_bytes()
     code.write_bytes(sound[:-100])
-    again = cache.assembled(toy(), "a")  # compiles anew
-    assert not any(f.is_a("External") for e in again.elements for f, *_ in e.made.values())
+    again = later(toy())  # compiles that part anew
+    used = [all(f.is_a("External") for f, *_ in e.made.values()) for e in again.elements]
+    assert used.count(False) == 1 and used.count(True) == PARTS - 1
     assert compiled._sum(code.read_bytes()) == code.with_suffix(".sum").read_text()
 
 
@@ -215,12 +258,13 @@ def test_code_that_was_touched_is_not_loaded(place, by_compiler):
 def test_a_compiler_that_fails_is_asked_once(place, by_compiler, monkeypatch, command):
     monkeypatch.setenv("JUMPLAB_CC", command)
     for _ in range(2):
-        cache.assembled(toy(), "a")
-    said = kept(place, ".failed")[0].read_text()
-    assert command in said and not kept(place, ".so") and not kept(place, ".working")
+        later(toy())
+    said = [path.read_text() for path in kept(place, ".failed")]
+    assert len(said) == PARTS and all(command in text for text in said)
+    assert not kept(place, ".so") and not kept(place, ".working")
     monkeypatch.setattr(compiled, "_begin", BEGIN)
     monkeypatch.setattr(compiled.subprocess, "Popen", lambda *a, **k: pytest.fail("it was asked again"))
-    cache.assembled(toy(), "a")
+    later(toy())
 
 
 def test_code_with_other_numbers_is_not_kept(place, by_compiler, monkeypatch):
@@ -230,25 +274,49 @@ def test_code_with_other_numbers_is_not_kept(place, by_compiler, monkeypatch):
     wrong.chmod(0o755)
     monkeypatch.setenv("JUMPLAB_CC", str(wrong))
     for _ in range(2):
-        cache.assembled(toy(), "a")
-    assert "other numbers" in kept(place, ".failed")[0].read_text() and not kept(place, ".so")
+        later(toy())
+    said = [path.read_text() for path in kept(place, ".failed")]
+    assert said and all("other numbers" in text for text in said)
+    assert len(kept(place, ".so")) == PARTS - len(said)  # of parts without a sum
+
+
+class Compiler:
+    """A process that compiles nothing, and ends when it is told to."""
+
+    def __init__(self, command, **how):
+        self.command, self.how, self.ended = command, how, False
+
+    def poll(self):
+        return 0 if self.ended else None
 
 
 def test_the_compiler_works_beside_the_plan(place, monkeypatch):
-    """In a process of its own, once; without a compiler nothing happens."""
+    """In a process of its own, one part at a time; without a compiler nothing happens."""
     monkeypatch.setenv("JUMPLAB_CC", "")
     for _ in range(2):
-        cache.assembled(toy(), "a")
-    assert compiled.compiler() is None and len(list(place.iterdir())) == 1
+        later(toy())
+    assert compiled.compiler() is None and len(list(place.iterdir())) == PARTS
     begun = []
+
+    def begin(command, **how):
+        begun.append(Compiler(command, **how))
+        return begun[-1]
+
+    monkeypatch.setattr(compiled, "_working", [])
     monkeypatch.setenv("JUMPLAB_CC", "cc -v")
-    monkeypatch.setattr(compiled.subprocess, "Popen", lambda command, **how: begun.append((command, how)))
+    monkeypatch.setattr(compiled.subprocess, "Popen", begin)
     for _ in range(3):
-        cache.assembled(toy(), "a")
-    (command, how), claim = begun[0], kept(place, ".working")
-    assert len(begun) == len(claim) == 1 and compiled.compiler() == ["cc", "-v"]
-    assert command[1:] == ["-m", "jumplab.ocp.compiled", str(claim[0].with_suffix(".casadi"))]
-    assert how["start_new_session"] and how["stdout"] == how["stderr"] == compiled.subprocess.DEVNULL
+        later(toy())
+    (first,), claim = begun, kept(place, ".working")
+    assert len(claim) == 1 and compiled.compiler() == ["cc", "-v"]
+    assert first.command[1:] == ["-m", "jumplab.ocp.compiled", str(claim[0].with_suffix(".casadi"))]
+    assert first.how["start_new_session"]
+    assert first.how["stdout"] == first.how["stderr"] == compiled.subprocess.DEVNULL
+    first.ended = True  # the next part is its turn
+    later(toy())
+    assert len(begun) == len(kept(place, ".working")) == 2
+    for compiler in begun:
+        compiler.ended = True
     os.utime(claim[0], (0, 0))  # whoever claimed it is long gone
-    cache.assembled(toy(), "a")
-    assert len(begun) == 2
+    later(toy())
+    assert len(begun) == 3 and begun[-1].command == first.command

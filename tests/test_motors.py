@@ -27,9 +27,11 @@ from jumplab.sim import INSTALLED, STEP_S, simulate_jump
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.stages.planner import Planner
-from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.terms import SpatialTerms
-from jumplab.stages.whole_body.settings import Contact
+from jumplab.stages.spatial import SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.planner import jump_contacts
+from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.spatial.settings import SPATIAL_MESH
+from jumplab.stages.spatial.terms import BASE, Body, SpatialTerms
 from jumplab.task import JumpTask
 
 NUMBERS = {"hip_pitch": (0.03, 1.5, 0.15), "knee": (0.04, 2.0, 0.2), "ankle_pitch": (0.02, 1.0, 0.1),
@@ -160,22 +162,58 @@ def test_five_links_turn_the_motors_too(bhr, heavy):
 
 
 def test_the_tree_turns_the_motors_too(heavy):
-    """Spatial torques in flight are Pinocchio's inverse dynamics without motors, plus what these take."""
-    b = SpatialTerms(heavy, SpatialLimits(), SpatialWeights(), Contact.FLIGHT)
+    """Torques in flight are Pinocchio's without motors, plus what armature and damping take."""
+    b = SpatialTerms(Body(heavy), SpatialLimits(), SpatialWeights(), {})
     n, rng = len(b.coordinates), np.random.default_rng(2)
-    q, v, a, z = (ca.SX.sym(key, count) for key, count in (("q", n), ("v", n), ("a", n), ("z", 3 + b.model.joints)))
-    point = SimpleNamespace(q=q, v=v, a=a, z=z, p=SimpleNamespace(gravity=9.8), memo={})
-    needed = ca.Function("needed", [q, v, a, z], [b.needed(point)[2]])
-    chart, rates, accels = (np.concatenate([np.zeros(3), 0.3 * rng.normal(size=n)]) for _ in "qva")
-    told = needed(chart[3:], rates[3:], accels[3:], np.zeros(3 + b.model.joints)).full().ravel()
+    q, v, a = (ca.SX.sym(key, n) for key in "qva")
+    point = SimpleNamespace(q=q, v=v, a=a, p=SimpleNamespace(gravity=9.8), memo={})
+    needed = ca.Function("needed", [q, v, a], [b.needed(point)[2]])
+    chart, rates, accels = 0.3 * rng.normal(size=(3, n))
+    told = needed(chart, rates, accels).full().ravel()
     model = pin.buildModelFromXML(heavy.urdf, pin.JointModelFreeFlyer())  # knows nothing of motors
-    model.gravity.linear = np.zeros(3)
+    model.gravity.linear = np.array([0.0, 0.0, -9.8])
     own = [x[0] for x in b.model.to_pinocchio(chart[None], rates[None], accels[None])]
     rigid = pin.rnea(model, model.createData(), *own)[6:]
-    armature, friction, damping = (numbers(heavy, key) for key in KEYS)
-    rate = rates[6:]
-    motors = armature * accels[6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
+    armature, damping = (numbers(heavy, key) for key in ("armature", "damping"))
+    motors = armature * accels[BASE:] + damping * rates[BASE:]
     np.testing.assert_allclose(told, rigid + motors, atol=1e-9)
+
+
+def spatial_problem(robot: Robot):
+    limits = SpatialLimits()
+    contacts = jump_contacts(limits, SPATIAL_MESH)
+    return Schedule(Body(robot), contacts, limits, SpatialWeights()).problem()
+
+
+def test_dry_friction_lowers_the_limits_of_torques_in_space(bhr, heavy):
+    """A joint that moves has that much less to give, whichever way; the rows have no kink."""
+    friction, effort = numbers(heavy, "friction"), numbers(heavy, "effort")
+    bounds, lines = [], []
+    for robot in (bhr, heavy):
+        problem = spatial_problem(robot)
+        bounds.append([x for _, x in problem.bounds() if x.name == "forces and torques"])
+        lines.append([t for _, t in problem.terms() if t.name == "torque-speed"])
+    for free, less in zip(*bounds, strict=True):
+        for side in ("lower", "upper"):
+            push, torque = np.split(getattr(less, side), [-len(friction)])
+            assert np.array_equal(push, getattr(free, side)[: len(push)])
+            sign = -1 if side == "lower" else 1
+            most = SpatialLimits().torque_share * effort - friction
+            np.testing.assert_allclose(sign * torque, most)
+    for free, less in zip(*lines, strict=True):
+        np.testing.assert_allclose(free.upper - less.upper, friction / effort)
+        np.testing.assert_allclose(less.lower, -less.upper)
+
+
+@pytest.mark.slow
+def test_a_tape_in_space_holds_motor_torques_within_the_motors(heavy):
+    side = Planner(heavy).plan(JumpTask(0.1, 0.25, side_m=0.1))
+    tape, rate = side.tape, side.tape.v[:, 6:]
+    assert audit(tape, side.robot, side.task).passed
+    armature, friction, damping = (numbers(heavy, key) for key in KEYS)
+    motors = armature * tape.a[:, 6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
+    np.testing.assert_allclose(tape.tau, rigid_torques(heavy, tape) + motors, atol=1e-6)
+    assert np.abs(motors).max() > 3.0 and np.all(np.abs(tape.tau) < numbers(heavy, "effort"))
 
 
 def rigid_torques(robot: Robot, tape) -> np.ndarray:

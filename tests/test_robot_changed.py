@@ -264,7 +264,8 @@ def test_a_changed_robot_is_planned_audited_and_on_file(bhr, tmp_path):
 def test_a_robot_that_is_heavier_on_one_side_jumps_in_space(bhr):
     robot = bhr.with_mass("left_foot", factor=1.3)
     plan = jl.plan(jl.JumpTask(distance_m=0.3, height_m=0.2), robot)
-    assert [row.stage for row in plan.statistics] == ["spatial"] and jl.audit(plan).passed
+    assert {row.stage.split(",")[0] for row in plan.statistics} == {"spatial"}
+    assert jl.audit(plan).passed
 
 
 @pytest.mark.skipif(not have_published(), reason="the published robots are not installed")

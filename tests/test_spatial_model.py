@@ -85,19 +85,64 @@ def test_wrenches_from_outside_are_taken_off():
     tree = canted()
     model, data, rng = SpatialModel(tree), tree.createData(), np.random.default_rng(1)
     force, moment, body = rng.normal(size=3) * 50, rng.normal(size=3) * 10, 6
+    own = model.bodies[body].own  # axes in which both are given
     q, v, a = (ca.SX.sym(k, len(model.names)) for k in "qva")
     s = SpatialState(model, q, v, a)
     told = ca.Function("told", [q, v, a], s.dynamics({body: (ca.DM(force), ca.DM(moment))}))
     chart = [x[:1] for x in states(len(model.names))]
     found = [x.full().squeeze() for x in told(*(x[0] for x in chart))]
     motion = [x[0] for x in model.to_pinocchio(*chart)]
-    pin.forwardKinematics(tree, data, motion[0])
     outside = pin.StdVec_Force([pin.Force.Zero() for _ in range(tree.njoints)])
-    turn = data.oMi[body + 1].rotation
-    outside[body + 1] = pin.Force(turn.T @ force, turn.T @ moment)
-    need, base = pin.rnea(tree, data, *motion, outside), data.oMi[1].rotation
+    outside[body + 1] = pin.Force(own @ force, own @ moment)
+    need = pin.rnea(tree, data, *motion, outside)
+    pin.forwardKinematics(tree, data, motion[0])
+    base = data.oMi[1].rotation
+    assert not np.allclose(own, np.eye(3))
     for mine, theirs in zip(found, (base @ need[:3], base @ need[3:6], need[6:]), strict=True):
         assert mine == pytest.approx(theirs, abs=EXACT)
+
+
+def test_rates_and_accelerations_of_points_are_pinocchios():
+    """In the body's own axes; and the place of a point seen from the base, in the base's."""
+    tree = canted()
+    model, data = SpatialModel(tree), tree.createData()
+    tip, local = np.array([0.1, 0.2, 0.3]), pin.ReferenceFrame.LOCAL
+    q, v, a = (ca.SX.sym(k, len(model.names)) for k in "qva")
+    s, bodies = SpatialState(model, q, v, a), (0, 4, model.joints)
+    places = [model.local(body + 1, tip) for body in bodies]
+    told = []
+    for body, place in zip(bodies, places, strict=True):
+        told += [*s.own_rates(body, place), *s.own_accelerations(body, place)]
+        told.append(s.from_base(body, place))
+    told = ca.Function("told", [q, v, a], told)
+    charts = states(len(model.names))
+    motions = model.to_pinocchio(*charts)
+    for row in range(len(charts[0])):
+        found = [x.full().ravel() for x in told(*(x[row] for x in charts))]
+        pin.forwardKinematics(tree, data, *(x[row] for x in motions))
+        for k, body in enumerate(bodies):
+            speed, spin, gain, turning, seen = found[5 * k : 5 * k + 5]
+            own, rate = model.bodies[body].own, pin.getVelocity(tree, data, body + 1, local)
+            more = pin.getClassicalAcceleration(tree, data, body + 1, local)
+            along = np.cross(rate.angular, tip)
+            gained = more.linear + np.cross(more.angular, tip) + np.cross(rate.angular, along)
+            assert own @ speed == pytest.approx(rate.linear + along, abs=EXACT)
+            assert own @ spin == pytest.approx(rate.angular, abs=EXACT)
+            assert own @ gain == pytest.approx(gained, abs=1e-8)
+            assert own @ turning == pytest.approx(more.angular, abs=1e-8)
+            assert seen == pytest.approx(data.oMi[1].actInv(data.oMi[body + 1].act(tip)), abs=EXACT)
+
+
+def test_charts_come_back_from_pinocchio_on_all_three_levels():
+    model = SpatialModel(canted())
+    rng, t = np.random.default_rng(4), np.linspace(0, 1, 300)[:, None]
+    q = t * np.array([0.3, -0.2, 1.0, -4 * np.pi, 0.9, 4 * np.pi, *np.ones(model.joints)])
+    v, a = 3 * rng.normal(size=q.shape), 20 * rng.normal(size=q.shape)
+    told = model.to_pinocchio(q, v, a)
+    for mine, theirs in zip(model.charts(*told), (q, v, a), strict=True):
+        assert mine == pytest.approx(theirs, abs=1e-8)
+    late = model.charts(*(x[200:] for x in told), near=q[199, 3:6])[0]
+    assert late == pytest.approx(q[200:], abs=1e-8)
 
 
 def test_chart_counts_full_turns_there_and_back():

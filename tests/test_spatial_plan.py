@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from test_transcription import data_vector, sparse
 
 import jumplab as jl
 from jumplab.auditing import audit
@@ -17,6 +18,9 @@ from jumplab.auditing.report import LIMITS, METHOD
 from jumplab.cli.common import misses
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.models.spatial import SpatialState
+from jumplab.ocp.assembly import pack
+from jumplab.ocp.nlp import EXPLAINED
 from jumplab.ocp.problem import Point
 from jumplab.robot.stance import configuration, stance_angles
 from jumplab.sim import STEP_S, Disturbance
@@ -25,12 +29,23 @@ from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.scene import Scene
 from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
-from jumplab.stages.spatial import SpatialLimits, SpatialWeights, shapes
-from jumplab.stages.spatial.start import spread
-from jumplab.stages.spatial.tape import ACCELERATION_GAP, FRICTION, LOADED_N, RATE_GAP, holds_between
-from jumplab.stages.spatial.terms import SpatialTerms
+from jumplab.stages.spatial import Contacts, Place, SpatialLimits, SpatialPlanner, SpatialWeights
+from jumplab.stages.spatial import planner as planning
+from jumplab.stages.spatial.apart import merged, too_close
+from jumplab.stages.spatial.shapes import ROUNDED_M, faces, gaps
+from jumplab.stages.spatial.tape import (
+    ACCELERATION_GAP,
+    AIR,
+    FLAT,
+    FRICTION,
+    LOADED_N,
+    RATE_GAP,
+    TOE,
+    edges,
+    holds_between,
+)
+from jumplab.stages.spatial.terms import BASE, Body, SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
-from jumplab.stages.whole_body.settings import Contact
 from jumplab.task import JumpTask
 
 SIDE = JumpTask(0.0, 0.4, side_m=0.3)
@@ -48,6 +63,20 @@ def jump(task: JumpTask):
 
 
 @cache
+def walker() -> SpatialPlanner:
+    """Plans one step with the right foot."""
+    robot = jl.Robot.load()
+    return SpatialPlanner(robot, contacts=Contacts.of("LR L LR", robot, [Place(0.15)]))
+
+
+@cache
+def step():
+    """Plan and tape of that step."""
+    plan = walker().plan(JumpTask(0.0, 0.2))
+    return plan, walker().tape(plan)
+
+
+@cache
 def run(task: JumpTask, mode: str, engine: str):
     return jl.simulate(jump(task), mode=mode, engine=engine)
 
@@ -57,10 +86,84 @@ def test_tape_is_exact_physics_between_the_nodes(task):
     plan = jump(task)
     r = replay(plan.tape, plan.robot, task)
     assert np.abs(r.base_residual).max() < 1e-6 * r.weight  # all six rows, at every millisecond
-    assert np.abs(r.momentum[r.flight] - r.momentum[r.flight][0]).max() < 1e-6  # all three components
-    toes = r.toe_corners[r.launch]
+    (flight,) = r.flights
+    assert np.abs(r.momentum[flight] - r.momentum[flight][0]).max() < 1e-6  # all three components
+    toes = r.toe_corners[r.ground]
     assert np.abs(toes - toes[0]).max() < 1e-6
     assert np.abs(r.tau - plan.tape.tau).max() < 1e-6
+
+
+def told_twice(tape) -> np.ndarray:
+    """Rows at whose instant another row follows."""
+    return np.flatnonzero(np.diff(tape.t) < 1e-6)
+
+
+@pytest.mark.parametrize("name", ["side", "turn", "step"])
+def test_tape_is_smooth_up_to_each_take_off_and_landing(name):
+    """Accelerations jump there alone, rates and places nowhere; heels rise from rest."""
+    tape = step()[1] if name == "step" else jump({"side": SIDE, "turn": TURN}[name]).tape
+    codes, twice = tape.extra["contacts"], told_twice(tape)
+    feet = np.flatnonzero(np.any((codes[1:] == AIR) != (codes[:-1] == AIR), axis=1))
+    lands = np.any(codes[feet + 1] > codes[feet], axis=1)
+    flies = ~codes[feet + 1].any(axis=1)
+    # a foot that leaves while another one stands needs no instant of its own
+    assert twice.tolist() == feet[lands | flies].tolist()
+    for x, most in ((tape.q, 1e-4), (tape.v, 1e-3)):  # a foot lands as closely as the solver meets its rows
+        assert np.abs(np.diff(x, axis=0)[twice]).max() < most
+    jumps = np.abs(np.diff(tape.a, axis=0)).max(axis=1)
+    around = np.maximum(np.roll(jumps, 1), np.roll(jumps, -1))
+    beside = np.concatenate([twice - 1, twice, twice + 1])
+    inside = np.setdiff1d(np.arange(1, len(jumps) - 1), beside)
+    assert np.all(jumps[inside] < 2 * around[inside] + 0.5)
+    dt = np.diff(tape.t)[:, None]
+    moves = np.setdiff1d(np.arange(len(dt)), twice)
+    mean = (tape.v[1:, 6:] + tape.v[:-1, 6:]) / 2
+    gap = np.diff(tape.q[:, 7:], axis=0)[moves] / dt[moves] - mean[moves]
+    assert np.abs(gap).max() < RATE_GAP
+
+
+@pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
+def test_tape_says_how_each_foot_stands(task):
+    """Flat, then on its toes, then in the air, both alike; there it carries nothing."""
+    tape = jump(task).tape
+    codes = tape.extra["contacts"]
+    assert np.array_equal(codes[:, 0], codes[:, 1])
+    assert np.all(np.diff(codes[:, 0].astype(int)) <= 0)
+    assert set(codes[:, 0].tolist()) == {FLAT, TOE, AIR}
+    assert np.array_equal(tape.phase == "launch", codes.any(axis=1))
+    assert not tape.f[codes == AIR].any()
+    rising = np.argmax(codes[:, 0] == TOE)
+    assert tape.extra["toe_phase_start"] == pytest.approx(tape.t[rising])
+
+
+def test_a_step_moves_one_foot_to_its_place(bhr):
+    """The other one stays where it is; forces and momentum are those of the motion all the same."""
+    plan, tape = step()
+    gauge, data, model = Gauge(bhr), bhr.model.createData(), bhr.model
+    soles = []
+    for q in tape.q:
+        pin.framesForwardKinematics(model, data, q)
+        soles.append([[data.oMf[frame].act(x) for x in bhr.foot.corners] for frame in gauge.frames])
+    soles, codes = np.array(soles), tape.extra["contacts"]
+    assert np.abs(soles[:, 0] - soles[0, 0]).max() < 1e-6 and np.all(codes[:, 0] == FLAT)
+    lifted = codes[:, 1] == AIR
+    assert soles[lifted, 1, :, 2].max() > 0.02 and soles[..., 2].min() > -1e-6
+    first, last = np.split(soles[~lifted, 1], [np.argmax(lifted)])
+    aside = plan.solution.phases["3 LR"].constants["right_y"] - Body(bhr).places[1, 1]
+    assert np.abs(first - first[0]).max() < 1e-6 and np.abs(last - last[0]).max() < 1e-6
+    way = np.tile([0.15, aside, 0.0], (4, 1))
+    assert last[0] - first[0] == pytest.approx(way, abs=1e-6)
+    assert abs(aside) < Place(0.15).free_m[1] + 1e-6
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for row in range(0, len(tape.t), 50):
+        need = pin.rnea(model, data, tape.q[row], tape.v[row], tape.a[row])
+        pin.computeJointJacobians(model, data, tape.q[row])
+        pin.updateFramePlacements(model, data)
+        for frame, wrench in zip(gauge.frames, tape.f[row], strict=True):
+            need -= pin.getFrameJacobian(model, data, frame, axes).T @ wrench
+        assert np.abs(need[:6]).max() < 1e-6 and need[6:] == pytest.approx(tape.tau[row], abs=1e-6)
+    assert (plan.flight_s, plan.launch_s) == (0.0, pytest.approx(tape.t[-1], abs=1e-3))
+    assert np.abs(tape.v[-1]).max() < 1e-3 and not tape.f[lifted, 1].any()
 
 
 @pytest.mark.parametrize("task", [SIDE, TURN], ids=["side", "turn"])
@@ -131,9 +234,10 @@ def test_mirrored_target_has_the_mirrored_plan_of_its_feet():
 def test_neighbour_is_planned_from_the_plan():
     before = jump(SIDE)
     after = planner().replan(before, replace(SIDE, side_m=0.31))
-    first, again = (p.whole_body.solution.statistics.iterations for p in (before, after))
+    first, again = (sum(row.iterations for row in p.statistics) for p in (before, after))
     assert again < first / 2
-    assert [row.stage for row in after.statistics] == ["spatial"]
+    assert [row.stage for row in after.statistics] == ["spatial, neighbour, held Gauss-Newton"]
+    assert after.whole_body.schedule.apart == before.whole_body.schedule.apart
     assert audit(after.tape, after.robot, after.task).passed
 
 
@@ -141,11 +245,15 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     last, verdicts = planner().stage("spatial"), iter([False, True, False, False, True, False, False, False])
     coarse = jump(SIDE).whole_body
     first = last.plan(SIDE, near=coarse).solution
-    monkeypatch.setattr("jumplab.stages.spatial.planner.holds_between", lambda tape, robot: next(verdicts))
-    settled, finer, kept = (last.plan(SIDE, near=coarse).solution for _ in range(3))
-    assert [len(x.j) for x in settled.phases.values()] == [12, 12, 16]
+    monkeypatch.setattr(planning, "holds_between", lambda tape, robot: next(verdicts))
+    plans = [last.plan(SIDE, near=coarse) for _ in range(3)]
+    settled, finer, kept = (plan.solution for plan in plans)
+    names = [[x.start for x in plan.attempts] for plan in plans]
+    assert names == [["neighbour", "settled"], *2 * [["neighbour", "settled", "finer mesh"]]]
+    mesh = [last.mesh.flat, last.mesh.toe, last.mesh.flight]
+    assert [len(x.j) for x in settled.phases.values()] == mesh
     assert settled.statistics.objective < first.statistics.objective
-    assert [len(x.j) for x in finer.phases.values()] == [18, 18, 24]
+    assert [len(x.j) for x in finer.phases.values()] == [np.ceil(planning.FINER * n) for n in mesh]
     assert kept.statistics.objective == first.statistics.objective  # neither is any better: the first stands
 
 
@@ -162,9 +270,10 @@ def test_limits_between_the_nodes_are_seen(bhr):
         moved = getattr(tape, name).copy()
         moved[row, column] += 2 * change
         assert not holds_between(replace(tape, **{name: moved}), bhr), name
-    pushed = tape.f.copy()
-    pushed[row, 0, 1] += FRICTION * pushed[row, 0, 2]
-    assert not holds_between(replace(tape, f=pushed), bhr)
+    for share in (0.99, 1.01):
+        pushed = tape.f.copy()
+        pushed[row, 0, :2] = 0.0, share * FRICTION * pushed[row, 0, 2]
+        assert holds_between(replace(tape, f=pushed), bhr) == (share < 1)
 
 
 def test_own_weights_and_terms_reach_it(bhr):
@@ -182,13 +291,15 @@ def test_own_weights_and_terms_reach_it(bhr):
 
 
 def test_points_know_the_robot_by_name(bhr):
-    b = SpatialTerms(bhr, SpatialLimits(), SpatialWeights(), Contact.FLIGHT)
+    b = SpatialTerms(Body(bhr), SpatialLimits(), SpatialWeights(), {})
     names = {"q": b.coordinates, "v": b.coordinates, "a": b.coordinates, "z": b.states}
     known = {key: ca.SX.sym(key, len(x)) for key, x in names.items()}
     constants = SimpleNamespace(**{f"{k}_{x}": ca.SX.sym(k + x) for k in ("com", "vel", "L") for x in "xyz"})
     time, more = ca.SX.sym("t"), SimpleNamespace(gravity=9.8)
     p = Point(**known, j=None, duration=time, s=1.0, c=constants, p=more, ref=None, view=partial(SpatialView, b))
-    assert ca.is_equal(p.joints.left_knee, known["q"][3 + b.joint_names.index("left_knee")])
+    knee = BASE + bhr.joint_names.index("left_knee")
+    assert ca.is_equal(p.joints.left_knee, known["q"][knee])
+    assert ca.is_equal(p.joint_rates.left_knee, known["v"][knee])
     assert p.com.shape == p.com_velocity.shape == p.L.shape == p.attitude.shape == p.origin("left_knee").shape == (3, 1)
     assert len(vars(p.torques)) == b.model.joints and all(x.is_zero() for x in p.feet_forces)
     with pytest.raises(InputError) as e:
@@ -216,33 +327,63 @@ def test_it_begins_in_the_posture_in_which_the_robot_waits(bhr):
     assert plan.planned_side_m == pytest.approx(0.3, abs=2e-3) and np.abs(plan.tape.v[0]).max() < 1e-3
 
 
-def test_a_refusal_names_a_smaller_target_that_is_planned(monkeypatch):
-    last, tried, known = planner().stage("spatial"), [], jump(SIDE).whole_body
+@pytest.fixture
+def refusing(monkeypatch):
+    """(stage, what it was asked for): nothing farther than half a metre to the side is solved."""
+    last, known, tried = planner().stage("spatial"), jump(SIDE).whole_body, []
 
-    def solved(nlp, task, begin, how):
-        tried.append((task.side_m, nlp is last._quick))
+    def solved(start, task, parameters, weights, begin, apart, attempts, explain=False):
+        tried.append((task.side_m, start.name, start.held, explain))
         if task.side_m > 0.5:
             raise SolverError("spatial: no plan", stage="spatial", violations=("flight/capture window by 1 m",))
         return replace(known, task=task)
 
     monkeypatch.setattr(last, "_solved", solved)
+    return last, tried
+
+
+STARTS = [("schedule", True), ("schedule", False), ("stance", False)]
+
+
+def test_a_refusal_names_a_smaller_target_that_is_planned(refusing):
+    last, tried = refusing
     with pytest.raises(SolverError) as e:
         last.plan(replace(SIDE, side_m=0.9))
-    assert tried == [(0.9, False), (0.9, False), (0.81, True), (0.63, True), (0.45, True)]
+    cold = [(0.9, *start, False) for start in STARTS]
+    smaller = [(side, "schedule", True, False) for side in (0.81, 0.63, 0.45)]
+    assert tried == [*cold, (0.9, "schedule", False, True), *smaller]
     said = "spatial: no plan; at this height, 0 m ahead and 0.45 m to the left with a turn of 0 deg is planned"
     assert str(e.value) == said and e.value.violations
 
 
-def test_where_there_is_a_motion_it_is_looked_for_from_a_smaller_target(monkeypatch):
-    last, known = planner().stage("spatial"), jump(SIDE).whole_body
+def test_where_nobody_reads_explanations_it_gives_up_sooner(refusing):
+    last, tried = refusing
+    token = EXPLAINED.set(False)
+    try:
+        for near in (None, jump(SIDE).whole_body):
+            with pytest.raises(SolverError) as e:
+                last.plan(replace(SIDE, side_m=0.9), near=near)
+            assert str(e.value) == "spatial: no plan"
+    finally:
+        EXPLAINED.reset(token)
+    neighbour = [("neighbour", True), ("neighbour", False)]
+    assert [x[1:3] for x in tried] == [STARTS[0], *neighbour, *STARTS[:2]]
 
-    def solved(nlp, task, begin, how):
-        if nlp is last.nlp:
-            raise SolverError("the search did not settle")
-        return replace(known, task=task)
 
-    monkeypatch.setattr(last, "_solved", solved)
-    assert last.plan(replace(SIDE, side_m=0.9)).task.side_m == 0.9
+def test_a_start_that_leads_nowhere_is_followed_by_the_next(monkeypatch):
+    """Each attempt is a row of the plan's statistics, those that failed too."""
+    first, *others = planning.COLD
+    hasty = replace(first, options={"max_iter": 3})
+    monkeypatch.setattr(planning, "COLD", (hasty, *others))
+    plan = planner().plan(SIDE, "direct")
+    attempts = plan.whole_body.attempts
+    made = [(x.start, x.hessian) for x in attempts[:2]]
+    assert made == [("schedule", "held Gauss-Newton"), ("schedule", "exact")]
+    assert (attempts[0].status, attempts[0].iterations) == ("Maximum_Iterations_Exceeded", 3)
+    assert attempts[1].iterations > 3 and attempts[1].cpu_s > attempts[0].cpu_s > 0
+    rows = [(row.stage, row.iterations, row.solve_s) for row in plan.statistics]
+    assert rows == [(f"spatial, {x.start}, {x.hessian}", x.iterations, x.cpu_s) for x in attempts]
+    assert audit(plan.tape, plan.robot, SIDE).passed
 
 
 def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carries(bhr):
@@ -318,27 +459,100 @@ def test_a_wrong_apex_has_a_direction(bhr):
 
 
 # what it is made of -----------------------------------------------------------------------------------------------
-def test_wrenches_are_spread_over_the_corners(bhr):
-    b = SpatialTerms(bhr, SpatialLimits(), SpatialWeights(), Contact.FLAT)
-    data = b.model.model.createData()
-    pin.framesForwardKinematics(b.model.model, data, b.model.to_pinocchio(*(x[None] for x in (b.stance,) * 3))[0][0])
-    f = np.zeros((1, 2, 6))
-    f[:, :, 2] = b.mg / 2
-    for i, name in enumerate(bhr.foot.frames):  # the middle of each sole carries half of the weight
-        arm = b.places[i] - data.oMf[b.model.model.getFrameId(name)].translation
-        f[0, i, 3:] = np.cross(arm, f[0, i, :3])
-    found = spread(b, b.stance[None], f)[0]
-    assert found.min() >= 0 and found.sum() == pytest.approx(b.mg, rel=1e-3)
+def test_derivatives_of_the_program_by_differences():
+    """Of all its rows, and of the Lagrangian's slope, along random ways."""
+    a, rng, h = walker().nlp.assembled, np.random.default_rng(5), 1e-6
+    x, p = pack(a, step()[0].solution.guess()), data_vector(a, rng)
+    lam_f, lam_g = 0.7, rng.normal(size=a.n_rows)
+
+    def slope(at):
+        return lam_f * a.grad_f(at, p)[1].full().ravel() + sparse(a.jac_g(at, p)[1]).T @ lam_g
+
+    jacobian, upper = sparse(a.jac_g(x, p)[1]), sparse(a.hess_lag(x, p, lam_f, lam_g))
+    for way in rng.normal(size=(3, a.size)):
+        rows = [a.nlp(x + s * h * way, p)[1].full().ravel() for s in (1, -1)]
+        bent = upper @ way + upper.T @ way - upper.diagonal() * way
+        for told, two in ((jacobian @ way, rows), (bent, [slope(x + s * h * way) for s in (1, -1)])):
+            seen = (two[0] - two[1]) / (2 * h)
+            np.testing.assert_allclose(told, seen, rtol=1e-5, atol=1e-6 * np.abs(seen).max())
 
 
-def test_pairs_that_can_meet_are_found_and_kept_apart(bhr):
-    b = SpatialTerms(bhr, SpatialLimits(), SpatialWeights(), Contact.FLIGHT)
-    names = {frozenset((p.first.name, p.second.name)) for p in b.pairs}
+@pytest.mark.parametrize("mode", ["flat", "toe"])
+def test_forces_at_the_soles_are_wrenches_of_the_feet_and_of_the_ground(bhr, mode):
+    """In the body's axes in the program, about the world's origin on the tape."""
+    b = SpatialTerms(Body(bhr), SpatialLimits(), SpatialWeights(), {1: mode})
+    rng, side = np.random.default_rng(0), 1
+    hold, pitch = np.array([0.3, -0.2, 0.1, 0.7]), 0.4 * (mode == "toe")
+    z = rng.uniform(0, 100, b.n_forces)
+    chart = np.append(np.zeros(b.nv), [pitch] * (mode == "toe"))
+    point = SimpleNamespace(q=ca.DM(chart), z=ca.DM(z))
+    told = *b.wrench(point, side), b.foot_force(point, side)
+    force, moment, carried = (ca.evalf(ca.SX(x)).full().ravel() for x in told)
+    turn = pin.rpy.rpyToMatrix(0.0, pitch, 0.7) @ b.body.axes[side].T  # attitude of the foot's body
+    origin = hold[:3] - turn @ b.body.tips[side]
+    ground = edges(b, side, hold) @ z
+    assert ground[:3] == pytest.approx(turn @ force, abs=1e-9)
+    assert ground[3:] == pytest.approx(turn @ moment + np.cross(origin, turn @ force), abs=1e-9)
+    heading = pin.rpy.rpyToMatrix(0.0, 0.0, -0.7) @ ground[:3]
+    assert np.abs(heading[:2]).sum() < b.limits.friction * heading[2]
+    assert heading == pytest.approx(carried, abs=1e-9)
+    about = ground[3:] - np.cross(hold[:3], ground[:3])  # the middle of the toe edge
+    across = np.array([-np.sin(0.7), np.cos(0.7), 0.0])
+    assert mode == "flat" or abs(about @ across) < 1e-9
+
+
+def test_links_that_are_no_neighbours_can_meet(bhr):
+    body = Body(bhr)
+    names = {frozenset(body.shapes[i].name for i in pair) for pair in body.candidates}
     assert frozenset(("trunk_1", "left_thigh_0")) in names  # pelvis and thigh meet within the joints' ranges
     assert frozenset(("left_foot_0", "right_foot_0")) in names
     assert frozenset(("left_thigh_0", "left_shank_0")) not in names  # neighbours
-    boxes, _ = shapes.boxes(bhr, b.model)
-    assert len(boxes) == len({box.name for box in boxes})
+    assert len(body.shapes) == len({box.name for box in body.shapes})
+
+
+def test_a_face_keeps_links_apart(bhr):
+    """Its distance in the program is that in postures, less the corners' rounding."""
+    body, tree, data = Body(bhr), bhr.model, bhr.model.createData()
+    named = {box.name: box for box in body.shapes}
+    left, right = named["left_foot_0"], named["right_foot_0"]
+    ways = [*faces(left, right), *faces(right, left)]
+    q = ca.SX.sym("q", len(body.model.names))
+    told = ca.Function("gaps", [q], [x.gap(SpatialState(body.model, q, q, q)) for x in ways])
+    rng = np.random.default_rng(1)
+    charts = body.stance + 0.2 * rng.normal(size=(5, len(body.stance)))
+    configurations = body.model.to_pinocchio(charts, 0 * charts, 0 * charts)[0]
+    for chart, q in zip(charts, configurations, strict=True):
+        pin.forwardKinematics(tree, data, q)
+        placed = list(zip(data.oMi[1:], body.model.bodies, strict=True))
+        turns = np.array([[x.rotation @ b.own for x, b in placed]])
+        places = np.array([[x.translation for x, _ in placed]])
+        sharp = np.array([gaps(x, turns, places)[0] for x in ways])
+        smooth = np.array([float(x) for x in told(chart)])
+        assert np.all(sharp >= smooth) and np.all(sharp - smooth < 3 * ROUNDED_M)
+
+
+def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
+    plan, last = jump(SIDE), planner().stage("spatial")
+    phases = list(plan.whole_body.solution.phases.values())
+    intervals, names = [len(p.j) for p in phases], list(plan.whole_body.solution.phases)
+    assert too_close(last.body, phases) == []
+    apart = plan.whole_body.schedule.apart
+    problem = plan.whole_body.solution.problem
+    rows = {(owner, t.name): t.skip for owner, t in problem.terms() if " apart, face " in t.name}
+    asked = {}
+    for x in apart:
+        asked[names[x.phase], x.pair.key] = x.first, intervals[x.phase] - x.last
+    assert rows == asked
+    assert apart and plan.statistics[-1].stage == "spatial, links apart, held Gauss-Newton"
+    q, rolls = phases[2].q.copy(), ("left_hip_roll", "right_hip_roll")
+    q[5:8, [BASE + bhr.joint_names.index(name) for name in rolls]] += [-0.3, 0.3]  # legs that cross
+    found = too_close(last.body, [*phases[:2], replace(phases[2], q=q)])
+    assert {x.phase for x in found} == {2}
+    assert all(1 <= x.first <= 5 and 7 <= x.last <= intervals[2] for x in found)
+    assert any({x.pair.first.name[:5], x.pair.second.name[:5]} == {"left_", "right"} for x in found)
+    later = [replace(x, first=x.first + 1, last=x.last + 2) for x in found]
+    assert merged(found, later) == tuple(replace(x, last=x.last + 2) for x in found)
+    assert merged(apart, ()) == apart
 
 
 def test_headed_turns_the_robot_about_the_vertical(bhr):

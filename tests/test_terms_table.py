@@ -17,18 +17,25 @@ from jumplab.ocp import Bound, Problem
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.stages import spatial, srmp, whole_body
+from jumplab.stages import srmp, whole_body
 from jumplab.stages.joint_qp.settings import GENTLE, Options
+from jumplab.stages.spatial import Contacts, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.planner import jump_contacts
+from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.spatial.settings import SPATIAL_MESH
+from jumplab.stages.spatial.terms import Body
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Limits, Weights
 from jumplab.task import JumpTask
 
 TABLE = Path(__file__).with_name("terms.txt")
 TARGET = JumpTask(0.6, 0.4, 0.3)  # for which the bounds that depend on the target are told
+ROUNDING = 1e-12  # below, a number is zero
 
 
 def number(x) -> str:
     values = np.atleast_1d(np.asarray(x, float))
+    values = np.where(np.abs(values) < ROUNDING, 0.0, values)
     return " ".join(f"{v:.5g}" for v in (values[:1] if np.all(values == values[0]) else values))
 
 
@@ -41,8 +48,11 @@ def lines(problem: Problem, parameters: dict) -> Iterator[str]:
 
     for phase in problem.phases:
         yield f"{problem.name}/{phase.name} | duration | {told(*phase.duration)} s | {phase.intervals} intervals"
-        for name, (low, high, scale) in phase.constants.items():
-            yield f"{problem.name}/{phase.name} | constant {name} | {told(low, high)} | scale {number(scale)}"
+        if phase.shared:
+            yield f"{problem.name}/{phase.name} | shares {phase.shared} with the phase before"
+        for name, (low, high, scale, *key) in phase.constants.items():
+            how = f"scale {number(scale)}" + "".join(f" | {x}" for x in key)
+            yield f"{problem.name}/{phase.name} | constant {name} | {told(low, high)} | {how}"
     for owner, x in (*problem.terms(), *problem.bounds()):
         head = f"{problem.place(owner)} | {x.name} | {x.equation}"
         if isinstance(x, Bound):
@@ -65,7 +75,10 @@ def table() -> str:
     flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
     found += [f"of a flip: {line}" for line in flips if line not in found]
     stance = SpatialModel(robot.model).of_pinocchio(stance_configuration(robot)[None])[0]
-    found += lines(spatial.build_problem(robot), {"stance": stance, "yaw": 2 * np.pi})
+    body, limits, weights = Body(robot), SpatialLimits(), SpatialWeights()
+    given = {"stance": stance, "yaw": 2 * np.pi, "takeoff_speed": TARGET.takeoff_speed}
+    for contacts in (jump_contacts(limits, SPATIAL_MESH), Contacts.hop(robot)):
+        found += lines(Schedule(body, contacts, limits, weights).problem(), given)
     for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
         for part, fields in asdict(options).items():
             rows = fields.items() if isinstance(fields, dict) else [("", fields)]

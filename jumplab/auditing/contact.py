@@ -18,23 +18,27 @@ def checks(r: Replay) -> list[Check]:
 
 
 def _geometry(r: Replay) -> list[Check]:
-    t, s, feet = r.tape.t, r.launch, r.tape.contact_frames
-    toe, points = r.toe_corners[s], r.sole_points  # (n, K, 2, 3), (N, K, P, 3)
-    slip = np.linalg.norm((toe - toe[0])[..., :2], axis=-1).max(axis=-1)
-    left = r.foot_rotation[s, :, :, 1]  # level, heel up or not (n, K, 3)
-    first = np.broadcast_to(left[0], left.shape)
-    turned = np.abs(np.arctan2(np.cross(first, left)[..., 2], (first * left)[..., :2].sum(-1)))
-    hover = np.abs(toe[..., 2]).max(axis=-1)
+    t, feet, toe, points = r.tape.t, r.tape.contact_frames, r.toe_corners, r.sole_points  # (N, K, 2, 3), (N, K, P, 3)
+    left = r.foot_rotation[..., 1]  # level, heel up or not (N, K, 3)
+    slip, turned, hover = (np.zeros(r.carrying.shape) for _ in range(3))
+    for k, rows in r.stands:
+        at, way = toe[rows, k], left[rows, k]
+        slip[rows, k] = np.linalg.norm((at - at[0])[..., :2], axis=-1).max(axis=-1)
+        first = np.broadcast_to(way[0], way.shape)
+        turned[rows, k] = np.abs(np.arctan2(np.cross(first, way)[..., 2], (first * way)[..., :2].sum(-1)))
+        hover[rows, k] = np.abs(at[..., 2] - r.surface(r.along(at[:1]))).max(axis=-1)
     above = 1e3 * (points[..., 2] - r.surface(r.along(points))).min(axis=-1)  # (N, K)
-    flying = t[r.flight]
-    share = (t - flying[0]) / (flying[-1] - flying[0])
-    middle = (share >= METHOD.mid_flight[0]) & (share <= METHOD.mid_flight[1])
+    middle = np.zeros(len(t), bool)
+    for rows in r.flights:
+        share = (t[rows] - t[rows][0]) / np.ptp(t[rows])
+        middle[rows] = (share >= METHOD.mid_flight[0]) & (share <= METHOD.mid_flight[1])
+    clear = [LIMITS["foot clearance"].worst(above[middle], t[middle], feet)] if middle.any() else []
     return [
-        LIMITS["toe slip"].worst(1e3 * slip, t[s], feet),
-        LIMITS["foot turn"].worst(1e3 * turned, t[s], feet),
-        LIMITS["toe on the ground"].worst(1e3 * hover, t[s], feet),
+        LIMITS["toe slip"].worst(1e3 * slip, t, feet),
+        LIMITS["foot turn"].worst(1e3 * turned, t, feet),
+        LIMITS["toe on the ground"].worst(1e3 * hover, t, feet),
         LIMITS["penetration"].worst(-above, t, feet),
-        LIMITS["foot clearance"].worst(above[middle], t[middle], feet),
+        *clear,
     ]
 
 

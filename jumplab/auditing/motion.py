@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.replay import Replay
+from jumplab.auditing.replay import Replay, carrying
 from jumplab.auditing.report import LIMITS, METHOD, Check
 from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
@@ -16,12 +18,19 @@ def form(tape: Tape) -> list[Check]:
     arrays = (tape.t, tape.q, tape.v, tape.a, tape.tau, tape.f)
     broken = sum(int((~np.isfinite(x)).sum()) for x in arrays)
     phase = np.asarray(tape.phase)
-    flying = phase == "flight"
-    faults = int((~flying & (phase != "launch")).sum())
-    faults += sum(int(np.sum(flying == x) < METHOD.min_samples) for x in (False, True))
-    faults += abs(int(np.sum(flying[1:] != flying[:-1])) - 1) + int(bool(flying[:1].any()))
-    step, same = np.diff(tape.t), flying[1:] == flying[:-1]
-    faults += int((~(step[same] > 0)).sum()) + int((step[~same] != 0).sum())
+    flying, step = phase == "flight", np.diff(tape.t)
+    faults = int((~flying & (phase != "launch")).sum()) + int(bool(flying[:1].any()))
+    faults += int((carrying(tape).any(axis=1) == flying).sum())
+    switched = flying[1:] != flying[:-1]
+    if "contacts" in tape.extra:  # where a foot lands an instant is there twice as well
+        landed = (np.diff(carrying(tape).astype(int), axis=0) > 0).any(axis=1)
+        doubled = switched | landed
+    else:
+        faults += abs(int(np.sum(switched)) - 1)
+        doubled = switched
+    faults += int((step[doubled] != 0).sum()) + int((~(step[~doubled] > 0)).sum())
+    ends = [0, *(np.flatnonzero(doubled) + 1).tolist(), len(tape.t)]
+    faults += sum(b - a < METHOD.min_samples for a, b in pairwise(ends))
     return [LIMITS["finite numbers"].check(broken), LIMITS["order of phases"].check(faults)]
 
 
@@ -34,7 +43,7 @@ def checks(r: Replay) -> list[Check]:
         *_steps(r),
         *_reintegration(r),
         *_switch(r),
-        *(_symmetry(r) if r.robot.planar and (r.task is None or r.task.in_plane) else ()),
+        *(_symmetry(r) if r.robot.planar and r.is_jump and (r.task is None or r.task.in_plane) else ()),
     ]
 
 
@@ -60,7 +69,7 @@ def _steps(r: Replay) -> list[Check]:
 def _reintegration(r: Replay) -> list[Check]:
     tape, rates = r.tape, _mean_rates(r)
     position, rate = np.zeros_like(tape.v), np.zeros_like(tape.v)
-    for phase in (r.launch, r.flight):
+    for phase in r.pieces:
         q = tape.q[phase.start]
         for i in range(phase.start + 1, phase.stop):
             q = pin.integrate(r.model, q, rates[i - 1] * r.step[i - 1])
@@ -74,14 +83,18 @@ def _reintegration(r: Replay) -> list[Check]:
 
 
 def _switch(r: Replay) -> list[Check]:
-    tape, i = r.tape, r.tape.takeoff_index
-    jumps = {
-        "position": 1e3 * pin.difference(r.model, tape.q[i - 1], tape.q[i]),
-        "rate": tape.v[i] - tape.v[i - 1],
-        "acceleration": tape.a[i] - tape.a[i - 1],
-    }
-    t, names = tape.t[i : i + 1], r.coordinates
-    return [LIMITS[f"{kind} at the switch"].worst(np.abs(jump)[None], t, names) for kind, jump in jumps.items()]
+    tape, rows = r.tape, np.array([p.start for p in r.pieces[1:]], int)
+    lands = (r.carrying[rows] & ~r.carrying[rows - 1]).any(axis=1)  # forces and accelerations may jump there
+    moved = [1e3 * pin.difference(r.model, tape.q[i - 1], tape.q[i]) for i in rows]
+    out, names = [], r.coordinates
+    for kind, jumps, at in (
+        ("position", np.reshape(moved, (-1, r.model.nv)), rows),
+        ("rate", tape.v[rows] - tape.v[rows - 1], rows),
+        ("acceleration", (tape.a[rows] - tape.a[rows - 1])[~lands], rows[~lands]),
+    ):
+        if len(at):
+            out.append(LIMITS[f"{kind} at the switch"].worst(np.abs(jumps), tape.t[at], names))
+    return out
 
 
 def mirror(model: pin.Model) -> list[tuple[int, int, float]] | None:
@@ -133,6 +146,10 @@ def target(r: Replay) -> list[Check]:
         LIMITS["sole on the surface"].worst(1e3 * off, t, feet, height=r.platform),
         LIMITS["sole flat at touchdown"].worst(1e3 * tilt, t, feet),
     ]
+    if not r.is_jump:
+        names = [*("base",) * 6, *map(str, r.tape.joint_names)]
+        ends = (("start at rest", slice(0, 1)), ("end at rest", slice(-1, None)))
+        return touchdown + [LIMITS[name].worst(np.abs(r.tape.v[row]), r.tape.t[row], names) for name, row in ends]
     return touchdown + (_asked(r, r.task) if r.task else [])
 
 
@@ -169,7 +186,7 @@ def _place(r: Replay, task: JumpTask) -> list[Check]:
 
 
 def _asked(r: Replay, task: JumpTask) -> list[Check]:
-    tape, i = r.tape, r.tape.takeoff_index
+    tape, i = r.tape, r.flights[0].start
     t, feet = tape.t, tape.contact_frames
     travel = (r.toe_corners[-1] - r.toe_corners[0]).mean(axis=1)[:, :2]  # (K, 2)
     miss = 1e3 * np.linalg.norm(travel - np.array([task.distance_m, 0.0]), axis=-1)

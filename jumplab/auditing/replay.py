@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pinocchio as pin
@@ -62,9 +62,43 @@ class Replay:
     gravity: float  # of the replayed model, positive [m/s^2]
     mass: float  # of the URDF [kg]
     weight: float  # m g [N]
-    launch: slice  # rows
-    flight: slice
-    step: np.ndarray  # (N - 1,) time steps [s]; zero across take-off
+    carrying: np.ndarray  # (N, K) whether a foot is on the ground, as the tape says; what it says is checked
+    step: np.ndarray  # (N - 1,) time steps [s]; zero across take-off, and where a foot lands
+
+    @cached_property
+    def pieces(self) -> list[slice]:
+        """Rows without a jump of accelerations: from one doubled instant to the next."""
+        ends = [0, *(np.flatnonzero(self.step == 0) + 1).tolist(), len(self.tape.t)]
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    @cached_property
+    def flights(self) -> list[slice]:
+        """Rows of each flight."""
+        return [p for p in self.pieces if not self.carrying[p].any()]
+
+    @cached_property
+    def ground(self) -> np.ndarray:
+        """(N,) whether any foot is on the ground."""
+        return self.carrying.any(axis=1)
+
+    @cached_property
+    def until_last_stand(self) -> slice:
+        """Rows up to the last one with a foot on the ground."""
+        return slice(0, int(np.flatnonzero(self.ground)[-1]) + 1)
+
+    @cached_property
+    def stands(self) -> list[tuple[int, slice]]:
+        """(foot, rows) of each contact."""
+        out = []
+        for k, column in enumerate(self.carrying.T):
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
+            out += [(k, slice(a, b)) for a, b in edges.reshape(-1, 2).tolist()]
+        return out
+
+    @property
+    def is_jump(self) -> bool:
+        """Whether both feet leave once, and the tape ends as they come down; else it is another schedule."""
+        return len(self.flights) == 1 and self.flights[0].stop == len(self.tape.t) and len(self.pieces) == 2
 
     @cached_property
     def sole_points(self) -> np.ndarray:
@@ -170,12 +204,20 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
     need["tau"] = need["tau"] + armature * tape.a[:, 6:] + need["lost"]
     motion["energy"] = motion["energy"] + (armature * tape.v[:, 6:] ** 2).sum(axis=1) / 2
     gravity, mass = float(-model.gravity.linear[2]), float(pin.computeTotalMass(model))
-    rows = {"launch": slice(0, tape.takeoff_index), "flight": slice(tape.takeoff_index, len(tape.t))}
+    rows = {"carrying": carrying(tape)}
     told = {"gravity": gravity, "mass": mass, "weight": mass * gravity, "step": np.diff(tape.t)}
     names = (*BASE, *map(str, tape.joint_names))
     return Replay(
         tape, robot, task, edge_m, model, geometry, soles, coordinates=names, **motion, **need, **rows, **told
     )
+
+
+def carrying(tape: Tape) -> np.ndarray:
+    """(N, K) whether a foot is on the ground: the tape's ``contacts``, without them all feet until take-off."""
+    told = tape.extra.get("contacts")
+    if isinstance(told, np.ndarray) and told.shape == tape.f.shape[:2]:
+        return told > 0
+    return np.repeat((np.asarray(tape.phase) != "flight")[:, None], tape.f.shape[1], axis=1)
 
 
 def _motors(tape: Tape, robot: Robot) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,7 @@ def fingerprint(words: list, key: str) -> str:
     return hashlib.sha256(json.dumps(made_of, default=lambda array: array.tolist()).encode()).hexdigest()
 
 
-_KNOWN: dict[str, Element] = {}  # of this process, by fingerprint
+KNOWN: dict[str, Element] = {}  # of this process, by fingerprint
 
 
 def assembled(problem: Problem, key: str | None = None) -> Assembled:
@@ -88,8 +88,8 @@ def assembled(problem: Problem, key: str | None = None) -> Assembled:
 def _kept(builder: ElementBuilder, part: Part, key: str) -> Element:
     """The element of a part, as it was kept or to be kept."""
     digest, place = fingerprint(part.words(builder.problem), key)[:32], folder()
-    if digest in _KNOWN:
-        return _KNOWN[digest]
+    if digest in KNOWN:
+        return KNOWN[digest]
     path = None if place is None else place / f"{digest}.casadi"
     found = None if path is None else _read(path, part)
     if found is None:
@@ -97,7 +97,7 @@ def _kept(builder: ElementBuilder, part: Part, key: str) -> Element:
         if path is not None:
             with suppress(InputError):  # a folder that cannot be written is no reason to fail
                 _write(path, found)
-    _KNOWN[digest] = found
+    KNOWN[digest] = found
     return found
 
 

@@ -16,7 +16,8 @@ from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
-from jumplab.stages.spatial import SpatialPlan
+from jumplab.stages.spatial import Contacts, SpatialPlan
+from jumplab.stages.spatial.planner import Attempt
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlan
 from jumplab.stages.whole_body.planner import platform_edge_m
@@ -50,6 +51,7 @@ class JumpPlan(Shown, Named):
     statistics : one row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less closely.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
+    contacts : the schedule that was asked for; None for a standing jump.
     """
 
     task: JumpTask
@@ -62,6 +64,7 @@ class JumpPlan(Shown, Named):
     statistics: tuple[StageRow, ...]
     skipped: str | None = None
     stored: Mapping[str, Any] | None = None
+    contacts: Contacts | None = None
 
     @classmethod
     def on_file(cls, tape: Tape, robot: Robot, summary: Mapping[str, Any]) -> JumpPlan:
@@ -77,6 +80,23 @@ class JumpPlan(Shown, Named):
         turned += f", turned by {round(math.degrees(self.task.rotation_rad))} deg" if self.task.rotation_rad else ""
         jump = f"{self.planned_distance_m:.2f} m far{turned}, rise {self.planned_rise_m:.2f} m"
         return f"{self.robot.name}, {jump}, {self.method}, {float(self.tape.t[-1]):.2f} s"
+
+    @property
+    def attempts(self) -> tuple[Attempt, ...]:
+        """Starts of the whole-body program that were tried, what they took and how they ended; the last one led here.
+
+        Empty for plans of the five-link program, whose solves are :attr:`statistics`.
+        """
+        if self.stored is not None:
+            return tuple(Attempt(**row) for row in self.stored.get("attempts", ()))
+        return self.whole_body.attempts if isinstance(self.whole_body, SpatialPlan) else ()
+
+    @property
+    def schedule(self) -> tuple[str, ...]:
+        """Feet that carry, phase by phase, as in :class:`jumplab.Contacts`; empty for a standing jump."""
+        if self.stored is not None:
+            return tuple(self.stored.get("contacts", ()))
+        return () if self.contacts is None else tuple(p.feet for p in self.contacts.phases)
 
     @property
     def t(self) -> np.ndarray:
@@ -195,6 +215,8 @@ class JumpPlan(Shown, Named):
             **({"tracking": self.tracking} if self.srmp else {}),
             "stages": [vars(row) for row in self.statistics],
             **({"skipped": self.skipped} if self.skipped else {}),
+            **({"contacts": list(self.schedule)} if self.contacts else {}),
+            **({"attempts": [vars(x) for x in self.attempts]} if self.attempts else {}),
             "manifest": {"weights": self.weights, "solvers": self.solvers, "seeds": NO_SEEDS},
         }
 

@@ -25,7 +25,7 @@ from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
 from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
-from jumplab.stages.spatial import SpatialLimits, SpatialPlan, SpatialPlanner
+from jumplab.stages.spatial import Contacts, SpatialLimits, SpatialPlan, SpatialPlanner
 from jumplab.stages.spatial.settings import FLIP_MESH
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
@@ -33,13 +33,14 @@ from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
 from jumplab.stages.whole_body.planner import check_platform
-from jumplab.task import JumpTask
+from jumplab.task import GRAVITY, JumpTask
 
 METHODS, USUAL = ("three-step", "direct"), "usual"
 FIRST_STAGES = "srmp", "joint qp"  # those that the direct method leaves out ...
 FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
 OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
+LEAST_RISE_M = 0.02  # that a target can say
 _COUNT = count()
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
@@ -328,9 +329,46 @@ class Planner:
         stance = None if start is None else self._standing(start)
         return self._placed(last.plan(task, weights=asked["spatial"].weights, stance=stance))
 
-    def _placed(self, body: SpatialPlan) -> JumpPlan:
+    def follow(
+        self, contacts: Contacts, *, gravity: float = GRAVITY, weights: Mapping[str, float] | None = None
+    ) -> JumpPlan:
+        """Plan a motion along a contact schedule: hops, run-ups, leaps, bounds, or one of your own.
+
+        Parameters
+        ----------
+        contacts : the schedule; it ends at rest.
+        gravity : [m/s^2].
+        weights : of cost terms of stage "spatial" in this plan, instead of their own.
+
+        Raises
+        ------
+        InputError, InfeasibleError, SolverError
+            If the schedule does not fit the robot, or no motion follows it.
+        """
+        require_type(contacts, Contacts, "the contact schedule")
+        if contacts.ends != "rest":
+            raise InputError("a schedule that ends at touchdown is a standing jump; ask for it by its target")
+        asked = sorted_out(weights=weights)["spatial"]
+        last = SpatialPlanner(self.robot, contacts=contacts, keep=self.keep, changes=self.changes["spatial"])
+        level = JumpTask(0.0, 0.1, gravity=gravity)  # a schedule has its own places; of a target only gravity is taken
+        body, ends = last.plan(level, weights=asked.weights), contacts.places[-2:]
+        tape = last.tape(body)
+        rise = tape.extra["com"][tape.phase == "flight", 2]
+        travel, turn = tape.extra["soles_travel"], float(tape.extra["feet_turn"])
+        task = JumpTask(
+            float(travel[0]),
+            max(LEAST_RISE_M, float(rise.max() - rise[0]) if len(rise) else 0.0),
+            contacts.surface[0] if ends else 0.0,
+            gravity=gravity,
+            side_m=float(travel[1]),
+            yaw_rad=turn,
+        )
+        plan = self._placed(replace(body, task=task), last)
+        return replace(plan, contacts=contacts)
+
+    def _placed(self, body: SpatialPlan, last: SpatialPlanner | None = None) -> JumpPlan:
         """The plan of a spatial solution, one row of statistics for each attempt."""
-        last = self.stage(_away(body.task))
+        last = last or self.stage(_away(body.task))
         robot, build_s = self.robot.under_gravity(body.task.gravity), last.nlp.build_s
         rows = tuple(
             StageRow(f"spatial, {x.start}, {x.hessian}", x.iterations, 0.0 if k else build_s, x.cpu_s)

@@ -27,6 +27,8 @@ from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverErro
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.assembly import pack, unpack
 from jumplab.ocp.cache import fingerprint
+from jumplab.ocp.derivatives import ElementBuilder
+from jumplab.ocp.problem import layouts
 from jumplab.robot import Robot
 from jumplab.stages.planner import Planner, here, make_tape
 from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
@@ -256,7 +258,10 @@ def key_of(body: WholeBodyPlanner) -> str:
         for o, t in problem.terms()
     ]
     intervals = sorted(body.mesh.intervals().items())
-    return fingerprint(problem, f"{body.robot.hash} {body.limits} {body.weights} {values} {intervals}")
+    bounds = [(owner, b.name, b.equation, b.on, b.where) for owner, b in problem.bounds()]
+    parts = ElementBuilder(problem, layouts(problem)).parts
+    words = [bounds, *(part.words(problem) for part in parts)]
+    return fingerprint(words, f"{body.robot.hash} {body.limits} {body.weights} {values} {intervals}")
 
 
 def _axis(name: str, values: Sequence[float]) -> tuple[float, ...]:

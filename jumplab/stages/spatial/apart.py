@@ -1,4 +1,4 @@
-"""Which links come too close on a tape, when, and which face of one keeps the other away there."""
+"""Which links come too close in a motion, when, and which face of one keeps the other away there."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from jumplab.io.tape import Tape
+from jumplab.ocp.solution import PhaseSolution
 from jumplab.stages.spatial.shapes import Pair, faces, gaps
 from jumplab.stages.spatial.terms import Body
 
-STEP_S = 0.008  # between the instants that are looked at
+SAMPLES = 3  # in every interval, that are looked at
 NODES = 2  # before and after such an instant that a row is for
 LEAST_M = 0.002  # distance that links must keep; the audit asks for half of it
 
@@ -28,24 +28,37 @@ class Apart:
     pair: Pair
 
 
-def too_close(body: Body, tape: Tape, durations: Sequence[float], intervals: Sequence[int]) -> list[Apart]:
-    """Rows for the links that meet on a tape of phases with these durations [s] and intervals; none if all is well."""
-    at = np.unique(np.searchsorted(tape.t, np.arange(0.0, tape.t[-1], STEP_S)))
+def too_close(body: Body, phases: Sequence[PhaseSolution]) -> list[Apart]:
+    """Rows for the links that meet in the motion of some phases, one after the other; none if all is well."""
+    at = [np.linspace(0.0, p.duration, SAMPLES * (len(p.t) - 1) + 1) for p in phases]
+    charts = np.concatenate([p.sample(t)[0][:, : body.model.model.nv] for p, t in zip(phases, at, strict=True)])
+    configurations = body.model.to_pinocchio(charts, 0 * charts, 0 * charts)[0]
+    phase = np.repeat(np.arange(len(phases)), [len(t) for t in at])
+    node = np.concatenate([np.arange(len(t)) / SAMPLES for t in at])
     tree = body.model.model
     data, turns, places = tree.createData(), [], []
-    for q in tape.q[at]:
+    for q in configurations:
         pin.forwardKinematics(tree, data, q)
         turns.append([data.oMi[j].rotation @ b.own for j, b in enumerate(body.model.bodies, start=1)])
         places.append([data.oMi[j].translation.copy() for j in range(1, tree.njoints)])
     turns, places = np.array(turns), np.array(places)
     out: list[Apart] = []
     for i, k in body.candidates:
+        middle = [places[:, x.body] + turns[:, x.body] @ x.centre for x in (body.shapes[i], body.shapes[k])]
+        reach = sum(np.linalg.norm(x.half) for x in (body.shapes[i], body.shapes[k]))
+        if np.linalg.norm(middle[0] - middle[1], axis=1).min() > reach + LEAST_M:
+            continue
         ways = [*faces(body.shapes[i], body.shapes[k]), *faces(body.shapes[k], body.shapes[i])]
         apart = np.array([gaps(way, turns, places) for way in ways])  # (12, n)
         near = np.flatnonzero(apart.max(axis=0) < LEAST_M)
-        met = [row for row in near if _distance(body, i, k, tape.q[at[row]]) < LEAST_M]
-        if met:
-            out += _rows(ways, apart, met, tape.t[at], durations, intervals)
+        met = [row for row in near if _distance(body, i, k, configurations[row]) < LEAST_M]
+        for number in np.unique(phase[met]):
+            rows = np.array(met)[phase[met] == number]
+            best = ways[int(np.argmax(apart[:, rows].min(axis=1)))]
+            first, last = int(node[rows].min()) - NODES, int(np.ceil(node[rows].max())) + NODES
+            first, last = max(1, first), min(len(phases[number].t) - 1, last)
+            if first <= last:
+                out.append(Apart(int(number), first, last, best))
     return out
 
 
@@ -70,18 +83,3 @@ def _distance(body: Body, i: int, k: int, q: np.ndarray) -> float:
     found = coal.DistanceResult()
     coal.distance(shapes[0].geometry, poses[0], shapes[1].geometry, poses[1], coal.DistanceRequest(), found)
     return float(found.min_distance)
-
-
-def _rows(ways, apart, met: list[int], t: np.ndarray, durations, intervals) -> list[Apart]:
-    """A row for each phase in which two links meet, with the face that is violated least there."""
-    ends, out = np.cumsum(durations), []
-    phase = np.minimum(np.searchsorted(ends, t[met] + 1e-9), len(ends) - 1)
-    for k in np.unique(phase):
-        rows = np.array(met)[phase == k]
-        best = ways[int(np.argmax(apart[:, rows].min(axis=1)))]
-        step = durations[k] / intervals[k]
-        since = (t[rows] - (ends[k] - durations[k])) / step
-        first, last = max(1, int(since.min()) - NODES), min(intervals[k], int(since.max()) + 1 + NODES)
-        if first <= last:
-            out.append(Apart(int(k), first, last, best))
-    return out

@@ -23,6 +23,11 @@ INTERVALS = {"two feet": 12, "one foot": 12, "toes": 6, FLIGHT: 12}
 STEP_SHARE = 0.33  # of the leg: a step or hop of usual length
 
 
+def sole_length(robot: Robot) -> float:
+    """Length of the sole [m]."""
+    return robot.foot.toe - robot.foot.heel
+
+
 @dataclass(frozen=True)
 class ContactPhase:
     """One phase: the feet that carry, and for how long.
@@ -122,6 +127,7 @@ class Contacts:
         landings = [(k, side) for k, p in enumerate(named) for side in p.modes if k == 0 or side not in named[k - 1].modes]
         object.__setattr__(self, "landings", tuple(landings))
         self._check_places()
+        _ = self.surface
 
     def _phases(self) -> Iterable[ContactPhase]:
         for p in self.phases:
@@ -164,10 +170,10 @@ class Contacts:
     def _check_places(self) -> None:
         first = len(self.phases[0].modes)
         later = self.landings[first:]
-        new = [side for _, side in later if side not in self.phases[0].modes]
-        if new:
+        if first == 1:
+            (side,) = self.phases[0].modes
             raise InputError(
-                f"phase {self.phases[0].name!r}: the schedule begins on one foot; where the {SIDES[new[0]]} one waits "
+                f"phase {self.phases[0].name!r}: the schedule begins on one foot; where the {SIDES[1 - side]} one waits "
                 f"nobody says; begin with 'LR'"
             )
         if len(self.places) != len(later):
@@ -176,6 +182,22 @@ class Contacts:
                 f"places: {len(self.places)} given, but feet come down {len(later)} times ({came}); a foot lands only "
                 f"after it has left the ground"
             )
+
+    @property
+    def surface(self) -> tuple[float, int]:
+        """Height of the ground on which the schedule ends [m], and the number of the first place on it.
+
+        Raises :class:`InputError` if places lie on more than one height besides the first.
+        """
+        heights = [p.up_m for p in self.places]
+        height = heights[-1] if heights else 0.0
+        first = next((i for i, up in enumerate(heights) if up == height), len(heights))
+        if any(up != 0 for up in heights[:first]) or any(up != height for up in heights[first:]):
+            raise InputError(
+                f"places at the heights {', '.join(f'{up:g}' for up in heights)} m: the ground has one step up or down; "
+                f"give all places after it the same up_m, and all before it none"
+            )
+        return height, first
 
     def contact_of(self, phase: int, side: int) -> int:
         """Index into :attr:`landings` of the contact that a foot has in a phase."""
@@ -231,14 +253,14 @@ class Contacts:
     @classmethod
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` lower."""
-        d = 1.3 * STEP_SHARE * leg_length(robot) if ahead_m is None else ahead_m
+        d = STEP_SHARE * leg_length(robot) + sole_length(robot) if ahead_m is None else ahead_m
         low = Place(d, up_m=-drop_m)
         return cls.of("LR L l - LR", robot, [low, low])
 
     @classmethod
     def drop_jump(cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None) -> Contacts:
         """Off an edge, down on both feet, and up again at once."""
-        d = 1.3 * STEP_SHARE * leg_length(robot) if ahead_m is None else ahead_m
+        d = STEP_SHARE * leg_length(robot) + sole_length(robot) if ahead_m is None else ahead_m
         j = STEP_SHARE * leg_length(robot) if jump_m is None else jump_m
         low, far = Place(d, up_m=-drop_m), Place(d + j, up_m=-drop_m)
         return cls.of("LR L l - LR lr - LR", robot, [low, low, far, far])

@@ -13,7 +13,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.io.tape import Tape
-from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp
+from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp, Solution
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
@@ -21,7 +21,7 @@ from jumplab.stages.spatial import starts
 from jumplab.stages.spatial.apart import Apart, merged, too_close
 from jumplab.stages.spatial.contacts import SIDES, ContactPhase, Contacts
 from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.settings import SPATIAL_MESH, TREE_MESH, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.tape import holds_between, make_tape
 from jumplab.stages.spatial.terms import Body
 from jumplab.stages.whole_body.planner import BodyPlan
@@ -41,6 +41,7 @@ NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
 HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
+USUAL_SIZE = 4500  # variables, up to which the patience of a start is what it says; larger programs have more
 ROUNDS = 4  # of rows for links that met
 SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal
 
@@ -137,7 +138,7 @@ class SpatialPlanner:
         changes: StageChanges = StageChanges(),
         body: Body | None = None,
     ):
-        self.robot, self.mesh = robot, mesh or (SPATIAL_MESH if robot.planar else TREE_MESH)
+        self.robot, self.mesh = robot, mesh or SPATIAL_MESH
         self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
         self.body = body or Body(robot)
         self.contacts = contacts or jump_contacts(limits, self.mesh)
@@ -145,15 +146,16 @@ class SpatialPlanner:
             raise InputError(
                 f"robot {robot.name}: a leg has fewer than six joints, so it cannot be planned to stand on one foot"
             )
-        self._taped: tuple[SpatialPlan, Tape] | None = None
+        self._taped: tuple[Solution, Tape] | None = None
         self._stood: dict[tuple, tuple[float, str, float] | None] = {}
         self._options = dict(options or {})
         self._key = f"{robot.hash} {limits} {weights}" if keep else None
         self._apart: dict[tuple, Nlp] = {}
+        self._terms: dict = {}
         self.nlp = self._nlp(())
 
     def _schedule(self, apart: tuple[Apart, ...]) -> Schedule:
-        return Schedule(self.body, self.contacts, self.limits, self.weights, apart)
+        return Schedule(self.body, self.contacts, self.limits, self.weights, apart, self._terms)
 
     def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
         """The program with rows for links that met."""
@@ -215,19 +217,13 @@ class SpatialPlanner:
         begin = near if near is not None and start.name == "neighbour" else self._motion(start, task)
         found = self._solved(start, task, parameters, weights, begin, apart, attempts)
         for _ in range(ROUNDS):
-            new = self._too_close(found)
+            new = too_close(self.body, list(found.solution.phases.values()))
             if not new:
                 break
             apart = merged(apart, new)
             again = replace(start, name="links apart", options=WARM | {"acceptable_iter": 1, "mu_init": 1e-3})
             found = self._solved(again, task, parameters, weights, found, apart, attempts)
         return found
-
-    def _too_close(self, found: SpatialPlan) -> list[Apart]:
-        phases = list(found.solution.phases.values())
-        return too_close(
-            self.body, self.tape(found), [p.duration for p in phases], [len(p.j) for p in phases]
-        )
 
     def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
         schedule = self._schedule(())
@@ -239,7 +235,8 @@ class SpatialPlanner:
     def _solved(self, start: Start, task, parameters, weights, begin, apart, attempts: list, **how) -> SpatialPlan:
         """One solve; what came of it is added to ``attempts``."""
         schedule, nlp = self._schedule(apart), self._nlp(apart)
-        options = {**IPOPT, **start.options, "max_cpu_time": start.patience_s, **self._options}
+        patience_s = start.patience_s * max(1.0, nlp.assembled.size / USUAL_SIZE)
+        options = {**IPOPT, **start.options, "max_cpu_time": patience_s, **self._options}
         nlp = nlp.with_options(options, HOLD if start.held else None)
         if isinstance(begin, SpatialPlan):
             guess = begin.solution.guess({p.name: p.intervals for p in self.contacts.phases})
@@ -255,8 +252,9 @@ class SpatialPlanner:
             raise
         s = solution.statistics
         attempts.append(Attempt(start.name, words, s.iterations, time.process_time() - began, s.status))
-        edge = self._edge(task)[0] - self.robot.foot.toe + float(self.robot.foot.center[0])
-        return SpatialPlan(task, solution, schedule, edge, self.limits)
+        origin = self.robot.foot.toe - float(self.robot.foot.center[0])
+        edge = self._edge(task)[0] if self.contacts.ends == "touchdown" else self._step()[1]
+        return SpatialPlan(task, solution, schedule, edge - origin, self.limits)
 
     def _settled(self, found: SpatialPlan, parameters, weights, attempts: list) -> SpatialPlan:
         """The plan, solved on where it passes limits between the nodes, first to the end, then on a finer mesh."""
@@ -318,8 +316,8 @@ class SpatialPlanner:
 
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan; that of the last one is kept."""
-        if self._taped is None or self._taped[0] is not plan:
-            self._taped = plan, make_tape(plan.schedule, plan.solution.phases, plan.task.gravity)
+        if self._taped is None or self._taped[0] is not plan.solution:
+            self._taped = plan.solution, make_tape(plan.schedule, plan.solution.phases, plan.task.gravity)
         return self._taped[1]
 
     def _references(self) -> dict[str, dict[str, np.ndarray]]:
@@ -335,6 +333,9 @@ class SpatialPlanner:
                     shape = 4 * u * (1 - u)
                     # in a jump the soles come down steeply, in a step they hardly leave the ground else
                     height = self.limits.clearance_m * (shape**3 if last else shape)
+                    if phases[k].flying:
+                        s = np.linspace(0, 1, len(u))
+                        height = np.maximum(height, self.limits.clearance_m * (4 * s * (1 - s)) ** 3)
                     out[phases[k].name][f"{SIDES[side]}_clearance"] = height[None]
         return out
 
@@ -349,11 +350,35 @@ class SpatialPlanner:
         values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
         values["straight"] = float(task.in_plane and self.contacts.ends == "touchdown")
+        if self.contacts.ends == "rest":
+            height, edge, room = self._step()
+            edge -= np.sign(height) * min(self.limits.edge_step_m, room)
+            return values | dict(platform=height, edge=edge, along=(1.0, 0.0), gravity=task.gravity)
         ways = np.cos(task.along_rad), np.sin(task.along_rad)
         edge, room = self._edge(task)
         # for clearance, also between the nodes, a platform counts as reaching further
         edge -= np.sign(task.platform_m) * min(self.limits.edge_step_m, room)
         return values | dict(edge=edge, along=ways, gravity=task.gravity)
+
+    def _step(self) -> tuple[float, float, float]:
+        """Height of the second surface of a schedule [m], where ahead of the world's origin it begins [m], and how far
+        the upper surface could reach further before it met a sole [m].
+        """
+        (height, first), room = self.contacts.surface, self.limits.edge_before_heel_m
+        length, toes = 2 * self.body.half_m, float(self.body.places[:, 0].mean())
+        near = max([toes, *(toes + p.ahead_m for p in self.contacts.places[:first])])
+        far = min([toes + p.ahead_m for p in self.contacts.places[first:]], default=near) - length
+        if height == 0:
+            return 0.0, 0.0, 0.0
+        if far - near < 2 * room:
+            raise InfeasibleError(
+                f"places on a surface {height:g} m higher: it would begin {far - near:.2f} m ahead of the toes that "
+                f"leave, which takes {2 * room:.2f} m; put the places {near + 2 * room + length - toes:.2f} m ahead",
+                number="ahead_m",
+                bound=near + 2 * room + length - toes,
+            )
+        edge = near + room if height < 0 else far - room
+        return height, edge, max(0.0, (far - edge if height < 0 else edge - near) - 0.01)
 
     def _check_standing(self, start: np.ndarray, gravity: float) -> None:
         """Refuse a robot whose motors cannot hold the posture in which it waits."""

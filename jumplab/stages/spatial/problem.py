@@ -39,11 +39,13 @@ class Schedule:
         limits: SpatialLimits,
         weights: SpatialWeights,
         apart: Iterable[Apart] = (),
+        terms: dict[tuple, SpatialTerms] | None = None,
         name: str = "spatial",
     ):
+        """``terms`` are those of the modes that are known already; others are added."""
         self.body, self.contacts, self.limits, self.weights, self.name = body, contacts, limits, weights, name
         self.apart = tuple(apart)
-        self.terms = {}
+        self.terms = {} if terms is None else terms
         for phase in contacts.phases:
             key = mode_key(phase.modes)
             if key not in self.terms:
@@ -75,8 +77,11 @@ class Schedule:
             # the first node is given, so it needs no rows
             terms += b.foot_rows(side, joined or k == 0, side in landed)
         terms += [b.swing_rows(side) for side in (0, 1) if side not in b.modes]
-        if given.feet == "LR":
-            terms.append(b.loads())
+        around = self.contacts.phases[max(k - 1, 0) : k + 2]
+        if given.feet == "LR" and all(p.flying or len(p.modes) == 2 for p in around):
+            terms.append(b.loads())  # where one foot steps the load goes from foot to foot
+        if len(b.modes) == 1:
+            terms += [b.torsion(side) for side in b.modes]
         if b.flying:
             terms += b.flight_rows()
         if last and self.contacts.ends == "touchdown":

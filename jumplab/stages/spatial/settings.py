@@ -17,6 +17,7 @@ class SpatialLimits:
     friction: float = 0.42  # below the lowest friction that the trials simulate (0.5), also between the nodes
     heel_margin_m: float = 0.03  # CoP ahead of the heel; at the toe none, it ends there before the heel rises
     side_margin_m: float = 0.02  # CoP inside the sole's sides
+    torsion_arm_m: float = 0.045  # on which friction resists the spin of a foot that carries alone
     foot_share: float = 0.15  # of the weight, on each flat foot at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
@@ -28,6 +29,7 @@ class SpatialLimits:
     flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
     clearance_m: float = 0.035  # of the soles over the ground in mid-flight
     body_clearance_m: float = 0.05  # of knees and hands over the ground
+    ankle_margin_m: float = 0.005  # of the ankle of a foot in the air, over its height in the stance
     sides_share: float = 0.45  # of the stance's distance between left and right leg, seen from the trunk
     hands_inward_m: float = 0.05  # by which hands may be further in than in the stance
     link_distance_m: float = 0.003  # between links that came too close without it
@@ -68,6 +70,5 @@ class SpatialWeights:
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
 
 
-SPATIAL_MESH = Mesh(12, 12, 16)  # coarse: the tape is exact between the nodes
-TREE_MESH = Mesh(20, 12, 16)  # of robots that no plane describes: weak ankles pass their limits between fewer nodes
+SPATIAL_MESH = Mesh(12, 8, 12)  # coarse: the tape is exact between the nodes
 FLIP_MESH = Mesh(20, 16, 28)  # a flip winds up longer, and turns faster

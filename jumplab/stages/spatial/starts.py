@@ -19,6 +19,7 @@ CROUCH, LANDED, TUCK = 0.20, 0.12, 0.15
 BOW, PITCH, HEEL_UP = 0.35, 0.12, 0.4
 CROUCH_S = 0.35  # before and after a flight
 SWING = 0.1  # of the leg, by which a foot that steps is lifted
+EARLY = 0.15  # of the way of a flight, which the base has made before it, and makes after it
 REACHED = 0.3  # [m, rad] a start whose feet are farther off their places is none
 IK_STEPS, DAMPING, IK_STEP_RAD = 10, 1e-4, 0.3
 RATE_BOX, ACCELERATION_BOX = 15.0, 150.0  # of differences, where the start is rough
@@ -54,8 +55,13 @@ class Reach:
         self.low, self.high = np.minimum(low, body.stance[BASE:]), np.maximum(high, body.stance[BASE:])
         self.tip = pin.SE3(np.eye(3), np.array(body.robot.foot.tip))
 
-    def __call__(self, chart: np.ndarray, goals: Mapping[int, pin.SE3]) -> tuple[np.ndarray, float]:
-        """The chart with its legs moved so that the middles of the toe edges are at ``goals``; what is left [m, rad]."""
+    def __call__(
+        self, chart: np.ndarray, goals: Mapping[int, pin.SE3], carrying: list[int]
+    ) -> tuple[np.ndarray, float]:
+        """The chart with its legs moved so that the middles of the toe edges are at ``goals``.
+
+        And by how much those that are ``carrying`` are still off [m, rad].
+        """
         chart, left = chart.copy(), 0.0
         for _ in range(IK_STEPS):
             q = self.body.model.to_pinocchio(chart[None], *np.zeros((2, 1, len(chart))))[0][0]
@@ -71,10 +77,9 @@ class Reach:
                 slope = frame[:, self.columns[side]]
                 step = slope.T @ np.linalg.solve(slope @ slope.T + DAMPING * np.eye(6), off)
                 chart[self.columns[side]] += np.clip(step, -IK_STEP_RAD, IK_STEP_RAD)
-                left = max(left, float(np.abs(off).max()))
+                if side in carrying:
+                    left = max(left, float(np.abs(off).max()))
             chart[BASE:] = np.clip(chart[BASE:], self.low, self.high)
-            if left < 1e-6:
-                break
         return chart, left
 
 
@@ -96,15 +101,20 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
     base = body.stance[:BASE]
     ahead = base[0] - body.places[:, 0].mean()
     keys = [(0.0, np.array([base[0], base[1], 0.0, 0.0]))]
+    above = [
+        None if p.flying else _over([holds[contacts.contact_of(k, s)] for s in p.modes], ahead)
+        for k, p in enumerate(contacts.phases)
+    ]
+    if contacts.ends == "touchdown":
+        above.append(_over(_goal(schedule, task), ahead))
     for k, p in enumerate(contacts.phases):
         if not p.flying:
-            keys.append(((starts[k] + starts[k + 1]) / 2, _over([holds[contacts.contact_of(k, s)] for s in p.modes], ahead)))
-    if contacts.ends == "touchdown":
-        keys.append((starts[-1], _over(_goal(schedule, task), ahead)))
-        keys.insert(-1, (starts[last] - 0.05, keys[-2][1]))
+            keys.append(((starts[k] + starts[k + 1]) / 2, above[k]))
+            continue
+        way = above[k + 1] - above[k - 1]
+        keys += [(starts[k], above[k - 1] + EARLY * way), (starts[k + 1], above[k + 1] - EARLY * way)]
     at, path = np.array([t for t, _ in keys]), np.array([x for _, x in keys])
-    width = 12 if contacts.ends == "rest" else 4
-    smooth = [gaussian_filter1d(np.interp(fine, at, path[:, i]), width, mode="nearest") for i in range(4)]
+    smooth = [gaussian_filter1d(np.interp(fine, at, path[:, i]), 6, mode="nearest") for i in range(4)]
     height, pitch = base[2] + smooth[3], np.full_like(fine, base[5])
     for k, p in enumerate(contacts.phases):
         if p.flying:
@@ -117,11 +127,12 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
         for t in np.linspace(starts[k], starts[k + 1], p.intervals + 1):
             x, y, z, yaw, lean = (np.interp(t, fine, c) for c in curves)
             chart[:BASE] = [x, y, z, yaw, base[4], lean]
-            goals = {
-                side: _foot(schedule, holds, task, k, side, t, starts, leg, lean - base[5]) for side in (0, 1)
-            }
-            chart, left = reach(chart, goals)
-            missed = max(missed, left if not p.flying else 0.0)
+            goals = {side: _foot(schedule, holds, task, k, side, t, starts, leg) for side in (0, 1)}
+            chart, left = reach(chart, goals, list(p.modes))
+            if left > REACHED:  # a leg that was drawn somewhere is no beginning
+                chart[BASE:] = body.stance[BASE:]
+                chart, left = reach(chart, goals, list(p.modes))
+            missed = max(missed, left)
             rows.append(chart.copy())
         charts.append(np.array(rows))
     charts[0][0] = body.stance
@@ -159,7 +170,7 @@ def _flown(t, start: float, end: float, leg: float, gravity: float, height: np.n
     pitch += (BOW - pitch[0]) * np.sin(np.pi * before) + (PITCH - pitch[0]) * (u > 0) * (1 - after)
 
 
-def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray, leg: float, lean: float) -> pin.SE3:
+def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray, leg: float) -> pin.SE3:
     """Where the middle of a toe edge is at one instant."""
     contacts = schedule.contacts
     phases = contacts.phases
@@ -177,7 +188,8 @@ def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray
     else:
         b = _goal(schedule, task)[side] if contacts.ends == "touchdown" else a
     u = (t - begin) / (end - begin)
-    x, y, z, yaw = a + (b - a) * u**3 * (10 - 15 * u + 6 * u * u)
+    x, y, z, yaw = a + (b - a) * _smooth(u)
+    z = a[2] + (b[2] - a[2]) * _smooth(2 * u if b[2] > a[2] else 2 * u - 1)  # above an edge before it, and beyond
     lift = SWING * leg * np.sin(np.pi * u)
     if phases[k].flying:
         s = (t - starts[k]) / (starts[k + 1] - starts[k])
@@ -190,6 +202,12 @@ def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray
         s = (t - starts[k]) / (starts[k + 1] - starts[k])
         way = way @ pin.rpy.rpyToMatrix(0.0, task.rotation_rad * s, 0.0)
     return pin.SE3(way, place)
+
+
+def _smooth(u: float) -> float:
+    """From 0 at 0 to 1 at 1, at rest at both."""
+    u = float(np.clip(u, 0.0, 1.0))
+    return u**3 * (10 - 15 * u + 6 * u * u)
 
 
 def still(schedule: Schedule, task: JumpTask) -> Motion:

@@ -10,31 +10,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 
 from jumplab.io.tape import RATE_HZ, Tape
-from jumplab.models.spatial import SpatialModel, SpatialState
+from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.contacts import SIDES
+from jumplab.stages.spatial.legs import LEG_STEPS, Legs, Motion
 from jumplab.stages.spatial.problem import Schedule
 from jumplab.stages.spatial.terms import BASE, EDGES, Body, SpatialTerms
 
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # over which a phase passes from where the one before ended on the tape to its own plan
-LEG_STEPS = 3  # of Newton's method from errors below a millimetre
-LANDINGS = 2  # corrections of a flight's end, each a hundred times smaller than the one before
+LANDINGS, LANDED_RAD = 6, 1e-7  # corrections of a flight's end, each ten times smaller than the one before; the last
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
 FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 AIR, TOE, FLAT = 0, 1, 2  # codes of a foot in the tape's ``contacts``
 CODES = {"toe": TOE, "flat": FLAT}
-
-Motion = tuple[np.ndarray, np.ndarray, np.ndarray]  # charts, rates, accelerations, each (n, 6 + joints)
 
 
 @dataclass(frozen=True)
@@ -136,56 +133,6 @@ def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
 
 
 # on the ground ------------------------------------------------------------------------------------------------------
-class Legs:
-    """Feet that carry as functions of the chart, mapped over many instants."""
-
-    def __init__(self, b: SpatialTerms, holds: Mapping[int, np.ndarray]):
-        """``holds`` are x, y, z [m] and yaw [rad] of the middle of the toe edge, by side."""
-        self.b, body, n = b, b.body, b.nv
-        q, v, a = (ca.SX.sym(k, n) for k in "qva")
-        state, rows, self.pitches = SpatialState(b.model, q, q, q), [], {}
-        for side, hold in holds.items():
-            turn = state.rotation(body.feet[side]) @ ca.DM(body.axes[side])
-            place = state.point(body.feet[side], body.tips[side]) - ca.DM(hold[:3])
-            short = body.short and side == 1
-            rows.append(place[[0, 2]] if short else place)
-            rows.append(ca.vertcat(np.cos(hold[3]) * turn[1, 0] - np.sin(hold[3]) * turn[0, 0], turn[2, 1], turn[2, 0]))
-            self.pitches[side] = sum(x.numel() for x in rows) - 1
-            if short:
-                rows.append(q[[3, 4]])
-        rows = ca.vertcat(*rows)
-        slope = ca.jtimes(rows, q, v)
-        drift = ca.jtimes(slope, ca.vertcat(q, v), ca.vertcat(v, a))
-        self._levels = ca.Function("levels", [q, v, a], [rows, slope, drift], {"cse": True})
-        self._slope = ca.Function("slope", [q], [rows, ca.jacobian(rows, q)], {"cse": True})
-        self.columns = np.array([1, 3, 4] * body.short + [k for side in holds for k in body.legs[side]])
-
-    def held(self, motion: Motion, pitch: Mapping[int, Motion]) -> Motion:
-        """The motion with the legs moved so that the feet stay in their places.
-
-        ``pitch`` are angle, rate and acceleration (n,) of each foot on its toes, by side.
-        """
-        n, (q, v, a) = len(motion[0]), (x.copy() for x in motion)
-        goals = np.zeros((3, n, self._levels.size1_out(0)))
-        for side, (angle, rate, gain) in pitch.items():
-            s, c, at = np.sin(angle), np.cos(angle), self.pitches[side]
-            goals[0, :, at], goals[1, :, at], goals[2, :, at] = -s, -c * rate, s * rate**2 - c * gain
-        for _ in range(LEG_STEPS):
-            rows, slope = (x.full() for x in self._slope.map(n)(q.T))
-            slope = slope.reshape(rows.shape[0], n, -1).transpose(1, 0, 2)
-            q[:, self.columns] += self._solved(slope, goals[0] - rows.T)
-        slope = self._slope.map(n)(q.T)[1].full().reshape(goals.shape[2], n, -1).transpose(1, 0, 2)
-        v[:, self.columns] += self._solved(slope, goals[1] - self._levels.map(n)(q.T, v.T, a.T)[1].full().T)
-        a[:, self.columns] += self._solved(slope, goals[2] - self._levels.map(n)(q.T, v.T, a.T)[2].full().T)
-        return q, v, a
-
-    def _solved(self, slope: np.ndarray, off: np.ndarray) -> np.ndarray:
-        """Least changes (n, .) of the columns that make up for what rows are off by (n, .)."""
-        rows = slope[:, :, self.columns]
-        across = rows.transpose(0, 2, 1)
-        return (across @ np.linalg.solve(rows @ across, off[..., None]))[..., 0]
-
-
 def holds_of(phase: PhaseSolution, b: SpatialTerms) -> dict[int, np.ndarray]:
     """x, y, z [m] and yaw [rad] of the middle of the toe edge of each foot that carries, by side."""
     return {
@@ -225,8 +172,7 @@ def _ground(schedule, solved, numbers: range, before: Piece | None, t, starts, g
             motion = [x + y for x, y in zip(motion, gone, strict=True)]
         pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
         holds = holds_of(phase, b)
-        legs = Legs(b, holds)
-        motion = _balanced(legs, motion, pitch, holds, t[own], gravity)
+        motion = _balanced(b.legs, motion, pitch, holds, t[own], gravity)
         parts.append((motion, *_planned(b, phase, holds, at)))
     motions, wrenches, codes = zip(*parts, strict=True)
     motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
@@ -261,7 +207,7 @@ def _balanced(legs: Legs, motion: Motion, pitch, holds, t: np.ndarray, gravity: 
 
     b = legs.b
     if len(b.raised) < len(b.modes) or not _in_line(list(holds.values())) or len(t) < 2:
-        return legs.held(motion, pitch)
+        return legs.held(motion, holds, pitch)
     q, v, a = (y.copy() for y in motion)
     edge = np.mean(list(holds.values()), axis=0)
     across, ahead = (pin.rpy.rpyToMatrix(0.0, 0.0, edge[3])[:, k] for k in (1, 0))
@@ -269,7 +215,7 @@ def _balanced(legs: Legs, motion: Motion, pitch, holds, t: np.ndarray, gravity: 
     push[:3] = ahead
 
     def moment(change: np.ndarray | float = 0.0):
-        need = np.array(list(_needed(b.model, *legs.held((q, v, a + change), pitch), gravity)))
+        need = np.array(list(_needed(b.model, *legs.held((q, v, a + change), holds, pitch), gravity)))
         return (need[:, 3:] - np.cross(edge[:3], need[:, :3])) @ across
 
     missing = moment()
@@ -279,7 +225,7 @@ def _balanced(legs: Legs, motion: Motion, pitch, holds, t: np.ndarray, gravity: 
         rate = cumulative_trapezoid(more, t, initial=0.0)
         for y, change in ((q, cumulative_trapezoid(rate, t, initial=0.0)), (v, rate), (a, more)):
             y += change[:, None] * push
-    return legs.held((q, v, a), pitch)
+    return legs.held((q, v, a), holds, pitch)
 
 
 def _in_line(holds: list[np.ndarray]) -> bool:
@@ -329,6 +275,8 @@ def _flight(body: Body, flight: PhaseSolution, before: Piece, t, start: float, e
 
     for _ in range(LANDINGS):
         shift, rate = _missed(body, flight, [x[-1] for x in moved()[:2]], ends)
+        if max(np.abs(shift).max(), np.abs(rate).max()) < LANDED_RAD:
+            break
         bends = _arriving(halves, since[-1], shift, rate)
         joints = [x + y for x, y in zip(joints, bends, strict=True)]
     q, v, a = model.charts(*moved(), near=chart0[0][3:6])

@@ -16,6 +16,7 @@ from jumplab.robot import Robot
 from jumplab.robot.reduction import mirror
 from jumplab.robot.stance import knees, stance_configuration
 from jumplab.stages.spatial.contacts import SIDES
+from jumplab.stages.spatial.legs import Legs
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.shapes import Box, boxes, candidates
 from jumplab.stages.whole_body.terms import POSITIVE, cost, row
@@ -29,6 +30,7 @@ BASE = len(CHART)
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
 SPIN_SCALE, ACCELERATION_SCALE = 10.0, 10.0  # [kg m^2/s], [m/s^2, rad/s^2] for conditioning
 PLACE_SCALE = 0.1  # [m]
+TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vanish
 
 
 class Body:
@@ -43,6 +45,7 @@ class Body:
     corners : (2, 4, 3) of the soles, in them: toe left, toe right, heel left, heel right.
     places : (2, 3) middles of the toe edges in the stance [m].
     legs : columns of the chart that follow from a foot that stands: six joints of each leg, or all it has.
+    ankle_m : height of the feet's joints in the stance [m].
     motors : key of :attr:`.Robot.actuators` -> (joints,).
     """
 
@@ -71,6 +74,7 @@ class Body:
         rows = [robot.actuators[name] for name in self.joint_names]
         self.motors = {key: np.array([r[key] for r in rows]) for key in rows[0]}
         self.legs = [self._leg(side, configuration) for side in (0, 1)]
+        self.ankle_m = float(data.oMi[self.feet[0] + 1].translation[2])
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -121,6 +125,12 @@ class Body:
         return candidates(self.robot, self.model, self.shapes)
 
     @cached_property
+    def shank_m(self) -> float:
+        """Half the thickness of the shank [m]: with a level shank its face is that much lower than the knee."""
+        halves = [np.sort(x.half)[0] for x in self.shapes if x.body in {1 + k for k, _, _ in self.knees}]
+        return float(max(halves, default=0.0))
+
+    @cached_property
     def limb_points(self) -> list[tuple[int, np.ndarray]]:
         """Knees, and the far ends of the bodies that end a limb but are no feet: (body, place in it)."""
         points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
@@ -166,6 +176,11 @@ class SpatialTerms:
         """The mode in a word."""
         letters = {0: "L", 1: "R"}
         return "".join(letters[s] if m == "flat" else letters[s].lower() for s, m in self.modes.items()) or "-"
+
+    @cached_property
+    def legs(self) -> Legs:
+        """The legs that follow from the feet that carry."""
+        return Legs(self)
 
     def _sole_points(self, mode: str) -> np.ndarray:
         """Points of the sole where forces act (k, 3), seen from the middle of the toe edge [m]; the toes' first."""
@@ -299,7 +314,9 @@ class SpatialTerms:
             return ca.vertcat(*(x[2] - self.ground(p, x) for x in places))
 
         how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
-        return row("body clearance", "ours", "m", heights, self.limits.body_clearance_m, np.inf, **how)
+        least = np.full(len(self.body.limb_points), self.limits.body_clearance_m)
+        least[:2] += self.body.shank_m
+        return row("body clearance", "ours", "m", heights, least, np.inf, **how)
 
     def sides_apart(self) -> Term:
         """Left and right knees, ankles, toes and heels keep a share of their distance in the stance, seen from the
@@ -391,13 +408,32 @@ class SpatialTerms:
         least = self.limits.foot_share * self.mg
         return row("load of each foot", "ours", "N", forces, least, np.inf, scale=self.mg, skip=(0, 0))
 
+    def torsion(self, side: int) -> Term:
+        """Friction holds a foot that carries alone against the moment about the vertical through its CoP."""
+        arm = self.limits.friction * self.limits.torsion_arm_m
+
+        def left(p):
+            force, moment = ca.SX.zeros(3), ca.SX.zeros(3)
+            for place, f in zip(self.points[side], self.point_forces(p, side), strict=True):
+                force += f / self.mg
+                moment += cross(ca.DM(place), f / self.mg)
+            twist = ca.dot(force, moment)  # that moment times the load
+            return ca.vertcat(arm * force[2] ** 2 - twist, arm * force[2] ** 2 + twist)
+
+        words = f"spin of {SIDES[side]} foot", "ours: friction", "m, of the squared weight"
+        return row(*words, left, -TORSION_SLACK_M, np.inf, scale=MOMENT_ARM_M / 10, group="torsion")
+
     def swing_rows(self, side: int) -> Term:
-        """A foot in the air keeps its sole's corners off the ground, by as much as the references ask for."""
+        """A foot in the air keeps its sole's corners off the ground, by as much as the references ask for, and its ankle
+        as high as it stands, or the shank would graze."""
+        k, least = self.body.feet[side], self.body.ankle_m + self.limits.ankle_margin_m
 
         def heights(p):
-            places = [self.state(p).point(self.body.feet[side], c) for c in self.body.corners[side]]
+            places = [self.state(p).point(k, c) for c in self.body.corners[side]]
             asked = getattr(p.ref, f"{SIDES[side]}_clearance")
-            return ca.vertcat(*(x[2] - self.ground(p, x) - asked for x in places))
+            ankle = self.state(p).point(k, np.zeros(3))
+            above = [x[2] - self.ground(p, x) - asked for x in places]
+            return ca.vertcat(*above, ankle[2] - self.ground(p, ankle) - least)
 
         how = {"scale": PLACE_SCALE, "skip": (1, 1), "group": "clearance"}
         return row(f"clearance of {SIDES[side]} sole", "ours", "m", heights, *POSITIVE, **how)

@@ -1,0 +1,297 @@
+"""Contact schedules: what they say of feet and places, the usual ones, and those that cannot be."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from jumplab.errors import InputError
+from jumplab.ocp.problem import layouts
+from jumplab.robot.stance import leg_length
+from jumplab.stages.spatial import ContactPhase, Contacts, Place, SpatialLimits, SpatialWeights
+from jumplab.stages.spatial.contacts import INTERVALS, STEP_SHARE, TIMES
+from jumplab.stages.spatial.planner import jump_contacts
+from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.spatial.terms import Body
+from jumplab.stages.whole_body import Mesh
+
+LEAP = "LR L lR R r - L LR"
+
+
+def phases(words: str, **how) -> tuple[ContactPhase, ...]:
+    """A phase of half a second for each word."""
+    return tuple(ContactPhase(word, (0.1, 1.0), 0.5, **how) for word in words.split())
+
+
+def one(word: str) -> ContactPhase:
+    return phases(word)[0]
+
+
+def schedule(words: str, places: int = 0, **how) -> Contacts:
+    return Contacts(phases(words), tuple(Place(0.3 + 0.1 * k) for k in range(places)), **how)
+
+
+def reached(contacts: Contacts) -> list[float]:
+    """How far ahead the places are [m]."""
+    return [p.ahead_m for p in contacts.places]
+
+
+def letters(contacts: Contacts) -> str:
+    return " ".join(p.feet for p in contacts.phases)
+
+
+# what a schedule says -----------------------------------------------------------------------------
+def test_letters_are_feet_and_how_they_stand():
+    modes = [one(word).modes for word in ("LR", "lR", "Lr", "l", "R", "-")]
+    flat, toe = "flat", "toe"
+    assert modes == [
+        {0: flat, 1: flat},
+        {0: toe, 1: flat},
+        {0: flat, 1: toe},
+        {0: toe},
+        {1: flat},
+        {},
+    ]
+    assert [one(word).flying for word in ("LR", "-")] == [False, True]
+
+
+def test_phases_have_names_of_their_own():
+    assert [p.name for p in schedule("LR lr - LR", 2).phases] == ["1 LR", "2 lr", "3 -", "4 LR"]
+    named = ContactPhase("LR", (0.1, 1.0), 0.5, name="push"), ContactPhase("L", (0.1, 1.0), 0.5)
+    assert [p.name for p in Contacts(named).phases] == ["push", "2 L"]
+
+
+def test_a_foot_that_comes_down_has_a_new_contact():
+    """A heel that rises or comes down again leaves the foot where it is."""
+    leap = schedule(LEAP, 3)
+    assert leap.landings == ((0, 0), (0, 1), (2, 1), (6, 0), (7, 1))
+    found = []
+    for k, p in enumerate(leap.phases):
+        found.append({side: leap.contact_of(k, side) for side in p.modes})
+    assert found == [{0: 0, 1: 1}, {0: 0}, {0: 0, 1: 2}, {1: 2}, {1: 2}, {}, {0: 3}, {0: 3, 1: 4}]
+    stands = schedule("LR lr LR L LR", 1)
+    assert stands.landings == ((0, 0), (0, 1), (4, 1)) and stands.contact_of(2, 1) == 1
+
+
+def stairs(words: str, *heights: float) -> Contacts:
+    return Contacts(phases(words), tuple(Place(0.3, up_m=up) for up in heights))
+
+
+@pytest.mark.parametrize(
+    ("heights", "surface"),
+    [
+        ((), (0.0, 0)),
+        ((0.0, 0.0), (0.0, 0)),
+        ((-0.3, -0.3), (-0.3, 0)),
+        ((0.0, 0.0, 0.2, 0.2), (0.2, 2)),
+    ],
+)
+def test_the_ground_has_one_step(heights, surface):
+    words = "LR" + " - LR" * (len(heights) // 2)
+    assert stairs(words, *heights).surface == surface
+
+
+# the usual ones -----------------------------------------------------------------------------------
+def usual(robot) -> dict[str, tuple[Contacts, str, list[float], float]]:
+    """Name -> (schedule, its letters, its places in steps of usual length, how high they are [m]).
+
+    Off an edge a step is longer by a sole.
+    """
+    off = 1 + (robot.foot.toe - robot.foot.heel) / (STEP_SHARE * leg_length(robot))
+    return {
+        "hop": (Contacts.hop(robot), "LR L l - LR", [1, 1], 0.0),
+        "hop off the right": (Contacts.hop(robot, foot="right"), "LR R r - LR", [1, 1], 0.0),
+        "hop onto the same": (Contacts.hop(robot, same=True), "LR L l - L LR", [1, 1], 0.0),
+        "run up": (Contacts.run_up(robot), "LR L lR R r - LR", [1, 2.6, 2.6], 0.0),
+        "two steps": (Contacts.run_up(robot, 2), "LR L lR R Lr L l - LR", [1, 1.9, 3.5, 3.5], 0.0),
+        "leap": (Contacts.leap(robot), LEAP, [1, 2.4, 2.4], 0.0),
+        "bound": (Contacts.bound(robot), "LR lr - LR lr - LR", [1, 1, 2, 2], 0.0),
+        "step off": (Contacts.step_off(robot, 0.3), "LR L l - LR", [off, off], -0.3),
+        "drop jump": (
+            Contacts.drop_jump(robot, 0.3),
+            "LR L l - LR lr - LR",
+            [off, off, off + 1, off + 1],
+            -0.3,
+        ),
+        "hurdle": (Contacts.hurdle(robot), LEAP, [1, 2.8, 2.8], 0.0),
+    }
+
+
+def test_the_usual_schedules_have_their_letters_and_places(bhr):
+    step = STEP_SHARE * leg_length(bhr)
+    for name, (contacts, said, ahead, up) in usual(bhr).items():
+        assert letters(contacts) == said, name
+        assert contacts.ends == "rest" and contacts.arrival == "soft", name
+        assert reached(contacts) == pytest.approx([step * x for x in ahead]), name
+        assert {p.up_m for p in contacts.places} == {up} and contacts.surface == (up, 0), name
+        assert {(p.left_m, p.turn_rad) for p in contacts.places} == {(0.0, 0.0)}, name
+        later = contacts.landings[2:]
+        assert len(later) == len(contacts.places), name
+        assert all(a.ahead_m <= b.ahead_m for a, b in pairwise(contacts.places)), name
+
+
+def test_lengths_may_be_told(bhr):
+    assert reached(Contacts.hop(bhr, 0.1)) == [0.1, 0.1]
+    bound, off = Contacts.bound(bhr, 3, 0.2), Contacts.drop_jump(bhr, 0.3, 0.4, 0.5)
+    assert reached(bound) == pytest.approx([0.2, 0.2, 0.4, 0.4, 0.6, 0.6])
+    assert reached(off) == pytest.approx([0.4, 0.4, 0.9, 0.9])
+
+
+def test_phases_take_times_that_suit_the_legs(bhr):
+    """Twice the time under a quarter of gravity; a solve begins within the bounds."""
+    unit = np.sqrt(leg_length(bhr) / bhr.gravity)
+    kinds = {"LR": "two feet", "L": "one foot", "r": "toes", "lr": "toes", "lR": "toes", "-": "-"}
+    for feet, kind in kinds.items():
+        p = ContactPhase.usual(feet, bhr)
+        assert (*p.time_s, p.guess_s) == pytest.approx([x * unit for x in TIMES[kind]]), feet
+        assert p.time_s[0] <= p.guess_s <= p.time_s[1] and p.intervals == INTERVALS[kind]
+        slow = ContactPhase.usual(feet, bhr.under_gravity(bhr.gravity / 4))
+        assert slow.guess_s == pytest.approx(2 * p.guess_s)
+    told = ContactPhase.usual("LR", bhr, (2.0, 3.0))
+    assert (told.time_s, told.guess_s) == ((2.0, 3.0), 2.0)
+
+
+def test_a_standing_jump_ends_in_flight():
+    limits = SpatialLimits()
+    contacts = jump_contacts(limits, Mesh(12, 6, 10))
+    assert letters(contacts) == "LR lr -" and contacts.ends == "touchdown"
+    found = [(p.name, p.time_s, p.intervals) for p in contacts.phases]
+    assert found == [
+        ("flat", limits.flat_s, 12),
+        ("toe", limits.toe_s, 6),
+        ("flight", limits.flight_s, 10),
+    ]
+
+
+# as a problem -------------------------------------------------------------------------------------
+def test_phases_share_what_does_not_jump(bhr):
+    """Where a foot lands, forces and accelerations jump; the rows of what is shared stand only once."""
+    limits, weights = SpatialLimits(), SpatialWeights()
+    phases = Schedule(Body(bhr), Contacts.leap(bhr), limits, weights).problem().phases
+    assert [p.shared for p in phases] == ["", "qvaz", "qv", "qvaz", "qvaz", "qvaz", "qv", "qv"]
+    skips = [{t.name: t.skip[0] for t in p.terms} for p in phases]
+    levels = "in place", "still", "held"
+    stood, landed, joined = (1, 1, 0), (0, 0, 0), (1, 1, 1)
+    for k, side, expected in (
+        (1, "left", joined),
+        (2, "left", stood),
+        (2, "right", landed),
+        (3, "right", joined),
+        (6, "left", landed),
+        (7, "left", stood),
+        (7, "right", landed),
+    ):
+        assert tuple(skips[k][f"{side} foot {level}"] for level in levels) == expected, (k, side)
+    assert [x["base forces"] for x in skips] == [0, 1, 0, 1, 1, 1, 0, 0]
+
+
+def test_footholds_are_one_unknown_in_all_phases_of_a_contact(bhr):
+    body = Body(bhr)
+    place = Place(0.3, 0.05, 0.2, 0.0, (0.01, 0.02), 0.1)
+    contacts = Contacts.of("LR L LR lr LR", bhr, [place])
+    schedule = Schedule(body, contacts, SpatialLimits(), SpatialWeights())
+    x, y, z = body.places[1]
+    moved = [(x + 0.29, x + 0.31), (y + 0.03, y + 0.07), (z, z), (0.1, 0.3)]
+    np.testing.assert_allclose(schedule.foothold(2), moved, atol=1e-12)
+    np.testing.assert_allclose(schedule.foothold(1), [(x, x), (y, y), (z, z), (0.0, 0.0)])
+    found = layouts(schedule.problem())
+    at = {}
+    for phase in schedule.problem().phases:
+        at[phase.name] = dict(zip(phase.constants, found[phase.name].constants[1:].tolist(), strict=True))
+    assert at["1 LR"]["left_x"] == at["2 L"]["left_x"] == at["5 LR"]["left_x"]
+    assert at["3 LR"]["right_x"] == at["4 lr"]["right_x"] == at["5 LR"]["right_x"]
+    assert at["1 LR"]["right_x"] != at["3 LR"]["right_x"]
+
+
+# refused ------------------------------------------------------------------------------------------
+WRITE = "write L and R for flat feet, l and r for toes, left before right, or '-' for flight"
+WAIT = "a schedule begins on flat feet, at rest; there is no support to wait on"
+ALONE = "the schedule begins on one foot; where the"
+AFTER = "a foot lands only after it has left the ground"
+STEP = "the ground has one step up or down; "
+STEP += "give all places after it the same up_m, and all before it none"
+CAME = "feet come down 2 times (left in phase '4 LR', right in phase '4 LR')"
+
+
+def long(low: float, high: float) -> tuple[ContactPhase, ...]:
+    return (ContactPhase("LR", (low, high), 0.5),)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Contacts(()), "a contact schedule needs at least one phase"),
+        (lambda: Contacts(("LR",)), "a phase of the schedule must be a ContactPhase, got 'LR'"),
+        (lambda: schedule("LR RL"), f"phase '2 RL': feet = 'RL'; {WRITE}"),
+        (lambda: schedule("LR both"), f"phase '2 both': feet = 'both'; {WRITE}"),
+        (
+            lambda: Contacts(long(0.5, 0.3)),
+            "phase '1 LR': its time of 0.5 to 0.3 s must be positive, and in order",
+        ),
+        (
+            lambda: Contacts(long(0.0, 0.3)),
+            "phase '1 LR': its time of 0 to 0.3 s must be positive, and in order",
+        ),
+        (
+            lambda: Contacts(long(0.1, np.inf)),
+            "phase '1 LR': its time of 0.1 to inf s must be positive, and in order",
+        ),
+        (
+            lambda: Contacts(phases("LR", intervals=1)),
+            "phase '1 LR': intervals = 1 must be a whole number of 2 or more",
+        ),
+        (
+            lambda: Contacts(phases("LR", intervals=2.5)),
+            "phase '1 LR': intervals = 2.5 must be a whole number of 2 or more",
+        ),
+        (
+            lambda: schedule("LR L L LR", 1),
+            "phase '3 L': the same feet carry as in the phase before; make one phase of them",
+        ),
+        (lambda: schedule("lr - LR", 2), f"phase '1 lr': {WAIT}"),
+        (lambda: schedule("Lr - LR", 2), f"phase '1 Lr': {WAIT}"),
+        (lambda: schedule("- LR", 2), f"phase '1 -': {WAIT}"),
+        (
+            lambda: Contacts(phases("LR L", name="go")),
+            "two phases are called 'go'; names must be unique in a schedule",
+        ),
+        (lambda: schedule("LR -", ends="flight"), "ends = 'flight': choose 'rest' or 'touchdown'"),
+        (lambda: schedule("LR", arrival="hard"), "arrival = 'hard': choose 'soft' or 'impact'"),
+        (
+            lambda: schedule("LR -"),
+            "phase '2 -': a schedule that ends with 'rest' has to end on the ground",
+        ),
+        (
+            lambda: schedule("LR - LR", 2, ends="touchdown"),
+            "phase '3 LR': a schedule that ends with 'touchdown' has to end in flight",
+        ),
+        (
+            lambda: schedule("L LR", 1),
+            f"phase '1 L': {ALONE} right one waits nobody says; begin with 'LR'",
+        ),
+        (
+            lambda: schedule("R - R", 1),
+            f"phase '1 R': {ALONE} left one waits nobody says; begin with 'LR'",
+        ),
+        (
+            lambda: schedule("LR lr - LR", 1),
+            f"places: 1 given, but {CAME}; {AFTER}",
+        ),
+        (
+            lambda: schedule("LR lr LR", 2),
+            f"places: 2 given, but feet come down 0 times (none); {AFTER}",
+        ),
+        (
+            lambda: stairs("LR - LR", 0.2, 0.3),
+            f"places at the heights 0.2, 0.3 m: {STEP}",
+        ),
+        (
+            lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0),
+            f"places at the heights 0.2, 0.2, 0, 0 m: {STEP}",
+        ),
+    ],
+)
+def test_refused(make, sentence):
+    with pytest.raises(InputError) as e:
+        make()
+    assert str(e.value) == sentence
