@@ -65,13 +65,21 @@ class Start:
     options: Mapping[str, Any]
 
 
+NEIGHBOUR = "neighbour"
 COLD = (
     Start("schedule", True, 7.0, {}),
     Start("schedule", False, 8.0, {}),
     Start("stance", False, 5.0, {}),
 )
-FROM_NEIGHBOUR = (Start("neighbour", True, 4.0, NEAR), Start("neighbour", False, 6.0, WARM | {"acceptable_iter": 1}))
+FROM_NEIGHBOUR = (
+    Start(NEIGHBOUR, True, 4.0, NEAR),
+    Start(NEIGHBOUR, False, 6.0, WARM | {"acceptable_iter": 1}),
+)
 QUICK = Start("schedule", True, 5.0, {"max_iter": 80})
+APART = Start("links apart", True, 5.0, WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80})
+SETTLED = Start("settled", False, 8.0, WARM | PATIENT)
+FINER_MESH = Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1})
+HELD_TURN_RAD = np.radians(100)  # with more than that to turn only the exact Hessian settles, so it is tried first
 
 
 @dataclass(frozen=True)
@@ -200,6 +208,8 @@ class SpatialPlanner:
         begun = (*FROM_NEIGHBOUR, *COLD) if near is not None else COLD
         if not EXPLAINED.get():
             begun = begun[:-2] if near is None else begun[:-1]
+        if abs(task.yaw_rad) > HELD_TURN_RAD or task.rotation_rad:
+            begun = sorted(begun, key=lambda start: (start.name != NEIGHBOUR, start.held))
         found, failure = None, None
         for start in begun:
             try:
@@ -212,17 +222,30 @@ class SpatialPlanner:
         return replace(self._settled(found, parameters, weights, attempts), attempts=tuple(attempts))
 
     def _tried(self, start: Start, task, parameters, weights, attempts: list, near: SpatialPlan | None) -> SpatialPlan:
-        """A plan from one start, with rows for whatever links meet on its tape."""
-        apart = near.schedule.apart if near is not None and start.name == "neighbour" else ()
-        begin = near if near is not None and start.name == "neighbour" else self._motion(start, task)
+        """A plan from one start, its links apart."""
+        begin, apart = near, ()
+        if near is not None and start.name == NEIGHBOUR:
+            apart = near.schedule.apart
+        else:
+            begin = self._motion(start, task)
         found = self._solved(start, task, parameters, weights, begin, apart, attempts)
+        return self._kept_apart(found, start.held, parameters, weights, attempts)
+
+    def _kept_apart(self, found: SpatialPlan, held: bool, parameters, weights, attempts: list) -> SpatialPlan:
+        """The plan, solved on with rows for whatever links meet in it."""
         for _ in range(ROUNDS):
             new = too_close(self.body, list(found.solution.phases.values()))
             if not new:
                 break
-            apart = merged(apart, new)
-            again = replace(start, name="links apart", options=WARM | {"acceptable_iter": 1, "mu_init": 1e-3})
-            found = self._solved(again, task, parameters, weights, found, apart, attempts)
+            apart = merged(found.schedule.apart, new)
+            ways = [replace(APART, held=kind) for kind in ((True, False) if held else (False,))]
+            for way in ways:
+                try:
+                    found = self._solved(way, found.task, parameters, weights, found, apart, attempts)
+                    break
+                except SolverError:
+                    if way is ways[-1]:
+                        raise
         return found
 
     def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
@@ -259,15 +282,13 @@ class SpatialPlanner:
     def _settled(self, found: SpatialPlan, parameters, weights, attempts: list) -> SpatialPlan:
         """The plan, solved on where it passes limits between the nodes, first to the end, then on a finer mesh."""
         first = found
-        patient = Start("settled", False, 8.0, WARM | PATIENT)
-        finer = Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1})
-        for start, planner in ((patient, lambda: self), (finer, lambda: self._finer)):
+        for start, planner in ((SETTLED, lambda: self), (FINER_MESH, lambda: self._finer)):
             if holds_between(self.tape(found), self.robot):
                 return found
             p = planner()
-            apart = p._scaled(found)
             try:
-                found = p._solved(start, found.task, parameters, weights, found, apart, attempts)
+                more = p._solved(start, found.task, parameters, weights, found, p._scaled(found), attempts)
+                found = p._kept_apart(more, False, parameters, weights, attempts)
             except SolverError:
                 continue
         return found if holds_between(self.tape(found), self.robot) else first
