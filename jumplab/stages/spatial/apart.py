@@ -52,14 +52,20 @@ def too_close(body: Body, phases: Sequence[PhaseSolution]) -> list[Apart]:
         apart = np.array([gaps(way, turns, places) for way in ways])  # (12, n)
         near = np.flatnonzero(apart.max(axis=0) < LEAST_M)
         met = [row for row in near if _distance(body, i, k, configurations[row]) < LEAST_M]
-        for number in np.unique(phase[met]):
-            rows = np.array(met)[phase[met] == number]
-            best = ways[int(np.argmax(apart[:, rows].min(axis=1)))]
-            first, last = int(node[rows].min()) - NODES, int(np.ceil(node[rows].max())) + NODES
-            first, last = max(1, first), min(len(phases[number].t) - 1, last)
-            if first <= last:
-                out.append(Apart(int(number), first, last, best))
+        for rows in _runs(np.array(met, int)):
+            best = ways[int(np.argmax(apart[:, rows].min(axis=1)))]  # one face, or neighbouring phases ask for two
+            for number in np.unique(phase[rows]):
+                own = rows[phase[rows] == number]
+                first, last = int(node[own].min()) - NODES, int(np.ceil(node[own].max())) + NODES
+                first, last = max(1, first), min(len(phases[number].t) - 1, last)
+                if first <= last:
+                    out.append(Apart(int(number), first, last, best))
     return out
+
+
+def _runs(rows: np.ndarray) -> list[np.ndarray]:
+    """Rows that follow each other with gaps of some nodes at most."""
+    return [x for x in np.split(rows, np.flatnonzero(np.diff(rows) > 2 * NODES * SAMPLES) + 1) if len(x)]
 
 
 def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:

@@ -67,9 +67,9 @@ class Start:
 
 NEIGHBOUR = "neighbour"
 COLD = (
-    Start("schedule", True, 7.0, {}),
+    Start("schedule", True, 9.0, {}),
     Start("schedule", False, 8.0, {}),
-    Start("stance", False, 5.0, {}),
+    Start("stance", False, 3.0, {}),
 )
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, True, 4.0, NEAR),
@@ -314,13 +314,13 @@ class SpatialPlanner:
         """Why there is no plan: the terms in conflict, and a smaller target that has one."""
         if not EXPLAINED.get():
             return failure
-        start = replace(COLD[1], patience_s=2.0)
+        start = replace(COLD[1], patience_s=1.0)
         try:
             motion = self._motion(start, task)
             self._solved(start, task, parameters, weights, motion, (), [], explain=True)
         except SolverError as e:
             failure = e
-        less = self._smaller(task, weights)
+        less = self._smaller(task, weights) if self.contacts.ends == "touchdown" else None
         words = "" if less is None else f"; at this height, {said(less.task)} is planned"
         return SolverError(f"{failure}{words}", stage=failure.stage, status=failure.status, violations=failure.violations)
 
