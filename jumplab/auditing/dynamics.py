@@ -62,7 +62,10 @@ def _flight(r: Replay) -> list[Check]:
         LIMITS["gravity in flight"].check(100 * max(abs(x / r.gravity - 1) for x in bent)),
         LIMITS["angular momentum in flight"].worst(spun[flown], t),
     ]
-    return [*(checks if r.flights else []), LIMITS["no force in flight"].worst(claimed, r.tape.t, r.tape.contact_frames)]
+    return [
+        *(checks if r.flights else []),
+        LIMITS["no force in flight"].worst(claimed, r.tape.t, r.tape.contact_frames),
+    ]
 
 
 def _takeoff(r: Replay) -> list[Check]:

@@ -1,9 +1,9 @@
 """Built functions for later problems and processes, serialised by CasADi, in a folder that may be deleted.
 
-A file holds one part of a problem (:class:`.Part`), so that problems which share a part share its functions. It is named
-by a hash of all that its content depends on: what it is built by (:data:`BUILT_BY`), CasADi's version, the part's own
-words, and the caller's key (robot and settings). It begins with a check sum; a file that does not fit
-it is passed over and replaced. The folder is ``$JUMPLAB_CACHE``, else the user's cache folder of this system; an empty
+A file holds one part of a problem (:class:`.Part`), so that problems which share a part share its functions. It is
+named by a hash of all that its content depends on: what it is built by (:data:`BUILT_BY`), CasADi's version, the part's
+own words, and the caller's key (robot and settings). It begins with a check sum; a file that does not fit it is passed
+over and replaced. The folder is ``$JUMPLAB_CACHE``, else the user's cache folder of this system; an empty
 ``$JUMPLAB_CACHE`` means that nothing is kept.
 """
 

@@ -62,7 +62,9 @@ class ContactPhase:
     def usual(cls, feet: str, robot: Robot, time_s: tuple[float, float] | None = None) -> ContactPhase:
         """A phase with times and intervals that suit the robot's legs; ``time_s`` instead of its bounds [s]."""
         carried = feet.replace(FLIGHT, "")
-        kind = FLIGHT if not carried else "toes" if carried.islower() else "one foot" if len(carried) == 1 else "two feet"
+        kind = (
+            FLIGHT if not carried else "toes" if carried.islower() else "one foot" if len(carried) == 1 else "two feet"
+        )
         if len(carried) == 2 and carried != carried.upper():
             kind = "toes"
         unit = math.sqrt(leg_length(robot) / robot.gravity)
@@ -124,7 +126,9 @@ class Contacts:
         object.__setattr__(self, "phases", tuple(named))
         object.__setattr__(self, "places", tuple(self.places))
         self._check_phases()
-        landings = [(k, side) for k, p in enumerate(named) for side in p.modes if k == 0 or side not in named[k - 1].modes]
+        landings = [
+            (k, side) for k, p in enumerate(named) for side in p.modes if k == 0 or side not in named[k - 1].modes
+        ]
         object.__setattr__(self, "landings", tuple(landings))
         self._check_places()
         _ = self.surface
@@ -154,7 +158,9 @@ class Contacts:
                 raise InputError(f"{where}: the same feet carry as in the phase before; make one phase of them")
         first, last = self.phases[0], self.phases[-1]
         if not first.feet.isupper():
-            raise InputError(f"phase {first.name!r}: a schedule begins on flat feet, at rest; there is no support to wait on")
+            raise InputError(
+                f"phase {first.name!r}: a schedule begins on flat feet, at rest; there is no support to wait on"
+            )
         names = [p.name for p in self.phases]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
@@ -172,8 +178,9 @@ class Contacts:
         later = self.landings[first:]
         if first == 1:
             (side,) = self.phases[0].modes
+            other = SIDES[1 - side]
             raise InputError(
-                f"phase {self.phases[0].name!r}: the schedule begins on one foot; where the {SIDES[1 - side]} one waits "
+                f"phase {self.phases[0].name!r}: the schedule begins on one foot; where the {other} one waits "
                 f"nobody says; begin with 'LR'"
             )
         if len(self.places) != len(later):
@@ -193,8 +200,9 @@ class Contacts:
         height = heights[-1] if heights else 0.0
         first = next((i for i, up in enumerate(heights) if up == height), len(heights))
         if any(up != 0 for up in heights[:first]) or any(up != height for up in heights[first:]):
+            told = ", ".join(f"{up:g}" for up in heights)
             raise InputError(
-                f"places at the heights {', '.join(f'{up:g}' for up in heights)} m: the ground has one step up or down; "
+                f"places at the heights {told} m: the ground has one step up or down; "
                 f"give all places after it the same up_m, and all before it none"
             )
         return height, first
@@ -258,7 +266,9 @@ class Contacts:
         return cls.of("LR L l - LR", robot, [low, low])
 
     @classmethod
-    def drop_jump(cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None) -> Contacts:
+    def drop_jump(
+        cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None
+    ) -> Contacts:
         """Off an edge, down on both feet, and up again at once."""
         d = STEP_SHARE * leg_length(robot) + sole_length(robot) if ahead_m is None else ahead_m
         j = STEP_SHARE * leg_length(robot) if jump_m is None else jump_m

@@ -322,7 +322,9 @@ class SpatialPlanner:
             failure = e
         less = self._smaller(task, weights) if self.contacts.ends == "touchdown" else None
         words = "" if less is None else f"; at this height, {said(less.task)} is planned"
-        return SolverError(f"{failure}{words}", stage=failure.stage, status=failure.status, violations=failure.violations)
+        return SolverError(
+            f"{failure}{words}", stage=failure.stage, status=failure.status, violations=failure.violations
+        )
 
     def _smaller(self, task: JumpTask, weights) -> SpatialPlan | None:
         """The plan of the largest of a few targets with less way and less turn."""

@@ -164,7 +164,7 @@ class Schedule:
     def _ends(self, k: int) -> list[Bound]:
         """The first node of the schedule and of heels that rise; forces that vanish; the last node, at rest."""
         b, phases = self.of(k), self.contacts.phases
-        out, size, free = [], len(b.coordinates), np.full(len(b.coordinates), np.inf)
+        out, free = [], np.full(len(b.coordinates), np.inf)
         if k == 0:
             out += [
                 Bound("stance", "ours: the paper prints no start", "rad", "q", _stance, _stance, "start"),
@@ -177,7 +177,9 @@ class Schedule:
             for on in "qva":
                 most = free.copy()
                 most[[b.nv + b.raised.index(side) for side in rising]] = 0.0
-                out.append(Bound(f"heels rise from rest ({on})", "ours", "rad, rad/s, rad/s^2", on, -most, most, "start"))
+                out.append(
+                    Bound(f"heels rise from rest ({on})", "ours", "rad, rad/s, rad/s^2", on, -most, most, "start")
+                )
         after = phases[k + 1].modes if k + 1 < len(phases) else b.modes
         if gone := self._leaving(b, after):
             most = np.full(len(b.states), np.inf)
@@ -199,7 +201,7 @@ class Schedule:
         return out
 
     def _leaving(self, b: SpatialTerms, after: dict[int, str]) -> list[int]:
-        """Columns of the forces that the phase ``after`` no longer has: those of feet in the air, of heels that rise."""
+        """Columns of the forces that the phase ``after`` no longer has: of feet that leave, of heels that rise."""
         gone, first = [], 0
         for side, points in b.points.items():
             count = len(EDGES) * len(points)

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot.stance import leg_length
 from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.terms import BASE, EDGES, Body
+from jumplab.stages.spatial.terms import BASE, Body
 from jumplab.task import JumpTask
 
 # of the base, as shares of the leg's length; angles [rad]
@@ -84,7 +84,7 @@ class Reach:
 
 
 def along(schedule: Schedule, task: JumpTask) -> Motion:
-    """A motion along the schedule: the base above the feet that carry, down before and after a flight, a parabola in it;
+    """A motion along the schedule: the base above feet that carry, down before and after a flight, a parabola in it;
     feet on their places, and between them on bumps; legs by inverse kinematics."""
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
@@ -93,7 +93,9 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
     times = np.array([p.guess_s for p in contacts.phases])
     last = count - 1
     if contacts.ends == "touchdown":
-        drop = max(task.takeoff_speed**2 - 2 * gravity * (task.platform_m - LANDED * leg), (0.3 * task.takeoff_speed) ** 2)
+        drop = max(
+            task.takeoff_speed**2 - 2 * gravity * (task.platform_m - LANDED * leg), (0.3 * task.takeoff_speed) ** 2
+        )
         times[last] = (task.takeoff_speed + np.sqrt(drop)) / gravity
     starts = np.concatenate([[0.0], np.cumsum(times)])
     holds = _footholds(schedule, task)
@@ -238,7 +240,11 @@ def guess(schedule: Schedule, motion: Motion) -> dict[str, PhaseGuess]:
         level = np.zeros((len(rows), len(heels)))
         z = np.zeros((len(rows), len(b.states)))
         for side in b.modes:
-            own = [i for i, name in enumerate(b.states[: b.n_forces]) if name.endswith(f"of {('left', 'right')[side]} foot")]
+            own = [
+                i
+                for i, name in enumerate(b.states[: b.n_forces])
+                if name.endswith(f"of {('left', 'right')[side]} foot")
+            ]
             z[:, own] = body.mg / len(b.modes) / len(own)
         constants = {}
         for side in b.modes:

@@ -135,9 +135,7 @@ def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
 # on the ground ------------------------------------------------------------------------------------------------------
 def holds_of(phase: PhaseSolution, b: SpatialTerms) -> dict[int, np.ndarray]:
     """x, y, z [m] and yaw [rad] of the middle of the toe edge of each foot that carries, by side."""
-    return {
-        side: np.array([phase.constants[f"{SIDES[side]}_{x}"] for x in ("x", "y", "z", "yaw")]) for side in b.modes
-    }
+    return {side: np.array([phase.constants[f"{SIDES[side]}_{x}"] for x in ("x", "y", "z", "yaw")]) for side in b.modes}
 
 
 def edges(b: SpatialTerms, side: int, hold: np.ndarray) -> np.ndarray:
@@ -251,7 +249,9 @@ def _needed(model: SpatialModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, gr
 
 
 # in flight ----------------------------------------------------------------------------------------------------------
-def _flight(body: Body, flight: PhaseSolution, before: Piece, t, start: float, ends: list[int], gravity: float) -> Piece:
+def _flight(
+    body: Body, flight: PhaseSolution, before: Piece, t, start: float, ends: list[int], gravity: float
+) -> Piece:
     """A flight: joints as planned, the base as momentum demands.
 
     It begins where the tape so far ends; the joints are as planned a little later, and the legs of the feet that come
@@ -284,7 +284,7 @@ def _flight(body: Body, flight: PhaseSolution, before: Piece, t, start: float, e
 
 
 def _arriving(t: np.ndarray, end: float, shift: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
-    """A motion (n, k) on three levels, at rest in zero at first, that ends at ``shift`` with ``rate``, unaccelerated."""
+    """A motion (n, k) on three levels from rest in zero to ``shift`` with ``rate``, unaccelerated."""
     s = (t / end)[:, None]
     x, y = shift, rate * end
     c3, c4, c5 = 10 * x - 4 * y, -15 * x + 7 * y, 6 * x - 3 * y

@@ -162,7 +162,9 @@ class SpatialTerms:
         self.coordinates = (*self.model.names, *(f"pitch of {SIDES[side]} foot" for side in self.raised))
         self.points = {side: self._sole_points(mode) for side, mode in self.modes.items()}
         names = [
-            f"force {k} of {SIDES[side]} foot" for side in self.modes for k in range(len(EDGES) * len(self.points[side]))
+            f"force {k} of {SIDES[side]} foot"
+            for side in self.modes
+            for k in range(len(EDGES) * len(self.points[side]))
         ]
         self.n_forces = len(names)
         self.states = (*names, *(f"torque of {name}" for name in body.joint_names))
@@ -350,7 +352,17 @@ class SpatialTerms:
         def gap(p):
             return pair.gap(self.state(p))
 
-        return row(pair.key, "ours", "m", gap, self.limits.link_distance_m, np.inf, scale=PLACE_SCALE, skip=skip, group=pair.key)
+        return row(
+            pair.key,
+            "ours",
+            "m",
+            gap,
+            self.limits.link_distance_m,
+            np.inf,
+            scale=PLACE_SCALE,
+            skip=skip,
+            group=pair.key,
+        )
 
     def ground(self, p: Point, x: ca.SX) -> ca.SX:
         """Height of the surface below a point."""
@@ -424,8 +436,10 @@ class SpatialTerms:
         return row(*words, left, -TORSION_SLACK_M, np.inf, scale=MOMENT_ARM_M / 10, group="torsion")
 
     def swing_rows(self, side: int) -> Term:
-        """A foot in the air keeps its sole's corners off the ground, by as much as the references ask for, and its ankle
-        as high as it stands, or the shank would graze."""
+        """A foot in the air keeps its sole's corners off the ground, by as much as the references ask for.
+
+        Its ankle stays as high as it stands, or the shank would graze.
+        """
         k, least = self.body.feet[side], self.body.ankle_m + self.limits.ankle_margin_m
 
         def heights(p):
@@ -511,7 +525,7 @@ class SpatialTerms:
 
     def capture_rows(self) -> Term:
         """Where the soles meet the ground, so that the robot can be caught."""
-        lim, moment, window = self.limits, self.limits.capture_moment, self.limits.capture_window_m
+        moment, window = self.limits.capture_moment, self.limits.capture_window_m
         if moment is None:
             how = {"at": "end", "scale": PLACE_SCALE}
             return row("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, **how)
