@@ -20,6 +20,7 @@ from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
+from jumplab.stages.spatial import Contacts
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
@@ -219,3 +220,13 @@ def test_the_readme_tells_the_stored_jumps():
     for line in shipped.verdicts():
         name, *cells = map(str, line.values())
         assert re.search(rf"^\| `{name}`, [^|]+ \| {re.escape(' | '.join(cells))} \|$", readme, re.M), line
+
+
+@here
+@pytest.mark.slow
+def test_the_g1_runs_up_and_leaves_from_one_foot():
+    robot = Robot.load("g1_arms")
+    plan = Planner(robot).follow(Contacts.run_up(robot))
+    report = audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+    assert report.passed, report.table()
+    assert plan.tape.extra["contacts"][plan.tape.takeoff_index - 1].tolist() == [0, 1]  # the right one, on its toes

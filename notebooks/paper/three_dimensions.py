@@ -1,7 +1,8 @@
 """Jumps in three dimensions, by the dozen: which targets are planned, and how they land.
 
 ``python -m paper.three_dimensions`` in the folder of the notebooks does what :data:`LOG` lacks, one line per target,
-and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file.
+and can be stopped and started again; playbacks and perturbed robots take an hour. Notebook 13 draws the file. Rows that
+tell ``attempts`` were made by the whole-body program, the others by the program before it.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ KINDS = {  # name -> targets
 
 
 def solve(planner: Planner, kind: str, target: Sequence[float]) -> dict[str, Any]:
-    """One plan as a row of plain types: planned, clean, CPU time [s], iterations, cost, what is used most.
+    """One plan as a row of plain types: planned, clean, CPU time [s], attempts and their iterations in all, cost of the
+    last, what is used most.
 
     ``runs`` of the landed are its playbacks, see :func:`played`; ``robots`` of the perturbed whether each one landed.
     """
@@ -86,9 +88,10 @@ def solve(planner: Planner, kind: str, target: Sequence[float]) -> dict[str, Any
     except JumplabError as e:
         return row | {"cpu_s": time.process_time() - began, "reason": str(e)[:160]}
     row |= {"planned": True, "cpu_s": time.process_time() - began}
-    s, report = plan.whole_body.solution.statistics, audit(plan.tape, plan.robot, task)
+    report = audit(plan.tape, plan.robot, task)
     most, share = most_used(report, plan.robot)
-    row |= {"iterations": s.iterations, "cost": s.objective, "limiting": most, "share": share}
+    row |= {"attempts": len(plan.attempts), "iterations": sum(x.iterations for x in plan.attempts)}
+    row |= {"cost": plan.whole_body.solution.statistics.objective, "limiting": most, "share": share}
     row |= {"clean": report.passed}
     if kind == "landed":
         row["runs"] = {f"{e}, {mode}": played(plan, e, mode) for e, mode in product(sim.INSTALLED, MODES)}
@@ -286,6 +289,22 @@ def yaw_turn(tape: Tape, whole: Mapping[str, np.ndarray]) -> Figure:
     axes[1].plot(tape.t, whole["base_deg"], **REFERENCE_STYLE)
     axes[0].set(title="(a) inertia about the vertical", ylabel="[kg m$^2$]")
     axes[1].set(title="(b) turn", ylabel="[deg]")
+    return fig
+
+
+def contacts(tape: Tape) -> Figure:
+    """Which foot is flat on the ground, on its toes or in the air, and the vertical force on each."""
+    fig = new_figure(PAGE_IN, 2.6)
+    feet, loads = fig.subplots(2, 1, sharex=True, height_ratios=(1, 2))
+    codes = tape.extra["contacts"]  # (N, 2): 0 in the air, 1 on its toes, 2 flat
+    for k, (name, color) in enumerate((("left", LAUNCH), ("right", VERMILION))):
+        for code, shade in ((1, tint(color, 0.35)), (2, color)):
+            feet.fill_between(tape.t, 0.6 - k, 1.4 - k, where=codes[:, k] == code, color=shade, linewidth=0)
+        loads.plot(tape.t, tape.f[:, k, 2], color=color, label=name)
+    feet.set(yticks=(1, 0), yticklabels=("left", "right"), title="(a) foot on the ground")
+    feet.grid(False)
+    loads.set(xlabel="time [s]", ylabel="force [N]", title="(b) vertical force of the ground")
+    loads.legend(frameon=False)
     return fig
 
 

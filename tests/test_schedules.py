@@ -1,0 +1,106 @@
+"""Motions along contact schedules: planned, exact on tape, audited foot by foot, kept in folders, refused in words."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import jumplab as jl
+from jumplab.auditing import audit
+from jumplab.auditing.replay import replay
+from jumplab.errors import InfeasibleError, InputError
+
+AIR, TOE, FLAT = 0, 1, 2
+
+
+@cache
+def hop() -> jl.JumpPlan:
+    robot = jl.Robot.load()
+    return jl.plan(robot=robot, contacts=jl.Contacts.hop(robot))
+
+
+def test_a_hop_follows_its_schedule():
+    plan = hop()
+    assert plan.schedule == ("LR", "L", "l", "-", "LR")
+    codes = plan.tape.extra["contacts"]
+    changes = [0, *(np.flatnonzero(np.any(np.diff(codes, axis=0), axis=1)) + 1)]
+    assert codes[changes].tolist() == [[FLAT, FLAT], [FLAT, AIR], [TOE, AIR], [AIR, AIR], [FLAT, FLAT]]
+    place = plan.contacts.places[0]
+    assert plan.planned_distance_m == pytest.approx(place.ahead_m, abs=1e-3)
+    assert abs(plan.planned_side_m) <= place.free_m[1] + 1e-3
+    assert np.abs(plan.tape.v[[0, -1]]).max() < 1e-3
+
+
+def test_its_attempts_say_what_was_tried():
+    plan = hop()
+    assert plan.attempts[0].start == "schedule" and plan.attempts[-1].status.startswith("Solve")
+    assert all(x.iterations > 0 and x.cpu_s > 0 for x in plan.attempts)
+    assert len(plan.statistics) == len(plan.attempts)
+    assert plan.summary["attempts"][0]["hessian"] == "held Gauss-Newton"
+
+
+def test_it_is_clean_foot_by_foot():
+    report = jl.audit(hop())
+    assert report.passed, report.table()
+    names = {c.name for c in report.checks}
+    assert {"end at rest", "toe slip", "foot clearance", "no force in flight", "free fall at take-off"} <= names
+    assert not {"distance", "rise", "left/right posture"} & names  # a schedule has its places, not a target
+
+
+def test_its_tape_is_exact_physics():
+    plan = hop()
+    r = replay(plan.tape, plan.robot, plan.task)
+    assert np.abs(r.base_residual).max() < 1e-6 * r.weight
+    for k, rows in r.stands:
+        toes = r.toe_corners[rows, k]
+        assert np.abs(toes - toes[0]).max() < 1e-6
+    for rows in r.flights:
+        assert np.abs(r.momentum[rows] - r.momentum[rows][0]).max() < 1e-6
+    assert len(r.stands) == 4 and len(r.flights) == 1 and not r.is_jump
+
+
+def test_the_audit_sees_a_foot_that_is_said_to_carry_and_does_not():
+    plan = hop()
+    codes = plan.tape.extra["contacts"].copy()
+    alone = np.flatnonzero((codes[:, 0] == FLAT) & (codes[:, 1] == AIR))
+    codes[alone, 1] = FLAT
+    tape = replace(plan.tape, extra=plan.tape.extra | {"contacts": codes})
+    failed = {c.name for c in audit(tape, plan.robot, plan.task).failed}
+    assert {"toe slip", "toe on the ground"} <= failed
+    codes = plan.tape.extra["contacts"].copy()
+    codes[alone[100:-100], 0] = AIR
+    tape = replace(plan.tape, extra=plan.tape.extra | {"contacts": codes})
+    assert [c.name for c in audit(tape, plan.robot, plan.task).failed] == ["order of phases"]
+
+
+def test_a_folder_keeps_the_schedule(tmp_path):
+    plan = hop()
+    assert jl.save(tmp_path / "hop", plan).passed
+    again = jl.load(tmp_path / "hop").plan
+    assert again.schedule == plan.schedule and again.attempts == plan.attempts
+    assert jl.audit(again).passed
+
+
+def test_nobody_plays_it_yet():
+    with pytest.raises(InputError) as e:
+        jl.simulate(hop())
+    said = "the plan follows the contacts LR L l - LR: only standing jumps can be simulated; its tape can be audited, "
+    assert str(e.value) == said + "viewed and saved"
+
+
+def test_either_a_target_or_a_schedule():
+    said = "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
+    for asked in ({}, {"task": jl.JumpTask(0.3, 0.3), "contacts": jl.Contacts.hop(jl.Robot.load())}):
+        with pytest.raises(InputError) as e:
+            jl.plan(**asked)
+        assert str(e.value) == said
+    with pytest.raises(InputError, match=r"^a contact schedule is planned by the whole-body program; leave method"):
+        jl.plan(contacts=jl.Contacts.hop(jl.Robot.load()), method="direct")
+
+
+def test_surfaces_that_would_meet_under_a_sole_are_refused(bhr):
+    with pytest.raises(InfeasibleError) as e:
+        jl.plan(robot=bhr, contacts=jl.Contacts.step_off(bhr, 0.1, ahead_m=0.2))
+    said = "places on a surface -0.1 m higher: it would begin -0.04 m ahead of the toes that leave, which takes 0.10 "
+    assert str(e.value) == said + "m; put the places 0.34 m ahead"
