@@ -99,11 +99,6 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     from jumplab.sim import Scene, simulate_jump
 
     require_type(plan, JumpPlan, "the plan to simulate")
-    if plan.schedule:
-        raise InputError(
-            f"the plan follows the contacts {' '.join(plan.schedule)}: only standing jumps can be simulated; its tape "
-            f"can be audited, viewed and saved"
-        )
     options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
     return simulate_jump(plan.tape, plan.robot, **options)
 

@@ -7,6 +7,7 @@ import pytest
 
 from jumplab.errors import InputError
 from jumplab.ocp.problem import layouts
+from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
 from jumplab.stages.spatial import ContactPhase, Contacts, Place, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.contacts import INTERVALS, STEP_SHARE, TIMES
@@ -121,7 +122,7 @@ def test_the_usual_schedules_have_their_letters_and_places(bhr):
     step = STEP_SHARE * leg_length(bhr)
     for name, (contacts, said, ahead, up) in usual(bhr).items():
         assert letters(contacts) == said, name
-        assert contacts.ends == "rest" and contacts.arrival == "soft", name
+        assert contacts.ends == "rest", name
         assert reached(contacts) == pytest.approx([step * x for x in ahead]), name
         assert {p.up_m for p in contacts.places} == {up} and contacts.surface == (up, 0), name
         assert {(p.left_m, p.turn_rad) for p in contacts.places} == {(0.0, 0.0)}, name
@@ -224,6 +225,16 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
         (lambda: Contacts(("LR",)), "a phase of the schedule must be a ContactPhase, got 'LR'"),
         (lambda: schedule("LR RL"), f"phase '2 RL': feet = 'RL'; {WRITE}"),
         (lambda: schedule("LR both"), f"phase '2 both': feet = 'both'; {WRITE}"),
+        (lambda: Contacts((ContactPhase(3, (0.2, 0.5), 0.3),)), f"phase '1 3': feet = 3; {WRITE}"),
+        (
+            lambda: Contacts((ContactPhase("LR", (0.2,), 0.3),)),
+            "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds",
+        ),
+        (
+            lambda: Contacts((ContactPhase("LR", (0.2, 0.5), float("nan")),)),
+            "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds",
+        ),
+        (lambda: Contacts.hop(Robot.load(), foot="both"), "foot = 'both': choose left or right"),
         (
             lambda: Contacts(long(0.5, 0.3)),
             "phase '1 LR': its time of 0.5 to 0.3 s must be positive, and in order",
@@ -256,7 +267,6 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
             "two phases are called 'go'; names must be unique in a schedule",
         ),
         (lambda: schedule("LR -", ends="flight"), "ends = 'flight': choose 'rest' or 'touchdown'"),
-        (lambda: schedule("LR", arrival="hard"), "arrival = 'hard': choose 'soft' or 'impact'"),
         (
             lambda: schedule("LR -"),
             "phase '2 -': a schedule that ends with 'rest' has to end on the ground",

@@ -9,9 +9,14 @@ import pytest
 import jumplab as jl
 from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
+from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
 
 AIR, TOE, FLAT = 0, 1, 2
+ANOTHER = (
+    "the plan follows another contact schedule than a standing jump: only standing jumps can be simulated; its tape "
+    "can be audited, viewed and saved"
+)
 
 
 @cache
@@ -82,11 +87,14 @@ def test_a_folder_keeps_the_schedule(tmp_path):
     assert jl.audit(again).passed
 
 
-def test_nobody_plays_it_yet():
+def test_nobody_plays_it_yet(tmp_path, capsys):
     with pytest.raises(InputError) as e:
         jl.simulate(hop())
-    said = "the plan follows the contacts LR L l - LR: only standing jumps can be simulated; its tape can be audited, "
-    assert str(e.value) == said + "viewed and saved"
+    assert str(e.value) == ANOTHER
+    jl.save(tmp_path / "hop", hop())
+    for command in ("simulate", "trials", "certify", "margins"):
+        assert main([command, str(tmp_path / "hop")]) == 2
+        assert ANOTHER in capsys.readouterr().err
 
 
 def test_either_a_target_or_a_schedule():

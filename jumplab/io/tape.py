@@ -56,6 +56,19 @@ class Tape(Shown):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
+    def require_jump(self) -> None:
+        """Refuse (:class:`InputError`) a tape along another contact schedule, which nothing plays."""
+        told = self.extra.get("contacts")
+        if told is None:
+            return
+        carried = np.asarray(told) > 0
+        switches = np.flatnonzero(np.any(np.diff(carried, axis=0), axis=1))
+        if len(switches) != 1 or carried[-1].any():
+            raise InputError(
+                "the plan follows another contact schedule than a standing jump: only standing jumps can be simulated; "
+                "its tape can be audited, viewed and saved"
+            )
+
     @property
     def takeoff_index(self) -> int:
         """Row of the first flight sample."""

@@ -206,6 +206,7 @@ def simulate_landing(tape: Tape, robot: Robot, disturbance: Disturbance, **optio
 def _check(tape, robot, perturbation, scene, reference, stand_s, from_apex) -> None:
     require_type(tape, Tape, "the tape to play")
     require_type(robot, Robot, "the robot to simulate")
+    tape.require_jump()
     for value, kind, what in ((perturbation, Perturbation, "the perturbation"), (scene, Scene, "the scene")):
         if value is not None:
             require_type(value, kind, what)

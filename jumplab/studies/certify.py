@@ -254,6 +254,7 @@ def certify(
     for engine in ENGINES:
         engine_class(engine)
     tape, robot, summary = store.read_plan(folder)
+    tape.require_jump()
     task, scene, plan = JumpTask(**summary["target"]), Scene.of_plan(summary, robot), series.plan_hash(summary)
     report = audit(tape, robot, task, edge_m=summary["platform_edge_m"])
     work: dict[TrialKey, series.Task] = {}

@@ -140,6 +140,7 @@ def margins(
     for name in names:
         ranges_at(name, 0.0)
     tape, robot, summary = store.read_plan(folder)
+    tape.require_jump()
     scene, plan = Scene.of_plan(summary, robot), series.plan_hash(summary)
 
     at_once = jobs or joblib.cpu_count()

@@ -346,6 +346,7 @@ def run_trials(
     """
     check_numbers(n, seed, jobs)
     tape, robot, summary = store.read_plan(folder)
+    tape.require_jump()
     scene, plan, known = Scene.of_plan(summary, robot), plan_hash(summary), settings.hash
     keys = [TrialKey(seed, index, known, plan) for index in range(n)]
     work = {key: joblib.delayed(run_trial)(tape, robot, scene, settings, key) for key in keys}

@@ -15,17 +15,19 @@ from jumplab.stages.spatial.terms import Body
 
 SAMPLES = 3  # in every interval, that are looked at
 NODES = 2  # before and after such an instant that a row is for
+MORE_M = 0.006  # that links which met between the nodes of their row keep besides
 LEAST_M = 0.002  # distance that links must keep; the audit asks for half of it
 
 
 @dataclass(frozen=True)
 class Apart:
-    """Two links that a face keeps apart, at nodes ``first`` to ``last`` of one phase."""
+    """Two links that a face keeps apart, at nodes ``first`` to ``last`` of one phase, by ``more_m`` than usual."""
 
     phase: int
     first: int
     last: int
     pair: Pair
+    more_m: float = 0.0
 
 
 def too_close(body: Body, phases: Sequence[PhaseSolution]) -> list[Apart]:
@@ -69,12 +71,17 @@ def _runs(rows: np.ndarray) -> list[np.ndarray]:
 
 
 def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
-    """Both; rows of one pair, face and phase are one row for the nodes from the first to the last of them."""
-    found: dict[tuple, Apart] = {}
-    for x in (*old, *new):
+    """Both; rows of one pair, face and phase are one row for the nodes from the first to the last of them.
+
+    Links that met in spite of their row met between its nodes: it asks for more.
+    """
+    found = {(x.phase, x.pair.key): x for x in old}
+    for x in new:
         key = x.phase, x.pair.key
-        y = found.get(key, x)
-        found[key] = Apart(x.phase, min(x.first, y.first), max(x.last, y.last), x.pair)
+        if key in found:
+            y = found[key]
+            x = Apart(x.phase, min(x.first, y.first), max(x.last, y.last), x.pair, y.more_m + MORE_M)
+        found[key] = x
     return tuple(found.values())
 
 

@@ -100,14 +100,13 @@ class Contacts:
     """A contact schedule.
 
     A foot that is on the ground in consecutive phases stays where it is, flat or on its toes; each time it comes down
-    again it has a new :class:`Place`.
+    again, without speed, it has a new :class:`Place`.
 
     Attributes
     ----------
     phases : one after the other; the first begins at rest in the stance.
     places : of all contacts after the first ones, in the order of the phases, left before right.
     ends : "rest" (the robot stands still) or "touchdown" (in flight, both flat soles about to meet the ground).
-    arrival : "soft" (a foot comes down without speed) or "impact" (an inelastic one).
 
     Raises
     ------
@@ -118,7 +117,6 @@ class Contacts:
     phases: tuple[ContactPhase, ...]
     places: tuple[Place, ...] = ()
     ends: str = "rest"
-    arrival: str = "soft"
     landings: tuple[tuple[int, int], ...] = field(init=False)  # (phase, side) of each contact, the first ones included
 
     def __post_init__(self):
@@ -143,12 +141,14 @@ class Contacts:
     def _check_phases(self) -> None:
         for k, p in enumerate(self.phases):
             where = f"phase {p.name!r}"
-            letters = p.feet.lower()
+            letters = p.feet.lower() if isinstance(p.feet, str) else ""
             if letters not in ("l", "r", "lr", FLIGHT):
                 raise InputError(
                     f"{where}: feet = {quoted(p.feet)}; write L and R for flat feet, l and r for toes, left before "
                     f"right, or '-' for flight"
                 )
+            if not (isinstance(p.time_s, tuple) and len(p.time_s) == 2 and 0 < p.guess_s < math.inf):
+                raise InputError(f"{where}: time_s must be (low, high) and guess_s a number, both in seconds")
             low, high = p.time_s
             if not 0 < low <= high < math.inf:
                 raise InputError(f"{where}: its time of {low:g} to {high:g} s must be positive, and in order")
@@ -167,8 +167,6 @@ class Contacts:
             raise InputError(f"two phases are called {twice[0]!r}; names must be unique in a schedule")
         if self.ends not in ("rest", "touchdown"):
             raise InputError(f"ends = {quoted(self.ends)}: choose 'rest' or 'touchdown'")
-        if self.arrival not in ("soft", "impact"):
-            raise InputError(f"arrival = {quoted(self.arrival)}: choose 'soft' or 'impact'")
         if last.flying != (self.ends == "touchdown"):
             need = "end in flight" if self.ends == "touchdown" else "end on the ground"
             raise InputError(f"phase {last.name!r}: a schedule that ends with {self.ends!r} has to {need}")
@@ -213,15 +211,15 @@ class Contacts:
 
     # the usual ones --------------------------------------------------------------------------------------------
     @classmethod
-    def of(
-        cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest", arrival: str = "soft"
-    ) -> Contacts:
+    def of(cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest") -> Contacts:
         """A schedule from words such as "LR L l - LR", with times that suit the robot's legs."""
-        return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends, arrival)
+        return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends)
 
     @classmethod
     def hop(cls, robot: Robot, ahead_m: float | None = None, *, foot: str = "left", same: bool = False) -> Contacts:
         """Off one foot, and down on both, or with ``same`` on the same one, the other following."""
+        if foot not in SIDES:
+            raise InputError(f"foot = {quoted(foot)}: choose {' or '.join(SIDES)}")
         d = STEP_SHARE * leg_length(robot) if ahead_m is None else ahead_m
         up, other = ("L", "R") if foot == "left" else ("R", "L")
         land = f"{up} LR" if same else "LR"

@@ -67,7 +67,7 @@ class Start:
 
 NEIGHBOUR = "neighbour"
 COLD = (
-    Start("schedule", True, 9.0, {}),
+    Start("schedule", True, 9.0, {"max_iter": 150}),
     Start("schedule", False, 8.0, {}),
     Start("stance", False, 3.0, {}),
 )
@@ -167,7 +167,7 @@ class SpatialPlanner:
 
     def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
         """The program with rows for links that met."""
-        key = tuple((x.phase, x.first, x.last, x.pair.key) for x in apart)
+        key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
         if key not in self._apart:
             if len(self._apart) > 8:
                 self._apart = {(): self._apart[()]}

@@ -357,7 +357,7 @@ class SpatialTerms:
             "ours",
             "m",
             gap,
-            self.limits.link_distance_m,
+            self.limits.link_distance_m + kept.more_m,
             np.inf,
             scale=PLACE_SCALE,
             skip=skip,
