@@ -242,6 +242,13 @@ def test_machine_code_gives_the_same_numbers(place, by_compiler):
             np.testing.assert_array_equal(u.full(), v.full())
 
 
+def test_one_compiler_makes_the_code_of_all_parts(place, by_compiler, monkeypatch):
+    monkeypatch.setattr(compiled, "_begin", lambda path: None)
+    later(toy())
+    compiled.build_all(kept(place, ".casadi")[-1])
+    assert len(kept(place, ".so")) == PARTS and not kept(place, ".working")
+
+
 def test_code_that_was_touched_is_not_loaded(place, by_compiler):
     for _ in range(2):
         later(toy())

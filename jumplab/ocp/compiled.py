@@ -28,6 +28,7 @@ from jumplab.io.files import write_file
 # no target of this machine alone, no fused multiply-add: the numbers stay those of the interpreter
 FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-sanitize=undefined")
 LONGEST_S = 1800.0  # a compiler that needs longer is lost
+TOGETHER_S = 600.0  # parts of one problem are kept within this time
 SAME = 1e-9  # relative; a compiler that calls other sines may round otherwise
 SUFFIX = f".{sysconfig.get_platform()}.so"
 _working: list[subprocess.Popen] = []  # of this process, which waits for none of them
@@ -116,7 +117,20 @@ def _compiled(path: Path, scratch: Path) -> bytes:
     return code.read_bytes()
 
 
+def build_all(path: Path) -> None:
+    """Compile the file at ``path``, then those of other parts that were kept about the same time, one by one."""
+    build(path)
+    oldest = path.stat().st_mtime - TOGETHER_S
+    for other in sorted(path.parent.glob(f"*{path.suffix}")):
+        claim, done = other.with_suffix(".working"), (other.with_suffix(x) for x in (SUFFIX, ".failed"))
+        with suppress(OSError):
+            if other.stat().st_mtime < oldest or any(x.exists() for x in (claim, *done)):
+                continue
+            claim.write_text(str(os.getpid()))
+            build(other)
+
+
 if __name__ == "__main__":
     with suppress(AttributeError, OSError):
         os.nice(19)  # whoever plans goes first
-    build(Path(sys.argv[1]))
+    build_all(Path(sys.argv[1]))
