@@ -224,9 +224,7 @@ class Truth:
         left = np.array([[place.rotation[:2, 1] for place in row] for row in self.foot[:LAUNCH]])
         heading = np.arctan2(-left[..., 0], left[..., 1])
         self.worst("foot turn", 1e3 * np.abs(heading - heading[0]), t, FEET)
-        stood = self.surface(self.toe[:1, ..., 0])  # under each foot's first place
-        hover = np.abs(self.toe[:LAUNCH, ..., 2] - stood).max(axis=-1)
-        self.worst("toe on the ground", 1e3 * hover, t, FEET)
+        self.worst("toe on the ground", 1e3 * np.abs(self.toe[:LAUNCH, ..., 2]).max(axis=-1), t, FEET)
         above = 1e3 * (self.sole[..., 2] - self.surface(self.sole[..., 0])).min(axis=-1)
         self.worst("penetration", -above, labels=FEET)
         air = t[-1] - t[LAUNCH]

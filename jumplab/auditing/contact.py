@@ -26,7 +26,8 @@ def _geometry(r: Replay) -> list[Check]:
         slip[rows, k] = np.linalg.norm((at - at[0])[..., :2], axis=-1).max(axis=-1)
         first = np.broadcast_to(way[0], way.shape)
         turned[rows, k] = np.abs(np.arctan2(np.cross(first, way)[..., 2], (first * way)[..., :2].sum(-1)))
-        hover[rows, k] = np.abs(at[..., 2] - r.surface(r.along(at[:1]))).max(axis=-1)
+        level = r.surface(r.along(at[:1])) if rows.start else 0.0  # every motion begins on the ground at zero
+        hover[rows, k] = np.abs(at[..., 2] - level).max(axis=-1)
     above = 1e3 * (points[..., 2] - r.surface(r.along(points))).min(axis=-1)  # (N, K)
     middle = np.zeros(len(t), bool)
     for rows in r.flights:
