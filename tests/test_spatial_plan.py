@@ -31,7 +31,7 @@ from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
 from jumplab.stages.spatial import Contacts, Place, SpatialLimits, SpatialPlanner, SpatialWeights
 from jumplab.stages.spatial import planner as planning
-from jumplab.stages.spatial.apart import merged, too_close
+from jumplab.stages.spatial.apart import MORE_M, merged, too_close
 from jumplab.stages.spatial.shapes import ROUNDED_M, faces, gaps
 from jumplab.stages.spatial.tape import (
     ACCELERATION_GAP,
@@ -551,7 +551,8 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     assert all(1 <= x.first <= 5 and 7 <= x.last <= intervals[2] for x in found)
     assert any({x.pair.first.name[:5], x.pair.second.name[:5]} == {"left_", "right"} for x in found)
     later = [replace(x, first=x.first + 1, last=x.last + 2) for x in found]
-    assert merged(found, later) == tuple(replace(x, last=x.last + 2) for x in found)
+    # they met in spite of their rows, so between the nodes: each asks for more
+    assert merged(found, later) == tuple(replace(x, last=x.last + 2, more_m=MORE_M) for x in found)
     assert merged(apart, ()) == apart
 
 
