@@ -21,7 +21,7 @@ class SpatialLimits:
     foot_share: float = 0.15  # of the weight, on each flat foot at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
-    straight_knee_rad: float = 0.15  # flexion at least while the feet stand, of robots that no plane describes: a leg
+    straight_knee_rad: float = 0.15  # flexion at least while a foot carries: a leg
     # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn
     flat_s: tuple[float, float] = (0.25, 0.70)  # duration of the flat-foot phase
@@ -66,7 +66,6 @@ class SpatialWeights:
     jerk: float = 2e-7  # [1] / [rad/s^3]^2 / [s]
     torque: float = 2e-4  # [1] / [N m]^2 / [s]
     force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
-    momentum_rate: float = 1.0  # [1] / [N m]^2 / [s]
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
 
 
