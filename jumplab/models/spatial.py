@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
+from jumplab.robot.reduction import EXACT_M, mirror
 from jumplab.task import GRAVITY
 
 CHART = ("x", "y", "z", "yaw", "roll", "pitch")  # coordinates of the base
@@ -91,6 +92,48 @@ class SpatialModel:
             self.carried[self.bodies[k].parent] += self.carried[k]
         self.joints, self.armature = len(self.bodies) - 1, np.array(model.armature[6:])
         self.names = (*CHART, *(b.name for b in self.bodies[1:]))
+
+    @cached_property
+    def across(self) -> tuple[int | None, ...]:
+        """Axis of each body's frame that lies across the x-z plane, of bodies in the middle; None of those beside it.
+
+        A body in the middle is its own mirror image: its joint turns about that axis, or is held at zero.
+        """
+        counterpart = {i: k for i, k, _ in self.pairs}
+        out = [1]
+        for j, b in enumerate(self.bodies[1:]):
+            lateral = b.turn[out[b.parent]] if out[b.parent] is not None else np.zeros(3)
+            along = np.flatnonzero(np.abs(lateral) > ALONG)
+            out.append(int(along[0]) if counterpart.get(j) == j and len(along) else None)
+        return tuple(out)
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int, float]]:
+        """Joints that are mirror images of each other, exactly; see :func:`jumplab.robot.reduction.mirror`."""
+        return mirror(self.model, EXACT_M)
+
+    @cached_property
+    def left_half(self) -> tuple[int, ...]:
+        """Bodies in the middle and to the left of it."""
+        return tuple(k for k in range(len(self.bodies)) if self.across[k] is not None or k in self._left)
+
+    @cached_property
+    def _left(self) -> frozenset[int]:
+        """Bodies to the left; those that begin in the middle go with what they carry."""
+        data, out = self.model.createData(), set()
+        pin.forwardKinematics(self.model, data, pin.neutral(self.model))
+        far = [data.oMi[k + 1].translation[1] for k in range(len(self.bodies))]
+        for k in range(len(self.bodies) - 1, 0, -1):
+            parent = self.bodies[k].parent
+            if self.across[parent] is None and abs(far[k]) > abs(far[parent]):
+                far[parent] = far[k]
+        for k in range(1, len(self.bodies)):
+            if self.across[k] is None:
+                parent = self.bodies[k].parent
+                beside = self.across[parent] is None
+                if parent in out if beside else far[k] > 0:
+                    out.add(k)
+        return frozenset(out)
 
     def local(self, joint: int, point: np.ndarray) -> np.ndarray:
         """A ``point`` (3,) in Pinocchio's frame of a ``joint`` (its index there), in the frame of its body here."""
@@ -203,101 +246,126 @@ class SpatialState:
 
     ``q``, ``v``, ``a`` (6 + joints,) are chart, rates and accelerations; vectors are in world axes if not said
     otherwise. ``gravity`` is positive [m/s^2].
+
+    In a motion that is ``even``, whose right half is the mirror image of the left one in the x-z plane, sums over the
+    tree run over the left half and count it twice.
     """
 
-    def __init__(self, model: SpatialModel, q: ca.SX, v: ca.SX, a: ca.SX, gravity: float | ca.SX = GRAVITY):
+    def __init__(
+        self, model: SpatialModel, q: ca.SX, v: ca.SX, a: ca.SX, gravity: float | ca.SX = GRAVITY, even: bool = False
+    ):
         self.model, self.q, self.v, self.a, self.gravity = model, q, v, a, gravity
         self._base = [Turn(axis, q[3 + k]) for k, axis in enumerate(ATTITUDE_AXES)]
         joints = enumerate(model.bodies[1:], start=6)
         self._turns = [None, *(Turn(b.axis, q[k], b.turn) for k, b in joints)]
+        self._even, self._counted = even, model.left_half if even else tuple(range(len(model.bodies)))
+        self._spins, self._accelerations, self._velocities, self._frames = {}, {}, {}, {}
 
-    @cached_property
-    def _spins(self) -> list[ca.SX]:
-        """Angular velocity of every body, in its own axes."""
-        spin = ca.SX.zeros(3)
-        for k, turn in enumerate(self._base):
-            spin = turn.into(spin)
-            spin[turn.axis] += self.v[3 + k]
-        spins = [spin]
-        for k, b in enumerate(self.model.bodies[1:], start=1):
-            spin = self._turns[k].into(spins[b.parent])
-            spin[b.axis] += self.v[5 + k]
-            spins.append(spin)
-        return spins
+    def _spin(self, k: int) -> ca.SX:
+        """Angular velocity of a body, in its own axes."""
+        if k not in self._spins:
+            b = self.model.bodies[k]
+            if k:
+                spin = self._turns[k].into(self._spin(b.parent))
+                spin[b.axis] += self.v[5 + k]
+            else:
+                spin = ca.SX.zeros(3)
+                for i, turn in enumerate(self._base):
+                    spin = turn.into(spin)
+                    spin[turn.axis] += self.v[3 + i]
+            self._spins[k] = spin
+        return self._spins[k]
 
-    @cached_property
-    def _accelerations(self) -> list[tuple[ca.SX, ca.SX]]:
-        """(linear less gravity, angular) acceleration of every body's origin, in its own axes."""
+    def _acceleration(self, k: int) -> tuple[ca.SX, ca.SX]:
+        """(linear less gravity, angular) acceleration of a body's origin, in its own axes."""
+        if k not in self._accelerations:
+            self._accelerations[k] = self._accelerated(k) if k else self._base_accelerated()
+        return self._accelerations[k]
+
+    def _base_accelerated(self) -> tuple[ca.SX, ca.SX]:
         linear, angular, spin = self.a[:3] + ca.vertcat(0, 0, self.gravity), ca.SX.zeros(3), ca.SX.zeros(3)
-        for k, turn in enumerate(self._base):
+        for i, turn in enumerate(self._base):
             linear, angular, spin = turn.into(linear), turn.into(angular), turn.into(spin)
-            angular += cross(spin, _unit(turn.axis, self.v[3 + k])) + _unit(turn.axis, self.a[3 + k])
-            spin[turn.axis] += self.v[3 + k]
-        found = [(linear, angular)]
-        for k, b in enumerate(self.model.bodies[1:], start=1):
-            turn, (linear, angular), spin = self._turns[k], found[b.parent], self._spins[b.parent]
-            if np.any(b.place):
-                linear = linear + cross(angular, b.place) + cross(spin, cross(spin, b.place))
-            linear, angular, spin = turn.into(linear), turn.into(angular), turn.into(spin)
-            angular += cross(spin, _unit(b.axis, self.v[5 + k])) + _unit(b.axis, self.a[5 + k])
-            found.append((linear, angular))
-        return found
+            angular += cross(spin, _unit(turn.axis, self.v[3 + i])) + _unit(turn.axis, self.a[3 + i])
+            spin[turn.axis] += self.v[3 + i]
+        return linear, angular
 
-    def _gathered(self, parts: list[tuple[ca.SX, ca.SX]]) -> tuple[ca.SX, ca.SX, list]:
+    def _accelerated(self, k: int) -> tuple[ca.SX, ca.SX]:
+        b, turn = self.model.bodies[k], self._turns[k]
+        (linear, angular), spin = self._acceleration(b.parent), self._spin(b.parent)
+        if np.any(b.place):
+            linear = linear + cross(angular, b.place) + cross(spin, cross(spin, b.place))
+        linear, angular, spin = turn.into(linear), turn.into(angular), turn.into(spin)
+        angular += cross(spin, _unit(b.axis, self.v[5 + k])) + _unit(b.axis, self.a[5 + k])
+        return linear, angular
+
+    def _doubled(self, k: int) -> int | None:
+        """The axis of a body's parent that lies across the plane, where both sides of the robot meet there."""
+        b = self.model.bodies[k]
+        return self.model.across[b.parent] if self._even and self.model.across[k] is None else None
+
+    def _gathered(self, parts: Mapping[int, tuple[ca.SX, ca.SX]]) -> tuple[ca.SX, ca.SX, dict[int, ca.SX]]:
         """Sums over the tree of (force-like, moment-like) vectors at the bodies' origins: at the base's origin in world
-        axes, and per joint the component of the moment about its axis."""
-        parts, along = list(parts), []
-        for k in range(len(parts) - 1, 0, -1):
+        axes, and per body the component of the moment about its joint's axis."""
+        parts, along = dict(parts), {}
+        for k in self._counted[:0:-1]:
             b, turn, (force, moment) = self.model.bodies[k], self._turns[k], parts[k]
-            along.append(moment[b.axis])
+            along[k] = moment[b.axis]
             force, moment = turn.out(force), turn.out(moment)
             if np.any(b.place):
                 moment = moment + cross(b.place, force)
+            if (across := self._doubled(k)) is not None:
+                force, moment = 2 * _without(force, across), 2 * _unit(across, moment[across])
             parts[b.parent] = parts[b.parent][0] + force, parts[b.parent][1] + moment
         force, moment = parts[0]
         for turn in self._base[::-1]:
             force, moment = turn.out(force), turn.out(moment)
-        return force, moment, along[::-1]
+        return force, moment, along
 
     def dynamics(self, wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = {}) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Inverse dynamics: (force, moment about the base's origin, joint torques) that the motion needs besides.
 
-        ``wrenches`` act from outside: body -> (force, moment about the body's origin), in the body's axes.
+        ``wrenches`` act from outside: body -> (force, moment about the body's origin), in the body's axes. In an even
+        motion those on the left half stand for those on the right one too, and torques of the right half are zeros.
         """
-        parts = []
-        for k, (b, spin, (linear, angular)) in enumerate(
-            zip(self.model.bodies, self._spins, self._accelerations, strict=True)
-        ):
+        parts = {}
+        for k in self._counted:
+            b, spin, (linear, angular) = self.model.bodies[k], self._spin(k), self._acceleration(k)
             first, second = ca.DM(b.first), ca.DM(b.second)
             force = b.mass * linear + cross(angular, first) + cross(spin, cross(spin, first))
             moment = second @ angular + cross(spin, second @ spin) + cross(first, linear)
             if k in wrenches:
                 force, moment = force - wrenches[k][0], moment - wrenches[k][1]
-            parts.append((force, moment))
-        force, moment, torques = self._gathered(parts)
+            parts[k] = force, moment
+        force, moment, along = self._gathered(parts)
+        torques = [along.get(k, ca.SX(0)) for k in range(1, len(self.model.bodies))]
         return force, moment, ca.vertcat(ca.SX(0, 1), *torques) + self.model.armature * self.a[6:]
 
     @cached_property
     def _momenta(self) -> tuple[ca.SX, ca.SX]:
         """Linear momentum, and angular momentum about the base's origin, of a base whose origin rests."""
-        linear, parts = [ca.SX.zeros(3)], []
-        for k, b in enumerate(self.model.bodies):
+        linear, parts = {0: ca.SX.zeros(3)}, {}
+        for k in self._counted:
+            b, spin = self.model.bodies[k], self._spin(k)
             if k:
                 at = linear[b.parent]
                 if np.any(b.place):
-                    at = at + cross(self._spins[b.parent], b.place)
-                linear.append(self._turns[k].into(at))
-            first, second, spin = ca.DM(b.first), ca.DM(b.second), self._spins[k]
-            parts.append((b.mass * linear[k] + cross(spin, first), second @ spin + cross(first, linear[k])))
+                    at = at + cross(self._spin(b.parent), b.place)
+                linear[k] = self._turns[k].into(at)
+            first, second = ca.DM(b.first), ca.DM(b.second)
+            parts[k] = b.mass * linear[k] + cross(spin, first), second @ spin + cross(first, linear[k])
         return self._gathered(parts)[:2]
 
     @cached_property
     def com_from_base(self) -> ca.SX:
         """CoM seen from the base's origin (3,) [m]."""
-        parts = [ca.SX(ca.DM(b.first)) for b in self.model.bodies]
-        for k in range(len(parts) - 1, 0, -1):
+        parts = {k: ca.SX(ca.DM(self.model.bodies[k].first)) for k in self._counted}
+        for k in self._counted[:0:-1]:
             b = self.model.bodies[k]
-            parts[b.parent] += self._turns[k].out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
+            more = self._turns[k].out(parts[k]) + self.model.carried[k] * ca.DM(b.place)
+            if (across := self._doubled(k)) is not None:
+                more = 2 * _without(more, across)
+            parts[b.parent] += more
         first = parts[0]
         for turn in self._base[::-1]:
             first = turn.out(first)
@@ -319,13 +387,9 @@ class SpatialState:
         linear, angular = self._momenta
         return angular - cross(self.com_from_base, linear)
 
-    @cached_property
-    def _frames(self) -> list:
-        return [None] * len(self.model.bodies)
-
     def spin(self, body: int) -> ca.SX:
         """Angular velocity (3,) of a body [rad/s]."""
-        return self.rotation(body) @ self._spins[body]
+        return self.rotation(body) @ self._spin(body)
 
     def rotation(self, body: int) -> ca.SX:
         """Attitude (3, 3) of a body."""
@@ -336,7 +400,7 @@ class SpatialState:
         return self._frame(body)[1]
 
     def _frame(self, k: int) -> tuple[ca.SX, ca.SX]:
-        if self._frames[k] is None:
+        if k not in self._frames:
             if k == 0:
                 turn = ca.SX.eye(3)
                 for one in self._base[::-1]:
@@ -366,28 +430,26 @@ class SpatialState:
             body = self.model.bodies[body].parent
         return place
 
-    @cached_property
-    def _velocities(self) -> list[ca.SX]:
-        """Velocity of every body's origin, in its own axes."""
-        linear = self.v[:3]
-        for turn in self._base:
-            linear = turn.into(linear)
-        found = [linear]
-        for k, b in enumerate(self.model.bodies[1:], start=1):
-            linear = found[b.parent]
-            if np.any(b.place):
-                linear = linear + cross(self._spins[b.parent], b.place)
-            found.append(self._turns[k].into(linear))
-        return found
+    def _velocity(self, k: int) -> ca.SX:
+        """Velocity of a body's origin, in its own axes."""
+        if k not in self._velocities:
+            b = self.model.bodies[k]
+            linear = self._velocity(b.parent) if k else self.v[:3]
+            if k and np.any(b.place):
+                linear = linear + cross(self._spin(b.parent), b.place)
+            for turn in [self._turns[k]] if k else self._base:
+                linear = turn.into(linear)
+            self._velocities[k] = linear
+        return self._velocities[k]
 
     def own_rates(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
         """Velocity of a point of a body, and angular velocity of the body (3,) each, in the body's axes."""
-        spin = self._spins[body]
-        return self._velocities[body] + cross(spin, ca.DM(local)), spin
+        spin = self._spin(body)
+        return self._velocity(body) + cross(spin, ca.DM(local)), spin
 
     def own_accelerations(self, body: int, local: np.ndarray) -> tuple[ca.SX, ca.SX]:
         """Acceleration of a point of a body, and angular acceleration of the body (3,) each, in the body's axes."""
-        spin, (linear, angular), arm = self._spins[body], self._accelerations[body], ca.DM(local)
+        spin, (linear, angular), arm = self._spin(body), self._acceleration(body), ca.DM(local)
         fall = self.gravity * self.rotation(body)[2, :].T
         return linear - fall + cross(angular, arm) + cross(spin, cross(spin, arm)), angular
 
@@ -410,3 +472,10 @@ def _unit(axis: int, size: ca.SX) -> ca.SX:
     x = ca.SX.zeros(3)
     x[axis] = size
     return x
+
+
+def _without(x: ca.SX, axis: int) -> ca.SX:
+    """The vector less its part along an axis."""
+    y = ca.SX(x)
+    y[axis] = 0
+    return y

@@ -46,8 +46,6 @@ def in_plane(robot: Robot) -> bool:
     feet = [model.frames[model.getFrameId(name)].parentJoint for name in robot.foot.frames]
     in_legs = {j for foot in feet for j in model.supports[foot]}
     free = {model.names[j] for j in range(2, model.njoints) if j not in in_legs} - set(robot.joints["shoulder_pitch"])
-    bodies = [(model.inertias[2 + i], model.inertias[2 + k]) for i, k, _ in pairs]
-    even = all(_alike(a, b) for a, b in [(model.inertias[1], model.inertias[1]), *bodies])
     axes = pin.computeJointJacobians(model, model.createData(), pin.neutral(model))[4]
     pitch = [axes[model.idx_vs[model.getJointId(name)]] for pair in robot.joints.values() for name in pair]
     try:
@@ -55,7 +53,13 @@ def in_plane(robot: Robot) -> bool:
     except RobotError:  # left and right share no angle
         ranges = False
     mirrored = len({i for row in pairs for i in row[:2]}) == model.nv - 6
-    return ranges and mirrored and even and not free and min(np.abs(pitch)) > PARALLEL
+    return ranges and mirrored and even_masses(model, pairs) and not free and min(np.abs(pitch)) > PARALLEL
+
+
+def even_masses(model: pin.Model, pairs: list[tuple[int, int, float]]) -> bool:
+    """Whether the base and the bodies of mirrored joints (:func:`mirror`) have mirrored masses and centres."""
+    bodies = [(model.inertias[2 + i], model.inertias[2 + k]) for i, k, _ in pairs]
+    return all(_alike(a, b) for a, b in [(model.inertias[1], model.inertias[1]), *bodies])
 
 
 def _alike(left: pin.Inertia, right: pin.Inertia) -> bool:

@@ -189,6 +189,14 @@ class Contacts:
             )
 
     @property
+    def even(self) -> bool:
+        """Whether left and right do the same: both carry in the same way, or none, and places are mirror images."""
+        if any(p.modes and (len(p.modes) == 1 or len(set(p.modes.values())) > 1) for p in self.phases):
+            return False
+        pairs = zip(self.places[::2], self.places[1::2], strict=True)
+        return all(a == replace(b, left_m=-b.left_m, turn_rad=-b.turn_rad) for a, b in pairs)
+
+    @property
     def surface(self) -> tuple[float, int]:
         """Height of the ground on which the schedule ends [m], and the number of the first place on it.
 

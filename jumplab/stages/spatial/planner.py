@@ -14,12 +14,14 @@ import numpy as np
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp, Solution
+from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.spatial import starts
 from jumplab.stages.spatial.apart import Apart, merged, too_close
 from jumplab.stages.spatial.contacts import SIDES, ContactPhase, Contacts
+from jumplab.stages.spatial.coordinates import Coordinates, even, whole
 from jumplab.stages.spatial.problem import Schedule
 from jumplab.stages.spatial.settings import SPATIAL_MESH, SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.tape import holds_between, make_tape
@@ -102,6 +104,11 @@ class SpatialPlan(BodyPlan):
     limits: SpatialLimits = SpatialLimits()  # that it was made with
     attempts: tuple[Attempt, ...] = ()  # that were made, the last one with success
 
+    @cached_property
+    def phases(self) -> dict[str, PhaseSolution]:
+        """The solution with every coordinate of the robot, as one of ``schedule.whole``."""
+        return self.schedule.spread(self.solution.phases)
+
     @property
     def launch_s(self) -> float:
         """Time until the feet first leave the ground [s]."""
@@ -145,10 +152,12 @@ class SpatialPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
         body: Body | None = None,
+        free: Coordinates | None = None,
     ):
         self.robot, self.mesh = robot, mesh or SPATIAL_MESH
         self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
         self.body = body or Body(robot)
+        self.free = free or whole(self.body)
         self.contacts = contacts or jump_contacts(limits, self.mesh)
         if self.body.short and any(len(p.modes) == 1 for p in self.contacts.phases):
             raise InputError(
@@ -157,13 +166,13 @@ class SpatialPlanner:
         self._taped: tuple[Solution, Tape] | None = None
         self._stood: dict[tuple, tuple[float, str, float] | None] = {}
         self._options = dict(options or {})
-        self._key = f"{robot.hash} {limits} {weights}" if keep else None
+        self._key = f"{robot.hash} {self.free.kind} {limits} {weights}" if keep else None
         self._apart: dict[tuple, Nlp] = {}
         self._terms: dict = {}
         self.nlp = self._nlp(())
 
     def _schedule(self, apart: tuple[Apart, ...]) -> Schedule:
-        return Schedule(self.body, self.contacts, self.limits, self.weights, apart, self._terms)
+        return Schedule(self.body, self.contacts, self.limits, self.weights, apart, self._terms, free=self.free)
 
     def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
         """The program with rows for links that met."""
@@ -202,6 +211,8 @@ class SpatialPlanner:
             If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
+        if (less := self._even_one(task, weights or {}, stance)) is not None:
+            return less.plan(task, weights=weights, near=near, stance=stance)
         weights = self.changes.spread(self.nlp.problem, weights or {})
         parameters = self.parameters(task, stance)
         attempts: list[Attempt] = []
@@ -221,11 +232,28 @@ class SpatialPlanner:
             raise self._explained(failure, task, parameters, weights)
         return replace(self._settled(found, parameters, weights, attempts), attempts=tuple(attempts))
 
+    def _even_one(self, task: JumpTask, weights: Mapping[str, float], stance) -> SpatialPlanner | None:
+        """The planner of even motions, where nothing asks for another."""
+        if self.free.even or not (task.in_plane and self.contacts.even) or self.changes.terms:
+            return None
+        named = (*weights, *self.changes.weights, *self.changes.off)
+        if any(name.rpartition("/")[2] == "mirror" for name in named) or self._even.free.kind == "whole":
+            return None
+        return self._even
+
+    @cached_property
+    def _even(self) -> SpatialPlanner:
+        how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        how |= {"contacts": self.contacts, "free": even(self.body)}
+        if how["free"].kind == "whole":
+            return self
+        return SpatialPlanner(self.robot, self.mesh, self.limits, self.weights, **how)
+
     def _tried(self, start: Start, task, parameters, weights, attempts: list, near: SpatialPlan | None) -> SpatialPlan:
         """A plan from one start, its links apart."""
         begin, apart = near, ()
         if near is not None and start.name == NEIGHBOUR:
-            apart = near.schedule.apart
+            apart = near.schedule.apart if near.schedule.free.kind == self.free.kind else ()
         else:
             begin = self._motion(start, task)
         found = self._solved(start, task, parameters, weights, begin, apart, attempts)
@@ -234,7 +262,9 @@ class SpatialPlanner:
     def _kept_apart(self, found: SpatialPlan, held: bool, parameters, weights, attempts: list) -> SpatialPlan:
         """The plan, solved on with rows for whatever links meet in it."""
         for _ in range(ROUNDS):
-            new = too_close(self.body, list(found.solution.phases.values()))
+            new = too_close(self.body, list(found.phases.values()))
+            if self.free.even:
+                new = [x for x in new if self._on_left(x)]
             if not new:
                 break
             apart = merged(found.schedule.apart, new)
@@ -247,6 +277,11 @@ class SpatialPlanner:
                     if way is ways[-1]:
                         raise
         return found
+
+    def _on_left(self, kept: Apart) -> bool:
+        """Whether a pair of links is no mere mirror image of another."""
+        half = self.body.model.left_half
+        return kept.pair.first.body in half or kept.pair.second.body in half
 
     def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
         schedule = self._schedule(())
@@ -262,8 +297,11 @@ class SpatialPlanner:
         options = {**IPOPT, **start.options, "max_cpu_time": patience_s, **self._options}
         nlp = nlp.with_options(options, HOLD if start.held else None)
         if isinstance(begin, SpatialPlan):
-            guess = begin.solution.guess({p.name: p.intervals for p in self.contacts.phases})
-            how["multipliers"] = begin.solution.multipliers
+            if begin.schedule.free.kind == self.free.kind:
+                guess = begin.solution.guess({p.name: p.intervals for p in self.contacts.phases})
+                how["multipliers"] = begin.solution.multipliers
+            else:
+                guess = starts.beside(schedule, begin.phases)
         else:
             guess = starts.guess(schedule, begin)
         began, words = time.process_time(), "held Gauss-Newton" if start.held else "exact"
@@ -308,7 +346,8 @@ class SpatialPlanner:
         phases = tuple(replace(p, intervals=math.ceil(FINER * p.intervals)) for p in self.contacts.phases)
         contacts = replace(self.contacts, phases=phases)
         how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
-        return SpatialPlanner(self.robot, self.mesh, self.limits, self.weights, contacts=contacts, **how)
+        how |= {"contacts": contacts, "free": self.free}
+        return SpatialPlanner(self.robot, self.mesh, self.limits, self.weights, **how)
 
     def _explained(self, failure: SolverError, task: JumpTask, parameters, weights) -> SolverError:
         """Why there is no plan: the terms in conflict, and a smaller target that has one."""
@@ -340,14 +379,14 @@ class SpatialPlanner:
     def tape(self, plan: SpatialPlan) -> Tape:
         """The 1 kHz tape of a plan; that of the last one is kept."""
         if self._taped is None or self._taped[0] is not plan.solution:
-            self._taped = plan.solution, make_tape(plan.schedule, plan.solution.phases, plan.task.gravity)
+            self._taped = plan.solution, make_tape(plan.schedule.whole, plan.phases, plan.task.gravity)
         return self._taped[1]
 
     def _references(self) -> dict[str, dict[str, np.ndarray]]:
         """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and foot."""
         phases = self.contacts.phases
         out = {p.name: {} for p in phases}
-        for side in (0, 1):
+        for side in self.free.sides:
             for run in _runs([side not in p.modes for p in phases]):
                 count, at, last = sum(phases[k].intervals for k in run), 0, run[-1] == len(phases) - 1
                 for k in run:
@@ -370,7 +409,7 @@ class SpatialPlanner:
         start = self.body.stance if stance is None else self.body.model.of_pinocchio(stance[None])[0]
         if not self.robot.planar:  # of others stage 1's closed forms tell
             self._check_standing(start, task.gravity)
-        values = dict(stance=start, distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
+        values = dict(stance=self.free.taken(start), distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
         values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
         values["straight"] = float(task.in_plane and self.contacts.ends == "touchdown")
         if self.contacts.ends == "rest":

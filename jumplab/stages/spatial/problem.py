@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from jumplab.models.spatial import CHART
 from jumplab.ocp.problem import Bound, Phase, Problem
+from jumplab.ocp.solution import PhaseSolution
 from jumplab.stages.spatial.apart import Apart
 from jumplab.stages.spatial.contacts import SIDES, Contacts
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.terms import BASE, EDGES, Body, SpatialTerms
+from jumplab.stages.spatial.coordinates import BASE, Coordinates, whole
+from jumplab.stages.spatial.terms import Body, SpatialTerms
 from jumplab.stages.spatial.view import SpatialView
 
 SCALES = {"q": 1.0, "v": 10.0, "a": 100.0}  # peaks of solutions, for conditioning
@@ -41,15 +44,17 @@ class Schedule:
         apart: Iterable[Apart] = (),
         terms: dict[tuple, SpatialTerms] | None = None,
         name: str = "spatial",
+        free: Coordinates | None = None,
     ):
         """``terms`` are those of the modes that are known already; others are added."""
+        self.free = free or whole(body)
         self.body, self.contacts, self.limits, self.weights, self.name = body, contacts, limits, weights, name
         self.apart = tuple(apart)
         self.terms = {} if terms is None else terms
         for phase in contacts.phases:
             key = mode_key(phase.modes)
             if key not in self.terms:
-                self.terms[key] = SpatialTerms(body, limits, weights, phase.modes)
+                self.terms[key] = SpatialTerms(body, limits, weights, phase.modes, self.free)
 
     def of(self, k: int) -> SpatialTerms:
         """Terms of a phase."""
@@ -59,6 +64,39 @@ class Schedule:
         """Sides of the feet that come down at the start of a phase; none at that of the first."""
         before = self.contacts.phases[k - 1].modes if k else self.contacts.phases[0].modes
         return [side for side in self.contacts.phases[k].modes if side not in before]
+
+    @cached_property
+    def whole(self) -> Schedule:
+        """The same with every coordinate free."""
+        if not self.free.even:
+            return self
+        return Schedule(self.body, self.contacts, self.limits, self.weights, self.apart, name=self.name)
+
+    def spread(self, phases: Mapping[str, PhaseSolution]) -> dict[str, PhaseSolution]:
+        """A solution as one of :attr:`whole`."""
+        if not self.free.even:
+            return dict(phases)
+        return {name: self._spread(k, x) for k, (name, x) in enumerate(phases.items())}
+
+    def _spread(self, k: int, phase: PhaseSolution) -> PhaseSolution:
+        b, w = self.of(k), self.whole.of(k)
+        motion = []
+        for level, x in enumerate((phase.q, phase.v, phase.a, phase.j)):
+            heels = [x[:, b.nv] for _ in w.raised]
+            motion.append(np.column_stack([self.free.charts(x, level), *heels]))
+        forces = [b.spread_forces(phase.z[:, : b.n_forces], side) for side in w.modes]
+        torques = np.zeros((len(phase.z), b.nv))
+        torques[:, b.nv - len(self.free.joints) :] = phase.z[:, b.n_forces :]
+        z = np.column_stack([*forces, self.free.charts(torques, 1)[:, BASE:]])
+        constants = dict(phase.constants)
+        if b.flying:
+            constants |= dict.fromkeys((n for n in w.constants if n not in constants), 0.0)
+        for side in w.modes:
+            for x, sign in (("x", 1.0), ("y", -1.0), ("z", 1.0), ("yaw", -1.0)):
+                value = phase.constants[f"{SIDES[0]}_{x}"]
+                constants[f"{SIDES[side]}_{x}"] = sign * value if side else value
+        q, v, a, j = motion
+        return replace(phase, q=q, v=v, a=a, j=j, z=z, constants=constants)
 
     def problem(self) -> Problem:
         """All phases in one problem."""
@@ -71,12 +109,12 @@ class Schedule:
         b, given, last = self.of(k), self.contacts.phases[k], k == len(self.contacts.phases) - 1
         landed = self.landed(k)
         joined = bool(k) and not landed
-        terms = [*b.smoothness(), *b.dynamics(joined), b.motor_lines(joined), b.body_clearance(), b.sides_apart()]
+        terms = [*b.smoothness(), *b.dynamics(joined), b.motor_lines(joined), b.body_clearance(), *b.sides_apart()]
         terms += [b.link_distance(x, given.intervals) for x in self.apart if x.phase == k]
-        for side in b.modes:
+        for side in b.sides:
             # the first node is given, so it needs no rows
             terms += b.foot_rows(side, joined or k == 0, side in landed)
-        terms += [b.swing_rows(side) for side in (0, 1) if side not in b.modes]
+        terms += [b.swing_rows(side) for side in self.free.sides if side not in b.modes]
         around = self.contacts.phases[max(k - 1, 0) : k + 2]
         if given.feet == "LR" and all(p.flying or len(p.modes) == 2 for p in around):
             terms.append(b.loads())  # where one foot steps the load goes from foot to foot
@@ -95,7 +133,7 @@ class Schedule:
             (*self._boxes(b), *self._ends(k)),
             b.states,
             self._constants(k),
-            {f"{SIDES[side]}_clearance": 1 for side in (0, 1) if side not in b.modes},
+            {f"{SIDES[side]}_clearance": 1 for side in self.free.sides if side not in b.modes},
             SCALES | {"z": self._sizes(b)},
             partial(SpatialView, b),
             b.integrated,
@@ -104,18 +142,18 @@ class Schedule:
         )
 
     def _sizes(self, b: SpatialTerms) -> np.ndarray:
-        effort = np.maximum(self.body.motors["effort"], 1.0)
+        effort = np.maximum(b.motors["effort"], 1.0)
         return np.concatenate([np.full(b.n_forces, self.body.mg / FORCE_SHARE), effort])
 
     def _constants(self, k: int) -> dict:
         """Footholds of the feet that carry, by contact; in flight the CoM's parabola and L."""
         b, out = self.of(k), {}
         if b.flying:
-            for kind, box in (("com", PLACE_BOX), ("vel", SPEED_BOX), ("L", SPIN_BOX)):
-                out |= {f"{kind}_{x}": box for x in "xyz"}
+            boxes = {"com": PLACE_BOX, "vel": SPEED_BOX, "L": SPIN_BOX}
+            out |= {name: boxes[name.partition("_")[0]] for name in b.constants}
             if self.contacts.ends == "touchdown" and k == len(self.contacts.phases) - 1:
                 out["vel_z"] = (_takeoff_speed, _takeoff_speed, 1.0)
-        for side in b.modes:
+        for side in b.sides:
             contact = self.contacts.contact_of(k, side)
             for x, (low, high) in zip(("x", "y", "z", "yaw"), self.foothold(contact), strict=True):
                 out[f"{SIDES[side]}_{x}"] = (low, high, 1.0, f"contact {contact} {x}")
@@ -135,7 +173,7 @@ class Schedule:
 
     def _boxes(self, b: SpatialTerms) -> tuple[Bound, ...]:
         """Ranges, speeds and torques of the joints; forces that only push; feet that tip only forward."""
-        lim, m, raised = b.limits, b.body.motors, len(b.raised)
+        lim, m, raised, free = b.limits, b.body.motors, len(b.raised), self.free
         wide = np.full(BASE, ANGLE_BOX_RAD)
         wide[CHART.index("roll")] = lim.roll_rad
         low, high = m["lower"] + lim.range_margin_rad, m["upper"] - lim.range_margin_rad
@@ -143,9 +181,12 @@ class Schedule:
         for k, sign, angle in b.body.knees:
             bent = sorted((sign * (least - angle), sign * (lim.knee_rad - angle)))
             low[k], high[k] = max(low[k], bent[0]), min(high[k], bent[1])
-        rates = np.concatenate([np.full(BASE, RATE_BOX), lim.speed_share * m["speed"], np.full(raised, np.inf)])
-        torques = lim.torque_share * m["effort"] - m["friction"]
-        q_low, q_high = np.concatenate([-wide, low, np.zeros(raised)]), np.concatenate([wide, high])
+        rates = np.concatenate([np.full(BASE, RATE_BOX), lim.speed_share * m["speed"]])
+        rates = np.concatenate([free.within(-rates, rates)[1], np.full(raised, np.inf)])
+        torques = free.within(*(s * np.concatenate([wide, b.usable_torques]) for s in (-1, 1)))[1]
+        torques = torques[free.size - len(free.joints) :]
+        q_low, q_high = free.within(np.concatenate([-wide, low]), np.concatenate([wide, high]))
+        q_low = np.concatenate([q_low, np.zeros(raised)])
         q_high = np.concatenate([q_high, np.full(raised, lim.heel_up_rad)])
         none, push = np.zeros(b.n_forces), np.full(b.n_forces, np.inf)
         return (
@@ -204,8 +245,8 @@ class Schedule:
         """Columns of the forces that the phase ``after`` no longer has: of feet that leave, of heels that rise."""
         gone, first = [], 0
         for side, points in b.points.items():
-            count = len(EDGES) * len(points)
-            toes = len(EDGES) * 2
+            count = len(b.edges) * len(points)
+            toes = count // 2
             if side not in after:
                 gone += range(first, first + count)
             elif b.modes[side] == "flat" and after[side] == "toe":

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from jumplab.ocp.solution import PhaseGuess
+from jumplab.ocp.solution import PhaseGuess, PhaseSolution
 from jumplab.robot.stance import leg_length
+from jumplab.stages.spatial.contacts import SIDES
 from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.terms import BASE, Body
+from jumplab.stages.spatial.coordinates import BASE
+from jumplab.stages.spatial.terms import Body, SpatialTerms
 from jumplab.task import JumpTask
 
 # of the base, as shares of the leg's length; angles [rad]
@@ -239,29 +241,44 @@ def guess(schedule: Schedule, motion: Motion) -> dict[str, PhaseGuess]:
         heels = [np.maximum(pitch[rows, side], 0.0) for side in b.raised]
         level = np.zeros((len(rows), len(heels)))
         z = np.zeros((len(rows), len(b.states)))
-        for side in b.modes:
-            own = [
-                i
-                for i, name in enumerate(b.states[: b.n_forces])
-                if name.endswith(f"of {('left', 'right')[side]} foot")
-            ]
+        for side in b.sides:
+            names = enumerate(b.states[: b.n_forces])
+            own = [i for i, name in names if name.endswith(f"of {SIDES[side]} foot")]
             z[:, own] = body.mg / len(b.modes) / len(own)
         constants = {}
-        for side in b.modes:
+        for side in b.sides:
             contact = contacts.contact_of(k, side)
             for name, box in zip(("x", "y", "z", "yaw"), schedule.foothold(contact), strict=True):
-                constants[f"{('left', 'right')[side]}_{name}"] = float(np.mean(box))
+                constants[f"{SIDES[side]}_{name}"] = float(np.mean(box))
         if b.flying:
-            constants |= _flight_constants(body, q[rows], v[rows], motion.durations[k], schedule)
-        out[phase.name] = PhaseGuess(
-            float(motion.durations[k]),
-            np.column_stack([motion.charts[k], *heels]),
-            np.column_stack([v[rows], level]),
-            np.column_stack([a[rows], level]),
-            z,
-            constants,
-        )
+            flown = _flight_constants(body, q[rows], v[rows], motion.durations[k], schedule)
+            constants |= {name: flown[name] for name in b.constants}
+        nodes = [np.column_stack([schedule.free.taken(motion.charts[k]), *heels])]
+        nodes += [np.column_stack([schedule.free.taken(x[rows]), level]) for x in (v, a)]
+        out[phase.name] = PhaseGuess(float(motion.durations[k]), *nodes, z, constants)
     return out
+
+
+def beside(schedule: Schedule, phases: Mapping[str, PhaseSolution]) -> dict[str, PhaseGuess]:
+    """Phase name -> start values of a solution with every coordinate free, in the coordinates of a schedule."""
+    out = {}
+    for k, phase in enumerate(schedule.contacts.phases):
+        b, w, near = schedule.of(k), schedule.whole.of(k), phases[phase.name].guess(phase.intervals)
+        columns = [w.coordinates.index(name) for name in b.coordinates]
+        z = np.zeros((len(near.q), len(b.states)))
+        z[:, b.n_forces :] = near.z[:, [w.states.index(name) for name in b.states[b.n_forces :]]]
+        for side in b.sides:
+            z[:, : b.n_forces] = b.mg / len(b.modes) / b.n_forces
+        constants = {name: near.constants[name] for name in _constant_names(b)}
+        motion = (x[:, columns] for x in (near.q, near.v, near.a))
+        out[phase.name] = PhaseGuess(near.duration, *motion, z, constants)
+    return out
+
+
+def _constant_names(b: SpatialTerms) -> list[str]:
+    if b.flying:
+        return b.constants
+    return [f"{SIDES[side]}_{x}" for side in b.sides for x in ("x", "y", "z", "yaw")]
 
 
 def _pitches(body: Body, q: np.ndarray) -> np.ndarray:

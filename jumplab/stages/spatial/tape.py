@@ -21,7 +21,8 @@ from jumplab.stages.reconstruction import SHORTEST_STEP
 from jumplab.stages.spatial.contacts import SIDES
 from jumplab.stages.spatial.legs import LEG_STEPS, Legs, Motion
 from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.terms import BASE, EDGES, Body, SpatialTerms
+from jumplab.stages.spatial.coordinates import BASE
+from jumplab.stages.spatial.terms import EDGES, Body, SpatialTerms
 
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # over which a phase passes from where the one before ended on the tape to its own plan

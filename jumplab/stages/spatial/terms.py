@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from jumplab.models.spatial import CHART, SpatialModel, SpatialState, cross
+from jumplab.models.spatial import SpatialModel, SpatialState, cross
 from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
-from jumplab.robot.reduction import mirror
+from jumplab.robot.reduction import even_masses, mirror
 from jumplab.robot.stance import knees, stance_configuration
 from jumplab.stages.spatial.contacts import SIDES
+from jumplab.stages.spatial.coordinates import BASE, Coordinates, whole
 from jumplab.stages.spatial.legs import Legs
 from jumplab.stages.spatial.settings import SpatialLimits, SpatialWeights
 from jumplab.stages.spatial.shapes import Box, boxes, candidates
@@ -26,10 +28,10 @@ if TYPE_CHECKING:
     from jumplab.stages.spatial.apart import Apart
 
 EDGES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # directions of the friction pyramid's edges
-BASE = len(CHART)
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
 SPIN_SCALE, ACCELERATION_SCALE = 10.0, 10.0  # [kg m^2/s], [m/s^2, rad/s^2] for conditioning
 PLACE_SCALE = 0.1  # [m]
+SOLE_SHARES = 0.0, 0.25, 0.5, 0.75, 1.0  # of the way from toes to heel
 TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vanish
 
 
@@ -106,6 +108,11 @@ class Body:
         return min(len(x) for x in self.legs) < 6
 
     @cached_property
+    def mirrored(self) -> bool:
+        """Whether left and right are built alike."""
+        return even_masses(self.model.model, self.model.pairs)
+
+    @cached_property
     def _boxes(self) -> tuple[list[Box], pin.GeometryModel]:
         return boxes(self.robot, self.model)
 
@@ -150,28 +157,43 @@ class SpatialTerms:
     modes : side -> "flat" or "toe", of the feet that carry; none in flight.
     coordinates : of a phase in this mode: the chart, then the pitch of each foot on its toes.
     states : force along each edge of each sole point's friction pyramid in the axes of the foothold, then torques.
+    sides : those of the modes that have rows and forces of their own; in an even motion the left foot stands for both.
     integrated : coordinates that do not follow from feet in place or from flight.
     """
 
-    def __init__(self, body: Body, limits: SpatialLimits, weights: SpatialWeights, modes: Mapping[int, str]):
+    def __init__(
+        self,
+        body: Body,
+        limits: SpatialLimits,
+        weights: SpatialWeights,
+        modes: Mapping[int, str],
+        free: Coordinates | None = None,
+    ):
         self.body, self.limits, self.weights, self.modes = body, limits, weights, dict(modes)
-        self.robot, self.model, self.mg = body.robot, body.model, body.mg
-        self.flying = not self.modes
-        self.nv = len(self.model.names)
-        self.raised = [side for side, mode in self.modes.items() if mode == "toe"]
-        self.coordinates = (*self.model.names, *(f"pitch of {SIDES[side]} foot" for side in self.raised))
-        self.points = {side: self._sole_points(mode) for side, mode in self.modes.items()}
+        self.robot, self.model, self.mg, self.free = body.robot, body.model, body.mg, free or whole(body)
+        self.flying, self.nv = not self.modes, self.free.size
+        self.sides = [side for side in self.modes if side in self.free.sides]
+        self.raised = [side for side in self.sides if self.modes[side] == "toe"]
+        self.coordinates = (*self.free.free_names, *(f"pitch of {SIDES[side]} foot" for side in self.raised))
+        self.edges = EDGES[:2] if self.free.plane else EDGES
+        self.points = {side: self._sole_points(self.modes[side]) for side in self.sides}
         names = [
             f"force {k} of {SIDES[side]} foot"
-            for side in self.modes
-            for k in range(len(EDGES) * len(self.points[side]))
+            for side in self.sides
+            for k in range(len(self.edges) * len(self.points[side]))
         ]
         self.n_forces = len(names)
-        self.states = (*names, *(f"torque of {name}" for name in body.joint_names))
-        follows = set(range(BASE)) if self.flying else {k for side in self.modes for k in body.legs[side]}
-        if body.short and len(self.modes) == 2:
+        self.states = (*names, *(f"torque of {body.joint_names[k]}" for k in self.free.joints))
+        follows = set(range(BASE)) if self.flying else {k for side in self.sides for k in body.legs[side]}
+        if self.short and len(self.modes) == 2:
             follows |= {1, 3, 4}
-        self.integrated = tuple(x for k, x in enumerate(self.coordinates) if k not in follows)
+        gone = {self.model.names[k] for k in follows}
+        self.integrated = tuple(x for x in self.coordinates if x not in gone)
+
+    @property
+    def short(self) -> bool:
+        """Whether both feet on the ground hold yaw and roll of a base that else could have them."""
+        return self.body.short and not self.free.even
 
     @property
     def kind(self) -> str:
@@ -190,21 +212,30 @@ class SpatialTerms:
         wide = foot.half_width - min(lim.side_margin_m, 0.4 * foot.half_width)
         length = 2 * self.body.half_m - min(lim.heel_margin_m, 0.4 * self.body.half_m)
         back = (0.0, -length) if mode == "flat" else (0.0,)
-        return np.array([[x, y, 0.0] for x in back for y in (wide, -wide)])
+        across = (0.0,) if self.free.plane else (wide, -wide)
+        return np.array([[x, y, 0.0] for x in back for y in across])
 
     # model on a point -------------------------------------------------------------------------------------------
-    def chart(self, x: ca.SX) -> ca.SX:
-        """The chart (6 + joints,) of a phase's coordinates, or its rates of theirs."""
-        return x[: self.nv]
+    def chart(self, x: ca.SX, level: int = 0) -> ca.SX:
+        """The chart (6 + joints,) of a phase's coordinates, or with ``level`` 1 or more its rates of theirs."""
+        return self.free.chart(x, level)
 
     def state(self, p: Point) -> SpatialState:
         """The robot at this point; made once."""
         if "state" not in p.memo:
-            p.memo["state"] = SpatialState(self.model, *(self.chart(x) for x in (p.q, p.v, p.a)), p.p.gravity)
+            motion = (self.chart(x, level) for level, x in enumerate((p.q, p.v, p.a)))
+            p.memo["state"] = SpatialState(self.model, *motion, p.p.gravity, self.free.even)
         return p.memo["state"]
 
+    def all_torques(self, p: Point) -> ca.SX:
+        """Motor torques (joints,) of all joints; of those that are held none [N m]."""
+        x = ca.SX.zeros(len(self.free.free))
+        for k, torque in zip(self.free.joints, ca.vertsplit(self.torques(p)), strict=True):
+            x[self.free.free.index(k + BASE)] = torque
+        return self.chart(x, 1)[BASE:]
+
     def torques(self, p: Point) -> ca.SX:
-        """Motor torques (joints,) less the motors' dry friction, whose kink at rest no solver likes [N m].
+        """Torques of the free joints' motors less their dry friction, whose kink at rest no solver likes [N m].
 
         The limits are lowered by that friction instead: joints that move have it, others need less.
         """
@@ -216,13 +247,27 @@ class SpatialTerms:
 
     def point_forces(self, p: Point, side: int) -> list[ca.SX]:
         """Forces (3,) at the points of one sole, in the axes of its foothold [N]."""
-        first = sum(len(EDGES) * len(x) for s, x in self.points.items() if s < side)
+        count = len(self.edges)
+        first = sum(count * len(x) for s, x in self.points.items() if s < side)
         found = []
         for k in range(len(self.points[side])):
-            f = p.z[first + 4 * k : first + 4 * (k + 1)]
+            f = p.z[first + count * k : first + count * (k + 1)]
             mu = self.limits.friction
-            found.append(ca.vertcat(mu * (f[0] - f[1]), mu * (f[2] - f[3]), f[0] + f[1] + f[2] + f[3]))
+            across = 0 if self.free.plane else mu * (f[2] - f[3])
+            found.append(ca.vertcat(mu * (f[0] - f[1]), across, ca.sum1(f)))
         return found
+
+    def spread_forces(self, z: np.ndarray, side: int) -> np.ndarray:
+        """Forces (n, .) along the edges of the pyramids of one foot when all coordinates are free, of even ones (n, .).
+
+        In the plane a point stands for two, one on each side of the sole; a right foot is the mirror image of a left.
+        """
+        f = z.reshape(len(z), -1, len(self.edges))
+        if self.free.plane:
+            f = np.repeat(np.concatenate([f / 2, 0 * f], axis=2), 2, axis=1)
+        elif side:
+            f = f.reshape(len(z), -1, 2, 4)[:, :, ::-1][..., [0, 1, 3, 2]]
+        return f.reshape(len(z), -1)
 
     def wrench(self, p: Point, side: int) -> tuple[ca.SX, ca.SX]:
         """Force and moment about the origin of the foot's body (3,) each, in its axes [N, N m]."""
@@ -239,17 +284,35 @@ class SpatialTerms:
 
     def foot_force(self, p: Point, side: int) -> ca.SX:
         """Force (3,) of the ground on one foot, in the axes of its foothold [N]; zero in the air."""
-        return sum(self.point_forces(p, side), ca.SX.zeros(3)) if side in self.modes else ca.SX.zeros(3)
+        if side not in self.modes:
+            return ca.SX.zeros(3)
+        if side in self.sides:
+            return sum(self.point_forces(p, side), ca.SX.zeros(3))
+        return ca.DM([1.0, -1.0, 1.0]) * self.foot_force(p, 0)
 
     def needed(self, p: Point) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """(force, moment about the base, torques of the motors) that the motion needs besides the ground's forces; made
-        once."""
+        """(force, moment about the base, torques of the free joints' motors) that the motion needs besides the ground's
+        forces, as far as they can change; made once."""
         if "needed" not in p.memo:
-            wrenches = {self.body.feet[side]: self.wrench(p, side) for side in self.modes}
+            wrenches = {self.body.feet[side]: self.wrench(p, side) for side in self.sides}
             force, moment, torques = self.state(p).dynamics(wrenches)
-            rates = p.v[BASE : self.nv]
-            p.memo["needed"] = force, moment, torques + ca.DM(self.body.motors["damping"]) * rates
+            torques = torques[self.free.joints] + ca.DM(self.motors["damping"]) * self.joint_rates(p)
+            p.memo["needed"] = force[self.free.places], moment[self.free.spins], torques
         return p.memo["needed"]
+
+    @property
+    def usable_torques(self) -> np.ndarray:
+        """Torques (joints,) that a plan may ask of the motors, less their dry friction [N m]."""
+        return self.limits.torque_share * self.body.motors["effort"] - self.body.motors["friction"]
+
+    @cached_property
+    def motors(self) -> dict[str, np.ndarray]:
+        """Key of :attr:`.Robot.actuators` -> (free joints,)."""
+        return {key: x[self.free.joints] for key, x in self.body.motors.items()}
+
+    def joint_rates(self, p: Point) -> ca.SX:
+        """Rates of the free joints [rad/s]."""
+        return p.v[self.nv - len(self.free.joints) : self.nv]
 
     def foot_axes(self, p: Point, side: int) -> ca.SX:
         """Attitude (3, 3) of a foot."""
@@ -265,15 +328,24 @@ class SpatialTerms:
         """Costs on accelerations, jerk, torques and forces."""
         w = self.weights
         terms = [
-            cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: p.a[3 : self.nv], w.acceleration),
-            cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: p.j[3 : self.nv], w.jerk, "mid"),
-            cost("torque", "ours: effort", "N m", self.torques, w.torque),
+            cost("acceleration", "WL-J2, WF-J2", "rad/s^2", lambda p: self.moving(p.a), w.acceleration),
+            cost("jerk", "WL-J2, WF-J2", "rad/s^3", lambda p: self.moving(p.j), w.jerk, "mid"),
+            cost("torque", "ours: effort", "N m", self.all_torques, w.torque),
         ]
         if not self.flying:
             terms.append(cost("force", "ours: spread", "N", lambda p: p.z[: self.n_forces], w.force))
-        if not self.robot.planar:
+        if not (self.robot.planar or self.free.even):
             terms.append(cost("mirror", "ours: a jump straight ahead is even", "rad", self.uneven, w.mirror))
         return terms
+
+    def moving(self, x: ca.SX) -> ca.SX:
+        """What turns, of derivatives: attitude of the base and joints, of both sides."""
+        return self.chart(x, 1)[[*(3 + k for k in range(3) if 3 + k in self.free.free), *self._moved]]
+
+    @cached_property
+    def _moved(self) -> list[int]:
+        """Columns of the chart of joints that are not held."""
+        return [BASE + int(k) for k in np.flatnonzero(np.abs(self.free.spread[BASE:]).any(axis=1))]
 
     def uneven(self, p: Point) -> ca.SX:
         """How far left and right are from mirror images in a jump straight ahead; yaw and roll of the base."""
@@ -287,7 +359,7 @@ class SpatialTerms:
         """
 
         def torques(p):
-            return (self.needed(p)[2] - self.torques(p)) / ca.DM(self.body.motors["effort"])
+            return (self.needed(p)[2] - self.torques(p)) / ca.DM(self.motors["effort"])
 
         how = {"identity": True, "skip": (int(joined), 0), "group": "dynamics"}
         return [
@@ -298,12 +370,12 @@ class SpatialTerms:
 
     def motor_lines(self, joined: bool) -> Term:
         """Torque against speed of every joint."""
-        m = self.body.motors
+        m = self.motors
         slope = m["effort"] / (m["no_load_speed"] - m["corner_speed"]) * self.limits.torque_share
         top = slope * m["no_load_speed"] - m["friction"]
 
         def line(p):
-            return (self.torques(p) + ca.DM(slope) * p.v[BASE : self.nv]) / ca.DM(m["effort"])
+            return (self.torques(p) + ca.DM(slope) * self.joint_rates(p)) / ca.DM(m["effort"])
 
         high = top / m["effort"]
         return row("torque-speed", "ours: motor line", "of the effort", line, -high, high, skip=(int(joined), 0))
@@ -311,39 +383,51 @@ class SpatialTerms:
     def body_clearance(self) -> Term:
         """Knees and hands stay away from the ground."""
 
+        half = set(self.model.left_half) if self.free.even else set(range(len(self.model.bodies)))
+        kept = [k for k, (body, _) in enumerate(self.body.limb_points) if body in half]
+
         def heights(p):
-            places = [self.state(p).point(body, local) for body, local in self.body.limb_points]
+            places = [self.state(p).point(*self.body.limb_points[k]) for k in kept]
             return ca.vertcat(*(x[2] - self.ground(p, x) for x in places))
 
         how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
         least = np.full(len(self.body.limb_points), self.limits.body_clearance_m)
         least[:2] += self.body.shank_m
+        least = least[kept]
         return row("body clearance", "ours", "m", heights, least, np.inf, **how)
 
-    def sides_apart(self) -> Term:
+    def sides_apart(self) -> list[Term]:
         """Left and right knees, ankles, toes and heels keep a share of their distance in the stance, seen from the
-        trunk; hands stay outside. Cheap rows, which hold for most motions what distances of links would."""
-        body, lim = self.body, self.limits
+        trunk; hands stay outside. Cheap rows, which hold for most motions what distances of links would. In the plane
+        nothing moves across it."""
+        if self.free.plane:
+            return []
+        body, lim, state = self.body, self.limits, self.state
         pairs = [[(1 + k, np.zeros(3)) for k, _, _ in body.knees], [(k, np.zeros(3)) for k in body.feet]]
         pairs += [list(zip(body.feet, places, strict=True)) for places in (body.tips, body.corners[:, 2:].mean(axis=1))]
         hands = body.limb_points[2:]
-        legs = range(len(pairs))
+        if self.free.even:
+            hands = [hand for hand in hands if hand[0] in self.model.left_half]
+
+        def distance(s, left, right):
+            if self.free.even:
+                return 2 * s.from_base(*left)[1]
+            return s.from_base(*left)[1] - s.from_base(*right)[1]
 
         def across(s):
-            y = [s.from_base(*left)[1] - s.from_base(*right)[1] for left, right in pairs]
-            return ca.vertcat(*y, *(s.from_base(*hand)[1] for hand in hands))
+            return ca.vertcat(*(distance(s, *pair) for pair in pairs), *(s.from_base(*hand)[1] for hand in hands))
 
         chart = ca.SX(ca.DM(body.stance))
         stood = ca.evalf(across(SpatialState(self.model, chart, 0 * chart, 0 * chart))).full().ravel()
         way = np.sign(stood)
-        least = [lim.sides_share * abs(stood[k]) for k in legs]
+        least = [lim.sides_share * abs(x) for x in stood[: len(pairs)]]
         least += [abs(x) - lim.hands_inward_m for x in stood[len(pairs) :]]
 
         def rows(p):
-            return ca.DM(way) * across(self.state(p))
+            return ca.DM(way) * across(state(p))
 
         how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
-        return row("sides apart", "ours", "m", rows, np.array(least), np.inf, **how)
+        return [row("sides apart", "ours", "m", rows, np.array(least), np.inf, **how)]
 
     def link_distance(self, kept: Apart, intervals: int) -> Term:
         """Two links stay apart at the nodes for which it is asked."""
@@ -383,19 +467,19 @@ class SpatialTerms:
             s, turn = self.state(p), self.foot_axes(p, side)
             heading = ca.cos(yaw) * turn[1, 0] - ca.sin(yaw) * turn[0, 0]
             pitch = turn[2, 0] + ca.sin(self.pitch(side, p.q))
-            return self._without_side(side, s.point(k, tip) - at, [heading, turn[2, 1], pitch], p.q)
+            return self._foot_rows(side, s.point(k, tip) - at, [heading, turn[2, 1], pitch], p.q)
 
         def rates(p):
             speed, spin = self.state(p).own_rates(k, tip)
             spin = ca.DM(axes).T @ spin
             spin[1] -= self.pitch(side, p.v)
-            return self._without_side(side, ca.DM(axes).T @ speed, [spin[2], spin[0], spin[1]], p.v)
+            return self._foot_rows(side, ca.DM(axes).T @ speed, [spin[2], spin[0], spin[1]], p.v)
 
         def accelerations(p):
             gain, spin = self.state(p).own_accelerations(k, tip)
             spin = ca.DM(axes).T @ spin
             spin[1] -= self.pitch(side, p.a)
-            return self._without_side(side, ca.DM(axes).T @ gain, [spin[2], spin[0], spin[1]], p.a)
+            return self._foot_rows(side, ca.DM(axes).T @ gain, [spin[2], spin[0], spin[1]], p.a)
 
         first = 1 if joined or not landed else 0
         levels = ("in place", "m, 1", place, 1.0, first), ("still", "m/s, rad/s", rates, 1.0, first)
@@ -405,17 +489,20 @@ class SpatialTerms:
             for said, unit, of, scale, skip in levels
         ]
 
-    def _without_side(self, side: int, place: ca.SX, turn: list[ca.SX], chart: ca.SX) -> ca.SX:
-        """The rows of a foot; short legs leave the base no yaw and no roll, and the right foot's side follows."""
-        if not self.body.short:
-            return ca.vertcat(place, *turn)
+    def _foot_rows(self, side: int, place: ca.SX, turn: list[ca.SX], chart: ca.SX) -> ca.SX:
+        """The rows of a foot that can change: place, heading, roll and pitch.
+
+        Short legs leave the base no yaw and no roll, and the right foot's side follows.
+        """
+        if not self.short:
+            return ca.vertcat(place, *turn)[self.free.foot]
         return ca.vertcat(place, *turn) if side == 0 else ca.vertcat(place[[0, 2]], *turn, chart[3], chart[4])
 
     def loads(self) -> Term:
         """Both flat feet carry."""
 
         def forces(p):
-            return ca.vertcat(*(self.foot_force(p, side)[2] for side in self.modes))
+            return ca.vertcat(*(self.foot_force(p, side)[2] for side in self.sides))
 
         least = self.limits.foot_share * self.mg
         return row("load of each foot", "ours", "N", forces, least, np.inf, scale=self.mg, skip=(0, 0))
@@ -443,7 +530,7 @@ class SpatialTerms:
         k, least = self.body.feet[side], self.body.ankle_m + self.limits.ankle_margin_m
 
         def heights(p):
-            places = [self.state(p).point(k, c) for c in self.body.corners[side]]
+            places = [self.state(p).point(k, c) for c in self._sole_edge(side)]
             asked = getattr(p.ref, f"{SIDES[side]}_clearance")
             ankle = self.state(p).point(k, np.zeros(3))
             above = [x[2] - self.ground(p, x) - asked for x in places]
@@ -452,6 +539,13 @@ class SpatialTerms:
         how = {"scale": PLACE_SCALE, "skip": (1, 1), "group": "clearance"}
         return row(f"clearance of {SIDES[side]} sole", "ours", "m", heights, *POSITIVE, **how)
 
+    def _sole_edge(self, side: int) -> np.ndarray:
+        """Points of the sole that stay clear of the ground: its corners, in the plane along its middle line."""
+        if not self.free.plane:
+            return self.body.corners[side]
+        ends = self.body.corners[side].reshape(2, 2, 3).mean(axis=1)
+        return np.array([ends[0] + share * (ends[1] - ends[0]) for share in SOLE_SHARES])
+
     # flight -----------------------------------------------------------------------------------------------------
     def flight_rows(self) -> list[Term]:
         """Flight: the CoM's parabola and all three components of L, at every node, the one of take-off included."""
@@ -459,20 +553,22 @@ class SpatialTerms:
         def com(p):
             t, c = p.time, p.c
             fall = ca.vertcat(0, 0, p.p.gravity * t * t / 2)
-            start, speed = (ca.vertcat(*(getattr(c, f"{k}_{x}") for x in "xyz")) for k in ("com", "vel"))
-            return self.state(p).com - (start + speed * t - fall)
+            start, speed = (self.constant(c, k) for k in ("com", "vel"))
+            return (self.state(p).com - (start + speed * t - fall))[self.free.places]
 
         def speed(p):
             fall = ca.vertcat(0, 0, p.p.gravity * p.time)
-            return self.state(p).com_velocity - (ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z) - fall)
+            return (self.state(p).com_velocity - (self.constant(p.c, "vel") - fall))[self.free.places]
 
         def kept(p):
-            return self.state(p).angular_momentum - ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
+            return (self.state(p).angular_momentum - self.constant(p.c, "L"))[self.free.spins]
+
+        at = self.free.turns
 
         def angles(left, right, step):
             """Of the base: places alone, rates come from L and accelerations from the moments."""
-            turned = right.q[3:6] - left.q[3:6] - step * (left.v[3:6] + right.v[3:6]) / 2
-            return turned - step**2 * (left.a[3:6] - right.a[3:6]) / 12
+            turned = right.q[at] - left.q[at] - step * (left.v[at] + right.v[at]) / 2
+            return turned - step**2 * (left.a[at] - right.a[at]) / 12
 
         return [
             row("ballistic CoM", "WF-D1", "m", com, identity=True, group="flight"),
@@ -481,46 +577,62 @@ class SpatialTerms:
             row("base turns", "state equation", "rad", angles, at="interval", identity=True),
         ]
 
+    def constant(self, c: SimpleNamespace, kind: str) -> ca.SX:
+        """A constant vector (3,) of the flight: "com", "vel" or "L"; what cannot change is zero."""
+        return ca.vertcat(*(getattr(c, f"{kind}_{x}", ca.SX(0)) for x in "xyz"))
+
+    @property
+    def constants(self) -> list[str]:
+        """Names of those that can change."""
+        moved = [f"{kind}_{'xyz'[k]}" for kind in ("com", "vel") for k in self.free.places]
+        return [*moved, *(f"L_{'xyz'[k]}" for k in self.free.spins)]
+
     # touchdown at the end of the schedule -----------------------------------------------------------------------
     def bend(self, p: Point) -> ca.SX:
-        """Flexion of both knees (2,) [rad]."""
-        return ca.vertcat(*(sign * p.q[BASE + k] + angle for k, sign, angle in self.body.knees))
+        """Flexion of the knees [rad]."""
+        chart, knees = self.chart(p.q), self.body.knees[: len(self.free.sides)]
+        return ca.vertcat(*(sign * chart[BASE + k] + angle for k, sign, angle in knees))
 
     def turned(self, p: Point, x: ca.SX | np.ndarray, way: int = 1) -> ca.SX:
         """A vector (3,) turned by the asked yaw, or back."""
         c, s = ca.cos(p.p.yaw), way * ca.sin(p.p.yaw)
         return ca.vertcat(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
 
-    def soles(self, p: Point) -> list[ca.SX]:
-        """Middles of both soles (3,) [m]."""
-        return [self.state(p).point(k, x) for k, x in zip(self.body.feet, self.body.middles, strict=True)]
+    def sole_middle(self, p: Point) -> ca.SX:
+        """Middle between both soles (3,) [m]; of an even motion, without the part across the plane."""
+        soles = [self.state(p).point(self.body.feet[side], self.body.middles[side]) for side in self.free.sides]
+        return sum(soles) / len(soles)
 
     def feet_at_goal(self, p: Point) -> ca.SX:
         """What is left between both feet and their new places: place (3,), pitch, roll, heading of each."""
-        rows, short = [], self.body.short
-        for side, sole in enumerate(self.soles(p)):
+        rows, short = [], self.short
+        for side in self.free.sides:
+            sole = self.state(p).point(self.body.feet[side], self.body.middles[side])
             first = self.body.places[side] - np.array([self.body.half_m, 0.0, 0.0])
             goal = self.turned(p, first) + ca.vertcat(p.p.distance, p.p.side, p.p.platform)
             axes, ahead = self.foot_axes(p, side), self.turned(p, np.array([1.0, 0.0, 0.0]))
             off = sole - goal
             if short:
                 off = self.turned(p, off, -1)[[0, 1, 2] if side == 0 else [0, 2]]
-            rows += [off, axes[2, 0], axes[2, 1], ca.dot(ahead, axes[:, 1])]
+            whole_rows = ca.vertcat(off, ca.dot(ahead, axes[:, 1]), axes[2, 1], axes[2, 0])
+            rows.append(whole_rows if short else whole_rows[self.free.foot])
         return ca.vertcat(*rows, *([p.q[3] - p.p.yaw, p.q[4]] if short else []))
 
     def capture(self, p: Point) -> ca.SX:
         """How far the middle between the soles is off the place (2,) where it catches the robot [m]."""
         lim = self.limits
         ahead = self.turned(p, np.array([lim.capture_offset_m, 0.0, 0.0]))
-        speed = ca.vertcat(p.c.vel_x, p.c.vel_y, 0)
-        return (sum(self.soles(p)) / 2 - self.state(p).com - ahead - lim.capture_slope_s * speed)[:2]
+        speed = self.constant(p.c, "vel")
+        off = self.sole_middle(p) - self.state(p).com - ahead - lim.capture_slope_s * speed
+        return off[[k for k in self.free.places if k < 2]]
 
     def sliding(self, p: Point) -> ca.SX:
-        """By how much (8,) soles come down steeply enough to stick, each way along x and y [m/s]."""
+        """By how much soles come down steeply enough to stick, each way along x and y (4,) of each foot [m/s]."""
         state, found = self.state(p), []
-        for k, x in zip(self.body.feet, self.body.middles, strict=True):
-            speed = state.rotation(k) @ state.own_rates(k, x)[0]
-            found.append(EDGES @ speed[:2] - self.limits.touchdown_slope * speed[2])
+        for side in self.free.sides:
+            k = self.body.feet[side]
+            speed = state.rotation(k) @ state.own_rates(k, self.body.middles[side])[0]
+            found.append(self.edges @ speed[:2] - self.limits.touchdown_slope * speed[2])
         return ca.vertcat(*found)
 
     def capture_rows(self) -> Term:
@@ -531,10 +643,10 @@ class SpatialTerms:
             return row("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, **how)
 
         def about_soles(p):
-            speed = ca.vertcat(p.c.vel_x, p.c.vel_y, p.c.vel_z - p.p.gravity * p.time)
-            spin = ca.vertcat(p.c.L_x, p.c.L_y, p.c.L_z)
-            arm = self.state(p).com - sum(self.soles(p)) / 2
-            return (spin + self.model.mass * ca.cross(arm, speed))[:2]
+            speed = self.constant(p.c, "vel") - ca.vertcat(0, 0, p.p.gravity * p.time)
+            arm = self.state(p).com - self.sole_middle(p)
+            about = self.constant(p.c, "L") + self.model.mass * ca.cross(arm, speed)
+            return about[[k for k in self.free.spins if k < 2]]
 
         words = "capture by momentum", "ours, for flips; replaces WF-E2", "kg m^2/s"
         return row(*words, about_soles, -moment, moment, at="end", scale=SPIN_SCALE)
@@ -546,31 +658,38 @@ class SpatialTerms:
 
         def within(rates, vertical):
             """Bounds on rates, those about the vertical wider where more than half a turn has to be stopped."""
+            vertical = np.array(vertical, float)
 
             def most(parameters):
                 more = max(0.0, abs(float(parameters["yaw"])) / np.pi - 1)
-                return rates + lim.touchdown_turning * more * np.array(vertical)
+                return rates + lim.touchdown_turning * more * vertical
 
             return (lambda parameters: -most(parameters)), most
 
         def spins(p):
-            return ca.vertcat(*(self.state(p).spin(k) for k in self.body.feet))
+            return ca.vertcat(*(self.state(p).spin(self.body.feet[side])[turning] for side in self.free.sides))
 
         def attitude(p):
-            return p.q[3:6] - ca.vertcat(p.p.yaw, 0, p.p.rotation)
+            return (self.chart(p.q)[3:6] - ca.vertcat(p.p.yaw, 0, p.p.rotation))[angles]
+
+        def trunk_rates(p):
+            return p.v[self.free.turns]
 
         def end(name, equation, unit, of, lower=0.0, upper=0.0, **how):
             return row(name, equation, unit, of, lower, upper, at="end", **how)
 
-        low = -lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]
-        high = lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]
+        turning = [1] if self.free.plane else [0, 1, 2]
+        angles = [self.free.free[k] - 3 for k in self.free.turns]
+        low = np.array([-lim.touchdown_yaw, -lim.touchdown_roll, lim.touchdown_pitch[0]])[angles]
+        high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
+        about = np.tile(np.array([0.0, 0.0, 1.0])[turning], len(self.free.sides))
         return [
             end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal),
-            end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, [0, 0, 1, 0, 0, 1])),
+            end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, about)),
             end("soles that stick at touchdown", "ours: friction", "m/s", self.sliding, *POSITIVE),
             end("attitude at touchdown", "ours", "rad", attitude, low, high),
             end("knees at touchdown", "ours: stroke", "rad", self.bend, *lim.touchdown_knee),
-            end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", lambda p: p.v[BASE : self.nv], -rate, rate),
-            end("trunk rates at touchdown", "ours", "rad/s", lambda p: p.v[3:6], *within(trunk, [1, 0, 0])),
+            end("joint rates at touchdown", "WF-E1, relaxed", "rad/s", self.joint_rates, -rate, rate),
+            end("trunk rates at touchdown", "ours", "rad/s", trunk_rates, *within(trunk, np.eye(3)[0][angles])),
             self.capture_rows(),
         ]

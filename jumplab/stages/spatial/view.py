@@ -9,7 +9,8 @@ import casadi as ca
 
 from jumplab.errors import InputError, quoted
 from jumplab.ocp.problem import Point
-from jumplab.stages.spatial.terms import BASE, SpatialTerms
+from jumplab.stages.spatial.coordinates import BASE
+from jumplab.stages.spatial.terms import SpatialTerms
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,12 @@ class SpatialView:
     @property
     def joint_rates(self) -> SimpleNamespace:
         """Joint rates [rad/s]."""
-        return self._named(self._terms.chart(self._point.v)[BASE:])
+        return self._named(self._terms.chart(self._point.v, 1)[BASE:])
 
     @property
     def torques(self) -> SimpleNamespace:
         """Joint torques [N m]."""
-        return self._named(self._terms.torques(self._point))
+        return self._named(self._terms.all_torques(self._point))
 
     @property
     def attitude(self) -> ca.SX:
