@@ -28,9 +28,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.sim.scene import Scene as Scene
     from jumplab.stages.plan import JumpPlan as JumpPlan
     from jumplab.stages.planner import Planner as Planner
-    from jumplab.stages.spatial import ContactPhase as ContactPhase
-    from jumplab.stages.spatial import Contacts as Contacts
-    from jumplab.stages.spatial import Place as Place
+    from jumplab.stages.whole_body import ContactPhase as ContactPhase
+    from jumplab.stages.whole_body import Contacts as Contacts
+    from jumplab.stages.whole_body import Place as Place
     from jumplab.studies.atlas import Atlas as Atlas
     from jumplab.studies.chain import run_chain as run_chain
     from jumplab.studies.envelope import envelope as envelope
@@ -39,9 +39,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
 
 _PLACES = {
     "JumpTask": "task",
-    "Contacts": "stages.spatial",
-    "ContactPhase": "stages.spatial",
-    "Place": "stages.spatial",
+    "Contacts": "stages.whole_body",
+    "ContactPhase": "stages.whole_body",
+    "Place": "stages.whole_body",
     "Robot": "robot",
     "Planner": "stages.planner",
     "JumpPlan": "stages.plan",

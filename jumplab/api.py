@@ -10,7 +10,7 @@ from jumplab.io import folder as folders
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
-from jumplab.stages.spatial import Contacts
+from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them

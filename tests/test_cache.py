@@ -18,7 +18,7 @@ from jumplab.ocp.derivatives import ElementBuilder
 from jumplab.ocp.nlp import Nlp
 from jumplab.ocp.problem import Problem, layouts
 from jumplab.robot.reach import reach, shipped_reach
-from jumplab.stages.spatial.problem import Schedule
+from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.srmp import SrmpPlanner
 from jumplab.stages.srmp import planner as srmp_planner
 from jumplab.stages.srmp.planner import reach_of

@@ -9,11 +9,11 @@ from jumplab.errors import InputError
 from jumplab.ocp.problem import layouts
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
-from jumplab.stages.spatial import ContactPhase, Contacts, Place, SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.contacts import INTERVALS, STEP_SHARE, TIMES
-from jumplab.stages.spatial.planner import jump_contacts
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.terms import Body
+from jumplab.stages.whole_body import ContactPhase, Contacts, Place, Limits, Weights
+from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES
+from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.terms import Body
 from jumplab.stages.whole_body import Mesh
 
 LEAP = "LR L lR R r - L LR"
@@ -153,7 +153,7 @@ def test_phases_take_times_that_suit_the_legs(bhr):
 
 
 def test_a_standing_jump_ends_in_flight():
-    limits = SpatialLimits()
+    limits = Limits()
     contacts = jump_contacts(limits, Mesh(12, 6, 10))
     assert letters(contacts) == "LR lr -" and contacts.ends == "touchdown"
     found = [(p.name, p.time_s, p.intervals) for p in contacts.phases]
@@ -167,7 +167,7 @@ def test_a_standing_jump_ends_in_flight():
 # as a problem -------------------------------------------------------------------------------------
 def test_phases_share_what_does_not_jump(bhr):
     """Where a foot lands, forces and accelerations jump; the rows of what is shared stand only once."""
-    limits, weights = SpatialLimits(), SpatialWeights()
+    limits, weights = Limits(), Weights()
     phases = Schedule(Body(bhr), Contacts.leap(bhr), limits, weights).problem().phases
     assert [p.shared for p in phases] == ["", "qvaz", "qv", "qvaz", "qvaz", "qvaz", "qv", "qv"]
     skips = [{t.name: t.skip[0] for t in p.terms} for p in phases]
@@ -190,7 +190,7 @@ def test_footholds_are_one_unknown_in_all_phases_of_a_contact(bhr):
     body = Body(bhr)
     place = Place(0.3, 0.05, 0.2, 0.0, (0.01, 0.02), 0.1)
     contacts = Contacts.of("LR L LR lr LR", bhr, [place])
-    schedule = Schedule(body, contacts, SpatialLimits(), SpatialWeights())
+    schedule = Schedule(body, contacts, Limits(), Weights())
     x, y, z = body.places[1]
     moved = [(x + 0.29, x + 0.31), (y + 0.03, y + 0.07), (z, z), (0.1, 0.3)]
     np.testing.assert_allclose(schedule.foothold(2), moved, atol=1e-12)

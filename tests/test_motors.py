@@ -27,11 +27,11 @@ from jumplab.sim import INSTALLED, STEP_S, simulate_jump
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.stages.planner import Planner
-from jumplab.stages.spatial import SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.planner import jump_contacts
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.settings import SPATIAL_MESH
-from jumplab.stages.spatial.terms import BASE, Body, SpatialTerms
+from jumplab.stages.whole_body import Limits, Weights
+from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import SPATIAL_MESH
+from jumplab.stages.whole_body.terms import BASE, Body, WholeBodyTerms
 from jumplab.task import JumpTask
 
 NUMBERS = {"hip_pitch": (0.03, 1.5, 0.15), "knee": (0.04, 2.0, 0.2), "ankle_pitch": (0.02, 1.0, 0.1),
@@ -163,7 +163,7 @@ def test_five_links_turn_the_motors_too(bhr, heavy):
 
 def test_the_tree_turns_the_motors_too(heavy):
     """Torques in flight are Pinocchio's without motors, plus what armature and damping take."""
-    b = SpatialTerms(Body(heavy), SpatialLimits(), SpatialWeights(), {})
+    b = WholeBodyTerms(Body(heavy), Limits(), Weights(), {})
     n, rng = len(b.coordinates), np.random.default_rng(2)
     q, v, a = (ca.SX.sym(key, n) for key in "qva")
     point = SimpleNamespace(q=q, v=v, a=a, p=SimpleNamespace(gravity=9.8), memo={})
@@ -180,9 +180,9 @@ def test_the_tree_turns_the_motors_too(heavy):
 
 
 def spatial_problem(robot: Robot):
-    limits = SpatialLimits()
+    limits = Limits()
     contacts = jump_contacts(limits, SPATIAL_MESH)
-    return Schedule(Body(robot), contacts, limits, SpatialWeights()).problem()
+    return Schedule(Body(robot), contacts, limits, Weights()).problem()
 
 
 def test_dry_friction_lowers_the_limits_of_torques_in_space(bhr, heavy):
@@ -198,7 +198,7 @@ def test_dry_friction_lowers_the_limits_of_torques_in_space(bhr, heavy):
             push, torque = np.split(getattr(less, side), [-len(friction)])
             assert np.array_equal(push, getattr(free, side)[: len(push)])
             sign = -1 if side == "lower" else 1
-            most = SpatialLimits().torque_share * effort - friction
+            most = Limits().torque_share * effort - friction
             np.testing.assert_allclose(sign * torque, most)
     for free, less in zip(*lines, strict=True):
         np.testing.assert_allclose(free.upper - less.upper, friction / effort)

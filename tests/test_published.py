@@ -20,7 +20,7 @@ from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
-from jumplab.stages.spatial import Contacts
+from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]

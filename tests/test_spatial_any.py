@@ -17,12 +17,12 @@ from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.roles import draft
 from jumplab.sim import simulate_jump
-from jumplab.stages.spatial import Contacts, Place, SpatialLimits, SpatialPlanner, SpatialWeights
-from jumplab.stages.spatial import starts as beginning
-from jumplab.stages.spatial.planner import jump_contacts
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.settings import SPATIAL_MESH
-from jumplab.stages.spatial.terms import Body
+from jumplab.stages.whole_body import Contacts, Place, Limits, WholeBodyPlanner, Weights
+from jumplab.stages.whole_body import starts as beginning
+from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import SPATIAL_MESH
+from jumplab.stages.whole_body.terms import Body
 from jumplab.studies.chain import Course, run_chain
 
 CANT_RAD = 0.44  # 25 degrees
@@ -89,9 +89,9 @@ def test_a_knee_may_be_bent_where_its_angle_is_zero(robot):
 
 
 def schedule_of(robot: Robot, contacts: Contacts | None = None) -> Schedule:
-    limits = SpatialLimits()
+    limits = Limits()
     contacts = contacts or jump_contacts(limits, SPATIAL_MESH)
-    return Schedule(Body(robot), contacts, limits, SpatialWeights())
+    return Schedule(Body(robot), contacts, limits, Weights())
 
 
 def seen(schedule: Schedule, motion: beginning.Motion) -> list[np.ndarray]:
@@ -152,7 +152,7 @@ def test_start_values_of_a_motion_share_nodes_and_carry_the_robot(short):
 def test_short_legs_do_not_stand_on_one_foot(short):
     contacts = Contacts.of("LR L LR", short, [Place(0.1)])
     with pytest.raises(InputError) as e:
-        SpatialPlanner(short, contacts=contacts)
+        WholeBodyPlanner(short, contacts=contacts)
     said = "robot five: a leg has fewer than six joints, "
     assert str(e.value) == f"{said}so it cannot be planned to stand on one foot"
 

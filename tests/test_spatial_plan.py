@@ -29,11 +29,11 @@ from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.scene import Scene
 from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
-from jumplab.stages.spatial import Contacts, Place, SpatialLimits, SpatialPlanner, SpatialWeights
-from jumplab.stages.spatial import planner as planning
-from jumplab.stages.spatial.apart import MORE_M, merged, too_close
-from jumplab.stages.spatial.shapes import ROUNDED_M, faces, gaps
-from jumplab.stages.spatial.tape import (
+from jumplab.stages.whole_body import Contacts, Place, Limits, WholeBodyPlanner, Weights
+from jumplab.stages.whole_body import planner as planning
+from jumplab.stages.whole_body.apart import MORE_M, merged, too_close
+from jumplab.stages.whole_body.shapes import ROUNDED_M, faces, gaps
+from jumplab.stages.whole_body.tape import (
     ACCELERATION_GAP,
     AIR,
     FLAT,
@@ -44,8 +44,8 @@ from jumplab.stages.spatial.tape import (
     edges,
     holds_between,
 )
-from jumplab.stages.spatial.terms import BASE, Body, SpatialTerms
-from jumplab.stages.spatial.view import SpatialView
+from jumplab.stages.whole_body.terms import BASE, Body, WholeBodyTerms
+from jumplab.stages.whole_body.view import SpatialView
 from jumplab.task import JumpTask
 
 SIDE = JumpTask(0.0, 0.4, side_m=0.3)
@@ -63,10 +63,10 @@ def jump(task: JumpTask):
 
 
 @cache
-def walker() -> SpatialPlanner:
+def walker() -> WholeBodyPlanner:
     """Plans one step with the right foot."""
     robot = jl.Robot.load()
-    return SpatialPlanner(robot, contacts=Contacts.of("LR L LR", robot, [Place(0.15)]))
+    return WholeBodyPlanner(robot, contacts=Contacts.of("LR L LR", robot, [Place(0.15)]))
 
 
 @cache
@@ -188,7 +188,7 @@ def test_soles_come_down_steeply_enough_to_stick(task):
         twist = pin.getFrameVelocity(plan.robot.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         speed = twist.linear + np.cross(twist.angular, arm)
         used.append(np.abs(speed[:2]).max() / -speed[2])
-    assert 0.2 < max(used) < SpatialLimits().touchdown_slope + 1e-3  # and it matters to these targets
+    assert 0.2 < max(used) < Limits().touchdown_slope + 1e-3  # and it matters to these targets
 
 
 def test_audit_sees_another_goal():
@@ -291,7 +291,7 @@ def test_own_weights_and_terms_reach_it(bhr):
 
 
 def test_points_know_the_robot_by_name(bhr):
-    b = SpatialTerms(Body(bhr), SpatialLimits(), SpatialWeights(), {})
+    b = WholeBodyTerms(Body(bhr), Limits(), Weights(), {})
     names = {"q": b.coordinates, "v": b.coordinates, "a": b.coordinates, "z": b.states}
     known = {key: ca.SX.sym(key, len(x)) for key, x in names.items()}
     constants = SimpleNamespace(**{f"{k}_{x}": ca.SX.sym(k + x) for k in ("com", "vel", "L") for x in "xyz"})
@@ -480,7 +480,7 @@ def test_derivatives_of_the_program_by_differences():
 @pytest.mark.parametrize("mode", ["flat", "toe"])
 def test_forces_at_the_soles_are_wrenches_of_the_feet_and_of_the_ground(bhr, mode):
     """In the body's axes in the program, about the world's origin on the tape."""
-    b = SpatialTerms(Body(bhr), SpatialLimits(), SpatialWeights(), {1: mode})
+    b = WholeBodyTerms(Body(bhr), Limits(), Weights(), {1: mode})
     rng, side = np.random.default_rng(0), 1
     hold, pitch = np.array([0.3, -0.2, 0.1, 0.7]), 0.4 * (mode == "toe")
     z = rng.uniform(0, 100, b.n_forces)

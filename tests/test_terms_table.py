@@ -19,11 +19,11 @@ from jumplab.robot.reach import reach
 from jumplab.robot.stance import stance_angles, stance_configuration
 from jumplab.stages import srmp, whole_body
 from jumplab.stages.joint_qp.settings import GENTLE, Options
-from jumplab.stages.spatial import Contacts, SpatialLimits, SpatialWeights
-from jumplab.stages.spatial.planner import jump_contacts
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.settings import SPATIAL_MESH
-from jumplab.stages.spatial.terms import Body
+from jumplab.stages.whole_body import Contacts, Limits, Weights
+from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import SPATIAL_MESH
+from jumplab.stages.whole_body.terms import Body
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Limits, Weights
 from jumplab.task import JumpTask
@@ -75,7 +75,7 @@ def table() -> str:
     flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
     found += [f"of a flip: {line}" for line in flips if line not in found]
     stance = SpatialModel(robot.model).of_pinocchio(stance_configuration(robot)[None])[0]
-    body, limits, weights = Body(robot), SpatialLimits(), SpatialWeights()
+    body, limits, weights = Body(robot), Limits(), Weights()
     given = {"stance": stance, "yaw": 2 * np.pi, "takeoff_speed": TARGET.takeoff_speed}
     for contacts in (jump_contacts(limits, SPATIAL_MESH), Contacts.hop(robot)):
         found += lines(Schedule(body, contacts, limits, weights).problem(), given)

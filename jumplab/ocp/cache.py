@@ -40,7 +40,7 @@ BUILT_BY = (
     "robot_import",
     "stages.srmp",
     "stages.whole_body",
-    "stages.spatial",
+    "stages.whole_body",
 )
 
 

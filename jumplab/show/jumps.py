@@ -18,7 +18,6 @@ from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.show import style, turning
 from jumplab.show.bodies import Silhouette, draw_ground, draw_path, film_strip, five_link_points
-from jumplab.stages.spatial import SpatialLimits
 from jumplab.stages.whole_body import Limits
 from jumplab.studies.envelope import BEYOND, OPEN, VERDICT, Envelope
 from jumplab.task import GRAVITY
@@ -116,13 +115,13 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 
 # limits ---------------------------------------------------------------------------------------------------------
 @style.styled
-def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits | None = None) -> Figure:
+def margins(tape: Tape, robot: Robot, limits: Limits | Limits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through the launch.
 
     ``limits`` are the planner's (its defaults if None), drawn dashed inside what the motors could do.
     """
     if turning.leaves_plane(tape):
-        return turning.margins(tape, robot, limits or SpatialLimits(), heel_up_time(tape))
+        return turning.margins(tape, robot, limits or Limits(), heel_up_time(tape))
     limits = limits or Limits()
     fig = style.new_figure(style.PAGE_IN, 3.9)
     names = [["hip", "knee", "ankle", "shoulder"], ["cop", "cop", "friction", "friction"]]

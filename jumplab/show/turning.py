@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.show import style
-from jumplab.stages.spatial import SpatialLimits
 from jumplab.stages.whole_body import Limits
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def pairs(robot: Robot) -> dict[str, list[int]]:
     return out
 
 
-def motor(ax: Axes, speed: float, corner: float, free: float, effort: float, limits: Limits | SpatialLimits) -> None:
+def motor(ax: Axes, speed: float, corner: float, free: float, effort: float, limits: Limits | Limits) -> None:
     """What a motor can do, torque against speed up to its no-load speed ``free``; dashed what the planner may use."""
     # driving: full torque to the corner, then a line to zero at the no-load speed; braking: full torque
     x = np.array([-free, -corner, 0.0, corner, free])
@@ -109,7 +108,7 @@ def feet_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
     }
 
 
-def margins(tape: Tape, robot: Robot, limits: Limits | SpatialLimits, heel_up: float) -> Figure:
+def margins(tape: Tape, robot: Robot, limits: Limits | Limits, heel_up: float) -> Figure:
     """Torque against speed of every pair of joints; CoP in both soles, and friction used by both feet."""
     joints, r = pairs(robot), feet_reaction(tape, robot)
     lines = -(-(len(joints) + 2) // COLUMNS)

@@ -4,10 +4,10 @@ import lazy_loader as lazy
 
 __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
-    submodules=["joint_qp", "plan", "planner", "reconstruction", "spatial", "srmp", "whole_body"],
+    submodules=["joint_qp", "plan", "planner", "reconstruction", "srmp", "whole_body"],
     submod_attrs={
         "plan": ["JumpPlan", "StageRow"],
-        "planner": ["Planner", "guess_from_joints", "make_tape", "to_link_angles"],
-        "reconstruction": ["expand", "planar_quantities"],
+        "planner": ["Planner", "make_tape", "motion_of_joints"],
+        "reconstruction": ["planar_columns", "planar_quantities", "to_link_angles"],
     },
 )

@@ -16,11 +16,9 @@ from jumplab.ocp.nlp import Solution, Statistics
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
 from jumplab.stages.joint_qp.changes import terms_table
-from jumplab.stages.spatial import Contacts, SpatialPlan
-from jumplab.stages.spatial.planner import Attempt
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body import WholeBodyPlan
-from jumplab.stages.whole_body.planner import platform_edge_m
+from jumplab.stages.whole_body import Contacts, WholeBodyPlan
+from jumplab.stages.whole_body.planner import Attempt
 from jumplab.task import JumpTask
 
 TRACKED = {"rho": "rho", "rho_rate": "rho_rate", "velocity": "com_velocity", "L": "L"}  # names on the tape
@@ -60,7 +58,7 @@ class JumpPlan(Shown, Named):
     tape: Tape
     srmp: SrmpPlan | None
     joints: JointPlan | None
-    whole_body: WholeBodyPlan | SpatialPlan | None
+    whole_body: WholeBodyPlan | None
     statistics: tuple[StageRow, ...]
     skipped: str | None = None
     stored: Mapping[str, Any] | None = None
@@ -83,13 +81,10 @@ class JumpPlan(Shown, Named):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """Starts of the whole-body program that were tried, what they took and how they ended; the last one led here.
-
-        Empty for plans of the five-link program, whose solves are :attr:`statistics`.
-        """
+        """Starts of the whole-body program that were tried, what they took and how they ended; the last one led here."""
         if self.stored is not None:
             return tuple(Attempt(**row) for row in self.stored.get("attempts", ()))
-        return self.whole_body.attempts if isinstance(self.whole_body, SpatialPlan) else ()
+        return () if self.whole_body is None else self.whole_body.attempts
 
     @property
     def schedule(self) -> tuple[str, ...]:
@@ -113,7 +108,7 @@ class JumpPlan(Shown, Named):
 
     @property
     def _spatial(self) -> bool:
-        return "soles_travel" in self.tape.extra
+        return "planar_toe" not in self.tape.extra
 
     @property
     def toe_phase_s(self) -> float:
@@ -209,7 +204,7 @@ class JumpPlan(Shown, Named):
             **away,
             "launch_s": body.launch_s,
             "flight_s": body.flight_s,
-            "platform_edge_m": platform_edge_m(self.task, self.robot, body.limits) if not away else body.edge_m,
+            "platform_edge_m": body.edge_m,
             "peak_torque_nm": _peaks(self.tape.joint_names, self.tape.tau),
             "peak_speed_rad_s": _peaks(self.tape.joint_names, self.tape.v[:, 6:]),
             **({"tracking": self.tracking} if self.srmp else {}),

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from itertools import count
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 from jumplab.errors import InfeasibleError, InputError, SolverError, quoted, require_type
 from jumplab.io.tape import Tape
 from jumplab.models.full import FullBody
-from jumplab.ocp import PhaseGuess, Statistics, Term
+from jumplab.ocp import Statistics, Term
+from jumplab.ocp.nlp import EXPLAINED
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
@@ -24,21 +25,21 @@ from jumplab.stages.changes import LAST, StageChanges, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, Options, map_to_joints
 from jumplab.stages.joint_qp.changes import changed, terms_table
 from jumplab.stages.plan import JumpPlan, StageRow
-from jumplab.stages.reconstruction import expand, planar_motion, planar_quantities
-from jumplab.stages.spatial import Contacts, SpatialLimits, SpatialPlan, SpatialPlanner
-from jumplab.stages.spatial.settings import FLIP_MESH
+from jumplab.stages.reconstruction import planar_columns
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
-from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, WholeBodyPlan, WholeBodyPlanner
-from jumplab.stages.whole_body.planner import check_platform
+from jumplab.stages.whole_body import Contacts, Limits, Mesh, Weights, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body.coordinates import even, whole
+from jumplab.stages.whole_body.planner import GIVEN
+from jumplab.stages.whole_body.starts import Motion
+from jumplab.stages.whole_body.terms import Body
 from jumplab.task import GRAVITY, JumpTask
 
 METHODS, USUAL = ("three-step", "direct"), "usual"
 FIRST_STAGES = "srmp", "joint qp"  # those that the direct method leaves out ...
 FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
-OWN_ARMS, OWN_ARMS_OF_FLIP = 0.75, 0.25  # share of stage 2's arms in stage 3's guess: they swing too far, most in flips
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 LEAST_RISE_M = 0.02  # that a target can say
 _COUNT = count()
@@ -60,7 +61,7 @@ class Planner:
         torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
         :class:`jumplab.stages.whole_body.view.BodyView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
         posture, time, see :class:`jumplab.stages.srmp.view.RodView`; out of the plane
-        :class:`jumplab.stages.spatial.view.SpatialView`. The direct planner takes those of "whole body", out of the
+        :class:`jumplab.stages.whole_body.view.SpatialView`. The direct planner takes those of "whole body", out of the
         plane of "spatial".
     weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's. For
         "joint qp" it is a factor on the block's own weights.
@@ -104,7 +105,8 @@ class Planner:
         self.token = os.getpid(), next(_COUNT)  # the same in copies that other processes get
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_stages": {}}  # another process builds its own
+        kept = {k: v for k, v in vars(self).items() if k != "_model"}
+        return {**kept, "_stages": {}}  # another process builds its own
 
     def _mesh(self, flip: bool = False) -> Mesh:
         given = self._given[2]
@@ -126,15 +128,23 @@ class Planner:
         settings = settled(SrmpSettings, self._given[1], flip)
         return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
 
-    def _away(self, flip: bool) -> SpatialPlanner:
-        how = dict(mesh=FLIP_MESH, limits=SpatialLimits().of_flip()) if flip else {}
-        return SpatialPlanner(self.robot, keep=self.keep, changes=self.changes["spatial"], **how)
+    @cached_property
+    def _model(self) -> Body:
+        """The robot as all whole-body programs see it."""
+        return Body(self.robot)
+
+    def _away(self, flip: bool) -> WholeBodyPlanner:
+        """The program of all coordinates; of a robot that no plane describes also that of even motions."""
+        return self._program(flip, changes=self.changes["spatial"], free=whole(self._model))
 
     def _body(self, flip: bool, tracking: bool) -> WholeBodyPlanner:
-        limits, how = settled(Limits, self._given[0], flip), dict(tracking=tracking, changes=self.changes["whole body"])
-        if flip:
-            return FlipPlanner(self.robot, self._mesh(True), limits, **how)
-        return WholeBodyPlanner(self.robot, self.mesh, limits, keep=self.keep, **how)
+        """The program of jumps in the plane."""
+        return self._program(flip, tracking=tracking, changes=self.changes["whole body"], free=even(self._model))
+
+    def _program(self, flip: bool, **how: Any) -> WholeBodyPlanner:
+        weights = Weights().of_flip() if flip else Weights()
+        how |= {"keep": self.keep, "body": self._model}
+        return WholeBodyPlanner(self.robot, self._mesh(flip), settled(Limits, self._given[0], flip), weights, **how)
 
     def prepared(
         self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False
@@ -259,41 +269,46 @@ class Planner:
                     f"side or turns; choose 'direct'"
                 )
             return self._spatial(task, weights, start)
-        check_platform(task, self.robot, self.limits)
+        self.stage("direct" + " flip" * bool(task.rotation_rad)).check_ground(task)
         if start is not None and task.rotation_rad:
             raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
         asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
         if (less := self._less(asked)) is not self:
             return less.plan(task, method, start=start)
-        where = {} if start is None else {"start": start}
+        last, weights = self.stage("whole body"), asked["whole body"].weights
         if method == "direct":
             if self.atlas is not None and not asked["whole body"]:
-                if (body := self.atlas.solve(self.stage("direct"), task, start)) is not None:
+                if (body := self.atlas.solve(self.stage("direct"), task, self._posture(start))) is not None:
                     return self._finished(method, body)
-            return self._finished(method, self._direct(task, weights=asked["whole body"].weights, **where))
+            return self._finished(method, self._direct(task, weights=weights, stance=self._posture(start)))
         if task.rotation_rad:
             return self._flip(task, asked)
         srmp, joints = self._first_two(task, start, asked)
-        last = self.stage("whole body")
-        guess = guess_from_joints(joints, last, task, srmp.toe_s)
-        body = last.plan(task, srmp, guess=guess, weights=asked["whole body"].weights, **where)
+        begin = motion_of_joints(joints, last, srmp.toe_s)
+        body = last.plan(task, srmp, begin=begin, weights=weights, stance=self._posture(start))
         return self._finished(method, body, srmp, joints, (_joint_row(joints),))
 
     def _direct(self, task: JumpTask, **how: Any) -> WholeBodyPlan:
-        """The whole body alone. What a straight push cannot reach is tried all the same, with less patience.
+        """The whole body alone.
 
-        Raises :class:`InfeasibleError` where neither can, with what the push is enough for.
+        Raises :class:`InfeasibleError` where it finds nothing and a straight push cannot reach the target either, with
+        what the push is enough for.
         """
-        planner = self.stage("direct flip" if task.rotation_rad else "direct")
+        planner, short = self.stage("direct" + " flip" * bool(task.rotation_rad)), None
         try:
             check_reachable(task, self.stage("reach"), self.robot)
         except InfeasibleError as e:
-            try:
-                return planner.plan(task, **how, **({} if task.rotation_rad else {"brief": True}))
-            except SolverError:
-                said = f"{e}; the whole body, arms and trunk included, was tried for a few seconds: no plan found"
-                raise InfeasibleError(said, number=e.number, bound=e.bound) from e
-        return planner.plan(task, **how)
+            short = e
+        explained = EXPLAINED.set(EXPLAINED.get() and short is None)
+        try:
+            return planner.plan(task, **how)
+        except SolverError as e:
+            if short is None:
+                raise
+            said = f"{short}; the whole body, arms and trunk included, was tried: no plan found"
+            raise InfeasibleError(said, number=short.number, bound=short.bound) from e
+        finally:
+            EXPLAINED.reset(explained)
 
     def _finished(
         self,
@@ -307,8 +322,10 @@ class Planner:
         """The plan with its tape and the table of stages; ``rows`` are stage 2's."""
         if srmp is not None:
             rows = (_row("1 SRMP", srmp.solution.statistics), *rows)
-        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
-        tape = make_tape(body, self.robot, srmp)
+        stage, kind = ("direct", "direct") if srmp is None else ("3 whole body", "whole body")
+        build_s = self.stage(kind + " flip" * bool(body.task.rotation_rad)).nlp.build_s
+        rows = (*rows, *body_rows(stage, body, build_s))
+        tape = make_tape(body, srmp)
         return JumpPlan(
             body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
         )
@@ -349,10 +366,11 @@ class Planner:
         if contacts.ends != "rest":
             raise InputError("a schedule that ends at touchdown is a standing jump; ask for it by its target")
         asked = sorted_out(weights=weights)["spatial"]
-        last = SpatialPlanner(self.robot, contacts=contacts, keep=self.keep, changes=self.changes["spatial"])
+        how = {"contacts": contacts, "keep": self.keep, "changes": self.changes["spatial"], "body": self._model}
+        last = WholeBodyPlanner(self.robot, limits=self.limits, **how)
         level = JumpTask(0.0, 0.1, gravity=gravity)  # a schedule has its own places; of a target only gravity is taken
         body, ends = last.plan(level, weights=asked.weights), contacts.places[-2:]
-        tape = last.tape(body)
+        tape = body.tape
         rise = tape.extra["com"][tape.phase == "flight", 2]
         travel, turn = tape.extra["soles_travel"], float(tape.extra["feet_turn"])
         task = JumpTask(
@@ -366,35 +384,28 @@ class Planner:
         plan = self._placed(replace(body, task=task), last)
         return replace(plan, contacts=contacts)
 
-    def _placed(self, body: SpatialPlan, last: SpatialPlanner | None = None) -> JumpPlan:
+    def _placed(self, body: WholeBodyPlan, last: WholeBodyPlanner | None = None) -> JumpPlan:
         """The plan of a spatial solution, one row of statistics for each attempt."""
         last = last or self.stage(_away(body.task))
-        robot, build_s = self.robot.under_gravity(body.task.gravity), last.nlp.build_s
-        rows = tuple(
-            StageRow(f"spatial, {x.start}, {x.hessian}", x.iterations, 0.0 if k else build_s, x.cpu_s)
-            for k, x in enumerate(body.attempts)
-        )
-        return JumpPlan(body.task, robot, "direct", last.tape(body), None, None, body, rows)
+        robot = self.robot.under_gravity(body.task.gravity)
+        rows = body_rows("spatial", body, last.nlp.build_s)
+        return JumpPlan(body.task, robot, "direct", body.tape, None, None, body, rows)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
         last, weights = self.stage("whole body flip"), asked["whole body"].weights
-        first = partial(self.stage("srmp flip").plan, weights=asked["srmp"].weights)
-        srmp, joints, body, skipped, rows = first(task), None, None, None, ()
+        srmp = self.stage("srmp flip").plan(task, weights=asked["srmp"].weights)
+        joints, begin, skipped, rows = None, None, None, ()
         try:
             joints = self._joints(srmp, asked)
-            rows = (_joint_row(joints),)
+            rows, begin = (_joint_row(joints),), motion_of_joints(joints, last, srmp.toe_s)
         except SolverError as e:
             skipped = f"{e}; {OTHERWISE}"
-        if joints is not None:
-            try:
-                guess = guess_from_joints(joints, last, task, srmp.toe_s)
-                body = last.plan(task, srmp, guess=guess, weights=weights)
-            except SolverError as e:
-                skipped, joints = f"stage 2: its motion led nowhere ({e}); {OTHERWISE}", None
-        body = body or last.plan(task, srmp, weights=weights, stage1=first)
+        body = last.plan(task, srmp, begin=begin, weights=weights)
+        if joints is not None and not body.began(GIVEN[0].name):
+            skipped, joints = f"stage 2: its motion led nowhere; {OTHERWISE}", None
         return self._finished("three-step", body, srmp, joints, rows, skipped)
 
     def _first_two(
@@ -407,6 +418,10 @@ class Planner:
             return srmp, self._joints(srmp, asked, step_s=STEPS_S, q0=q0)
         except SolverError:  # at its limits a jump needs more of them
             return srmp, self._joints(srmp, asked, q0=q0)
+
+    def _posture(self, start: np.ndarray | None) -> np.ndarray | None:
+        """The same as :meth:`_standing`; None for the stance."""
+        return None if start is None else self._standing(start)
 
     def _standing(self, start: np.ndarray) -> np.ndarray:
         """Configuration (nq,) of a posture (5,) in which the robot waits, the middle of the soles at the origin."""
@@ -439,7 +454,7 @@ class Planner:
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         if not (task.in_plane and self.robot.planar):
-            near = previous.whole_body if isinstance(previous.whole_body, SpatialPlan) else None
+            near = previous.whole_body if isinstance(previous.whole_body, WholeBodyPlan) else None
             if near is None:
                 return self.plan(task, previous.method, start=start)
             try:
@@ -448,14 +463,15 @@ class Planner:
             except SolverError:
                 return self.plan(task, previous.method, start=start)
             return self._placed(body)
-        if task.rotation_rad or isinstance(previous.whole_body, SpatialPlan):  # nothing of it fits the plane
+        if task.rotation_rad or previous.contacts is not None or previous.whole_body is None:
             return self.plan(task, previous.method, start=start)
-        check_platform(task, self.robot, self.limits)
+        self.stage("direct").check_ground(task)
         self.prepared(previous.method)
+        how = {"near": previous.whole_body, "stance": self._posture(start)}
         if previous.method == "direct":
-            return self._finished("direct", self._direct(task, near=previous.whole_body, start=start))
+            return self._finished("direct", self._direct(task, **how))
         srmp = self._pendulum(task, start, near=previous.srmp)
-        body = self.stage("whole body").plan(task, srmp, near=previous.whole_body, start=start)
+        body = self.stage("whole body").plan(task, srmp, **how)
         return self._finished(previous.method, body, srmp)
 
 
@@ -484,78 +500,28 @@ def _joint_row(joints: JointPlan) -> StageRow:
     return StageRow("2 joint map" + ", gentle" * bool(joints.gentle), s.iterations, s.total_s - s.solve_s, s.solve_s)
 
 
-def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
-    """What stage 3 or the direct planner cost: the coarse mesh, if there was one, and the fine one, each time."""
-    coarse = () if body.coarse is None else (_row(f"{stage}, coarse", body.coarse),)
-    uneven = (_row(f"{stage}, uneven", statistics) for statistics in body.uneven)
-    return (*coarse, *uneven, _row(stage, body.solution.statistics))
+def body_rows(stage: str, body: WholeBodyPlan, build_s: float) -> tuple[StageRow, ...]:
+    """What the whole-body program cost, one row for each attempt."""
+    return tuple(
+        StageRow(f"{stage}, {x.start}, {x.hessian}", x.iterations, 0.0 if k else build_s, x.cpu_s)
+        for k, x in enumerate(body.attempts)
+    )
 
 
-def guess_from_joints(
-    joints: JointPlan, planner: WholeBodyPlanner, task: JumpTask, toe_s: float, own_arms: float | None = None
-) -> dict[str, PhaseGuess]:
-    """Stage 2's roll-out as stage 3's initial guess: left and right are averaged into link angles.
-
-    The arms swing partly as in :meth:`WholeBodyPlanner.naive_guess`; ``own_arms`` is stage 2's share of them, by
-    default :data:`OWN_ARMS`. ``toe_s`` is the length of the toe phase [s].
-    """
-    share = (OWN_ARMS_OF_FLIP if task.rotation_rad else OWN_ARMS) if own_arms is None else own_arms
-    motion, row = to_link_angles(planner.robot, joints.q, joints.v, joints.a), int(np.argmax(joints.phase == "flight"))
-    takeoff, naive, out = float(joints.t[row]), planner.naive_guess(task), {}
-    now, names = (x[row : row + 1] for x in motion), ("com", "com_velocity")
-    at_takeoff = planar_quantities(planner.robot, *now, np.zeros((1, 2)), task.gravity, names)
-    ballistic = dict(zip(("com_x", "com_z", "vel_x", "vel_z"), np.ravel([at_takeoff[k] for k in names]), strict=True))
-    for name, t in planner.mesh.nodes(takeoff - toe_s, takeoff, joints.t[-1]).items():
-        q, v, a = (np.stack([np.interp(t, joints.t, x) for x in y.T], -1) for y in motion)
-        if name == "flat":
-            q, v, a = q[:, 1:], v[:, 1:], a[:, 1:]
-        if name == "toe":
-            q[:, 0] = np.maximum(q[:, 0], 0.0)
-        body = PhaseGuess(t[-1] - t[0], q, v, a, None, ballistic if name == "flight" else {})
-        out[name] = _with_arms(body, naive[name], share)
-    return out
+def motion_of_joints(joints: JointPlan, planner: WholeBodyPlanner, toe_s: float) -> Motion:
+    """Stage 2's roll-out as a motion that stage 3 begins with; ``toe_s`` is the length of the toe phase [s]."""
+    charts = planner.body.model.of_pinocchio(joints.q)
+    takeoff, end = float(joints.t[int(np.argmax(joints.phase == "flight"))]), float(joints.t[-1])
+    times = planner.mesh.nodes(takeoff - toe_s, takeoff, end)
+    rows = [np.stack([np.interp(t, joints.t, x) for x in charts.T], -1) for t in times.values()]
+    return Motion(np.array([t[-1] - t[0] for t in times.values()]), rows)
 
 
-def _with_arms(body: PhaseGuess, arms: PhaseGuess, own: float) -> PhaseGuess:
-    """One phase of a guess, its last link swinging by a share of its ``own``, and as in another guess in its time."""
-    pace, joined = arms.duration / body.duration, []
-    for k, (x, y) in enumerate(((body.q, arms.q), (body.v, arms.v), (body.a, arms.a))):
-        arm = own * x[:, -1] + (1 - own) * (y[:, -1] * pace**k)
-        joined.append(np.column_stack([x[:, :-1], arm]))
-    return replace(body, q=joined[0], v=joined[1], a=joined[2])
-
-
-def to_link_angles(
-    robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Absolute link angles (n, 5) with rates and accelerations from full-robot q, v, a; the mean of left and right."""
-    model, sagittal = robot.model, robot.sagittal
-    parts = [[(model.getJointId(n), sign) for n, row, sign in robot.role_signs() if row == i] for i in range(4)]
-    iq = [[(model.idx_qs[j], sign) for j, sign in part] for part in parts]
-    iv = [[(model.idx_vs[j], sign) for j, sign in part] for part in parts]
-    pitch = np.unwrap(2 * np.arctan2(q[:, 4], q[:, 6]), period=2 * np.pi)
-    out = []
-    for values, index, trunk in ((q, iq, pitch), (v, iv, v[:, 4]), (a, iv, a[:, 4])):
-        joints = np.zeros((len(values), 4))  # arms that are held stay at zero
-        for i, pair in enumerate(index):
-            if pair:
-                joints[:, i] = np.mean([sign * values[:, column] for column, sign in pair], axis=0)
-        out.append(sagittal.link_angles(joints, trunk))
-    return tuple(out)
-
-
-def make_tape(body: WholeBodyPlan, robot: Robot, srmp: SrmpPlan | None = None) -> Tape:
-    """The 1 kHz tape of a whole-body plan, with planar and stage-1 trajectories under their own names."""
-    gravity = body.task.gravity
-    motion = planar_motion(body.solution.phases, gravity, robot)
-    state = (motion[k] for k in ("angles", "rates", "accels", "toe_acceleration"))
-    values = planar_quantities(robot, *state, gravity)
-    extra = {
-        "planar_com": motion["toe"] + values["com"],
-        "planar_com_velocity": motion["toe_velocity"] + values["com_velocity"],
-    }
-    extra |= {f"planar_{k}": values[k] for k in ("L", "rho", "rho_rate", "joints", "joint_rates", "torques")}
-    return expand(motion, robot, gravity, extra | _of_stage1(srmp), values["ground_wrench"])
+def make_tape(body: WholeBodyPlan, srmp: SrmpPlan | None = None) -> Tape:
+    """The 1 kHz tape of a whole-body plan in the plane, with planar and stage-1 trajectories under their own names."""
+    robot, gravity = body.schedule.body.robot, body.task.gravity
+    tape = body.tape
+    return replace(tape, extra={**tape.extra, **planar_columns(tape, robot.under_gravity(gravity)), **_of_stage1(srmp)})
 
 
 def _of_stage1(srmp: SrmpPlan | None) -> dict[str, np.ndarray]:

@@ -35,7 +35,7 @@ from jumplab.stages.whole_body import WholeBodyPlan, WholeBodyPlanner
 from jumplab.studies.envelope import most_used
 from jumplab.task import JumpTask
 
-FILE, FORMAT = "atlas.npz", 1
+FILE, FORMAT = "atlas.npz", 2
 MAX_NODES = 2500  # some minutes of work, ten seconds to load
 GIVE_UP = 2  # so many nodes in a row without a plan, and the farther ones of the row are not tried
 SWEEPS = 3  # over the grid; the last one seldom finds anything
@@ -50,7 +50,6 @@ class Node:
     distance_m: float
     height_m: float
     cost: float
-    jerk: float | None  # its weight, if the tape asked for a dearer one
     limiting: str  # what is used most
     share: float  # of its limit
     x: np.ndarray  # (n,) the motion, as the problem's scaled variables
@@ -179,7 +178,6 @@ class Atlas:
             distance_m=task.distance_m,
             height_m=task.height_m,
             cost=float(s @ [n.cost for n in nodes]),
-            jerk=max((n.jerk for n in nodes if n.jerk is not None), default=None),
             x=s @ [n.x for n in nodes],
         )
         return [blend, nearest]
@@ -238,7 +236,7 @@ class Atlas:
         head = {"format": FORMAT, "robot": self.robot, "key": self.key}
         head |= {"distances": self.distances, "heights": self.heights}
         head["done"] = sorted(self.heights if done is None else done)
-        head["nodes"] = [(n.distance_m, n.height_m, n.cost, n.jerk, n.limiting, n.share) for n in nodes]
+        head["nodes"] = [(n.distance_m, n.height_m, n.cost, n.limiting, n.share) for n in nodes]
         buffer, folder = io.BytesIO(), Path(folder)
         np.savez_compressed(buffer, head=np.array(json.dumps(head)), rows=np.array([n.x for n in nodes]))
         with made(folder), locked(folder):
@@ -281,11 +279,9 @@ def _between(axis: Sequence[float], x: float) -> tuple[int, float]:
 
 
 def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
-    jerks = {row["weight"] for row in plan.solution.cost_shares if row["name"] == "jerk"}
-    jerk = jerks.pop() if len(jerks) == 1 and jerks != {body.weights.jerk} else None
-    most = most_used(audit(make_tape(plan, body.robot), body.robot, plan.task), body.robot)
+    most = most_used(audit(make_tape(plan), body.robot, plan.task), body.robot)
     cost, x = plan.solution.statistics.objective, pack(body.nlp.assembled, plan.solution.guess())
-    return Node(plan.task.distance_m, plan.task.height_m, cost, jerk, *most, x)
+    return Node(plan.task.distance_m, plan.task.height_m, cost, *most, x)
 
 
 def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tuple[float, list[Node]]:
@@ -294,7 +290,7 @@ def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tu
     for distance in distances:
         task = JumpTask(distance, height)
         try:
-            plan = body.plan(task, near=plan, settle=False)
+            plan = body.plan(task, near=plan)
         except (SolverError, InfeasibleError):
             plan, failed = None, failed + 1
             if failed >= GIVE_UP:
@@ -312,7 +308,7 @@ def _cheaper(body: WholeBodyPlanner, node: Node, near: Node) -> Node | None:
         plan = _from(body, task, near)
         if plan.solution.statistics.objective >= CHEAPER * node.cost:
             return None
-        found = _node(body, body.plan(task, near=plan, settle=False))
+        found = _node(body, body.plan(task, near=plan))
         return found if found.cost < CHEAPER * node.cost else None
     except JumplabError:
         return None
@@ -321,7 +317,7 @@ def _cheaper(body: WholeBodyPlanner, node: Node, near: Node) -> Node | None:
 def _from(body: WholeBodyPlanner, task: JumpTask, node: Node, start: np.ndarray | None = None) -> WholeBodyPlan:
     """The plan for a target a few steps from a node; raises :class:`SolverError` if it is not that close."""
     near = {name: phase.guess() for name, phase in unpack(body.nlp.assembled, node.x).items()}
-    return body.settled(task, near, jerk=node.jerk, start=start)
+    return body.beside(task, near, stance=start)
 
 
 def _loaded(path: Path) -> tuple[Atlas, set[float]]:

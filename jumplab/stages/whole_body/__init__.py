@@ -1,13 +1,15 @@
-"""Stage 3: whole-body launch and flight of the five-link robot (Sec. V of the paper), and the direct planner.
+"""Stage 3 and the direct planner: the whole-body program, one jump of any tree of joints along any contact schedule.
 
-Coordinates are the absolute angles of foot, shank, thigh, trunk and arm, rooted at the toe: in launch the toe is the
-origin, so contact needs no equation; in flight the CoM is the parabola and the toe follows from it, so only dL/dt = 0
-remains. Term names carry the paper's equations; what the paper leaves out is marked "ours".
+Coordinates are the base's place and attitude and all joints (``coordinates.py``: or those of an even or a planar
+motion); a :class:`Contacts` says which foot carries when. Legs that carry follow from their foot's place on three
+levels, in flight the base follows from the CoM's parabola and L. Forces act at the soles' corners along the edges of
+their friction pyramids: friction, CoP and yaw torque are bounds. The tape between the nodes is exact (``tape.py``).
+Term names carry the paper's equations; what the paper leaves out is marked "ours". Start reading in ``contacts.py``,
+then ``terms.py``.
 """
 
-from jumplab.stages.whole_body.flips import FlipPlanner
+from jumplab.stages.whole_body.contacts import ContactPhase, Contacts, Place
 from jumplab.stages.whole_body.planner import WholeBodyPlan, WholeBodyPlanner
-from jumplab.stages.whole_body.problem import build_problem
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 
-__all__ = ["FlipPlanner", "Limits", "Mesh", "Weights", "WholeBodyPlan", "WholeBodyPlanner", "build_problem"]
+__all__ = ["ContactPhase", "Contacts", "Limits", "Mesh", "Place", "Weights", "WholeBodyPlan", "WholeBodyPlanner"]

@@ -1,45 +1,108 @@
-"""Solving stage 3 for a target: guesses, references, the result."""
+"""Solving the whole-body program: a list of starts, each with its patience, one after the other; and the result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, Shown, SolverError
-from jumplab.ocp.nlp import WARM, Near, Nlp, PhaseGuess, Solution, Statistics
+from jumplab.errors import InfeasibleError, InputError, Shown, SolverError
+from jumplab.io.tape import Tape
+from jumplab.ocp.nlp import EXPLAINED, WARM, Nlp, Solution
+from jumplab.ocp.solution import PhaseGuess, PhaseSolution
 from jumplab.robot import Robot
-from jumplab.robot.stance import stance_angles
+from jumplab.robot.stance import holding
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.problem import build_problem
-from jumplab.stages.whole_body.settings import FOLLOWED_JERK_STEP, Limits, Mesh, Weights
-from jumplab.stages.whole_body.terms import relative
+from jumplab.stages.whole_body import starts
+from jumplab.stages.whole_body.apart import Apart, merged, too_close
+from jumplab.stages.whole_body.contacts import SIDES, ContactPhase, Contacts
+from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
+from jumplab.stages.whole_body.tape import make_tape, used_between
+from jumplab.stages.whole_body.terms import Body
 from jumplab.task import JumpTask
 
-TOE_PHASE_S = 0.12  # heel-up time of the naive guess
-# naive guess: knee, trunk, heel-up, arm [rad]
-POSTURES = {
-    "crouch": (1.6, 0.65, 0.0, 0.5),
-    "take-off": (0.4, 0.25, 0.35, -1.0),
-    "tuck": (1.4, 0.3, 0.0, -0.2),
-    "touchdown": (0.9, 0.15, 0.0, 0.2),
-}
-FINE = {"tol": 1e-4, "compl_inf_tol": 1e-5}  # beyond, the cost moves by less than one in a million
-# the coarse solution is only a start, digits beyond these would be lost on the finer mesh
-COARSE = {"tol": 1e-2, "dual_inf_tol": 1e-1, "constr_viol_tol": 5e-5, "acceptable_tol": 1e-1, "acceptable_iter": 3}
-# shares of a phase over which angles and rates of a guess are averaged before the coarse mesh: a roll-out's rates jump
-GUESS_WIDTHS = (0.05, 0.2)
-# stage 2's motion is near enough for small multipliers; a naive guess is not
-NEAR = {"bound_mult_init_method": "mu-based", "mu_init": 0.1}
-# what the coarse mesh leads to is a good start on the fine one but for its multipliers
-REFINED = {"bound_mult_init_method": "mu-based", "mu_init": 1e-2, "max_iter": 70}
-REFINED |= {"quality_function_max_section_steps": 3}  # a rough choice of the next barrier will do
-BRIEF = {"max_cpu_time": 3.0}  # [s] for a target that most likely has no plan; what was found there took one
-EVENING = (2.0, 4.0, 8.0)  # factors of the jerk's weight, in turn, where it jumps farther than a tape can follow
+# beyond, the cost moves by less than one in a million
+IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4, "max_iter": 250}
+# joints that lie at a stop for many nodes have multipliers that settle last: where all rows are met, and the cost moves
+# by less than 0.2 % twice in a row, the motion stands
+IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
+IPOPT |= {"acceptable_constr_viol_tol": 5e-5, "acceptable_obj_change_tol": 2e-3, "acceptable_iter": 2}
+# where the Hessian is bent the wrong way, what is added to it should be close to what the last step needed
+IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
+NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
+# where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
+PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
+HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
+FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
+USUAL_SIZE = 4500  # variables, up to which the patience of a start is what it says; larger programs have more
+BROKEN = 1.5  # times a limit between the nodes, beyond which a motion is none
+ROUNDS = 4  # of rows for links that met
+SHORTER = 0.9, 0.7, 0.5  # of way and turn, tried after a refusal
+
+
+@dataclass(frozen=True)
+class Start:
+    """One way to begin a solve: a motion to begin with, the Hessian, and how long it may take.
+
+    Attributes
+    ----------
+    name : of the motion: "schedule" (inverse kinematics along it), "stance" (carried along), "neighbour" (a plan for a
+        target close by).
+    held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
+    patience_s : processor time after which it is given up [s].
+    options : of ipopt besides the usual ones.
+    """
+
+    name: str
+    held: bool
+    patience_s: float
+    options: Mapping[str, Any]
+
+
+NEIGHBOUR = "neighbour"
+COLD = (
+    Start("schedule", True, 9.0, {"max_iter": 150}),
+    Start("schedule", False, 8.0, {}),
+    Start("stance", False, 3.0, {}),
+)
+FROM_NEIGHBOUR = (
+    Start(NEIGHBOUR, True, 4.0, NEAR),
+    Start(NEIGHBOUR, False, 6.0, WARM | {"acceptable_iter": 1}),
+)
+# in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is tried soon
+IN_PLANE = (
+    Start("schedule", True, 2.0, {"max_iter": 50}),
+    Start("schedule", False, 4.0, {}),
+    Start("stance", False, 2.0, {}),
+)
+GIVEN = (
+    Start("given motion", True, 3.0, {"max_iter": 60}),
+    Start("given motion", False, 5.0, {}),
+)
+QUICK = Start("schedule", True, 5.0, {"max_iter": 80})
+APART = Start("links apart", True, 5.0, WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80})
+SETTLED = Start("settled", False, 8.0, WARM | PATIENT)
+FINER_MESH = Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1})
+HELD_TURN_RAD = np.radians(100)  # with more than that to turn only the exact Hessian settles, so it is tried first
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of one start."""
+
+    start: str
+    hessian: str
+    iterations: int
+    cpu_s: float
+    status: str
 
 
 @dataclass(frozen=True)
@@ -47,312 +110,516 @@ class Asked:
     """What every solve of one target is asked for, whatever its mesh and its start."""
 
     task: JumpTask
-    srmp: SrmpPlan | None  # stage 1's plan to follow, with tracking
     parameters: Mapping[str, Any]
-    weights: Mapping[str, float] = field(default_factory=dict)  # instead of the terms' own
-    off: tuple[str, ...] = ()  # terms left out
-    brief: bool = False  # whether to give up soon, unexplained
+    weights: Mapping[str, float]  # instead of the terms' own
+    references: Mapping[str, Mapping[str, np.ndarray]]
+    attempts: list[Attempt]  # made so far
+    srmp: SrmpPlan | None = None
 
 
 @dataclass(frozen=True, repr=False)
-class BodyPlan(Shown):
-    """A jump of the whole body, in the plane or out of it."""
+class WholeBodyPlan(Shown):
+    """Result of the whole-body program."""
 
     task: JumpTask
-    solution: Solution  # on the planner's mesh; its phases are "flat", "toe" and "flight"
+    solution: Solution  # in the coordinates of the program; see :attr:`phases`
+    schedule: Schedule
+    edge_m: float  # where the ground steps up or down, ahead of the toes' first place [m]
+    limits: Limits = Limits()  # that it was made with
+    attempts: tuple[Attempt, ...] = ()  # that were made, the last one with success
+
+    @cached_property
+    def tape(self) -> Tape:
+        """The 1 kHz tape of the motion."""
+        return make_tape(self.schedule.whole, self.phases, self.task.gravity)
+
+    @cached_property
+    def used(self) -> float:
+        """Largest share of the limits that the tape uses, also between the nodes."""
+        return used_between(self.tape, self.schedule.body.robot)
+
+    def after(self, attempts: Iterable[Attempt]) -> WholeBodyPlan:
+        """The same plan, with what was tried before it."""
+        plan = replace(self, attempts=tuple(attempts))
+        vars(plan).update(tape=self.tape, phases=self.phases, used=self.used)  # it is the same motion
+        return plan
+
+    @cached_property
+    def phases(self) -> dict[str, PhaseSolution]:
+        """The solution with every coordinate of the robot, as one of ``schedule.whole``."""
+        return self.schedule.spread(self.solution.phases)
+
+    def began(self, start: str) -> bool:
+        """Whether the solve that led here began with a start of that name."""
+        known = {x.name for x in (*COLD, *IN_PLANE, *GIVEN, *FROM_NEIGHBOUR)}
+        return [x.start for x in self.attempts if x.start in known][-1:] == [start]
 
     @property
     def launch_s(self) -> float:
-        """Duration of the launch [s]."""
-        return self.solution.phases["flat"].duration + self.solution.phases["toe"].duration
+        """Time until the feet first leave the ground [s]."""
+        durations = [p.duration for p in self.solution.phases.values()]
+        flying = [p.flying for p in self.schedule.contacts.phases]
+        return float(sum(durations[: flying.index(True)])) if any(flying) else float(sum(durations))
 
     @property
     def flight_s(self) -> float:
-        """Duration of the flight [s]."""
-        return self.solution.phases["flight"].duration
-
-
-@dataclass(frozen=True, repr=False)
-class WholeBodyPlan(BodyPlan):
-    """Result of stage 3 or of the direct planner."""
-
-    coarse: Statistics | None = None  # of the coarse mesh before it; None if there was none, or it found nothing
-    limits: Limits = Limits()  # that it was made with
-    # of the solves before it whose jerk jumped farther than a tape can follow; after each, the jerk's weight was raised
-    uneven: tuple[Statistics, ...] = ()
-
-    @property
-    def jerk_step(self) -> float:
-        """Largest jump of the jerk of a joint or of the trunk from one interval to the next [rad/s^3]."""
-        jerks = [np.pad(x.j, ((0, 0), (5 - x.j.shape[1], 0))) for x in self.solution.phases.values()]  # flat feet: none
-        return float(np.abs(np.diff(relative(np.vstack(jerks).T))).max())
+        """Duration of the first flight [s]; 0 if there is none."""
+        pairs = zip(self.solution.phases.values(), self.schedule.contacts.phases, strict=True)
+        return next((x.duration for x, p in pairs if p.flying), 0.0)
 
 
 def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> float:
-    """Where the ground steps up or down, ahead of the toe's first place [m].
+    """Where the ground steps up or down in a jump straight ahead, from the toes' first place [m].
 
     A platform begins a little before the landing heel; when the robot jumps down, the launching surface ends a little
     ahead of its toe.
     """
     if task.platform_m < 0:
         return limits.edge_before_heel_m
-    return task.distance_m + robot.sagittal.heel[0] - limits.edge_before_heel_m
+    return task.distance_m - (robot.foot.toe - robot.foot.heel) - limits.edge_before_heel_m
 
 
-def check_platform(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> None:
-    """Refuse a step up or down that the launching or the landing sole would stand across (:class:`InfeasibleError`)."""
-    if task.platform_m == 0:
-        return
-    least = 2 * limits.edge_before_heel_m - robot.sagittal.heel[0]
-    if task.distance_m < least:
-        raise InfeasibleError(
-            f"platform = {task.platform_m:g} m at a distance of {task.distance_m:g} m: the two surfaces would meet "
-            f"under a sole of {robot.name}; that takes a distance of at least {least:.2f} m (backward jumps only on "
-            f"the level)",
-            number="distance_m",
-            bound=least,
-        )
+def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
+    """The schedule of a standing jump, which ends at touchdown."""
+    phases = (
+        ContactPhase("LR", limits.flat_s, 0.6, mesh.flat, "flat"),
+        ContactPhase("lr", limits.toe_s, 0.12, mesh.toe, "toe"),
+        ContactPhase("-", limits.flight_s, 0.5, mesh.flight, "flight"),
+    )
+    return Contacts(phases, ends="touchdown")
 
 
 class WholeBodyPlanner:
-    """Stage 3 for one robot (or, without ``tracking``, the direct planner): built once, solved for any target.
+    """The whole-body program of one robot and one schedule: built once, solved for any target.
 
-    With ``refine`` a target is solved on a coarse mesh first and refined from there, without it on ``mesh`` at once.
-    With ``approach`` the coarse mesh only takes the few steps of ``Nlp.gauss_newton_steps``; where they lead
-    nowhere, and without it, ipopt solves it. ``keep`` keeps what was built for later processes. ``changes`` are own
-    terms, other weights, and terms left out.
+    ``contacts`` are by default those of a standing jump. ``keep`` keeps what was built for later processes; ``changes``
+    are own terms, weights and switches.
     """
 
     def __init__(
         self,
         robot: Robot,
-        mesh: Mesh = Mesh(),
+        mesh: Mesh | None = None,
         limits: Limits = Limits(),
         weights: Weights = Weights(),
         *,
-        tracking: bool = True,
+        contacts: Contacts | None = None,
+        tracking: bool = False,
         options: Mapping | None = None,
-        refine: bool = True,
-        approach: bool = True,
         keep: bool = False,
         changes: StageChanges = StageChanges(),
+        body: Body | None = None,
+        free: Coordinates | None = None,
     ):
-        self.robot, self.mesh, self.limits, self.weights, self.tracking = robot, mesh, limits, weights, tracking
-        self.stance, self._steps, self._coarse, self.changes = stance_angles(robot), approach, None, changes
-        options = dict(options or {})
-        problem = changes.applied(build_problem(robot, mesh, limits, weights, tracking=tracking))
-        key = f"{robot.hash} {limits} {weights} {tracking}" if keep else None
-        self.nlp = Nlp(problem, {**FINE, **options}, key)
-        if refine:
-            coarse = {**COARSE, **(NEAR if tracking else {}), **options}
-            self._coarse = Nlp(problem.on_mesh(mesh.coarse().intervals()), coarse, key, self.nlp)
-            self._refined = self.nlp.with_options({**FINE, **REFINED, **options})
-        self._warm = self.nlp.with_options({**FINE, **WARM, **options})
-        self._brief = self.nlp.with_options({**FINE, **REFINED, **BRIEF, **options})
+        self.robot, self.mesh, self.tracking = robot, mesh or Mesh(), tracking
+        self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
+        self.body = body or Body(robot)
+        self.free = free or (even(self.body) if tracking else whole(self.body))
+        self.contacts = contacts or jump_contacts(limits, self.mesh)
+        if self.body.short and any(len(p.modes) == 1 for p in self.contacts.phases):
+            raise InputError(
+                f"robot {robot.name}: a leg has fewer than six joints, so it cannot be planned to stand on one foot"
+            )
+        self._stood: dict[tuple, tuple[float, str, float] | None] = {}
+        self._options = dict(options or {})
+        self._key = f"{robot.hash} {self.free.kind} {limits} {weights} {tracking}" if keep else None
+        self._apart: dict[tuple, Nlp] = {}
+        self._terms: dict = {}
+
+    @property
+    def nlp(self) -> Nlp:
+        """The program without rows for links that met."""
+        return self._nlp(())
+
+    def _schedule(self, apart: tuple[Apart, ...]) -> Schedule:
+        return Schedule(
+            self.body,
+            self.contacts,
+            self.limits,
+            self.weights,
+            apart,
+            self._terms,
+            free=self.free,
+            tracking=self.tracking,
+        )
+
+    def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
+        """The program with rows for links that met."""
+        key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
+        if key not in self._apart:
+            if len(self._apart) > 8:
+                self._apart = {(): self._apart[()]}
+            problem = self.changes.applied(self._schedule(apart).problem())
+            self._apart[key] = Nlp(problem, {**IPOPT, **self._options}, self._key)
+        return self._apart[key]
+
+    @cached_property
+    def terms(self) -> dict:
+        """Mode -> its terms."""
+        return self._schedule(()).terms
 
     def plan(
         self,
         task: JumpTask,
         srmp: SrmpPlan | None = None,
         *,
-        guess: Mapping[str, PhaseGuess] | None = None,
+        begin: starts.Motion | None = None,
         weights: Mapping[str, float] | None = None,
-        off: tuple[str, ...] = (),
         near: WholeBodyPlan | None = None,
-        start: np.ndarray | None = None,
-        settle: bool = True,
-        brief: bool = False,
+        stance: np.ndarray | None = None,
     ) -> WholeBodyPlan:
-        """Solve for a target; with tracking, ``srmp`` is stage 1's plan for it.
+        """Solve for a target; where the motion passes limits between the nodes, on to the end, then on a finer mesh.
 
         Parameters
         ----------
-        guess : start values on any mesh; those of :meth:`naive_guess` if None.
-        weights, off : as in :meth:`jumplab.ocp.nlp.Nlp.solve`.
-        near : this planner's plan for a target close by, to begin with instead of ``guess``; if that leads nowhere, the
-            target is solved from ``guess`` all the same.
-        start : absolute link angles (5,) in which the robot waits at rest, soles flat; the stance if None.
-        settle : take a few steps from ``near`` if it is close enough, see :meth:`jumplab.ocp.nlp.Nlp.settled`; the
-            least cost is found without.
-        brief : give up soon, and explain nothing: for a target that most likely has no plan.
+        srmp : with tracking, stage 1's plan for the target.
+        begin : a motion to begin with, before all other starts.
+        weights : of cost terms, instead of their own.
+        near : this planner's plan for a target close by, to begin with.
+        stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's places; it if None.
 
         Raises
         ------
         SolverError
-            If there is no plan; names the terms in conflict.
+            If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
+            Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
-        asked = Asked(task, srmp, self.parameters(task, srmp, start), weights or {}, off, brief)
-        return replace(self._evened(self._begun(asked, guess, near, settle), asked), limits=self.limits)
-
-    def _run(self, solve: Callable, asked: Asked, start, mesh: Mesh | None = None, **how) -> Solution | Near:
-        """Call an NLP's ``solve`` or ``approach`` with start values, or with a solution on any mesh.
-
-        ``mesh`` is that of the NLP, by default the planner's; ``how`` are further arguments. All solves pass here.
-        """
-        mesh = mesh or self.mesh
-        if isinstance(start, Solution | Near):
-            how |= {"multipliers": start.multipliers} if isinstance(start, Solution) else {}
-            guess = start.guess(mesh.intervals())
-        else:
-            guess = {name: start[name].resampled(n) for name, n in mesh.intervals().items()}
-        weights = self.changes.spread(self.nlp.problem, asked.weights)
-        how |= {"references": self.references(asked.srmp, mesh), "weights": weights, "off": asked.off}
-        return solve(asked.parameters, guess, **how)
-
-    def _evened(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
-        """The plan, with a dearer jerk if it jumps too far. Whoever sets the jerk's weight or drops it is obeyed."""
-        if self._jerk_set(asked):
-            return found
-        for factor in EVENING:
-            if found.jerk_step <= FOLLOWED_JERK_STEP:
-                break
-            dearer = replace(asked, weights={**asked.weights, "jerk": factor * self.weights.jerk})
+        if (less := self._even_one(task, weights or {}, stance)) is not None:
+            return less.plan(task, srmp, begin=begin, weights=weights, near=near, stance=stance)
+        weights = self.changes.spread(self.nlp.problem, weights or {})
+        asked = Asked(task, self.parameters(task, stance, srmp), weights, self._references(srmp), [], srmp)
+        best, failure = None, None
+        for start in self._starts(task, near, begin):
             try:
-                even = self._run(self._warm.solve, dearer, found.solution, explain=False)
-            except SolverError:
-                break  # the audit says what is wrong with the tape
-            found = replace(found, solution=even, uneven=(*found.uneven, found.solution.statistics))
+                found = self._settled(self._tried(start, asked, near if start.name == NEIGHBOUR else begin), asked)
+            except SolverError as e:
+                failure = e
+                continue
+            if best is None or found.used < best.used:
+                best = found
+            if best.used <= 1:
+                break
+        if best is None:
+            raise self._explained(failure, asked)
+        if best.used > BROKEN:
+            raise SolverError(
+                f"{self.nlp.problem.name}: motions that keep every limit at the nodes break them between the nodes, at "
+                f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
+                stage=self.nlp.problem.name,
+            )
+        return best.after(asked.attempts)
+
+    def _starts(self, task: JumpTask, near, begin) -> Iterable[Start]:
+        """The list of starts for a target, in their order."""
+        cold = IN_PLANE if self.free.plane else COLD
+        if not EXPLAINED.get():
+            cold = cold[:-1]
+        found = [*(FROM_NEIGHBOUR if near is not None else ()), *(GIVEN if begin is not None else ()), *cold]
+        if abs(task.yaw_rad) > HELD_TURN_RAD or task.rotation_rad:
+            return sorted(found, key=lambda start: (start.name != NEIGHBOUR, start.name in ("stance",), start.held))
         return found
 
-    def _begun(self, asked: Asked, guess, near: WholeBodyPlan | None, settle: bool) -> WholeBodyPlan:
-        """The solution: from the plan for a target close by, from the coarse mesh, or from the guess itself.
-
-        Direct plans for targets farther away begin with the coarse mesh: it takes less time, and costs no more.
-        """
-        close = near is not None and asked.task.is_near(near.task)
-        ways: list[Callable[[], WholeBodyPlan]] = []
-
-        def fresh() -> Mapping[str, PhaseGuess]:
-            return guess or self.naive_guess(asked.task)
-
-        if close and settle:
-            ways.append(lambda: self._beside(asked, near.solution))
-        if near is not None:
-            ways.append(
-                lambda: WholeBodyPlan(asked.task, self._run(self._warm.solve, asked, near.solution, explain=False))
-            )
-        if self._coarse is not None:
-            ways.insert(len(ways) if close or self.tracking else 0, lambda: self._refine(asked, fresh()))
-        for way in ways:
-            with suppress(SolverError):
-                return way()
-        if asked.brief and ways:
-            raise SolverError(f"{self.nlp.problem.name}: no plan was found soon", stage=self.nlp.problem.name)
-        return WholeBodyPlan(
-            asked.task, self._run(self.nlp.solve, asked, fresh())
-        )  # the last word, and the explanation
-
-    def settled(
-        self,
-        task: JumpTask,
-        near: Mapping[str, PhaseGuess],
-        *,
-        jerk: float | None = None,
-        start: np.ndarray | None = None,
+    def beside(
+        self, task: JumpTask, near: Mapping[str, PhaseGuess], *, stance: np.ndarray | None = None
     ) -> WholeBodyPlan:
-        """The direct plan for a target, a few steps from the motion ``near`` of one close by; without tracking only.
+        """Solve for a target from a motion of one close by, in this program's coordinates; nothing else is tried.
 
-        ``jerk`` is that one's weight of the jerk if the tape asked for a dearer one; ``start`` as in :meth:`plan`.
-        Raises :class:`SolverError` if the target is not that close.
+        Raises :class:`SolverError` if that leads nowhere.
         """
-        asked = Asked(task, None, self.parameters(task, None, start))
-        found = self._settled(asked, near, {} if jerk is None or self._jerk_set(asked) else {"jerk": jerk})
-        return replace(self._evened(found, asked), limits=self.limits)
+        asked = Asked(task, self.parameters(task, stance), {}, self._references(None), [])
+        found = self._solved(FROM_NEIGHBOUR[0], asked, near, ())
+        found = self._kept_apart(found, True, asked)
+        return self._settled(found, asked).after(asked.attempts)
 
-    def _settled(self, asked: Asked, near: Mapping[str, PhaseGuess], weights: Mapping[str, float]) -> WholeBodyPlan:
-        how = {"references": self.references(asked.srmp, self.mesh), "off": asked.off}
-        how["weights"] = self.changes.spread(self.nlp.problem, {**asked.weights, **weights})
-        return WholeBodyPlan(asked.task, self.nlp.settled(asked.parameters, near, **how))
+    def _even_one(self, task: JumpTask, weights: Mapping[str, float], stance) -> WholeBodyPlanner | None:
+        """The planner of even motions, where nothing asks for another."""
+        if self.free.even or not (task.in_plane and self.contacts.even) or self.changes.terms:
+            return None
+        named = (*weights, *self.changes.weights, *self.changes.off)
+        if any(name.rpartition("/")[2] == "mirror" for name in named) or self._even.free.kind == "whole":
+            return None
+        return self._even
 
-    def _beside(self, asked: Asked, near: Solution) -> WholeBodyPlan:
-        """A plan a few steps from one for a target close by, whose jerk may have been made dearer for the tape."""
-        jerk, weights = {row["weight"] for row in near.cost_shares if row["name"] == "jerk"}, {}
-        if not self._jerk_set(asked) and jerk & {factor * self.weights.jerk for factor in EVENING}:
-            weights["jerk"] = jerk.pop()
-        if not self.nlp.weighs_as(near, self.changes.spread(self.nlp.problem, {**asked.weights, **weights})):
-            raise SolverError(f"{self.nlp.problem.name}: the plan to begin with has other weights", stage="whole body")
-        return self._settled(asked, near.guess(), weights)
+    @cached_property
+    def _even(self) -> WholeBodyPlanner:
+        how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        turns = self.limits.capture_moment is not None  # a flip: in the plane, if the feet stay in it
+        how |= {"contacts": self.contacts, "free": in_plane(self.body) if turns else even(self.body)}
+        if how["free"].kind == "whole":
+            return self
+        return WholeBodyPlanner(self.robot, self.mesh, self.limits, self.weights, **how)
 
-    def _jerk_set(self, asked: Asked) -> bool:
-        """Whether somebody set the jerk's weight by hand, or dropped it."""
-        set_by_hand = *asked.weights, *asked.off, *self.changes.weights, *self.changes.off
-        return any(name.rpartition("/")[2] == "jerk" for name in set_by_hand)
+    def _tried(self, start: Start, asked: Asked, given: WholeBodyPlan | starts.Motion | None) -> WholeBodyPlan:
+        """A plan from one start, its links apart."""
+        begin, apart = given, ()
+        if start.name == NEIGHBOUR:
+            apart = given.schedule.apart if given.schedule.free.kind == self.free.kind else ()
+        elif start.name != GIVEN[0].name:
+            begin = self._motion(start, asked.task)
+        found = self._solved(start, asked, begin, apart)
+        return self._kept_apart(found, start.held, asked)
 
-    def _refine(self, asked: Asked, guess) -> WholeBodyPlan:
-        """The solution from a few steps on the coarse mesh, or where they lead nowhere, from ipopt's solution there."""
-        mesh = self.mesh.coarse()
-        if self.tracking:
-            guess = {name: phase.smoothed(*GUESS_WIDTHS) for name, phase in guess.items()}
+    def _kept_apart(self, found: WholeBodyPlan, held: bool, asked: Asked) -> WholeBodyPlan:
+        """The plan, solved on with rows for whatever links meet in it."""
+        for _ in range(ROUNDS):
+            new = too_close(self.body, list(found.phases.values()))
+            if self.free.even:
+                new = [x for x in new if self._on_left(x)]
+            if not new:
+                break
+            apart = merged(found.schedule.apart, new)
+            ways = [replace(APART, held=kind) for kind in ((True, False) if held else (False,))]
+            for way in ways:
+                try:
+                    found = self._solved(way, asked, found, apart)
+                    break
+                except SolverError:
+                    if way is ways[-1]:
+                        raise
+        return found
 
-        def refined(first):
-            nlp = self._brief if asked.brief else self._refined
-            solution = self._run(nlp.solve, asked, first, explain=False)
-            return WholeBodyPlan(asked.task, solution, first.statistics)
+    def _on_left(self, kept: Apart) -> bool:
+        """Whether a pair of links is no mere mirror image of another."""
+        half = self.body.model.left_half
+        return kept.pair.first.body in half or kept.pair.second.body in half
 
-        if self._steps:
+    def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
+        schedule = self._schedule(())
+        if start.name == "stance":
+            return starts.still(schedule, task)
+        motion = starts.along(schedule, task)
+        return motion if motion.missed < starts.REACHED else starts.still(schedule, task)
+
+    def _solved(self, start: Start, asked: Asked, begin, apart, *, explain: bool = False) -> WholeBodyPlan:
+        """One solve; what came of it is added to the attempts.
+
+        It begins with a plan, with a motion, or with values at the nodes.
+        """
+        schedule, nlp = self._schedule(apart), self._nlp(apart)
+        patience_s = start.patience_s * max(1.0, nlp.assembled.size / USUAL_SIZE)
+        options = {**IPOPT, **start.options, "max_cpu_time": patience_s, **self._options}
+        nlp = nlp.with_options(options, HOLD if start.held else None)
+        how: dict[str, Any] = {"explain": explain, "weights": asked.weights, "references": asked.references}
+        if isinstance(begin, Mapping):
+            guess = begin
+        elif isinstance(begin, WholeBodyPlan):
+            if begin.schedule.free.kind == self.free.kind:
+                guess = begin.solution.guess({p.name: p.intervals for p in self.contacts.phases})
+                how["multipliers"] = begin.solution.multipliers
+            else:
+                guess = starts.beside(schedule, begin.phases)
+        else:
+            guess = starts.guess(schedule, begin)
+        began, words = time.process_time(), "held Gauss-Newton" if start.held else "exact"
+        try:
+            solution = nlp.solve(asked.parameters, guess, **how)
+        except SolverError as e:
+            asked.attempts.append(Attempt(start.name, words, e.iterations, time.process_time() - began, str(e.status)))
+            raise
+        s = solution.statistics
+        asked.attempts.append(Attempt(start.name, words, s.iterations, time.process_time() - began, s.status))
+        origin = self.robot.foot.toe - float(self.robot.foot.center[0])
+        edge = self._edge(asked.task)[0] if self.contacts.ends == "touchdown" else self._step()[1]
+        return WholeBodyPlan(asked.task, solution, schedule, edge - origin, self.limits)
+
+    def _settled(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
+        """The plan, solved on where it passes limits between the nodes, first to the end, then on a finer mesh."""
+        first = found
+        for start, planner in ((SETTLED, lambda: self), (FINER_MESH, lambda: self._finer)):
+            if found.used <= 1:
+                return found
+            p = planner()
+            finer = replace(asked, references=p._references(asked.srmp))
             try:
-                return refined(self._run(self._coarse.gauss_newton_steps, asked, guess, mesh))
+                more = p._solved(start, finer, found, p._scaled(found))
+                found = p._kept_apart(more, False, finer)
             except SolverError:
-                if asked.brief:
-                    raise
-                # too far away for linear rows; what stays inside all limits finds more, and takes longer
-        return refined(self._run(self._coarse.solve, asked, guess, mesh, explain=False))
+                continue
+        return found if found.used <= 1 else first
 
-    def parameters(self, task: JumpTask, srmp: SrmpPlan | None = None, start: np.ndarray | None = None) -> dict:
-        """Parameter values of the problem for a target and a ``start`` (see :meth:`plan`).
+    def _scaled(self, found: WholeBodyPlan) -> tuple[Apart, ...]:
+        """Rows for links that met, at the nodes of this planner's mesh."""
+        out = []
+        for x in found.schedule.apart:
+            ratio = self.contacts.phases[x.phase].intervals / found.schedule.contacts.phases[x.phase].intervals
+            last = min(self.contacts.phases[x.phase].intervals, math.ceil(ratio * x.last))
+            out.append(replace(x, first=max(1, int(ratio * x.first)), last=last))
+        return tuple(out)
 
-        Raises :class:`InfeasibleError` for an impossible platform.
+    @cached_property
+    def _finer(self) -> WholeBodyPlanner:
+        """The same program on half as many nodes again."""
+        phases = tuple(replace(p, intervals=math.ceil(FINER * p.intervals)) for p in self.contacts.phases)
+        contacts = replace(self.contacts, phases=phases)
+        how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        how |= {"contacts": contacts, "free": self.free, "tracking": self.tracking}
+        return WholeBodyPlanner(self.robot, self.mesh, self.limits, self.weights, **how)
+
+    def _explained(self, failure: SolverError, asked: Asked) -> SolverError:
+        """Why there is no plan: the terms in conflict, and a smaller target that has one."""
+        if not EXPLAINED.get():
+            return failure
+        start, task = replace(COLD[1], patience_s=1.0), asked.task
+        try:
+            self._solved(start, replace(asked, attempts=[]), self._motion(start, task), (), explain=True)
+        except SolverError as e:
+            failure = e
+        less = self._smaller(asked) if self.contacts.ends == "touchdown" else None
+        words = "" if less is None else f"; at this height, {said(less.task)} is planned"
+        return SolverError(
+            f"{failure}{words}", stage=failure.stage, status=failure.status, violations=failure.violations
+        )
+
+    def _smaller(self, asked: Asked) -> WholeBodyPlan | None:
+        """The plan of the largest of a few targets with less way and less turn."""
+        task = asked.task
+        if self.tracking:
+            return None
+        for share in SHORTER:
+            less = {name: round(share * getattr(task, name), 3) for name in ("distance_m", "side_m", "yaw_rad")}
+            easier = replace(task, **less)
+            try:
+                return self._tried(QUICK, replace(asked, task=easier, parameters=self.parameters(easier)), None)
+            except (InfeasibleError, SolverError):
+                continue
+        return None
+
+    def _references(self, srmp: SrmpPlan | None) -> dict[str, dict[str, np.ndarray]]:
+        """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and foot.
+
+        With tracking also stage 1's trajectories, by share of each phase.
         """
-        check_platform(task, self.robot, self.limits)
-        edge = platform_edge_m(task, self.robot, self.limits) - np.sign(task.platform_m) * self.limits.edge_step_m
-        stance = self.stance if start is None else start
-        values = dict(stance=stance, distance=task.distance_m, platform=task.platform_m, edge=edge)
-        values |= dict(takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad, gravity=task.gravity)
+        phases = self.contacts.phases
+        out = {p.name: {} for p in phases}
+        for side in self.free.sides:
+            for run in _runs([side not in p.modes for p in phases]):
+                count, at, last = sum(phases[k].intervals for k in run), 0, run[-1] == len(phases) - 1
+                for k in run:
+                    u = (at + np.arange(phases[k].intervals + 1)) / count
+                    at += phases[k].intervals
+                    shape = 4 * u * (1 - u)
+                    # in a jump the soles come down steeply, in a step they hardly leave the ground else
+                    height = self.limits.clearance_m * (shape**3 if last else shape)
+                    if phases[k].flying:
+                        s = np.linspace(0, 1, len(u))
+                        height = np.maximum(height, self.limits.clearance_m * (4 * s * (1 - s)) ** 3)
+                    out[phases[k].name][f"{SIDES[side]}_clearance"] = height[None]
+        return self._followed(srmp, out) if self.tracking else out
+
+    def _followed(self, srmp: SrmpPlan, out: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+        """The same with stage 1's trajectories."""
+        intervals = {p.name: p.intervals for p in self.contacts.phases}
+        split = srmp.launch_s - srmp.toe_s
+        spans = {"flat": (0.0, split), "toe": (split, srmp.launch_s), "flight": (0.0, srmp.flight_s)}
+        for name, count in intervals.items():
+            t, part = np.linspace(*spans[name], count + 1), srmp.flight if name == "flight" else srmp.launch
+            names = ("rho", "rho_rate") if name == "flight" else ("rho", "rho_rate", "L")
+            out[name] |= {k: np.interp(t, part.t, getattr(part, k))[None] for k in names}
+            if name != "flight":
+                out[name]["velocity"] = np.array([np.interp(t, part.t, x) for x in part.com_velocity.T])
+        return out
+
+    def parameters(
+        self, task: JumpTask, stance: np.ndarray | None = None, srmp: SrmpPlan | None = None
+    ) -> dict[str, Any]:
+        """Parameter values of the problem for a target; with tracking, ``srmp`` is stage 1's plan for it.
+
+        Raises :class:`InfeasibleError` for an impossible platform, and if the robot cannot even stand as it begins.
+        """
+        start = self.body.stance if stance is None else self.body.model.of_pinocchio(stance[None])[0]
+        if not self.robot.planar:  # of others stage 1's closed forms tell
+            self._check_standing(start, task.gravity)
+        values = dict(stance=self.free.taken(start), distance=task.distance_m, side=task.side_m, yaw=task.yaw_rad)
+        values |= dict(platform=task.platform_m, takeoff_speed=task.takeoff_speed, rotation=task.rotation_rad)
         if self.tracking:
             values |= dict(momentum=srmp.launch.L[-1], launch_s=[srmp.launch_s - srmp.toe_s, srmp.toe_s])
-        return values
+        values["straight"] = float(task.in_plane and self.contacts.ends == "touchdown")
+        if self.contacts.ends == "rest":
+            height, edge, room = self._step()
+            edge -= np.sign(height) * min(self.limits.edge_step_m, room)
+            return values | dict(platform=height, edge=edge, along=(1.0, 0.0), gravity=task.gravity)
+        ways = np.cos(task.along_rad), np.sin(task.along_rad)
+        edge, room = self._edge(task)
+        # for clearance, also between the nodes, a platform counts as reaching further
+        edge -= np.sign(task.platform_m) * min(self.limits.edge_step_m, room)
+        return values | dict(edge=edge, along=ways, gravity=task.gravity)
 
-    def references(self, srmp: SrmpPlan | None, mesh: Mesh) -> dict[str, dict[str, np.ndarray]] | None:
-        """Stage 1's trajectories at a mesh's nodes, by share of each phase; None if they are not tracked."""
-        if not self.tracking:
-            return None
-        launch, nodes = srmp.launch, mesh.nodes(srmp.launch_s - srmp.toe_s, srmp.launch_s, srmp.launch_s)
+    def check_ground(self, task: JumpTask) -> None:
+        """Refuse a step up or down that a sole would stand across (:class:`InfeasibleError`)."""
+        self._edge(task)
 
-        def sampled(t, phase, *names):
-            return {k: np.interp(t, phase.t, getattr(phase, k))[None] for k in names}
+    def _step(self) -> tuple[float, float, float]:
+        """Height of the second surface of a schedule [m], where ahead of the world's origin it begins [m], and how far
+        the upper surface could reach further before it met a sole [m].
+        """
+        (height, first), room = self.contacts.surface, self.limits.edge_before_heel_m
+        length, toes = 2 * self.body.half_m, float(self.body.places[:, 0].mean())
+        near = max([toes, *(toes + p.ahead_m for p in self.contacts.places[:first])])
+        far = min([toes + p.ahead_m for p in self.contacts.places[first:]], default=near) - length
+        if height == 0:
+            return 0.0, 0.0, 0.0
+        if far - near < 2 * room:
+            raise InfeasibleError(
+                f"places on a surface {height:g} m higher: it would begin {far - near:.2f} m ahead of the toes that "
+                f"leave, which takes {2 * room:.2f} m; put the places {near + 2 * room + length - toes:.2f} m ahead",
+                number="ahead_m",
+                bound=near + 2 * room + length - toes,
+            )
+        edge = near + room if height < 0 else far - room
+        return height, edge, max(0.0, (far - edge if height < 0 else edge - near) - 0.01)
 
-        out = {}
-        for name in ("flat", "toe"):
-            velocity = np.array([np.interp(nodes[name], launch.t, x) for x in launch.com_velocity.T])
-            out[name] = sampled(nodes[name], launch, "rho", "rho_rate", "L") | {"velocity": velocity}
-        t = np.linspace(0, srmp.flight_s, mesh.flight + 1)
-        return out | {"flight": sampled(t, srmp.flight, "rho", "rho_rate")}
+    def _check_standing(self, start: np.ndarray, gravity: float) -> None:
+        """Refuse a robot whose motors cannot hold the posture in which it waits."""
+        if (key := (gravity, start.tobytes())) not in self._stood:
+            q = self.body.model.to_pinocchio(start[None], *np.zeros((2, 1, len(start))))[0][0]
+            self._stood[key] = holding(self.robot.under_gravity(gravity), q, self.limits.friction)
+        share, joint, torque = self._stood[key] or (0.0, "", 0.0)
+        if share > 1:
+            effort = self.robot.actuators[joint]["effort"]
+            raise InfeasibleError(
+                f"robot {self.robot.name} cannot stand as it begins: however the ground's forces are shared, a joint "
+                f"needs {share:.1f} times its effort, {joint} {torque:.3g} N m of {effort:.3g}; if these are motors' "
+                f"efforts before their gears, give those of the joints in [limits]"
+            )
 
-    # guesses ----------------------------------------------------------------------------------------------------
-    def _posture(self, name: str) -> np.ndarray:
-        """Absolute link angles (5,) of a named posture of :data:`POSTURES`, CoM roughly above the sole."""
-        knee, trunk, heel, arm = POSTURES[name]
-        angles = stance_angles(self.robot, knee, within_limits=False)
-        return angles + np.array([heel, heel * 0.5, 0.0, trunk - angles[3], trunk + arm - angles[4]])
+    def _edge(self, task: JumpTask) -> tuple[float, float]:
+        """Where the ground steps up or down [m], along the travel from the world's origin.
 
-    def naive_guess(self, task: JumpTask) -> dict[str, PhaseGuess]:
-        """Start values that know only the target: straight lines through four postures, at rest at every node."""
-        p = {name: self._posture(name) for name in POSTURES}
-        push = (p["crouch"] + p["take-off"]) / 2
-        push[0] = 0.0
-        turn = np.full(5, task.rotation_rad)
-        flight_s = task.flight_time(min(task.platform_m, 0.9 * task.height_m))
-        n, lean = self.mesh, 0.3 * np.tanh(task.distance_m)
-        flat = _through([self.stance, p["crouch"], push], [0, 0.6, 1], n.flat)[:, 1:]
-        toe = _through([push, p["take-off"]], [0, 1], n.toe)
-        fly = _through([p["take-off"], p["tuck"] + turn / 2, p["touchdown"] + turn], [0, 0.5, 1], n.flight)
-        speed = (task.distance_m - lean) / flight_s
-        ballistic = dict(com_x=lean - 0.12, com_z=0.65, vel_x=speed, vel_z=task.takeoff_speed)
-        phases = ("flat", 0.7, flat, {}), ("toe", TOE_PHASE_S, toe, {}), ("flight", flight_s, fly, ballistic)
-        still = {name: np.zeros_like(q) for name, _, q, _ in phases}
-        return {name: PhaseGuess(s, q, still[name], still[name], None, c) for name, s, q, c in phases}
+        And how far the upper surface could reach further before it met a sole [m].
+        """
+        along = np.array([np.cos(task.along_rad), np.sin(task.along_rad)])
+        c, s = np.cos(task.yaw_rad), np.sin(task.yaw_rad)
+        soles = self.robot.foot.corners - self.robot.foot.tip
+        corners = (self.body.places[:, None] + soles).reshape(-1, 3)[:, :2]
+        landed = ([task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])) @ along
+        room, first = self.limits.edge_before_heel_m, float((corners @ along).max())
+        up, down = float(landed.min()) - room, first + room
+        edge = down if task.platform_m < 0 else up
+        apart = up - first if task.platform_m > 0 else float(landed.min()) - down
+        if task.platform_m and apart < -1e-9:  # rounding
+            way = float(np.hypot(task.distance_m, task.side_m))
+            least = np.ceil(100 * (way - apart) - 1e-6) / 100
+            raise InfeasibleError(
+                f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would meet under a "
+                f"sole of {self.robot.name}; that takes a distance of at least {least:.2f} m",
+                number="distance_m",
+                bound=float(least),
+            )
+        return edge, max(0.0, apart)
 
 
-def _through(knots, shares, intervals) -> np.ndarray:
-    s = np.linspace(0, 1, intervals + 1)
-    return np.stack([np.interp(s, shares, column) for column in np.array(knots).T], -1)
+def _runs(flags: list[bool]) -> Iterator[list[int]]:
+    """Runs of consecutive indices whose flag is set."""
+    run: list[int] = []
+    for k, flag in enumerate([*flags, False]):
+        if flag:
+            run.append(k)
+        elif run:
+            yield run
+            run = []
+
+
+def said(task: JumpTask) -> str:
+    """Way and turn of a target in words."""
+    turn = f"{np.degrees(task.yaw_rad):.3g} deg"
+    return f"{task.distance_m:g} m ahead and {task.side_m:g} m to the left with a turn of {turn}"

@@ -14,8 +14,8 @@ from jumplab.errors import InputError, RobotError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.stance import check_stance
 from jumplab.sim.scene import REACH_M, Block, Scene
+from jumplab.stages.whole_body import Limits
 from jumplab.stages.whole_body.planner import platform_edge_m
-from jumplab.stages.whole_body.settings import Limits
 from jumplab.task import JumpTask
 
 CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}  # half-way to the bottom of a landing: soon reached, quick to launch

@@ -11,7 +11,7 @@ import numpy as np
 from jumplab.models.spatial import SpatialState
 
 if TYPE_CHECKING:
-    from jumplab.stages.spatial.terms import SpatialTerms
+    from jumplab.stages.whole_body.terms import WholeBodyTerms
 
 LEG_STEPS = 3  # of Newton's method from errors below a millimetre
 HELD_M = 1e-10  # [m, rad] closer, a foot is in its place
@@ -22,7 +22,7 @@ Motion = tuple[np.ndarray, np.ndarray, np.ndarray]  # charts, rates, acceleratio
 class Legs:
     """Feet that carry as functions of the chart, mapped over many instants; made once for a mode."""
 
-    def __init__(self, b: SpatialTerms):
+    def __init__(self, b: WholeBodyTerms):
         self.b, body, n = b, b.body, b.nv
         q, v, a, holds = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("a", n), ca.SX.sym("holds", 4, len(b.modes))
         state, rows, self.pitches = SpatialState(b.model, q, q, q), [], {}

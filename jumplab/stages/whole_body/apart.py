@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.ocp.solution import PhaseSolution
-from jumplab.stages.spatial.shapes import Pair, faces, gaps
-from jumplab.stages.spatial.terms import Body
+from jumplab.stages.whole_body.shapes import Pair, faces, gaps
+from jumplab.stages.whole_body.terms import Body
 
 SAMPLES = 3  # in every interval, that are looked at
 NODES = 2  # before and after such an instant that a row is for

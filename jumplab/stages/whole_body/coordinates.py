@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 
 from jumplab.models.spatial import CHART
 
 if TYPE_CHECKING:
-    from jumplab.stages.spatial.terms import Body
+    from jumplab.stages.whole_body.terms import Body
 
 BASE = len(CHART)
 IN_PLANE = [CHART.index(x) for x in ("x", "z", "pitch")]
@@ -124,26 +125,38 @@ def whole(body: Body) -> Coordinates:
 
 
 def even(body: Body) -> Coordinates:
-    """Those of the simplest even motion of a robot: in the plane for one that five links describe; else of its left
-    half. Every coordinate of a robot whose halves are no mirror images, or whose feet then would not be free to move.
+    """Those of even motions: in the plane for a robot that five links describe, else of its left half.
+
+    Every coordinate of a robot whose halves are no mirror images, or whose feet then would not be free to move.
     """
-    model, planar = body.model, body.robot.planar
-    pairs = model.pairs
-    swing = {name for pair in body.robot.joints.values() for name in pair}
-    if len({i for pair in pairs for i in pair[:2]}) < model.joints or not (planar or body.mirrored):
+    if body.robot.planar:
+        return in_plane(body)
+    if body.short or not body.mirrored or len({i for pair in body.model.pairs for i in pair[:2]}) < body.model.joints:
         return whole(body)
-    if body.short and not planar:
+    return _mirrored(body, "even", set(body.joint_names))
+
+
+def in_plane(body: Body) -> Coordinates:
+    """Those of motions in which only joints with a role and those in the middle that pitch move; every coordinate of a
+    robot whose feet would leave the plane then."""
+    mirrored = body.robot.planar or body.mirrored
+    if not mirrored or len({i for pair in body.model.pairs for i in pair[:2]}) < body.model.joints:
         return whole(body)
-    n, left, columns, links = len(model.names), set(model.left_half), [], []
-    for k in IN_PLANE:
-        columns.append(np.eye(n)[k])
-        links.append(k)
+    middle = {body.joint_names[i] for i, k, sign in body.model.pairs if i == k and sign > 0}
+    found = _mirrored(body, "plane", middle | {name for pair in body.robot.joints.values() for name in pair})
+    return found if body.robot.planar or _feet_stay(body, found) else whole(body)
+
+
+def _mirrored(body: Body, kind: str, moving: set[str]) -> Coordinates:
+    """Even motions of the ``moving`` joints; the others stay as in the stance, which they have to contain."""
+    model = body.model
+    n, left = len(model.names), set(model.left_half)
+    columns, links = [np.eye(n)[k] for k in IN_PLANE], list(IN_PLANE)
     rest = np.where(np.isin(np.arange(n), IN_PLANE), 0.0, body.stance)
     rest[[1, 3, 4]] = 0.0
-    for i, k, sign in pairs:
+    for i, k, sign in model.pairs:
         one, other = (i, k) if i + 1 in left else (k, i)
-        held = (i == k and sign < 0) or (planar and model.names[BASE + one] not in swing)
-        if held:
+        if (i == k and sign < 0) or model.names[BASE + one] not in moving:
             continue
         column = np.zeros(n)
         column[BASE + one], column[BASE + other] = 1.0, sign if i != k else 1.0
@@ -152,6 +165,18 @@ def even(body: Body) -> Coordinates:
         links.append(BASE + one)
     order = np.argsort(links)
     free, spread = tuple(int(links[i]) for i in order), np.array(columns)[order].T
-    found = Coordinates("plane" if planar else "even", model.names, free, spread, rest)
+    found = Coordinates(kind, model.names, free, spread, rest)
     again = found.charts(found.taken(body.stance[None]))[0]
     return found if np.abs(again - body.stance).max() < SAME_RAD else whole(body)
+
+
+def _feet_stay(body: Body, free: Coordinates) -> bool:
+    """Whether feet keep their distance from the plane, heading and roll whatever the free coordinates are."""
+    tree, rng = body.model.model, np.random.default_rng(0)
+    data, seen = tree.createData(), []
+    for x in rng.uniform(-1.0, 1.0, (8, free.size)):
+        q = body.model.to_pinocchio(free.charts(x[None]), *np.zeros((2, 1, len(body.stance))))[0][0]
+        pin.framesForwardKinematics(tree, data, q)
+        frames = [data.oMf[tree.getFrameId(name)] for name in body.robot.foot.frames]
+        seen.append([(f.act(body.robot.foot.tip)[1], f.rotation[0, 1], f.rotation[2, 1]) for f in frames])
+    return bool(np.ptp(seen, axis=0).max() < SAME_RAD)

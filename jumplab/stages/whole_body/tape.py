@@ -7,7 +7,7 @@ dynamics still misses. In flight the joints' polynomials stand; the base follows
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,19 +17,22 @@ from jumplab.io.tape import RATE_HZ, Tape
 from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
-from jumplab.stages.reconstruction import SHORTEST_STEP
-from jumplab.stages.spatial.contacts import SIDES
-from jumplab.stages.spatial.legs import LEG_STEPS, Legs, Motion
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.coordinates import BASE
-from jumplab.stages.spatial.terms import EDGES, Body, SpatialTerms
+from jumplab.stages.whole_body.contacts import SIDES
+from jumplab.stages.whole_body.coordinates import BASE
+from jumplab.stages.whole_body.legs import LEG_STEPS, Legs, Motion
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.terms import EDGES, Body, WholeBodyTerms
 
+SHORTEST_STEP = 0.05  # share of a sample; a shorter last step is joined to the one before
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # over which a phase passes from where the one before ended on the tape to its own plan
-LANDINGS, LANDED_RAD = 6, 1e-7  # corrections of a flight's end, each ten times smaller than the one before; the last
+LANDINGS, LANDED_RAD = 10, 1e-6  # corrections of a flight's end at most, in a jump two or three; the last is less
+SLOW, DIFFERENCE = 0.5, 1e-5  # a correction that leaves more than that share; for a derivative [rad, rad/s]
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
 FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
+RANGE_GAP, PRESSURE_GAP = 1e-3, 2e-3  # [rad] beyond a stop, [m] of the CoP beyond the sole
+PRESSED_N = 50.0  # [N] on a foot from which on its CoP is looked at
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 AIR, TOE, FLAT = 0, 1, 2  # codes of a foot in the tape's ``contacts``
 CODES = {"toe": TOE, "flat": FLAT}
@@ -96,10 +99,10 @@ def _times(start: float, end: float, first: bool) -> np.ndarray:
     return np.append(np.arange(start, end - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), end)
 
 
-def holds_between(tape: Tape, robot: Robot) -> bool:
-    """Whether motors and ground can give what the tape takes, also between the nodes, and rates are those of angles.
+def used_between(tape: Tape, robot: Robot) -> float:
+    """Largest share of the limits that the tape uses: of motors, stops and ground, and of gaps between angles and rates.
 
-    The limits are those of the audit.
+    The limits are those of the audit; up to 1 the tape holds them, also between the nodes.
     """
     motors = [robot.actuators[name] for name in robot.joint_names]
     keys = "effort", "speed", "corner_speed", "no_load_speed"
@@ -113,10 +116,34 @@ def holds_between(tape: Tape, robot: Robot) -> bool:
         for x, y, most in ((tape.q[:, 7:], rate, RATE_GAP), (rate, tape.a[:, 6:], ACCELERATION_GAP))
     )
     along, load = np.linalg.norm(tape.f[..., :2], axis=-1), np.maximum(tape.f[..., 2], LOADED_N)
-    given = (
-        np.all(np.abs(tape.tau) <= effort * left) and np.all(np.abs(rate) <= speed) and np.all(along <= FRICTION * load)
-    )
-    return bool(given and all(np.abs(gap).max() <= most for gap, most in gaps))
+    shares = [np.abs(tape.tau) / effort + (1 - left), np.abs(rate) / speed, along / (FRICTION * load)]
+    low, high = (np.array([m[key] for m in motors]) for key in ("lower", "upper"))
+    beyond = np.maximum(low - tape.q[:, 7:], tape.q[:, 7:] - high)
+    shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot) / PRESSURE_GAP]
+    shares += [np.abs(gap) / most for gap, most in gaps]
+    return float(max(x.max() for x in shares))
+
+
+def _pressed_outside(tape: Tape, robot: Robot) -> np.ndarray:
+    """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge (n, 2) [m]."""
+    model, data, foot = robot.model, robot.model.createData(), robot.foot
+    frames, out = [model.getFrameId(name) for name in foot.frames], np.full((len(tape.t), 2), -np.inf)
+    contacts = tape.extra["contacts"]
+    for k in np.flatnonzero((tape.f[..., 2] > PRESSED_N).any(axis=1)):
+        pin.framesForwardKinematics(model, data, tape.q[k])
+        for i, frame in enumerate(frames):
+            force, moment = tape.f[k, i, :3], tape.f[k, i, 3:]
+            if force[2] <= PRESSED_N:
+                continue
+            turn, origin = data.oMf[frame].rotation, data.oMf[frame].translation
+            down = origin[2] - (origin + turn @ foot.tip)[2]
+            arm = np.array([-down * force[0] - moment[1], -down * force[1] + moment[0]]) / force[2]
+            ahead = turn[:2, 0] / np.linalg.norm(turn[:2, 0])
+            seen = arm - (turn @ foot.tip)[:2]
+            x, y = ahead @ seen, ahead[0] * seen[1] - ahead[1] * seen[0]
+            length = foot.toe - foot.heel if contacts[k, i] == FLAT else 0.0
+            out[k, i] = max(x, -x - length, abs(y) - foot.half_width)
+    return out
 
 
 def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
@@ -134,12 +161,12 @@ def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
 
 
 # on the ground ------------------------------------------------------------------------------------------------------
-def holds_of(phase: PhaseSolution, b: SpatialTerms) -> dict[int, np.ndarray]:
+def holds_of(phase: PhaseSolution, b: WholeBodyTerms) -> dict[int, np.ndarray]:
     """x, y, z [m] and yaw [rad] of the middle of the toe edge of each foot that carries, by side."""
     return {side: np.array([phase.constants[f"{SIDES[side]}_{x}"] for x in ("x", "y", "z", "yaw")]) for side in b.modes}
 
 
-def edges(b: SpatialTerms, side: int, hold: np.ndarray) -> np.ndarray:
+def edges(b: WholeBodyTerms, side: int, hold: np.ndarray) -> np.ndarray:
     """(6, 4 k): force and moment about the world's origin per unit of each edge of one foot's friction pyramids."""
     turn, columns = pin.rpy.rpyToMatrix(0.0, 0.0, hold[3]), []
     for point in b.points[side]:
@@ -185,7 +212,7 @@ def _offset(before: Piece, phase: PhaseSolution) -> tuple[np.ndarray, np.ndarray
     return q, v, np.zeros(n)
 
 
-def _planned(b: SpatialTerms, phase: PhaseSolution, holds, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _planned(b: WholeBodyTerms, phase: PhaseSolution, holds, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Wrenches (n, 2, 6) about the world's origin as planned, and codes of the contacts (n, 2)."""
     wrench, codes, first = np.zeros((len(at), 2, 6)), np.zeros((len(at), 2), np.int8), 0
     for side, hold in holds.items():
@@ -270,18 +297,61 @@ def _flight(
     off = [x[BASE:] - y[0] for x, y in zip(chart0, planned, strict=True)]
     joints = [x + y for x, y in zip(planned, _fading(off, halves), strict=True)]
 
-    def moved():
+    def moved(joints: list[np.ndarray], rows: slice = slice(None)):
         chart, rates = _turning(model, joints, chart0[0][3:6], spin, since)
-        return _falling(model, [x[: len(t)] for x in joints], chart, rates, com, since, gravity)
+        own = [x[: len(t)][rows] for x in joints]
+        return _falling(model, own, chart[rows], rates[rows], com, since[rows], gravity)
 
-    for _ in range(LANDINGS):
-        shift, rate = _missed(body, flight, [x[-1] for x in moved()[:2]], ends)
-        if max(np.abs(shift).max(), np.abs(rate).max()) < LANDED_RAD:
-            break
-        bends = _arriving(halves, since[-1], shift, rate)
-        joints = [x + y for x, y in zip(joints, bends, strict=True)]
-    q, v, a = model.charts(*moved(), near=chart0[0][3:6])
+    def bent(change: np.ndarray):
+        bends = _arriving(halves, since[-1], *np.split(change, 2))
+        return [x + y for x, y in zip(joints, bends, strict=True)]
+
+    def missed(change: np.ndarray) -> np.ndarray:
+        last = moved(bent(change), slice(-1, None))
+        return np.concatenate(_missed(body, flight, [x[0] for x in last[:2]], ends))
+
+    q, v, a = model.charts(*moved(bent(_landed(missed, 2 * len(chart0[0][BASE:])))), near=chart0[0][3:6])
     return Piece(t, (q, v, a), np.zeros((len(t), 2, 6)), np.zeros((len(t), 2), np.int8))
+
+
+def _landed(missed: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
+    """The change (size,) of joints and rates at the end of a flight by which nothing is missed there any more.
+
+    A change moves the base as well: in a jump by little, in a flip by about as much, so its effect is measured there.
+    """
+    change, now, slope = np.zeros(size), missed(np.zeros(size)), np.eye(size)
+    best, measured = (change, now), False
+    for _ in range(LANDINGS):
+        if np.abs(now).max() < LANDED_RAD:
+            break
+        step, before = slope @ now, now
+        change = change + step
+        now = missed(change)
+        if np.abs(now).max() < np.abs(best[1]).max():
+            best = change, now
+        if measured or np.abs(now).max() < SLOW * np.abs(before).max():
+            slope = _learnt(slope, step, now - before)
+        else:
+            (change, now), measured = best, True
+            slope = -np.linalg.pinv(_measured(missed, change, now, np.flatnonzero(now)))
+    return best[0]
+
+
+def _measured(missed: Callable[[np.ndarray], np.ndarray], change, now, columns) -> np.ndarray:
+    """Derivative (size, size) of what is missed by the change, by differences in some of its entries."""
+    slope = np.zeros((len(change), len(change)))
+    for k in columns:
+        moved = change.copy()
+        moved[k] += DIFFERENCE
+        slope[:, k] = (missed(moved) - now) / DIFFERENCE
+    return slope
+
+
+def _learnt(slope: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Broyden's update of how a correction follows from what is missed, which a ``step`` has changed by ``change``."""
+    wrong, along = step + slope @ change, step @ slope
+    size = along @ change
+    return slope if abs(size) < 1e-30 else slope - np.outer(wrong, along) / size
 
 
 def _arriving(t: np.ndarray, end: float, shift: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:

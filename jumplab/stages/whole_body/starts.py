@@ -10,20 +10,23 @@ import pinocchio as pin
 
 from jumplab.ocp.solution import PhaseGuess, PhaseSolution
 from jumplab.robot.stance import leg_length
-from jumplab.stages.spatial.contacts import SIDES
-from jumplab.stages.spatial.problem import Schedule
-from jumplab.stages.spatial.coordinates import BASE
-from jumplab.stages.spatial.terms import Body, SpatialTerms
+from jumplab.stages.whole_body.contacts import SIDES
+from jumplab.stages.whole_body.coordinates import BASE
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.terms import Body, WholeBodyTerms
 from jumplab.task import JumpTask
 
 # of the base, as shares of the leg's length; angles [rad]
 CROUCH, LANDED, TUCK = 0.20, 0.12, 0.15
 BOW, PITCH, HEEL_UP = 0.35, 0.12, 0.4
+# the arms about a flight: back in the crouch, ahead as the feet leave, by the middle of the flight and at its end
+ARMS = 0.5, -1.0, -0.2, 0.2
 CROUCH_S = 0.35  # before and after a flight
 SWING = 0.1  # of the leg, by which a foot that steps is lifted
 EARLY = 0.15  # of the way of a flight, which the base has made before it, and makes after it
 REACHED = 0.3  # [m, rad] a start whose feet are farther off their places is none
 IK_STEPS, DAMPING, IK_STEP_RAD = 10, 1e-4, 0.3
+NEAR_M = 1e-3  # [m, rad] near enough for a start
 RATE_BOX, ACCELERATION_BOX = 15.0, 150.0  # of differences, where the start is rough
 
 
@@ -69,7 +72,7 @@ class Reach:
             q = self.body.model.to_pinocchio(chart[None], *np.zeros((2, 1, len(chart))))[0][0]
             pin.computeJointJacobians(self.tree, self.data, q)
             pin.updateFramePlacements(self.tree, self.data)
-            left = 0.0
+            left = far = 0.0
             for side, goal in goals.items():
                 at = self.data.oMf[self.frames[side]] * self.tip
                 off = pin.log6(at.actInv(goal)).vector
@@ -79,9 +82,12 @@ class Reach:
                 slope = frame[:, self.columns[side]]
                 step = slope.T @ np.linalg.solve(slope @ slope.T + DAMPING * np.eye(6), off)
                 chart[self.columns[side]] += np.clip(step, -IK_STEP_RAD, IK_STEP_RAD)
+                far = max(far, float(np.abs(off).max()))
                 if side in carrying:
                     left = max(left, float(np.abs(off).max()))
             chart[BASE:] = np.clip(chart[BASE:], self.low, self.high)
+            if far < NEAR_M:
+                break
         return chart, left
 
 
@@ -120,17 +126,22 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
     at, path = np.array([t for t, _ in keys]), np.array([x for _, x in keys])
     smooth = [gaussian_filter1d(np.interp(fine, at, path[:, i]), 6, mode="nearest") for i in range(4)]
     height, pitch = base[2] + smooth[3], np.full_like(fine, base[5])
+    arms = np.zeros_like(fine)
     for k, p in enumerate(contacts.phases):
         if p.flying:
             _flown(fine, starts[k], starts[k + 1], leg, gravity, height, pitch)
+            arms += _swung(fine, starts[k], starts[k + 1])
     turned = np.interp(fine, [starts[last], starts[-1]], [0.0, task.rotation_rad])
     curves = [*smooth[:2], height, smooth[2], pitch + turned]
+    shoulders = body.shoulders
     reach, chart, missed, charts = Reach(body, schedule.limits.range_margin_rad), body.stance.copy(), 0.0, []
     for k, p in enumerate(contacts.phases):
         rows = []
         for t in np.linspace(starts[k], starts[k + 1], p.intervals + 1):
             x, y, z, yaw, lean = (np.interp(t, fine, c) for c in curves)
             chart[:BASE] = [x, y, z, yaw, base[4], lean]
+            for column, sign in shoulders:
+                chart[column] = body.stance[column] + sign * np.interp(t, fine, arms)
             goals = {side: _foot(schedule, holds, task, k, side, t, starts, leg) for side in (0, 1)}
             chart, left = reach(chart, goals, list(p.modes))
             if left > REACHED:  # a leg that was drawn somewhere is no beginning
@@ -172,6 +183,13 @@ def _flown(t, start: float, end: float, leg: float, gravity: float, height: np.n
     height -= leg * CROUCH * np.sin(np.pi * before) * (before < 1)
     height -= leg * LANDED * np.minimum(2 * u, 1) * (1 - np.sin(np.pi * after / 2))
     pitch += (BOW - pitch[0]) * np.sin(np.pi * before) + (PITCH - pitch[0]) * (u > 0) * (1 - after)
+
+
+def _swung(t, start: float, end: float) -> np.ndarray:
+    """Swing of the arms about one flight [rad], backward positive."""
+    crouch, left, middle, landed = ARMS
+    times = start - CROUCH_S, start - 0.4 * CROUCH_S, start, (start + end) / 2, end, end + CROUCH_S
+    return np.interp(t, times, [0.0, crouch, left, middle, landed, 0.0])
 
 
 def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray, leg: float) -> pin.SE3:
@@ -267,15 +285,14 @@ def beside(schedule: Schedule, phases: Mapping[str, PhaseSolution]) -> dict[str,
         columns = [w.coordinates.index(name) for name in b.coordinates]
         z = np.zeros((len(near.q), len(b.states)))
         z[:, b.n_forces :] = near.z[:, [w.states.index(name) for name in b.states[b.n_forces :]]]
-        for side in b.sides:
-            z[:, : b.n_forces] = b.mg / len(b.modes) / b.n_forces
+        z[:, : b.n_forces] = b.mg / len(b.modes) / max(1, b.n_forces // max(1, len(b.sides)))
         constants = {name: near.constants[name] for name in _constant_names(b)}
         motion = (x[:, columns] for x in (near.q, near.v, near.a))
         out[phase.name] = PhaseGuess(near.duration, *motion, z, constants)
     return out
 
 
-def _constant_names(b: SpatialTerms) -> list[str]:
+def _constant_names(b: WholeBodyTerms) -> list[str]:
     if b.flying:
         return b.constants
     return [f"{SIDES[side]}_{x}" for side in b.sides for x in ("x", "y", "z", "yaw")]
