@@ -13,8 +13,6 @@ MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run
 MAX_HEIGHT_M = 1.5  # beyond any human's CoM rise: surely a typo
 MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump
 
-NEAR = {"distance_m": 0.1, "side_m": 0.1, "height_m": 0.1, "platform_m": 0.05, "yaw_rad": 0.2}  # see is_near
-
 
 def _number(name: str, value, low: float, high: float, unit: str) -> float:
     try:
@@ -75,11 +73,6 @@ class JumpTask:
     def in_plane(self) -> bool:
         """Whether the jump stays in the sagittal plane: neither side nor yaw."""
         return self.side_m == 0 and self.yaw_rad == 0
-
-    def is_near(self, other: JumpTask) -> bool:
-        """Whether a few steps lead from a plan for ``other`` to one for this target that costs hardly more."""
-        same = (self.rotation_rad, self.gravity) == (other.rotation_rad, other.gravity)
-        return same and all(abs(getattr(self, n) - getattr(other, n)) <= most + 1e-9 for n, most in NEAR.items())
 
     @property
     def along_rad(self) -> float:

@@ -13,6 +13,6 @@ __getattr__, __dir__, __all__ = lazy.attach(
         "changes": ["changed"],
         "nlp": ["Nlp"],
         "problem": ["Bound", "Phase", "Point", "Problem", "Term"],
-        "solution": ["Near", "PhaseGuess", "PhaseSolution", "Solution", "Statistics"],
+        "solution": ["PhaseGuess", "PhaseSolution", "Solution", "Statistics"],
     },
 )

@@ -60,12 +60,6 @@ class Assembled:
         self.n_rows = len(self.rows)
         self._assemble()
 
-    def on_mesh_of(self, problem: Problem) -> Assembled:
-        """The same problem on another mesh, from the same small functions; ``ValueError`` if it is another problem."""
-        if problem.on_mesh({name: x.phase.intervals for name, x in self.layouts.items()}) != self.problem:
-            raise ValueError(f"{problem.name}: functions of another problem")
-        return Assembled(problem, self.elements)
-
     def _make_blocks(self):
         x, p, weight_at = self._x, self._p, self.n_par
         for e in self.elements:

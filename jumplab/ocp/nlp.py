@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from contextvars import ContextVar
 from copy import copy
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -22,8 +21,7 @@ from jumplab.ocp.assembly import Assembled, Posed, pack_multipliers, pose, unpac
 from jumplab.ocp.cache import assembled
 from jumplab.ocp.derivatives import JERK_CHAIN, scatter
 from jumplab.ocp.problem import Problem
-from jumplab.ocp.solution import Multipliers, Near, PhaseGuess, Solution, Statistics
-from jumplab.ocp.sqp import GaussNewton
+from jumplab.ocp.solution import Multipliers, PhaseGuess, Solution, Statistics
 
 EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)  # off where nobody reads why there is no plan
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -65,16 +63,13 @@ class Nlp:
     problem : what to solve.
     options : of ipopt, besides :data:`IPOPT`.
     key : if given, what is built is kept for later processes, see :func:`jumplab.ocp.cache.assembled`.
-    like : the same problem, ready on another mesh; saves most of the building.
     """
 
-    def __init__(
-        self, problem: Problem, options: Mapping | None = None, key: str | None = None, like: Nlp | None = None
-    ):
+    def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None):
         began = time.perf_counter()
         tell(f"building {problem.name}")
         self.problem, self._options, self._hold = problem, {**IPOPT, **(options or {})}, None
-        self.assembled = assembled(problem, key) if like is None else like.assembled.on_mesh_of(problem)
+        self.assembled = assembled(problem, key)
         self.build_s = time.perf_counter() - began
 
     def with_options(self, options: Mapping, hold: float | None = None) -> Nlp:
@@ -100,30 +95,6 @@ class Nlp:
         quiet = ("print_time", "error_on_fail", "show_eval_warnings", "calc_lam_p")
         options |= dict.fromkeys(quiet, False) | {"no_nlp_grad": True}  # all derivatives are given
         return ca.nlpsol("solver", "ipopt", a.nlp, options)
-
-    def _steps_of(self) -> GaussNewton:
-        try:
-            return self._gauss_newton
-        except ValueError as e:  # a term joins what is not neighbouring: no stage-by-stage order, so no steps
-            raise SolverError(str(e), stage=self.problem.name, status="approach") from e
-
-    @cached_property
-    def _gauss_newton(self) -> GaussNewton:
-        return GaussNewton(self.assembled)
-
-    def gauss_newton_steps(self, parameters: Mapping, guess: Mapping[str, PhaseGuess], **how: Any) -> Near:
-        """Come near a solution in a few steps; ``how`` are references, weights, off as of :meth:`solve`.
-
-        Raises :class:`SolverError` if a step is no number.
-        """
-        a, posed = self.assembled, pose(self.assembled, parameters, guess, **how)
-        check_start(a, posed)
-        method, began = self._steps_of(), time.perf_counter()
-        x, count = method.steps(posed)
-        f, g = (y.full().ravel() for y in a.nlp(x, posed.p))
-        spent, residual = time.perf_counter() - began, float(np.max(posed.beyond(g), initial=0.0))
-        statistics = Statistics(count, "Approached", self.build_s, spent, len(x), len(g), float(f[0]), residual)
-        return Near(unpack(a, x), statistics)
 
     def solve(
         self,
@@ -167,25 +138,6 @@ class Nlp:
             raise _failure(a, posed, x, status, iterations, explain and EXPLAINED.get())
         functions_s = sum(value for key, value in stats.items() if key.startswith("t_proc_nlp_"))
         return self._solution(posed, (x, lam_x, lam_g), iterations, status, solve_s, functions_s)
-
-    def settled(self, parameters: Mapping, near: Mapping[str, PhaseGuess], **how: Any) -> Solution:
-        """From the solution for a target close by to a plan for this one, in a few steps without ipopt.
-
-        Every row is met as closely as ipopt meets it; the cost is not quite the least, see
-        :meth:`jumplab.ocp.sqp.GaussNewton.settled`. ``near`` is that solution's :meth:`Solution.guess`, with the same
-        weights; ``how`` are references, weights, off as of :meth:`solve`. Raises :class:`SolverError` if the target is
-        not that close.
-        """
-        posed = pose(self.assembled, parameters, near, **how)
-        check_start(self.assembled, posed)
-        method, began = self._steps_of(), time.perf_counter()
-        *found, count = method.settled(posed)
-        return self._solution(posed, found, count, "Settled", time.perf_counter() - began)
-
-    def weighs_as(self, near: Solution, weights: Mapping[str, float]) -> bool:
-        """Whether a solution was found with just the weights that :meth:`solve` would take from ``weights``."""
-        now = [weights.get(f"{o}/{t.name}", weights.get(t.name, t.weight)) for o, t in self.assembled.cost_terms]
-        return now == [row["weight"] for row in near.cost_shares]
 
     def _solution(
         self,

@@ -22,8 +22,8 @@ A further wish is a further term: :func:`jumplab.ocp.changed`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -231,10 +231,6 @@ class Problem:
             if name not in short | full:
                 listed = ", ".join(sorted(short))
                 raise InputError(f"{what} {name!r}: the problem {self.name!r} has no such term; it has {listed}")
-
-    def on_mesh(self, intervals: Mapping[str, int]) -> Problem:
-        """A copy with other numbers of steps, phase name -> intervals; the terms are the same objects."""
-        return replace(self, phases=tuple(replace(p, intervals=intervals[p.name]) for p in self.phases))
 
     def table(self) -> list[dict]:
         """One row per term and bound: stage, phase, name, kind, at, unit, equation, value (weight or bounds)."""

@@ -55,16 +55,6 @@ class PhaseGuess(Shown):
         values = {key: x for key in "qvaz" if (x := getattr(self, key)) is not None}
         return replace(self, **{key: resampled(old, x, new) for key, x in values.items()})
 
-    def smoothed(self, width: float, rate_width: float) -> PhaseGuess:
-        """The same guess with a Gaussian mean over that share of the phase: of q, and of the rates v and a."""
-        s = np.linspace(0, 1, len(self.q))
-
-        def mean(x, width):
-            weights = np.exp(-(((s[:, None] - s) / width) ** 2) / 2)
-            return None if x is None else weights / weights.sum(axis=1, keepdims=True) @ x
-
-        return replace(self, q=mean(self.q, width), v=mean(self.v, rate_width), a=mean(self.a, rate_width))
-
 
 @dataclass(frozen=True, repr=False)
 class PhaseSolution(Shown):
@@ -126,22 +116,16 @@ class Statistics:
 
 
 @dataclass(frozen=True, repr=False)
-class Near(Shown):
-    """A start, not a solution: phases that a few steps led to, rows still violated."""
+class Solution(Shown):
+    """Result of one solve, every row met; what each cost and the tightest row of each constraint is, for people."""
 
     phases: dict[str, PhaseSolution]
     statistics: Statistics
-
-    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
-        """All phases as the start of a solve, on another mesh if asked."""
-        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}
-
-
-@dataclass(frozen=True, repr=False)
-class Solution(Near):
-    """Result of one solve, every row met; what each cost and the tightest row of each constraint is, for people."""
-
     problem: Problem
     cost_shares: tuple[dict, ...]
     constraint_report: tuple[dict, ...]
     multipliers: Multipliers
+
+    def guess(self, intervals: Mapping[str, int] | None = None) -> dict[str, PhaseGuess]:
+        """All phases as the start of a solve, on another mesh if asked."""
+        return {n: p.guess((intervals or {}).get(n)) for n, p in self.phases.items()}

@@ -81,7 +81,7 @@ class JumpPlan(Shown, Named):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """Starts of the whole-body program that were tried, what they took and how they ended; the last one led here."""
+        """Starts of the whole-body program that were tried, what they took, and how they ended."""
         if self.stored is not None:
             return tuple(Attempt(**row) for row in self.stored.get("attempts", ()))
         return () if self.whole_body is None else self.whole_body.attempts

@@ -181,7 +181,6 @@ class Planner:
             raise InputError(f"method {quoted(method)}: choose one of {', '.join(METHODS)}")
         asked = sorted_out(weights=weights)
         first = any(self.changes[stage] or asked[stage] for stage in FIRST_STAGES) or self._given[1] is not None
-        first = first or (flip and self.robot.planar and self.atlas is None)
         names = (n for x in (self.changes[LAST], asked[LAST]) for n in (*x.weights, *x.off))
         first = first or any(n.rpartition("/")[2].startswith(FOLLOWING) for n in names)
         if method == USUAL:
@@ -441,8 +440,7 @@ class Planner:
     def replan(self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None) -> JumpPlan:
         """Plan a target close to one that has a plan of this robot, by the same method and beginning with that plan.
 
-        Stages 1 and 3 begin with their previous solutions; a target within :data:`jumplab.task.NEAR` takes a few steps
-        from there, see :meth:`jumplab.ocp.nlp.Nlp.settled`. Stage 2, whose result is only a start for stage 3, is left
+        Stages 1 and 3 begin with their previous solutions. Stage 2, whose result is only a start for stage 3, is left
         out: the previous whole body is the better one. Where a previous solution leads nowhere, the stage starts anew.
         A flip is planned anew. ``start`` as in :meth:`plan`.
 

@@ -2,8 +2,7 @@
 
 What is compared: the three steps from nothing but the target; ``plan`` is the same to the end of the 1 kHz tape.
 ``direct`` is the solve of one NLP with the same model, limits, mesh, tolerances and derivatives, without stages 1 and
-2, from a naive guess; of its two ways with ipopt alone, at once or over a coarse mesh, the faster one counts. Begun
-with the Gauss-Newton steps that stage 3 begins with, it is faster still, and the usual method; that is timed too, and
+2, with the exact Hessian. With the held Gauss-Newton Hessian it is faster, and the usual method; that is timed too, and
 its ratio told. Re-plans and new processes are those of the usual method. Times are medians; every plan that was timed
 is audited afterwards.
 """
@@ -29,14 +28,16 @@ from jumplab.errors import InputError, JumplabError, SolverError
 from jumplab.io.folder import versions
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import map_to_joints
-from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, guess_from_joints, make_tape
+from jumplab.stages.planner import STEPS_S, JumpPlan, Planner, body_rows, make_tape, motion_of_joints
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.stages.whole_body.coordinates import even
+from jumplab.stages.whole_body.planner import IN_PLANE
+from jumplab.stages.whole_body.terms import Body
 from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
 
-AT_ONCE, OVER_COARSE, APPROACHED = "direct, at once", "direct, over a coarse mesh", "direct, Gauss-Newton first"
-DIRECT = (AT_ONCE, OVER_COARSE)  # by ipopt alone, from a cold start
-WAYS = {AT_ONCE: {"refine": False}, OVER_COARSE: {"approach": False}, APPROACHED: {}}  # of solving the direct NLP
+AT_ONCE, HELD = "direct, exact Hessian", "direct, held Gauss-Newton first"
+WAYS = {AT_ONCE: IN_PLANE[1:], HELD: IN_PLANE}  # lists of starts of the direct NLP
 TAPE = "plan: tape"
 ATLAS, AUDITED = "atlas", "atlas, with tape and audit"
 SHORT = 5  # times on end that what takes less than 0.1 s is done
@@ -52,15 +53,15 @@ def report(
     -------
     dict of plain types: ``head``; ratios of CPU times, None if not measured: three steps (``warm``), plan with its tape
     (``tape``), re-plan, and new process (``cold``, ``cold_kept`` with functions on file; over build and solve) over the
-    direct solve, three steps over the approached one (``three_over_direct_gn``), a plan from an atlas over the direct
+    direct solve, three steps over the held one (``three_over_direct_gn``), a plan from an atlas over the direct
     solve (``atlas_over_direct``); ``process_s``, wall time of a new process with functions on file, from its start to
     the audit's end; ``plans_per_s``, audited plans from an atlas by one core; ``node_growth_error``, see
     :func:`line_error`;
-    ``peak_memory_gib``; ``peer`` (by which way ipopt alone was faster), ``audits`` (name -> clean, of), ``median_s``
+    ``peak_memory_gib``; ``audits`` (name -> clean, of), ``median_s``
     and ``raw_s`` (CPU and wall times), ``where`` (stage -> share of a plan's time), ``growth``, ``machine``.
     """
     cpu, known = watch.cpu, versions()
-    peer = min(DIRECT, key=lambda name: np.median(cpu[name]))
+    peer = AT_ONCE
     steps = np.sum([times for name, times in cpu.items() if name.startswith("plan: ") and name != TAPE], axis=0)
     whole = np.add(cpu["direct, build"], cpu[peer])
     raw = {"cpu": cpu, "wall": watch.wall}
@@ -75,11 +76,9 @@ def report(
         "cold_over_direct": _ratio(cpu.get("cold"), whole),
         "peak_memory_gib": max(peaks, default=None),
         "node_growth_error": line_error(growth["nodes"]),
-        "peer": peer,
         "tape_over_direct": _ratio(cpu["plan"], cpu[peer]),
-        "warm_over_approached": _ratio(steps, cpu[APPROACHED]),
         "cold_kept_over_direct": _ratio(cpu.get("cold, functions kept"), whole),
-        "three_over_direct_gn": _ratio(steps, cpu[APPROACHED]),
+        "three_over_direct_gn": _ratio(steps, cpu[HELD]),
         "atlas_over_direct": _ratio(cpu.get(ATLAS), cpu[peer]),
         "process_s": medians["wall"].get("process"),
         "plans_per_s": 1 / medians["cpu"][AUDITED] if AUDITED in cpu else None,
@@ -113,7 +112,7 @@ def rows(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     steps_s = sum(t for name, t in cpu.items() if name.startswith("plan: ") and name != TAPE)
     ratios = {"three steps": "warm", "plan": "tape", "re-plan": "replan", "cold": "cold"}
     ratios = {name: found[f"{key}_over_direct"] for name, key in ratios.items()} | {ATLAS: found["atlas_over_direct"]}
-    ratios |= {"cold, functions kept": found["cold_kept_over_direct"], found["peer"]: 1.0}
+    ratios |= {"cold, functions kept": found["cold_kept_over_direct"], AT_ONCE: 1.0}
     return [{"what": n, "CPU [s]": t, "ratio": ratios.get(n)} for n, t in {"three steps": steps_s, **cpu}.items()]
 
 
@@ -188,7 +187,9 @@ def bench(
         raise InputError(f"repeats = {repeats}: it takes 1 or more")
     robot, watch = Robot.load(robot_name), Stopwatch()
     planner, atlas = Planner(robot, mesh=mesh), _atlas(robot, mesh, task)
-    ways = {name: WholeBodyPlanner(robot, mesh, tracking=False, **how).plan for name, how in WAYS.items()}
+    body = Body(robot)
+    how = {"body": body, "free": even(body)}
+    ways = {name: WholeBodyPlanner(robot, mesh, starts=starts, **how).plan for name, starts in WAYS.items()}
     audits: dict[str, list[bool]] = {}
     near = planner.plan(replace(task, distance_m=task.distance_m - NEIGHBOUR_M))
     for way in ways.values():
@@ -224,9 +225,9 @@ def _once(
     robot, last = planner.robot, planner.stage("whole body")
     srmp = watch("plan: 1 SRMP", planner.stage("srmp").plan, task)
     joints = watch("plan: 2 joint map", map_to_joints, srmp, robot, STEPS_S, "direct")
-    guess = watch("plan: 2 to 3", guess_from_joints, joints, last, task, srmp.toe_s)
-    body = watch("plan: 3 whole body", last.plan, task, srmp, guess=guess)
-    watch(TAPE, make_tape, body, robot, srmp)
+    begin = watch("plan: 2 to 3", motion_of_joints, joints, last, srmp.toe_s)
+    body = watch("plan: 3 whole body", last.plan, task, srmp, begin=begin)
+    watch(TAPE, make_tape, body, srmp)
     bodies = {name: watch(name, way, task) for name, way in ways.items()}
     plans = {
         "plan": watch("plan", planner.plan, task, "three-step"),
@@ -234,10 +235,10 @@ def _once(
     }
     answered = watch(ATLAS, atlas.atlas.solve, atlas.stage("direct"), task, times=SHORT)
     watch(AUDITED, lambda: audit(atlas.plan(task).tape, atlas.robot, task), times=SHORT)
-    watch("direct, build", lambda: WholeBodyPlanner(robot, planner.mesh, tracking=False, refine=False).nlp.prepare())
+    watch("direct, build", lambda: WholeBodyPlanner(robot, planner.mesh, free=even(last.body)).nlp.prepare())
     for name, body in {**bodies, **({ATLAS: answered} if answered else {})}.items():
-        rows = body_rows("direct", body)
-        plans[name] = JumpPlan(task, robot, "direct", make_tape(body, robot), None, None, body, rows)
+        rows = body_rows("direct", body, 0.0)
+        plans[name] = JumpPlan(task, robot, "direct", make_tape(body), None, None, body, rows)
     return plans
 
 
@@ -280,12 +281,13 @@ def _nodes(planner: Planner, task: JumpTask, nodes: Sequence[int]) -> list[dict[
     for n in nodes:
         flat, toe = max(round(n / 3), 2), max(round(4 * n / 15), 2)
         mesh, watch = Mesh(flat, toe, max(n - flat - toe, 2)), Stopwatch()
-        body = watch("build", WholeBodyPlanner, planner.robot, mesh, refine=False)
-        guess = guess_from_joints(joints, body, task, srmp.toe_s)
+        body = WholeBodyPlanner(planner.robot, mesh, tracking=True)
+        watch("build", lambda planned: planned.nlp.prepare(), body)
+        begin = motion_of_joints(joints, body, srmp.toe_s)
         for _ in range(NODE_REPEATS):
-            plan = watch("solve", body.plan, task, srmp, guess=guess)
-        s, solve_s = plan.solution.statistics, float(np.median(watch.cpu["solve"]))
-        count = s.iterations + sum(x.iterations for x in plan.uneven)
+            plan = body.plan(task, srmp, begin=begin)
+        s, solve_s = plan.solution.statistics, sum(x.cpu_s for x in plan.attempts)
+        count = sum(x.iterations for x in plan.attempts)
         row = {"intervals": sum(mesh.intervals().values()), "variables": s.variables, "iterations": count}
         rows.append(row | dict(build_s=watch.cpu["build"][0], solve_s=solve_s, iteration_s=solve_s / count))
     return rows
@@ -294,20 +296,20 @@ def _nodes(planner: Planner, task: JumpTask, nodes: Sequence[int]) -> list[dict[
 def _spread(
     planner: Planner, ways: Mapping[str, Callable], task: JumpTask, spread: Sequence[tuple[float, float]]
 ) -> list[dict[str, Any]]:
-    """Other targets, each planned once by three steps, by ipopt at once and begun with Gauss-Newton steps: CPU times
-    [s] and their ratios; not those without a plan."""
+    """Other targets, each planned once by three steps, and directly in both ways: CPU times [s] and their ratios; not
+    those without a plan."""
     rows = []
     for distance, height in spread:
         place = {"distance_m": distance * task.distance_m, "height_m": height * task.height_m}
         other, watch = replace(task, **place), Stopwatch()
         try:
             plan = watch("plan", planner.plan, other, "three-step")
-            for name in (AT_ONCE, APPROACHED):
+            for name in WAYS:
                 watch(name, ways[name], other)
         except JumplabError:
             continue
-        plan_s, direct_s, begun_s = (watch.cpu[name][0] for name in ("plan", AT_ONCE, APPROACHED))
+        plan_s, direct_s, begun_s = (watch.cpu[name][0] for name in ("plan", *WAYS))
         times = {"plan_s": plan_s, "direct_s": direct_s, "ratio": plan_s / direct_s}
-        times |= {"approached_s": begun_s, "ratio_approached": plan_s / begun_s}
+        times |= {"held_s": begun_s, "ratio_held": plan_s / begun_s}
         rows.append(place | times | {"clean": audit(plan.tape, planner.robot, other).passed})
     return rows

@@ -195,14 +195,6 @@ class SrmpPlanner:
             If there is no solution; names the violated terms.
         """
         check_reachable(task, self.reach, self.robot, self.settings)
-        spread = self.changes.spread(self.nlp.problem, weights)
-        if near is not None and task.is_near(near.task) and self.nlp.weighs_as(near.solution, spread):
-            how = {"weights": spread, "off": self.changes.still_there(self.nlp.problem, off)}
-            try:
-                found = self.nlp.settled(parameters(task, self.reach, start), near.solution.guess(), **how)
-                return sample_plan(task, found, self.reach, self.robot.sagittal.total_mass)
-            except SolverError:
-                pass  # ipopt finds more
         if near is not None:
             try:
                 return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)

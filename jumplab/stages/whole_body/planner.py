@@ -210,7 +210,9 @@ class WholeBodyPlanner:
         changes: StageChanges = StageChanges(),
         body: Body | None = None,
         free: Coordinates | None = None,
+        starts: Iterable[Start] | None = None,
     ):
+        self._begun = None if starts is None else tuple(starts)
         self.robot, self.mesh, self.tracking = robot, mesh or Mesh(), tracking
         self.limits, self.weights, self.changes, self._keep = limits, weights, changes, keep
         self.body = body or Body(robot)
@@ -314,6 +316,7 @@ class WholeBodyPlanner:
         cold = IN_PLANE if self.free.plane else COLD
         if not EXPLAINED.get():
             cold = cold[:-1]
+        cold = cold if self._begun is None else self._begun
         found = [*(FROM_NEIGHBOUR if near is not None else ()), *(GIVEN if begin is not None else ()), *cold]
         if abs(task.yaw_rad) > HELD_TURN_RAD or task.rotation_rad:
             return sorted(found, key=lambda start: (start.name != NEIGHBOUR, start.name in ("stance",), start.held))
@@ -343,6 +346,7 @@ class WholeBodyPlanner:
     @cached_property
     def _even(self) -> WholeBodyPlanner:
         how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        how["starts"] = self._begun
         turns = self.limits.capture_moment is not None  # a flip: in the plane, if the feet stay in it
         how |= {"contacts": self.contacts, "free": in_plane(self.body) if turns else even(self.body)}
         if how["free"].kind == "whole":

@@ -100,7 +100,7 @@ def _times(start: float, end: float, first: bool) -> np.ndarray:
 
 
 def used_between(tape: Tape, robot: Robot) -> float:
-    """Largest share of the limits that the tape uses: of motors, stops and ground, and of gaps between angles and rates.
+    """Largest share that the tape uses of the limits of motors, stops, ground, and of gaps between angles and rates.
 
     The limits are those of the audit; up to 1 the tape holds them, also between the nodes.
     """

@@ -22,7 +22,8 @@ from jumplab.sim.pilot import AFTER_FALL_S, EXTRA_S, Pilot
 from jumplab.sim.playback import Command
 from jumplab.sim.result import STAND_S
 from jumplab.sim.scene import Scene
-from jumplab.stages.planner import USUAL, JumpPlan, Planner, to_link_angles
+from jumplab.stages.planner import USUAL, JumpPlan, Planner
+from jumplab.stages.reconstruction import to_link_angles
 from jumplab.studies.chain.course import Course, placed, seen_from
 
 FIRST_STAND_S = 0.5  # the first plan, too, is made from a measured posture, once a push of the start is gone
