@@ -24,8 +24,8 @@ from jumplab.robot.stance import stance_angles
 from jumplab.sim import STEP_S, SimulationResult
 from jumplab.stages.joint_qp import map_to_joints
 from jumplab.stages.plan import JumpPlan
-from jumplab.stages.planner import STEPS_S, guess_from_joints, to_link_angles
-from jumplab.stages.reconstruction import expand, planar_quantities
+from jumplab.stages.planner import STEPS_S, motion_of_joints
+from jumplab.stages.reconstruction import planar_quantities, to_link_angles
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 from jumplab.task import GRAVITY, JumpTask

@@ -1,6 +1,6 @@
 """Stage 3 exactly as the paper prints it: launch, then flight, in the paper's own coordinates (Sec. V).
 
-Kept to be compared with :mod:`jumplab.whole_body.problem`, never to plan with. theta = [x; z; pitch; q_hip; q_knee;
+Kept to be compared with :mod:`jumplab.stages.whole_body.problem`, never to plan with. theta = [x; z; pitch; q_hip; q_knee;
 q_ankle; q_shoulder]; (x, z) is the paper's base, the top of the trunk, seen from the middle of the sole's first place.
 Weights are those of ours, so that only the formulation differs. Where the paper is silent the kindest reading is taken:
 the boxes hold the robot's joint ranges and speeds, no force pulls at a node, and the search stays near stage 2's
@@ -22,13 +22,13 @@ from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
+from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import ROLES
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body.settings import Contact, Limits, Weights
-from jumplab.stages.whole_body.terms import WholeBodyTerms
-from jumplab.task import JumpTask
+from jumplab.stages.whole_body import Weights
+from jumplab.task import GRAVITY, JumpTask
 
 COORDINATES = ("x", "z", "pitch", *SAGITTAL_JOINTS)
 # absolute angles of foot, shank, thigh, trunk and arm from theta; rates and accelerations likewise
@@ -57,7 +57,7 @@ class PrintedPlan:
         solves, ``flight`` and ``motion`` hold it.
     motion : 1 kHz samples of what was solved: t (n,) [s], flying (n,), angles, rates, accels (n, 5) of the links, toe,
         toe_velocity, toe_acceleration (n, 2), toe_phase_start [s]; the input of
-        :func:`jumplab.stages.reconstruction.expand`.
+        :func:`paper.expansion.expand`.
     F_x, F_z, tau_y : (n,) planned ground wrench at the toe [N, N m], linear between nodes, 0 in flight.
     """
 
@@ -102,12 +102,13 @@ def _moment(lever, force):
     return lever[1] * force[0] - lever[0] * force[1]
 
 
-class PrintedTerms(WholeBodyTerms):
-    """Expressions of Sec. V at one instant in the paper's coordinates; pure. Inertia terms are those of ours."""
+class PrintedTerms:
+    """Expressions of Sec. V at one instant in the paper's coordinates; pure. Inertia is tracked as in ours."""
 
-    def __init__(self, robot: Robot, weights: Weights, contact: Contact = Contact.TOE):
-        super().__init__(robot, Limits(), weights, contact)
-        self.base = PaperCoordinates(robot.sagittal).base
+    def __init__(self, robot: Robot, weights: Weights, flying: bool = False):
+        self.model, self.weights, self.flying = robot.sagittal, weights, flying
+        self.mg, self.base = self.model.total_mass * GRAVITY, PaperCoordinates(robot.sagittal).base
+        self.stance_inertia = self.model.total_mass * rod_of(robot, stance_angles(robot))[3] ** 2  # [kg m^2]
 
     def state(self, p: Point) -> PlanarState:
         """The five links seen from the toe."""
@@ -152,13 +153,22 @@ class PrintedTerms(WholeBodyTerms):
                     lambda p: self.base_rows(p, flying) / size, skip=skip)  # fmt: skip
 
     def _shared(self) -> list[Term]:
-        kept, w = ("track inertia", "track inertia rate", "ankle rate"), self.weights
-        smooth = "WF-J2" if self.flying else "WL-J2"
-        return [
-            *(t for t in self.tracking() if t.name in kept),
-            Term("acceleration", smooth, "m/s^2, rad/s^2", "node", lambda p: p.a, weight=w.joint_acceleration),
-            Term("jerk", smooth, "m/s^3, rad/s^3", "mid", lambda p: p.j, weight=w.jerk),
-        ]
+        w, s, smooth, size = self.weights, self.state, "WF-J2" if self.flying else "WL-J2", self.stance_inertia**2
+        tracked = "WF-J1" if self.flying else "WL-J1"
+        rates = w.track_flight_inertia_rate if self.flying else w.track_inertia_rate
+        rows = [
+            Term("track inertia", tracked, "kg m^2", "node", lambda p: s(p).inertia - p.ref.rho,
+                 weight=float(w.track_inertia / size)),
+            Term("track inertia rate", tracked, "kg m^2/s", "node", lambda p: s(p).inertia_rate - p.ref.rho_rate,
+                 weight=float(rates / size)),
+            # both sides together
+            Term("acceleration", smooth, "m/s^2, rad/s^2", "node", lambda p: p.a, weight=2 * w.acceleration),
+            Term("jerk", smooth, "m/s^3, rad/s^3", "mid", lambda p: p.j, weight=2 * w.jerk),
+        ]  # fmt: skip
+        if self.flying:
+            rows.append(Term("ankle rate", "WF-J2", "rad/s", "node", lambda p: s(p).joint_rates[2],
+                             weight=w.ankle_rate))  # fmt: skip
+        return rows
 
     def launch(self) -> tuple[Term, ...]:
         """WL-*: tracking, smoothness, heel; dynamics, contact, end velocity."""
@@ -191,7 +201,7 @@ def _given(name: str):
 
 def build_printed(robot: Robot, weights: Weights = Weights(), intervals: int = INTERVALS) -> tuple[Problem, Problem]:
     """The launch problem and the flight problem of Sec. V, each alone; durations are stage 1's."""
-    terms, flown = PrintedTerms(robot, weights), PrintedTerms(robot, weights, Contact.FLIGHT)
+    terms, flown = PrintedTerms(robot, weights), PrintedTerms(robot, weights, True)
     m, fixed = robot.sagittal, (_given("duration"), _given("duration"))
     low, high, rate = -np.array(BASE_BOX), np.array(BASE_BOX), np.array([*BASE_RATE_BOX, *m.speed])
     boxes = (Bound("position box", "WL-S, WF-S", "m, rad", "q", [*low, *m.lower], [*high, *m.upper], "inner"),
