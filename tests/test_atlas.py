@@ -8,10 +8,11 @@ import pytest
 
 from jumplab.auditing import audit
 from jumplab.errors import InputError
-from jumplab.ocp.sqp import MET
 from jumplab.robot import Robot
+from jumplab.robot.stance import configuration, stance_angles
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body.planner import Asked
+from jumplab.stages.whole_body import WholeBodyPlanner
+from jumplab.stages.whole_body.planner import IPOPT
 from jumplab.studies.atlas import Atlas, Node, key_of
 from jumplab.studies.envelope import envelope
 from jumplab.task import JumpTask
@@ -30,10 +31,11 @@ def planner() -> Planner:
 
 
 def optimum(task: JumpTask, plan) -> float:
-    """Cost of the least dear motion close to a plan."""
+    """Cost of the least dear motion close to a plan: solved on until nothing changes any more."""
     body = planner().stage("direct")
-    asked = Asked(task, None, body.parameters(task))
-    return body._run(body._warm.solve, asked, plan.whole_body.solution).statistics.objective
+    last = {"acceptable_iter": 50, "acceptable_obj_change_tol": 1e-9}
+    patient = WholeBodyPlanner(body.robot, body=body.body, free=body.free, options=last)
+    return patient.plan(task, near=plan.whole_body).solution.statistics.objective
 
 
 def test_every_node_has_a_plan():
@@ -46,12 +48,15 @@ def test_every_node_has_a_plan():
 def test_a_target_between_nodes_is_a_few_steps_away(place):
     task = JumpTask(*place)
     plan = planner().plan(task, "direct")
-    s = plan.whole_body.solution.statistics
-    assert s.status == "Settled" and s.iterations <= 4 and s.residual <= MET
+    cold = planner().stage("direct").plan(task)
+    s, most = plan.whole_body.solution.statistics, IPOPT["acceptable_constr_viol_tol"]
+    assert [x.start for x in plan.attempts] == ["neighbour"] and s.residual <= most
+    assert 2 * s.iterations <= sum(x.iterations for x in cold.attempts)
     assert audit(plan.tape, plan.robot, task).passed
     assert plan.planned_distance_m == pytest.approx(task.distance_m, abs=1e-3)
     best = optimum(task, plan)
-    assert best * (1 - 1e-6) <= s.objective <= 1.03 * best  # the nodes are 0.2 and 0.15 m apart
+    # rows may be missed by so little that the cost is a hundred-thousandth less
+    assert best * (1 - 5e-5) <= s.objective <= 1.002 * best
 
 
 def test_at_a_node_it_is_the_node():
@@ -61,11 +66,11 @@ def test_at_a_node_it_is_the_node():
 
 
 def test_a_jump_begins_in_the_posture_that_is_asked_for():
-    body, task = planner().stage("direct"), JumpTask(0.6, 0.35)
-    start = body.stance + np.array([0.0, 0.02, -0.02, 0.03, 0.0])
+    robot, task = Robot.load(), JumpTask(0.6, 0.35)
+    start = stance_angles(robot) + np.array([0.0, 0.02, -0.02, 0.03, 0.0])
     plan = planner().plan(task, "direct", start=start)
-    assert plan.whole_body.solution.statistics.status == "Settled"
-    np.testing.assert_allclose(plan.whole_body.solution.phases["flat"].q[0], start[1:], atol=1e-6)
+    assert [x.start for x in plan.attempts] == ["neighbour"]
+    np.testing.assert_allclose(plan.tape.q[0, 7:], configuration(robot, start)[7:], atol=1e-6)
 
 
 def test_four_nodes_are_blended_by_their_distance():
@@ -87,7 +92,7 @@ def test_outside_it_says_what_limits_there(task, sentence):
     node = atlas().nodes[place]
     assert atlas().beyond(task) == sentence.format(node.limiting, 100 * node.share)
     assert atlas().starts(task) == []
-    assert planner().plan(task, "direct").whole_body.solution.statistics.status != "Settled"
+    assert planner().plan(task, "direct").whole_body.began("schedule")
 
 
 @pytest.mark.parametrize("other", [{"platform_m": 0.2}, {"rotation_rad": 2 * np.pi}, {"gravity": 3.7}, {"side_m": 0.1}])
@@ -165,7 +170,7 @@ def test_key_follows_weights_and_own_terms():
     assert plain == atlas().key == key_of(Planner(Robot.load()).stage("direct"))
     for how in (
         {"weights": {"whole body/torque": 2.0}},
-        {"off": ["whole body/sole clearance"]},
+        {"off": ["whole body/clearance of left sole"]},
         {"mesh": {"flight": 24}},
     ):
         assert key_of(Planner(Robot.load(), **how).stage("direct")) != plain
@@ -181,7 +186,8 @@ def test_a_cheaper_neighbour_replaces_a_dear_node():
 
 def test_a_map_begins_with_an_atlas():
     one, (cell,) = atlas(), envelope(Robot.load(), (0.55,), (0.35,), atlas=atlas()).cells
-    assert cell.solved and 0 < cell.iterations <= 4 and 0.3 < cell.share <= 1.0
+    (cold,) = envelope(Robot.load(), (0.55,), (0.35,)).cells
+    assert cell.solved and 0 < 2 * cell.iterations <= cold.iterations and 0.3 < cell.share <= 1.0
     other = Robot.load().with_mass("trunk", factor=1.1)
     with pytest.raises(InputError, match="the atlas is of robot bhr with other limits, terms or mesh"):
         envelope(other, (0.55,), (0.35,), atlas=one)

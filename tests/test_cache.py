@@ -18,11 +18,12 @@ from jumplab.ocp.derivatives import ElementBuilder
 from jumplab.ocp.nlp import Nlp
 from jumplab.ocp.problem import Problem, layouts
 from jumplab.robot.reach import reach, shipped_reach
-from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.srmp import SrmpPlanner
+from jumplab.stages.srmp import build_problem as srmp_problem
 from jumplab.stages.srmp import planner as srmp_planner
 from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.stages.whole_body.problem import Schedule
 
 BEGIN = compiled._begin
 PARTS = len(ElementBuilder(toy(), layouts(toy())).parts)  # of the toy: each has its own file
@@ -146,10 +147,15 @@ def test_other_words_are_other_files(place, counted):
 def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
     """Whatever the modules of the problems import, at any depth, is in the key; and every name listed is there."""
     graph, package = import_graph(), Path(cache.__file__).parent.parent
-    planners = SrmpPlanner(bhr, keep=True), WholeBodyPlanner(bhr, Mesh(3, 2, 4), refine=False, keep=True)
-    assert len(list(place.glob("*.casadi"))) == sum(len(p.nlp.assembled.elements) for p in planners)
-    roots = {Assembled.__module__, Schedule.__module__}
-    roots |= {sys.modules[type(p).__module__].build_problem.__module__ for p in planners}
+    mesh = Mesh(3, 2, 4)
+    planners = (
+        SrmpPlanner(bhr, keep=True),
+        WholeBodyPlanner(bhr, mesh, keep=True),
+        WholeBodyPlanner(bhr, mesh, tracking=True, keep=True),
+    )
+    parts = sum(len(p.nlp.assembled.elements) for p in planners)  # which builds them
+    assert len(list(place.glob("*.casadi"))) == parts
+    roots = {Assembled.__module__, Schedule.__module__, srmp_problem.__module__}
     roots |= {t.expression.__module__ for p in planners for _, t in p.nlp.problem.terms()}
     found = roots.union(*(graph.find_upstream_modules(root) for root in roots))
     listed = tuple(f"jumplab.{name}" for name in cache.BUILT_BY)
@@ -158,6 +164,7 @@ def test_what_a_problem_is_built_by_is_all_listed(bhr, place):
     for name in cache.BUILT_BY:
         place = package.joinpath(*name.split("."))
         assert place.is_dir() or place.with_suffix(".py").is_file(), name
+    assert len(set(cache.BUILT_BY)) == len(cache.BUILT_BY)
 
 
 def test_the_folder_is_the_systems(monkeypatch, tmp_path):

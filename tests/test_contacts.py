@@ -9,12 +9,11 @@ from jumplab.errors import InputError
 from jumplab.ocp.problem import layouts
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
-from jumplab.stages.whole_body import ContactPhase, Contacts, Place, Limits, Weights
+from jumplab.stages.whole_body import ContactPhase, Contacts, Limits, Mesh, Place, Weights
 from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES
 from jumplab.stages.whole_body.planner import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.terms import Body
-from jumplab.stages.whole_body import Mesh
 
 LEAP = "LR L lR R r - L LR"
 

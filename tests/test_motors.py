@@ -27,10 +27,10 @@ from jumplab.sim import INSTALLED, STEP_S, simulate_jump
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Limits, Weights
+from jumplab.stages.whole_body import Limits, Mesh, Weights
+from jumplab.stages.whole_body.coordinates import even, whole
 from jumplab.stages.whole_body.planner import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.settings import SPATIAL_MESH
 from jumplab.stages.whole_body.terms import BASE, Body, WholeBodyTerms
 from jumplab.task import JumpTask
 
@@ -179,26 +179,25 @@ def test_the_tree_turns_the_motors_too(heavy):
     np.testing.assert_allclose(told, rigid + motors, atol=1e-9)
 
 
-def spatial_problem(robot: Robot):
-    limits = Limits()
-    contacts = jump_contacts(limits, SPATIAL_MESH)
-    return Schedule(Body(robot), contacts, limits, Weights()).problem()
-
-
-def test_dry_friction_lowers_the_limits_of_torques_in_space(bhr, heavy):
+@pytest.mark.parametrize("coordinates", [whole, even], ids=["in space", "in the plane"])
+def test_dry_friction_lowers_the_limits_of_torques(bhr, heavy, coordinates):
     """A joint that moves has that much less to give, whichever way; the rows have no kink."""
-    friction, effort = numbers(heavy, "friction"), numbers(heavy, "effort")
-    bounds, lines = [], []
+    limits, bounds, lines = Limits(), [], []
     for robot in (bhr, heavy):
-        problem = spatial_problem(robot)
+        body = Body(robot)
+        free = coordinates(body)
+        contacts = jump_contacts(limits, Mesh())
+        problem = Schedule(body, contacts, limits, Weights(), free=free).problem()
         bounds.append([x for _, x in problem.bounds() if x.name == "forces and torques"])
         lines.append([t for _, t in problem.terms() if t.name == "torque-speed"])
+    friction, effort = (numbers(heavy, key)[free.joints] for key in ("friction", "effort"))
+    assert len(friction) == (4 if free.plane else 14)
     for free, less in zip(*bounds, strict=True):
         for side in ("lower", "upper"):
             push, torque = np.split(getattr(less, side), [-len(friction)])
             assert np.array_equal(push, getattr(free, side)[: len(push)])
             sign = -1 if side == "lower" else 1
-            most = Limits().torque_share * effort - friction
+            most = limits.torque_share * effort - friction
             np.testing.assert_allclose(sign * torque, most)
     for free, less in zip(*lines, strict=True):
         np.testing.assert_allclose(free.upper - less.upper, friction / effort)

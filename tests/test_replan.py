@@ -12,11 +12,9 @@ from test_transcription import toy
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
 from jumplab.ocp.assembly import Assembled, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
-from jumplab.ocp.nlp import WARM, Nlp, PhaseGuess
+from jumplab.ocp.nlp import GOOD_STATUSES, WARM, Nlp, PhaseGuess
 from jumplab.ocp.problem import Term
-from jumplab.robot import Robot
 from jumplab.stages import planner as pipeline
-from jumplab.stages import whole_body
 from jumplab.task import JumpTask
 
 
@@ -104,7 +102,8 @@ def test_a_neighbouring_target(bhr, method):
     assert audit(again.tape, bhr, again.task).passed
     cost = [p.whole_body.solution.statistics.objective for p in (again, fresh)]
     assert cost[0] <= 1.01 * cost[1]
-    assert again.whole_body.solution.statistics.status == "Settled"
+    assert again.whole_body.began("neighbour") and len(again.whole_body.attempts) == 1
+    assert again.whole_body.solution.statistics.status in GOOD_STATUSES
     spent = [sum(r.iterations for r in p.statistics if "joint" not in r.stage) for p in (again, fresh)]
     assert spent[0] < spent[1] / 2
 
@@ -114,18 +113,3 @@ def test_of_another_robot():
     with pytest.raises(InputError) as e:
         planner().replan(other, JumpTask(0.9, 0.5))
     assert str(e.value) == "the previous plan is for the robot other, not for bhr"
-
-
-@pytest.mark.slow
-def test_a_jerk_that_jumps_too_far_is_made_dearer(monkeypatch):
-    """The default jump's jerk jumps by 16,000 rad/s^3; allowed less, it is solved again, and moves more evenly."""
-    module, task = whole_body.planner, JumpTask(1.0, 0.5)
-    planner = whole_body.WholeBodyPlanner(Robot.load(), tracking=False)
-    usual = planner.plan(task)
-    monkeypatch.setattr(module, "FOLLOWED_JERK_STEP", 0.8 * usual.jerk_step)
-    even = planner.plan(task)
-    assert even.jerk_step <= 0.8 * usual.jerk_step
-    jerk = {row["name"]: row["weight"] for row in even.solution.cost_shares}["jerk"]
-    assert jerk / planner.weights.jerk in module.EVENING
-    monkeypatch.setattr(module, "EVENING", ())
-    assert planner.plan(task).jerk_step == pytest.approx(usual.jerk_step, rel=1e-6)

@@ -1,6 +1,7 @@
 """Plans that allow for other robots: sampled robots against the whole model, and the margins that move."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import casadi as ca
@@ -9,10 +10,12 @@ import pytest
 
 import jumplab as jl
 from jumplab.errors import InputError
+from jumplab.ocp.problem import Point
 from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
 from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits
+from jumplab.stages.whole_body.view import PlaneView
 from jumplab.studies import robust
 from jumplab.studies.margins import ranges_at
 
@@ -25,17 +28,14 @@ def plans(bhr):
 
 
 def ends_of(plan, model):
-    """Points of a finished plan as the term sees them, in numbers."""
-    from jumplab.models.planar import PlanarState
-
-    found = {}
-    for name, x in plan.whole_body.solution.phases.items():
-        pad = 5 - x.q.shape[1]
-        row = [ca.SX(np.pad(y[-1], (pad, 0))) for y in (x.q, x.v, x.a)]
-        moved = lambda m, row=row: PlanarState(m, *row)  # noqa: E731
-        found[name] = SimpleNamespace(
-            end=SimpleNamespace(moved=moved, duration=x.duration, p=SimpleNamespace(gravity=9.8))
-        )
+    """Capture point of another robot in a finished plan, as the term has it, in numbers."""
+    schedule, found = plan.whole_body.schedule, {}
+    for k, (name, x) in enumerate(plan.whole_body.solution.phases.items()):
+        nodes = {key: ca.SX(ca.DM(getattr(x, key)[-1])) for key in "qvaz"}
+        more = {"c": SimpleNamespace(**x.constants), "p": SimpleNamespace(gravity=9.8)}
+        view = partial(PlaneView, schedule.of(k))
+        end = Point(**nodes, **more, j=None, duration=ca.SX(x.duration), s=ca.SX(1), ref=None, view=view)
+        found[name] = SimpleNamespace(end=end)
     return float(ca.DM(ca.evalf(robust.capture_point(model, found))))
 
 
@@ -75,21 +75,21 @@ def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, p
 
 def test_limits_that_robots_lose_are_not_planned_with(bhr):
     ranges = Ranges.none(friction=(0.4, 0.4), torque_loss=(0.0, 0.1), speed_loss=(0.0, 0.05))
-    made = Planner(bhr, **robust.robust_changes(TASK, bhr, ranges, {"limits": {"hand_clearance_m": 0.06}}))
+    made = Planner(bhr, **robust.robust_changes(TASK, bhr, ranges, {"limits": {"body_clearance_m": 0.06}}))
     assert made.limits.friction == pytest.approx(0.36) and made.limits.torque_share == pytest.approx(0.765)
-    assert made.limits.speed_share == pytest.approx(0.855) and made.limits.hand_clearance_m == 0.06
+    assert made.limits.speed_share == pytest.approx(0.855) and made.limits.body_clearance_m == 0.06
     own = robust.robust_changes(TASK, bhr, ranges, {"limits": {"torque_share": 0.8}})
     assert Planner(bhr, **own).limits.torque_share == 0.8
 
 
 def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
     """Its own rows say where the soles belong; what was asked for besides stays, and own limits win."""
-    flip, given = replace(TASK, rotation_rad=-2 * np.pi), {"limits": {"hand_clearance_m": 0.06}, "off": ["jerk"]}
+    flip, given = replace(TASK, rotation_rad=-2 * np.pi), {"limits": {"body_clearance_m": 0.06}, "off": ["jerk"]}
     found = robust.robust_changes(flip, bhr, Ranges(), given)
     assert found["off"] == ["jerk"] and "terms" not in found
     assert found["limits"]["opening_speed_share"] == robust.OPENING_SHARE < Limits().of_flip().opening_speed_share
     assert settled(Limits, found["limits"], flip=True) == replace(
-        Limits().of_flip(), friction=0.38, hand_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
+        Limits().of_flip(), friction=0.38, body_clearance_m=0.06, opening_speed_share=robust.OPENING_SHARE
     )
     own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})
     assert own["limits"]["opening_speed_share"] == 0.5

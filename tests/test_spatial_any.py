@@ -17,11 +17,10 @@ from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.robot_import.roles import draft
 from jumplab.sim import simulate_jump
-from jumplab.stages.whole_body import Contacts, Place, Limits, WholeBodyPlanner, Weights
+from jumplab.stages.whole_body import Contacts, Limits, Mesh, Place, Weights, WholeBodyPlanner
 from jumplab.stages.whole_body import starts as beginning
 from jumplab.stages.whole_body.planner import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.settings import SPATIAL_MESH
 from jumplab.stages.whole_body.terms import Body
 from jumplab.studies.chain import Course, run_chain
 
@@ -90,7 +89,7 @@ def test_a_knee_may_be_bent_where_its_angle_is_zero(robot):
 
 def schedule_of(robot: Robot, contacts: Contacts | None = None) -> Schedule:
     limits = Limits()
-    contacts = contacts or jump_contacts(limits, SPATIAL_MESH)
+    contacts = contacts or jump_contacts(limits, Mesh())
     return Schedule(Body(robot), contacts, limits, Weights())
 
 

@@ -1,13 +1,26 @@
-"""The model of any tree in space against Pinocchio: dynamics, momentum, places, and the chart of the base."""
+"""The model of any tree in space against Pinocchio: dynamics, momentum, places, and the chart of the base.
+
+And even motions, in which the left half stands for both: against the whole tree, and as whole motions of a robot.
+"""
+
+import math
+from functools import cache
+from types import SimpleNamespace
+from xml.etree import ElementTree as ET
 
 import casadi as ca
+import fixtures_robots as robots
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import jump, planner
 
 from jumplab.errors import RobotError
 from jumplab.models.spatial import SpatialModel, SpatialState, rates
+from jumplab.ocp.problem import Point
 from jumplab.robot import Robot
+from jumplab.stages.whole_body import coordinates
+from jumplab.stages.whole_body.terms import Body
 
 EXACT = 1e-9
 
@@ -201,3 +214,194 @@ def test_free_base_is_needed():
     with pytest.raises(RobotError) as e:
         SpatialModel(model)
     assert str(e.value) == "robot arm: the spatial model takes a free base and joints of one axis each"
+
+
+# even motions -----------------------------------------------------------------------------------------------------
+def canted_shoulders(urdf: str = robots.GOOD, config: str = robots.config("canted_shoulders")) -> Robot:
+    """A robot with shoulders that turn about axes 0.3 rad off the pitch axis, as mirror images."""
+    robot, angle = ET.fromstring(urdf), 0.3
+    for side, sign in (("left", 1), ("right", -1)):
+        axis = f"0 {math.cos(angle):.12f} {sign * math.sin(angle):.12f}"
+        robots.joint(robot, f"{side}_shoulder_pitch").find("axis").set("xyz", axis)
+    return Robot.from_text(robots.text(robot), config)
+
+
+def free_waist() -> Robot:
+    """The same with a chest above the pelvis, and a pitch joint between them that moves: one in the middle."""
+    urdf, config = robots.waist()
+    return canted_shoulders(urdf, config.partition("[locked]")[0])
+
+
+# name -> kind of even coordinates, how many there are, and the robot
+EVEN = {
+    "bhr": ("plane", 7, Robot.load),
+    "canted": ("even", 10, canted_shoulders),
+    "waist": ("even", 11, free_waist),
+}
+
+
+@cache
+def body_of(name: str) -> Body:
+    return Body(EVEN[name][2]())
+
+
+def even_motion(free: coordinates.Coordinates, count: int = 4):
+    """Random motions of the free coordinates (count, .), several full turns of pitch among them."""
+    rng = np.random.default_rng(7)
+    q, v, a = (size * rng.normal(size=(count, free.size)) for size in (1.0, 3.0, 20.0))
+    q[:, 2] *= 6
+    return q, v, a
+
+
+def mirrored(x: np.ndarray, moment: bool = False) -> np.ndarray:
+    """The mirror image of a force or velocity in the x-z plane; of a moment or angular velocity."""
+    return x * ([-1.0, 1.0, -1.0] if moment else [1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize("name", EVEN)
+def test_the_left_half_of_an_even_motion_stands_for_the_whole_tree(name):
+    """Dynamics with a wrench on each foot, momentum and CoM; torques of the left half and of the middle."""
+    body, kind, size = body_of(name), *EVEN[name][:2]
+    free, tree = coordinates.even(body), body.robot.model.copy()
+    assert (free.kind, free.size, free.even) == (kind, size, True)
+    tree.armature[6:] = 0.02
+    model = SpatialModel(tree)
+    n, kept = len(model.names), [k - 1 for k in model.left_half if k]
+    (left, right), rng = body.feet, np.random.default_rng(2)
+    assert left in model.left_half and right not in model.left_half
+    q, v, a, loads = (ca.SX.sym(k, size) for k, size in (("q", n), ("v", n), ("a", n), ("loads", 12)))
+    push = {left: (loads[:3], loads[3:6]), right: (loads[6:9], loads[9:])}
+    whole, half = (SpatialState(model, q, v, a, even=even) for even in (False, True))
+    told = []
+    for state, wrenches in ((whole, push), (half, {left: push[left]})):
+        force, moment, torques = state.dynamics(wrenches)
+        told += [force, moment, torques[kept], state.com, state.com_velocity, state.angular_momentum]
+    told = ca.Function("told", [q, v, a, loads], told)
+    turns = ca.Function("turns", [q], [whole.rotation(k) for k in (left, right)])
+    for motion in zip(*even_motion(free), strict=True):
+        chart = [free.charts(x[None], level)[0] for level, x in enumerate(motion)]
+        force, moment = 100 * rng.normal(size=3), 20 * rng.normal(size=3)
+        axes = [x.full() for x in turns(chart[0])]
+        given = [axes[0].T @ force, axes[0].T @ moment]
+        given += [axes[1].T @ mirrored(force), axes[1].T @ mirrored(moment, True)]
+        found = [x.full().ravel() for x in told(*chart, np.concatenate(given))]
+        for mine, theirs in zip(found[6:], found[:6], strict=True):
+            assert mine == pytest.approx(theirs, abs=EXACT)
+        assert np.abs(found[0][[0, 2]]).min() > 1 and np.abs(found[5][1]) > 1e-3  # there is something to compare
+
+
+@pytest.mark.parametrize("name", EVEN)
+def test_even_motions_are_mirror_images(name):
+    """Through Pinocchio: the CoM stays in the plane, momentum too; feet are in mirrored places at mirrored speeds."""
+    body = body_of(name)
+    free, tree, data = coordinates.even(body), body.robot.model, body.robot.model.createData()
+    charts = [free.charts(x, level) for level, x in enumerate(even_motion(free))]
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    frames = [tree.getFrameId(frame) for frame in body.robot.foot.frames]
+    for q, v, _ in zip(*body.model.to_pinocchio(*charts), strict=True):
+        momentum = pin.computeCentroidalMomentum(tree, data, q, v)
+        assert data.com[0][1] == pytest.approx(0.0, abs=EXACT)
+        assert momentum.vector[[1, 3, 5]] == pytest.approx(0.0, abs=1e-8)
+        pin.framesForwardKinematics(tree, data, q)
+        places = [data.oMf[frame].act(body.robot.foot.tip) for frame in frames]
+        assert places[1] == pytest.approx(mirrored(places[0]), abs=EXACT)
+        pin.forwardKinematics(tree, data, q, v)
+        twists = [pin.getFrameVelocity(tree, data, frame, axes) for frame in frames]
+        assert twists[1].linear == pytest.approx(mirrored(twists[0].linear), abs=1e-8)
+        assert twists[1].angular == pytest.approx(mirrored(twists[0].angular, True), abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", [coordinates.whole, coordinates.even, coordinates.in_plane])
+@pytest.mark.parametrize("name", EVEN)
+def test_charts_are_the_same_in_symbols_and_in_numbers(name, kind):
+    """On all three levels; what a phase has besides is passed over, and the free coordinates come back."""
+    body = body_of(name)
+    free = kind(body)
+    x = ca.SX.sym("x", free.size + 1)
+    seen = ca.Function("seen", [x], [free.chart(x, level) for level in range(3)])
+    for level, values in enumerate(even_motion(free)):
+        told = free.charts(np.column_stack([values, np.ones(len(values))]), level)
+        assert told.shape == (len(values), len(body.model.names))
+        assert told == pytest.approx(free.charts(values, level), abs=0)
+        for row, chart in zip(values, told, strict=True):
+            assert seen(np.append(row, 1.0))[level].full().ravel() == pytest.approx(chart, abs=1e-12)
+        assert free.taken(told) == pytest.approx(values, abs=1e-12)
+    assert free.charts(free.taken(body.stance[None]))[0] == pytest.approx(body.stance, abs=1e-9)
+    assert free.charts(np.zeros((1, free.size)), 1) == pytest.approx(0.0, abs=0)
+
+
+@pytest.mark.parametrize("name", EVEN)
+def test_bounds_of_free_coordinates_are_the_tighter_of_both_sides(name):
+    """Just inside, the whole chart is inside its bounds; just outside, it is not."""
+    body = body_of(name)
+    free, rng = coordinates.even(body), np.random.default_rng(3)
+    n = len(body.model.names)
+    low, high = -rng.uniform(1, 2, n), rng.uniform(1, 2, n)
+    least, most = free.within(low, high)
+    moved = np.abs(free.spread).any(axis=1)
+    for end, way in ((least, 1), (most, -1)):
+        for k in range(free.size):
+            inside, outside = (np.zeros(free.size) for _ in range(2))
+            inside[k], outside[k] = end[k] + 1e-9 * way, end[k] - 1e-9 * way
+            for x, kept in ((inside, True), (outside, False)):
+                chart = (free.charts(x[None], 1)[0])[moved]
+                assert np.all((low[moved] <= chart) & (chart <= high[moved])) == kept
+
+
+# a planar plan is one of all coordinates --------------------------------------------------------------------------
+def along(phase, solution, parameters) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Term -> its values (rows, nodes) at the nodes of a solution that it is for, with lower and upper end (rows, 1).
+
+    References are zeros: soles in the air are asked to be above the ground, by nothing more.
+    """
+    count, out = phase.intervals, {}
+    for term in phase.terms:
+        if term.is_cost or term.at not in ("node", "end"):
+            continue
+        first, last = (term.skip[0], count - term.skip[1]) if term.at == "node" else (count, count)
+        columns = []
+        for k in range(first, last + 1):
+            x = [ca.SX(ca.DM(y[k])) for y in (solution.q, solution.v, solution.a)]
+            given = solution.constants, parameters, {name: np.zeros(n) for name, n in phase.references.items()}
+            c, p, ref = (SimpleNamespace(**{n: ca.SX(ca.DM(np.atleast_1d(y))) for n, y in z.items()}) for z in given)
+            z, s = ca.SX(ca.DM(solution.z[k])), ca.SX(k / count)
+            point = Point(*x, None, z, ca.SX(solution.duration), s, c, p, ref, view=phase.view)
+            columns.append(ca.evalf(ca.SX(term.expression(point))).full().ravel())
+        values, ends = np.array(columns).T, []
+        for end in (term.lower, term.upper):
+            end = end(parameters) if callable(end) else end
+            ends.append(np.broadcast_to(np.asarray(end, float).ravel(), len(values))[:, None])
+        out[term.name] = values, *ends
+    return out
+
+
+@pytest.mark.parametrize("target", [(1.0, 0.5, 0.0, "direct"), (0.6, 0.5, 0.3, "three-step")], ids=str)
+def test_the_phases_of_a_planar_plan_meet_the_rows_of_the_whole_program(target):
+    """With every coordinate of both sides: contact, dynamics and flight as exactly as in the plane, limits too."""
+    body, stages = jump(*target).whole_body, planner()
+    assert body.schedule.free.plane and not body.schedule.whole.free.even
+    data = stages.stage("spatial").parameters(body.task)
+    own = stages.stage("direct").parameters(body.task) | dict(momentum=0.0, launch_s=np.zeros(2))
+    flat, deep = body.schedule.problem(), body.schedule.whole.problem()
+    assert [p.coordinates[:20] for p in deep.phases] == 3 * [body.schedule.body.model.names]
+    for plane, whole in zip(flat.phases, deep.phases, strict=True):
+        told = along(plane, body.solution.phases[plane.name], own)
+        found = along(whole, body.phases[whole.name], data)
+        equal = {name for name, (_, low, high) in found.items() if np.array_equal(low, high)}
+        missed = {name: np.abs(values).max() for name, (values, _, _) in told.items() if name in equal}
+        for side in ("left", "right"):
+            missed |= {n.replace("left", side): x for n, x in missed.items() if n.startswith("left foot")}
+        assert set(missed) == equal and equal >= {"base forces", "base moments", "joint dynamics"}
+        for name in equal:
+            assert np.abs(found[name][0]).max() <= missed[name] + 1e-9, name
+        for side in [] if whole.name == "flight" else ["left", "right"]:
+            assert np.abs(found[f"{side} foot in place"][0]).max() < 1e-6
+        # the plane asks for no soles that stick
+        for name in set(found) - equal - {"soles that stick at touchdown"}:
+            values, low, high = found[name]
+            assert np.maximum(low - values, values - high).max() < 1e-4, name
+        for bound in whole.bounds:
+            x = getattr(body.phases[whole.name], bound.on)
+            rows = {"all": x, "inner": x[1:], "start": x[:1], "end": x[-1:]}[bound.where]
+            low, high = (np.asarray(y(data) if callable(y) else y) for y in (bound.lower, bound.upper))
+            assert np.maximum(low - rows, rows - high).max() < 1e-4, bound.name

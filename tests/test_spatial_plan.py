@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, replace
 from functools import cache, partial
+from itertools import chain, repeat
 from types import SimpleNamespace
 
 import casadi as ca
@@ -29,9 +30,10 @@ from jumplab.sim.playback import Actuators, Playback
 from jumplab.sim.scene import Scene
 from jumplab.sim.servo import Servo
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Contacts, Place, Limits, WholeBodyPlanner, Weights
+from jumplab.stages.whole_body import Contacts, Limits, Place, Weights, WholeBodyPlanner
 from jumplab.stages.whole_body import planner as planning
 from jumplab.stages.whole_body.apart import MORE_M, merged, too_close
+from jumplab.stages.whole_body.coordinates import BASE, even
 from jumplab.stages.whole_body.shapes import ROUNDED_M, faces, gaps
 from jumplab.stages.whole_body.tape import (
     ACCELERATION_GAP,
@@ -39,12 +41,13 @@ from jumplab.stages.whole_body.tape import (
     FLAT,
     FRICTION,
     LOADED_N,
+    PRESSURE_GAP,
     RATE_GAP,
     TOE,
     edges,
-    holds_between,
+    used_between,
 )
-from jumplab.stages.whole_body.terms import BASE, Body, WholeBodyTerms
+from jumplab.stages.whole_body.terms import Body, WholeBodyTerms
 from jumplab.stages.whole_body.view import SpatialView
 from jumplab.task import JumpTask
 
@@ -73,7 +76,7 @@ def walker() -> WholeBodyPlanner:
 def step():
     """Plan and tape of that step."""
     plan = walker().plan(JumpTask(0.0, 0.2))
-    return plan, walker().tape(plan)
+    return plan, plan.tape
 
 
 @cache
@@ -241,25 +244,59 @@ def test_neighbour_is_planned_from_the_plan():
     assert audit(after.tape, after.robot, after.task).passed
 
 
-def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_again_on_a_finer_mesh(monkeypatch):
-    last, verdicts = planner().stage("spatial"), iter([False, True, False, False, True, False, False, False])
-    coarse = jump(SIDE).whole_body
-    first = last.plan(SIDE, near=coarse).solution
-    monkeypatch.setattr(planning, "holds_between", lambda tape, robot: next(verdicts))
-    plans = [last.plan(SIDE, near=coarse) for _ in range(3)]
+AHEAD = JumpTask(0.4, 0.3)
+
+
+@pytest.fixture
+def doubted(monkeypatch, bhr):
+    """(planner of even jumps that begins with a neighbour or not at all, its plan, how to say what is used of limits).
+
+    The last number that is said stands for all further motions.
+    """
+    body = Body(bhr)
+    last = WholeBodyPlanner(bhr, body=body, free=even(body), starts=())
+    known = planner().plan(AHEAD, "direct").whole_body
+    assert known.used <= 1 and last.plan(AHEAD, near=known).used <= 1
+
+    def said(*shares: float) -> None:
+        told = chain(shares, repeat(shares[-1]))
+        monkeypatch.setattr(planning, "used_between", lambda tape, robot: next(told))
+
+    return last, known, said
+
+
+def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_again_on_a_finer_mesh(doubted):
+    last, known, said = doubted
+    first, plans = last.plan(AHEAD, near=known).solution, []
+    for shares in ((1.2, 0.9), (1.2, 1.2, 0.9), (1.2, 1.3)):
+        said(*shares)
+        plans.append(last.plan(AHEAD, near=known))
     settled, finer, kept = (plan.solution for plan in plans)
     names = [[x.start for x in plan.attempts] for plan in plans]
-    assert names == [["neighbour", "settled"], *2 * [["neighbour", "settled", "finer mesh"]]]
+    both = ["neighbour", "settled", "finer mesh"]
+    assert names == [["neighbour", "settled"], both, both + both]
     mesh = [last.mesh.flat, last.mesh.toe, last.mesh.flight]
     assert [len(x.j) for x in settled.phases.values()] == mesh
     assert settled.statistics.objective < first.statistics.objective
     assert [len(x.j) for x in finer.phases.values()] == [np.ceil(planning.FINER * n) for n in mesh]
-    assert kept.statistics.objective == first.statistics.objective  # neither is any better: the first stands
+    assert kept.statistics.objective == first.statistics.objective  # none is any better: the first stands
+    assert plans[2].used == 1.2
+
+
+def test_a_motion_that_breaks_limits_between_the_nodes_is_none(doubted):
+    last, known, said = doubted
+    said(2.0, 1.9, 1.8)
+    with pytest.raises(SolverError) as e:
+        last.plan(AHEAD, near=known)
+    assert str(e.value) == (
+        "whole body: motions that keep every limit at the nodes break them between the nodes, at best by a factor of "
+        "1.8; ask for less, or for a finer mesh"
+    )
 
 
 def test_limits_between_the_nodes_are_seen(bhr):
     tape = jump(SIDE).tape
-    assert holds_between(tape, bhr)
+    assert 0.5 < used_between(tape, bhr) <= 1
     assert [LIMITS[f"{x} against {y}"].limit for x, y in (("rates", "positions"), ("accelerations", "rates"))] == [
         RATE_GAP,
         ACCELERATION_GAP,
@@ -269,11 +306,21 @@ def test_limits_between_the_nodes_are_seen(bhr):
     for name, column, change in (("tau", bhr.joint_names.index("left_ankle_pitch"), effort), ("v", 12, 0.05)):
         moved = getattr(tape, name).copy()
         moved[row, column] += 2 * change
-        assert not holds_between(replace(tape, **{name: moved}), bhr), name
+        assert used_between(replace(tape, **{name: moved}), bhr) > 1, name
+    (ahead, _, below), down = tape.f[row, 0, [0, 1, 2]], -bhr.foot.tip[2]  # on a flat foot that looks ahead
+    assert np.all(tape.extra["contacts"][row] == FLAT)
     for share in (0.99, 1.01):
         pushed = tape.f.copy()
-        pushed[row, 0, :2] = 0.0, share * FRICTION * pushed[row, 0, 2]
-        assert holds_between(replace(tape, f=pushed), bhr) == (share < 1)
+        aside = share * FRICTION * below
+        pushed[row, 0, :2] = 0.0, aside
+        pushed[row, 0, 3:5] += down * (aside - tape.f[row, 0, 1]), down * ahead  # the CoP stays
+        used = used_between(replace(tape, f=pushed), bhr)
+        assert (used <= 1) == (share < 1) and used >= share - 1e-9
+    for share in (0.9, 1.5):
+        pushed = tape.f.copy()
+        pushed[row, 0, 4] = -down * ahead - (bhr.foot.toe + share * PRESSURE_GAP) * below  # the CoP beyond the toes
+        used = used_between(replace(tape, f=pushed), bhr)
+        assert used == pytest.approx(max(share, used_between(tape, bhr)), abs=1e-6)
 
 
 def test_own_weights_and_terms_reach_it(bhr):
@@ -308,7 +355,7 @@ def test_points_know_the_robot_by_name(bhr):
 
 
 def test_names_that_do_not_exist_are_refused():
-    with pytest.raises(InputError, match="the problem 'spatial' has no such term"):
+    with pytest.raises(InputError, match="the problem 'whole body' has no such term"):
         planner().plan(SIDE, "direct", weights={"spatial/flight/torq": 0.01})
 
 
@@ -332,11 +379,11 @@ def refusing(monkeypatch):
     """(stage, what it was asked for): nothing farther than half a metre to the side is solved."""
     last, known, tried = planner().stage("spatial"), jump(SIDE).whole_body, []
 
-    def solved(start, task, parameters, weights, begin, apart, attempts, explain=False):
-        tried.append((task.side_m, start.name, start.held, explain))
-        if task.side_m > 0.5:
+    def solved(start, asked, begin, apart, *, explain=False):
+        tried.append((asked.task.side_m, start.name, start.held, explain))
+        if asked.task.side_m > 0.5:
             raise SolverError("spatial: no plan", stage="spatial", violations=("flight/capture window by 1 m",))
-        return replace(known, task=task)
+        return replace(known, task=asked.task)
 
     monkeypatch.setattr(last, "_solved", solved)
     return last, tried
@@ -554,6 +601,20 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     # they met in spite of their rows, so between the nodes: each asks for more
     assert merged(found, later) == tuple(replace(x, last=x.last + 2, more_m=MORE_M) for x in found)
     assert merged(apart, ()) == apart
+
+
+def test_rows_for_links_that_met_stay_where_they_are_on_another_mesh():
+    """A neighbour that was solved on a finer mesh, and one on the usual mesh: the same shares of each phase."""
+    first, last = jump(SIDE).whole_body, planner().stage("spatial")
+    fine = last._finer.plan(SIDE, near=first)
+    found = []
+    for plan in (first, fine, last.plan(SIDE, near=fine)):
+        count = [p.intervals for p in plan.schedule.contacts.phases]
+        rows = {(x.phase, x.pair.key): (x.first / count[x.phase], x.last / count[x.phase]) for x in plan.schedule.apart}
+        assert rows and all(0 < begin <= end <= 1 for begin, end in rows.values())
+        found.append(rows)
+    for key, (begin, end) in found[0].items():
+        assert all(rows[key][0] <= begin and rows[key][1] >= end for rows in found[1:])
 
 
 def test_headed_turns_the_robot_about_the_vertical(bhr):

@@ -40,7 +40,6 @@ BUILT_BY = (
     "robot_import",
     "stages.srmp",
     "stages.whole_body",
-    "stages.whole_body",
 )
 
 

@@ -280,7 +280,8 @@ def _between(axis: Sequence[float], x: float) -> tuple[int, float]:
 
 def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
     most = most_used(audit(make_tape(plan), body.robot, plan.task), body.robot)
-    cost, x = plan.solution.statistics.objective, pack(body.nlp.assembled, plan.solution.guess())
+    motion = plan.solution.guess(body.mesh.intervals())  # it may have been solved on a finer mesh
+    cost, x = plan.solution.statistics.objective, pack(body.nlp.assembled, motion)
     return Node(plan.task.distance_m, plan.task.height_m, cost, *most, x)
 
 

@@ -7,7 +7,7 @@ import json
 import re
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +22,19 @@ from jumplab.models.full import FullBody
 from jumplab.robot import SAGITTAL_JOINTS, Robot
 from jumplab.robot.stance import stance_angles
 from jumplab.sim import STEP_S, SimulationResult
-from jumplab.stages.joint_qp import map_to_joints
+from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import STEPS_S, motion_of_joints
 from jumplab.stages.reconstruction import planar_quantities, to_link_angles
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
-from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.stages.whole_body import Mesh, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body.starts import Motion
 from jumplab.task import GRAVITY, JumpTask
+from paper.expansion import expand
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
-MESHES = {"fine mesh": {"refine": False}, "coarse first": {"approach": False}, "steps first": {}}  # of stage 3
-LOOSE_MESH = Mesh(13, 10, 15)  # half of stage 3's mesh ...
+LOOSE_MESH = Mesh(6, 4, 6)  # half of stage 3's mesh ...
 LOOSE_TOLERANCE = {"tol": 1e-2, "constr_viol_tol": 5e-5}  # ... and tolerances that leave millimetres open
 SAME_COST = 1.01  # more than this times the least cost known is another jump
 READINGS = ("the paper says", "we do", "because", "effect")
@@ -127,26 +128,23 @@ def five_against_nine(robot: Robot, samples: int = 20, seed: int = 0) -> dict[st
 
 @dataclass(frozen=True)
 class Start:
-    """Stage 3 from one initial guess, at one target.
+    """Stage 3 from one start, at one target.
 
     Attributes
     ----------
-    task, start : the target, and one of :data:`STARTS`.
-    iterations : of stage 3, those on the coarse mesh, of half as many intervals, counted half; None if it failed.
-    alone_s, total_s : processor time of stage 3, and with that of making the guess [s]; None if it failed.
+    task, start : the target, and one of :data:`STARTS`; "crouch" is the planner's own, by inverse kinematics along the
+        contacts.
+    iterations : of stage 3, in all its attempts; None if it failed.
+    alone_s, total_s : processor time of stage 3's solves, and with that of making the start [s]; None if it failed.
     cost : of the jump it ends in [1]; None if it failed.
-    mesh : one of :data:`MESHES`: the fine mesh at once, the coarse one first, or that by Gauss-Newton steps.
-    fine : iterations on the fine mesh; None if it failed.
     """
 
     task: JumpTask
     start: str
-    iterations: float | None = None
+    iterations: int | None = None
     alone_s: float | None = None
     total_s: float | None = None
     cost: float | None = None
-    mesh: str = "steps first"
-    fine: int | None = None
 
 
 def spread_targets(number: int) -> list[JumpTask]:
@@ -155,67 +153,79 @@ def spread_targets(number: int) -> list[JumpTask]:
     return [JumpTask(round(x, 3), round(z, 3)) for x, z in spread]
 
 
-def compare_starts(
-    tasks: Iterable[JumpTask], robot: Robot, starts: Sequence[str] = STARTS, meshes: Sequence[str] = ("steps first",)
-) -> list[Start]:
+def compare_starts(tasks: Iterable[JumpTask], robot: Robot, starts: Sequence[str] = STARTS) -> list[Start]:
     """Stage 3 from a crouch, from stage 2's motion, and from a looser stage 3 (end of Sec. V).
 
     Returns
     -------
-    Per target one row for each of ``meshes`` and ``starts``. Stages 1 to 3 are built once, and not counted.
+    Per target one row for each of ``starts``. Stages 1 to 3 are built once, and not counted.
 
     Raises
     ------
     InputError, InfeasibleError, SolverError
         If stage 1 refuses a target; what fails later is a row without numbers.
     """
-    stage1, whole = SrmpPlanner(robot), {mesh: WholeBodyPlanner(robot, **MESHES[mesh]) for mesh in meshes}
-    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE) if STARTS[2] in starts else None
+    stage1, whole = SrmpPlanner(robot), WholeBodyPlanner(robot, tracking=True)
+    loose = WholeBodyPlanner(robot, LOOSE_MESH, options=LOOSE_TOLERANCE, tracking=True)
     rows = []
     for task in tasks:
         first = stage1.plan(task)
-        for mesh, name in itertools.product(meshes, starts):
+        for name in starts:
             try:
-                rows.append(replace(_from_start(name, task, first, whole[mesh], loose), mesh=mesh))
+                rows.append(_from_start(name, task, first, whole, loose))
             except JumplabError:
-                rows.append(Start(task, name, mesh=mesh))
+                rows.append(Start(task, name))
     return rows
 
 
-def _from_start(
-    name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner | None
-) -> Start:
-    began = time.process_time()
-    guess = None  # the planner's own: four postures joined by straight lines
+def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlanner, loose: WholeBodyPlanner) -> Start:
+    began, loose_s = time.process_time(), 0.0
+    begin = None
     if name == "stage 2":
-        there = whole.robot.under_gravity(task.gravity)
-        try:  # as the planner does it
-            motion = map_to_joints(first, there, STEPS_S, "direct")
-        except SolverError:
-            motion = map_to_joints(first, there, method="direct")
-        guess = guess_from_joints(motion, whole, task, first.toe_s)
-    elif loose and name == "looser stage 3":
-        guess = loose.plan(task, first).solution.guess(asdict(whole.mesh))
-    ready = time.process_time()
-    plan = whole.plan(task, first, guess=guess)
-    end = time.process_time()
-    s, coarse = plan.solution.statistics, plan.coarse.iterations if plan.coarse else 0
-    spent = s.iterations + coarse / 2, end - ready, end - began
-    return Start(task, name, *spent, s.objective, fine=s.iterations)
+        begin = motion_of_joints(_mapped(first, whole.robot.under_gravity(task.gravity)), whole, first.toe_s)
+    making_s = time.process_time() - began
+    if name == "looser stage 3":
+        plan = loose.plan(task, first)
+        begin, loose_s = _motion_of(plan, whole.mesh), solved_s(plan)
+    plan = whole.plan(task, first, begin=begin)
+    count, alone_s = sum(x.iterations for x in plan.attempts), solved_s(plan)
+    return Start(task, name, count, alone_s, making_s + loose_s + alone_s, plan.solution.statistics.objective)
+
+
+def _mapped(first: SrmpPlan, robot: Robot) -> JointPlan:
+    """Stage 2 as the planner does it: with long steps, or where those find no way with the usual ones."""
+    try:
+        return map_to_joints(first, robot, STEPS_S, "direct")
+    except SolverError:
+        return map_to_joints(first, robot, method="direct")
+
+
+def _motion_of(plan: WholeBodyPlan, mesh: Mesh) -> Motion:
+    """A plan as a motion to begin with, on another mesh."""
+    charts, size = [], len(plan.schedule.body.stance)
+    for name, count in mesh.intervals().items():
+        phase = plan.phases[name]
+        charts.append(phase.sample(np.linspace(0.0, phase.duration, count + 1))[0][:, :size])
+    return Motion(np.array([phase.duration for phase in plan.phases.values()]), charts)
+
+
+def solved_s(plan: WholeBodyPlan) -> float:
+    """Processor time of all attempts that led to a plan [s]."""
+    return sum(x.cpu_s for x in plan.attempts)
 
 
 def against_crouch(rows: Sequence[Start]) -> list[dict]:
-    """One row per mesh and start: solved targets, and medians of iterations and time as shares of the crouch's.
+    """One row per start: solved targets, and medians of iterations and time as shares of the crouch's.
 
-    The crouch is that on the mesh of the first row. Only targets count that it has solved too; shares are None where
-    there is none. ``costlier`` counts the jumps that cost more than :data:`SAME_COST` times the cheapest one found for
-    their target, from whatever start; ``by at most [%]`` is how much more.
+    Only targets count that the crouch has solved too; shares are None where there is none. ``costlier`` counts the
+    jumps that cost more than :data:`SAME_COST` times the cheapest one found for their target, from whatever start; ``by
+    at most [%]`` is how much more.
     """
-    crouch = {r.task: r for r in rows if (r.start, r.mesh) == (STARTS[0], rows[0].mesh) and r.iterations is not None}
+    crouch = {r.task: r for r in rows if r.start == STARTS[0] and r.iterations is not None}
     least = {t: min((r.cost for r in rows if r.task == t and r.cost is not None), default=0.0) for t in crouch}
     out = []
-    for name, mesh in dict.fromkeys((r.start, r.mesh) for r in rows):
-        here = [r for r in rows if (r.start, r.mesh) == (name, mesh)]
+    for name in dict.fromkeys(r.start for r in rows):
+        here = [r for r in rows if r.start == name]
         both = [(r, crouch[r.task]) for r in here if r.iterations is not None and r.task in crouch]
         shares = {
             "iterations, share": [r.iterations / c.iterations for r, c in both],
@@ -224,7 +234,7 @@ def against_crouch(rows: Sequence[Start]) -> list[dict]:
         }
         above = [r.cost / least[r.task] for r, _ in both]
         out.append(
-            {"start": name, "mesh": mesh, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
+            {"start": name, "solved": sum(r.iterations is not None for r in here), "targets": len(here)}
             | {key: float(np.median(x)) if x else None for key, x in shares.items()}
             | {"costlier": sum(x > SAME_COST for x in above), "by at most [%]": 100 * (max(above, default=1.0) - 1)}
         )
@@ -232,15 +242,12 @@ def against_crouch(rows: Sequence[Start]) -> list[dict]:
 
 
 def spared(rows: Sequence[Start]) -> str:
-    """What stage 2's motion spares against a crouch on the same mesh, in words."""
-    told = []
-    for mesh in dict.fromkeys(r.mesh for r in rows):
-        crouch, guess = against_crouch([r for r in rows if r.mesh == mesh and r.start in STARTS[:2]])
-        shares = (guess[key] for key in ("iterations, share", "with the guess, share"))
-        gain = ["?" if share is None else f"{1 - share:.0%}" for share in shares]
-        worse = f"costlier jumps: {guess['costlier']}, from the crouch {crouch['costlier']}"
-        told.append(f"{mesh}, {gain[0]} of iterations and {gain[1]} of time ({worse})")
-    return "; ".join(told)
+    """What stage 2's motion spares against a crouch, in words."""
+    crouch, guess = against_crouch([r for r in rows if r.start in STARTS[:2]])
+    shares = (guess[key] for key in ("iterations, share", "with the guess, share"))
+    gain = ["?" if share is None else f"{1 - share:.0%}" for share in shares]
+    worse = f"costlier jumps: {guess['costlier']}, from the crouch {crouch['costlier']}"
+    return f"{gain[0]} of iterations and {gain[1]} of time ({worse})"
 
 
 def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:

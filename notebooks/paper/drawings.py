@@ -383,14 +383,14 @@ def _tracked(plan: JointPlan):
 # starts of stage 3 ----------------------------------------------------------------------------------------------
 @styled
 def guess_comparison(rows: Iterable[Start], quantities: Mapping[str, str]) -> Figure:
-    """One panel per quantity, one column of dots per start and mesh, a thin line per target, a bar at the median.
+    """One panel per quantity, one column of dots per start, a thin line per target, a bar at the median.
 
     Parameters
     ----------
-    rows : one per target, start and mesh.
+    rows : one per target and start.
     quantities : attribute of a row -> axis label with unit.
     """
-    by = {(r.task, f"{r.start},\n" + r.mesh.replace(" ", "\n")): r for r in rows}
+    by = {(r.task, r.start): r for r in rows}
     targets, starts = (list(dict.fromkeys(keys)) for keys in zip(*by, strict=True))
     fig = new_figure(PAGE_IN, 2.5)
     axes = fig.subplots(1, len(quantities), squeeze=False)[0]

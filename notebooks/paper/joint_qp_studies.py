@@ -17,7 +17,7 @@ from jumplab.stages.joint_qp import DirectSolver, JointMapper, JointPlan, Option
 from jumplab.stages.joint_qp.problem import State, StepQp
 from jumplab.stages.joint_qp.settings import GENTLE
 from jumplab.stages.joint_qp.solve import CLARABEL
-from jumplab.stages.planner import STEPS_S, guess_from_joints
+from jumplab.stages.planner import STEPS_S, motion_of_joints
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.task import JumpTask
@@ -160,21 +160,20 @@ def weights_tried(srmp: SrmpPlan, robot: Robot, phase: str, name: str, values: S
 
 def choices_tried(task: JumpTask, srmp: SrmpPlan, robot: Robot) -> list[dict]:
     """Stage 2 as the planner runs it and with one choice changed: tracking, and where stage 3 ends from there."""
-    whole, rows = WholeBodyPlanner(robot), []
-    choices: dict[str, tuple[dict[str, Any], float | None]] = {
-        "as planned": ({}, None),
-        "steps of 10 ms, as in this notebook": ({"step_s": 0.01}, None),
-        "arms towards the stance": ({"options": Options(arm_rad=0.0)}, None),
-        "gentle weights": ({"options": GENTLE}, None),
-        "guess with stage 2's arms alone": ({}, 1.0),
-        "guess with the postures' arms alone": ({}, 0.0),
+    whole, rows = WholeBodyPlanner(robot, tracking=True), []
+    choices: dict[str, dict[str, Any]] = {
+        "as planned": {},
+        "steps of 10 ms, as in this notebook": {"step_s": 0.01},
+        "arms towards the stance": {"options": Options(arm_rad=0.0)},
+        "gentle weights": {"options": GENTLE},
     }
-    for name, (how, own_arms) in choices.items():
+    for name, how in choices.items():
         plan = map_to_joints(srmp, robot, method="direct", **{"step_s": STEPS_S, **how})
-        s = whole.plan(task, srmp, guess=guess_from_joints(plan, whole, task, srmp.toe_s, own_arms)).solution.statistics
+        led = whole.plan(task, srmp, begin=motion_of_joints(plan, whole, srmp.toe_s))
         row = {"choice": name, "steps": plan.statistics.steps}
         row |= {"take-off speed [%]": 100 * plan.tracking["takeoff_velocity"]}
         row |= {"L at take-off [%]": 100 * plan.tracking["takeoff_momentum"]}
         row |= {f"rho in {x} [%]": 100 * plan.tracking[f"{x}_inertia_rms"] for x in ("launch", "flight")}
-        rows.append({**row, "stage 3, fine iterations": s.iterations, "stage 3, cost": s.objective})
+        row |= {"stage 3, iterations": sum(x.iterations for x in led.attempts)}
+        rows.append({**row, "stage 3, cost": led.solution.statistics.objective})
     return rows

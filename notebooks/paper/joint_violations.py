@@ -8,7 +8,7 @@ import pinocchio as pin
 from jumplab.models.full import FullBody, FullTerms
 from jumplab.robot import Robot
 from jumplab.stages.joint_qp import JointPlan
-from jumplab.stages.planner import to_link_angles
+from jumplab.stages.reconstruction import to_link_angles
 from jumplab.stages.whole_body import Limits
 
 LOADED_N = 5.0  # a foot that carries less has no meaningful CoP or friction
@@ -66,7 +66,7 @@ def touchdown_rows(plan: JointPlan, robot: Robot) -> list[dict]:
     _, knee, _, _ = robot.sagittal.joint_angles(angles)  # hip, knee, ankle, shoulder
     ground = FullBody(robot).motion(plan.q[0], plan.v[0]).toe[0, 2]
     found = {
-        ("trunk pitch", "deg"): (deg(angles[3]), *deg(aims.touchdown_trunk)),
+        ("trunk pitch", "deg"): (deg(angles[3]), *deg(aims.touchdown_pitch)),
         ("knee", "deg"): (deg(knee), *deg(aims.touchdown_knee)),
         ("foot pitch", "deg"): (deg(x.foot_pitch[0]), 0.0, 0.0),
         ("toe above the ground", "mm"): (1000 * (x.toe[0, 2] - ground), 0.0, 0.0),

@@ -137,13 +137,16 @@ def even(body: Body) -> Coordinates:
 
 
 def in_plane(body: Body) -> Coordinates:
-    """Those of motions in which only joints with a role and those in the middle that pitch move; every coordinate of a
-    robot whose feet would leave the plane then."""
+    """Those of even motions whose feet stay in their planes: of the legs only joints with a role move, and of a robot
+    that five links describe no other ones. Every coordinate of a robot whose feet would leave the plane then."""
     mirrored = body.robot.planar or body.mirrored
     if not mirrored or len({i for pair in body.model.pairs for i in pair[:2]}) < body.model.joints:
         return whole(body)
-    middle = {body.joint_names[i] for i, k, sign in body.model.pairs if i == k and sign > 0}
-    found = _mirrored(body, "plane", middle | {name for pair in body.robot.joints.values() for name in pair})
+    moving = {name for pair in body.robot.joints.values() for name in pair}
+    if not body.robot.planar:
+        legs = {k - 1 for foot in body.feet for k in body.chain(foot)}
+        moving |= {name for k, name in enumerate(body.joint_names) if k not in legs}
+    found = _mirrored(body, "plane", moving)
     return found if body.robot.planar or _feet_stay(body, found) else whole(body)
 
 

@@ -357,7 +357,7 @@ class WholeBodyPlanner:
         """A plan from one start, its links apart."""
         begin, apart = given, ()
         if start.name == NEIGHBOUR:
-            apart = given.schedule.apart if given.schedule.free.kind == self.free.kind else ()
+            apart = self._scaled(given) if given.schedule.free.kind == self.free.kind else ()
         elif start.name != GIVEN[0].name:
             begin = self._motion(start, asked.task)
         found = self._solved(start, asked, begin, apart)
@@ -384,8 +384,9 @@ class WholeBodyPlanner:
 
     def _on_left(self, kept: Apart) -> bool:
         """Whether a pair of links is no mere mirror image of another."""
-        half = self.body.model.left_half
-        return kept.pair.first.body in half or kept.pair.second.body in half
+        model = self.body.model
+        left = {k for k in model.left_half if model.across[k] is None}
+        return kept.pair.first.body in left or kept.pair.second.body in left
 
     def _motion(self, start: Start, task: JumpTask) -> starts.Motion:
         schedule = self._schedule(())

@@ -47,12 +47,13 @@ class Limits:
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02
-    capture_moment: float | None = None  # if set, not the window but L about the soles' middle [kg m^2/s], either way
-    # in the plane instead: that L of a flip forward, and of one backward the capture point + slope * take-off speed,
-    # ahead of the toes (measured)
-    capture_forward: tuple[float, float] = (6.0, 10.0)
-    capture_backward_m: tuple[float, float] = (0.09, 0.12)
-    capture_backward_slope_s: float = 0.05
+    # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l) with the leg's length l
+    capture_moment: float | None = None
+    # in the plane instead: that L of a flip forward; and of one backward the capture point + slope * take-off speed,
+    # ahead of the toes, in shares of l and of sqrt(l / g) (measured)
+    capture_forward: tuple[float, float] = (0.070, 0.116)
+    capture_backward: tuple[float, float] = (0.12, 0.16)
+    capture_backward_slope: float = 0.18
     opening_speed_share: float = 1.0  # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
     # where left and right move differently
     side_margin_m: float = 0.02  # CoP inside the sole's sides
@@ -89,7 +90,7 @@ class Limits:
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
             touchdown_foot_rate=8.0,
             touchdown_ankle_stroke=0.12,  # an ankle at its stop cannot keep a tilted robot's soles flat
-            capture_moment=4.0,
+            capture_moment=0.047,
         )
 
 

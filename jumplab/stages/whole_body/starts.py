@@ -21,6 +21,7 @@ CROUCH, LANDED, TUCK = 0.20, 0.12, 0.15
 BOW, PITCH, HEEL_UP = 0.35, 0.12, 0.4
 # the arms about a flight: back in the crouch, ahead as the feet leave, by the middle of the flight and at its end
 ARMS = 0.5, -1.0, -0.2, 0.2
+FOLD_RAD, FOLDED = 1.3, (0.2, 0.8)  # of hips and knees in a flight that turns over, between those shares of it
 CROUCH_S = 0.35  # before and after a flight
 SWING = 0.1  # of the leg, by which a foot that steps is lifted
 EARLY = 0.15  # of the way of a flight, which the base has made before it, and makes after it
@@ -142,6 +143,9 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
             chart[:BASE] = [x, y, z, yaw, base[4], lean]
             for column, sign in shoulders:
                 chart[column] = body.stance[column] + sign * np.interp(t, fine, arms)
+            if p.flying and task.rotation_rad:
+                rows.append(_folded(body, chart, (t - starts[k]) / (starts[k + 1] - starts[k])))
+                continue
             goals = {side: _foot(schedule, holds, task, k, side, t, starts, leg) for side in (0, 1)}
             chart, left = reach(chart, goals, list(p.modes))
             if left > REACHED:  # a leg that was drawn somewhere is no beginning
@@ -192,6 +196,19 @@ def _swung(t, start: float, end: float) -> np.ndarray:
     return np.interp(t, times, [0.0, crouch, left, middle, landed, 0.0])
 
 
+def _folded(body: Body, chart: np.ndarray, share: float) -> np.ndarray:
+    """The chart with legs as in the stance, folded in the middle of the flight: they turn over with the body."""
+    found, (first, last) = chart.copy(), FOLDED
+    legs = sorted({k for side in body.legs for k in side})
+    found[legs] = body.stance[legs]
+    fold = FOLD_RAD * _smooth(share / first) * (1 - _smooth((share - last) / (1 - last)))
+    for k, sign, _ in body.knees:
+        found[BASE + k] += sign * fold
+    for name, sign in zip(body.robot.joints["hip_pitch"], body.robot.sagittal.signs[0], strict=True):
+        found[BASE + body.joint_names.index(name)] -= sign * fold
+    return found
+
+
 def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray, leg: float) -> pin.SE3:
     """Where the middle of a toe edge is at one instant."""
     contacts = schedule.contacts
@@ -220,9 +237,6 @@ def _foot(schedule, holds, task, k: int, side: int, t: float, starts: np.ndarray
     tip = HEEL_UP * (1 - u) ** 2 if phases[left].modes[side] == "toe" else 0.0
     way = pin.rpy.rpyToMatrix(0.0, tip, yaw)
     place = np.array([x, y, z + lift])
-    if task.rotation_rad and phases[k].flying:  # legs turn with the body
-        s = (t - starts[k]) / (starts[k + 1] - starts[k])
-        way = way @ pin.rpy.rpyToMatrix(0.0, task.rotation_rad * s, 0.0)
     return pin.SE3(way, place)
 
 

@@ -17,7 +17,7 @@ from jumplab.ocp.problem import Point, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.reduction import even_masses, mirror
-from jumplab.robot.stance import knees, stance_angles, stance_configuration
+from jumplab.robot.stance import knees, leg_length, stance_angles, stance_configuration
 from jumplab.robot_import.config import ROLES
 from jumplab.stages.whole_body.contacts import SIDES
 from jumplab.stages.whole_body.coordinates import BASE, PITCH, Coordinates, whole
@@ -94,6 +94,16 @@ class Body:
         self.motors = {key: np.array([r[key] for r in rows]) for key in rows[0]}
         self.legs = [self._leg(side, configuration) for side in (0, 1)]
         self.ankle_m = float(data.oMi[self.feet[0] + 1].translation[2])
+
+    @cached_property
+    def leg_m(self) -> float:
+        """Length l of the legs in the stance [m]."""
+        return leg_length(self.robot)
+
+    @property
+    def spin_size(self) -> float:
+        """Natural size of angular momenta m l sqrt(g l) [kg m^2/s]."""
+        return float(self.model.mass * self.leg_m * np.sqrt(GRAVITY * self.leg_m))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -444,13 +454,15 @@ class WholeBodyTerms:
     def sides_apart(self) -> list[Term]:
         """Left and right knees, ankles, toes and heels keep a share of their distance in the stance, seen from the
         trunk; hands stay outside. Cheap rows, which hold for most motions what distances of links would. In the plane
-        nothing moves across it."""
-        if self.free.plane:
+        legs do not move across it."""
+        if self.robot.planar and self.free.plane:
             return []
         body, lim, state = self.body, self.limits, self.state
         pairs = [[(1 + k, np.zeros(3)) for k, _, _ in body.knees], [(k, np.zeros(3)) for k in body.feet]]
         pairs += [list(zip(body.feet, places, strict=True)) for places in (body.tips, body.corners[:, 2:].mean(axis=1))]
         hands = body.limb_points[2:]
+        if self.free.plane:
+            pairs = []
         if self.free.even:
             hands = [hand for hand in hands if hand[0] in self.model.left_half]
 
@@ -684,6 +696,8 @@ class WholeBodyTerms:
     def capture_rows(self) -> list[Term]:
         """Where the soles meet the ground, so that the robot can be caught; of a flip by its momentum."""
         moment, window = self.limits.capture_moment, self.limits.capture_window_m
+        if moment is not None:
+            moment = moment * self.body.spin_size
         if moment is None:
             how = {"at": "end", "scale": PLACE_SCALE}
             return [row("capture window", "ours; replaces WF-E2", "m", self.capture, -window, window, **how)]
@@ -703,6 +717,7 @@ class WholeBodyTerms:
         """A flip forward asks for its angular momentum about the soles, which the impact does not change; a flip
         backward for its capture point, x + v_x / sqrt(g / z), ahead of the toes."""
         lim, mass, body = self.limits, self.model.mass, self.body
+        slope_s = lim.capture_backward_slope * float(np.sqrt(body.leg_m / GRAVITY))
 
         def moved(p, local):
             """Arm from a point of the left foot to the CoM, and L about that point over the mass."""
@@ -715,7 +730,8 @@ class WholeBodyTerms:
 
         def backward(p):
             arm, left = moved(p, body.tips[0])
-            return arm[0] + left / ca.sqrt(p.p.gravity * arm[1]) + lim.capture_backward_slope_s * p.p.takeoff_speed
+            # far from a landing the CoM of a start may be below the toes
+            return arm[0] + left / ca.sqrt(p.p.gravity * ca.fmax(arm[1], body.leg_m / 2)) + slope_s * p.p.takeoff_speed
 
         def one_way(of, sign, bounds):  # in flips of the other direction the row is a constant inside its bounds
             return lambda p: ca.if_else(sign * p.p.rotation > 0, of(p), sum(bounds) / 2)
@@ -723,7 +739,8 @@ class WholeBodyTerms:
         def end(name, way, unit, of, bounds, scale):
             return row(name, f"ours, for flips {way}; replaces WF-E2", unit, of, *bounds, at="end", scale=scale)
 
-        ahead, back = lim.capture_forward, lim.capture_backward_m
+        ahead = [x * body.spin_size for x in lim.capture_forward]
+        back = [x * body.leg_m for x in lim.capture_backward]
         return [
             end("capture by momentum", "forward", "kg m^2/s", one_way(forward, 1, ahead), ahead, SPIN_SCALE),
             end("capture beyond the toes", "backward", "m", one_way(backward, -1, back), back, PLACE_SCALE),
