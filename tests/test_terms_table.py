@@ -12,25 +12,33 @@ from pathlib import Path
 
 import numpy as np
 
-from jumplab.models.spatial import SpatialModel
 from jumplab.ocp import Bound, Problem
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
-from jumplab.robot.stance import stance_angles, stance_configuration
-from jumplab.stages import srmp, whole_body
+from jumplab.stages import srmp
 from jumplab.stages.joint_qp.settings import GENTLE, Options
-from jumplab.stages.whole_body import Contacts, Limits, Weights
+from jumplab.stages.srmp import SrmpSettings
+from jumplab.stages.whole_body import Contacts, Limits, Mesh, Weights, coordinates
 from jumplab.stages.whole_body.planner import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.settings import SPATIAL_MESH
 from jumplab.stages.whole_body.terms import Body
-from jumplab.stages.srmp import SrmpSettings
-from jumplab.stages.whole_body import Limits, Weights
 from jumplab.task import JumpTask
 
 TABLE = Path(__file__).with_name("terms.txt")
 TARGET = JumpTask(0.6, 0.4, 0.3)  # for which the bounds that depend on the target are told
 ROUNDING = 1e-12  # below, a number is zero
+PROGRAMS = "direct", "whole body", "spatial"  # the whole-body program in the plane, there with stage 1, and in space
+
+
+def program(body: Body, name: str, contacts: Contacts | None = None, *, flip: bool = False) -> Problem:
+    """The whole-body program under the name of a stage; of a standing jump without ``contacts``."""
+    limits, weights, mesh = Limits(), Weights(), Mesh()
+    if flip:
+        limits, weights, mesh = limits.of_flip(), weights.of_flip(), mesh.of_flip()
+    free = coordinates.whole(body) if name == "spatial" else coordinates.even(body)
+    contacts = contacts or jump_contacts(limits, mesh)
+    how = dict(name=name, free=free, tracking=name == "whole body")
+    return Schedule(body, contacts, limits, weights, **how).problem()
 
 
 def number(x) -> str:
@@ -47,12 +55,16 @@ def lines(problem: Problem, parameters: dict) -> Iterator[str]:
         return f"{number(low)} ... {number(high)}"
 
     for phase in problem.phases:
-        yield f"{problem.name}/{phase.name} | duration | {told(*phase.duration)} s | {phase.intervals} intervals"
+        head = f"{problem.name}/{phase.name}"
+        yield f"{head} | duration | {told(*phase.duration)} s | {phase.intervals} intervals"
+        if phase.integrated is not None:
+            given = [x for x in phase.coordinates if x not in phase.integrated]
+            yield f"{head} | integrated | {', '.join(phase.integrated)} | not {', '.join(given) or 'any'}"
         if phase.shared:
-            yield f"{problem.name}/{phase.name} | shares {phase.shared} with the phase before"
+            yield f"{head} | shares {phase.shared} with the phase before"
         for name, (low, high, scale, *key) in phase.constants.items():
             how = f"scale {number(scale)}" + "".join(f" | {x}" for x in key)
-            yield f"{problem.name}/{phase.name} | constant {name} | {told(low, high)} | {how}"
+            yield f"{head} | constant {name} | {told(low, high)} | {how}"
     for owner, x in (*problem.terms(), *problem.bounds()):
         head = f"{problem.place(owner)} | {x.name} | {x.equation}"
         if isinstance(x, Bound):
@@ -67,18 +79,17 @@ def lines(problem: Problem, parameters: dict) -> Iterator[str]:
 def table() -> str:
     """The file's text."""
     robot = Robot.load()
-    values = dict(stance=stance_angles(robot), distance=TARGET.distance_m, platform=TARGET.platform_m, edge=0.4)
-    values |= dict(takeoff_speed=TARGET.takeoff_speed, rotation=0.0, gravity=TARGET.gravity, momentum=1.0, launch_s=1.0)
-    rod = srmp.parameters(TARGET, reach(robot))
-    found = [*lines(srmp.build_problem(robot), rod), *lines(whole_body.build_problem(robot), values)]
+    body, rod = Body(robot), srmp.parameters(TARGET, reach(robot))
+    found = [*lines(srmp.build_problem(robot), rod)]
     flips = [*lines(srmp.build_problem(robot, SrmpSettings().of_flip()), rod)]
-    flips += lines(whole_body.build_problem(robot, limits=Limits().of_flip(), weights=Weights().of_flip()), values)
+    for name in PROGRAMS:
+        free = coordinates.whole(body) if name == "spatial" else coordinates.even(body)
+        given = {"stance": free.taken(body.stance), "yaw": 2 * np.pi, "takeoff_speed": TARGET.takeoff_speed}
+        found += lines(program(body, name), given)
+        flips += lines(program(body, name, flip=True), given)
+        if name == "spatial":
+            found += lines(program(body, name, Contacts.hop(robot)), given)
     found += [f"of a flip: {line}" for line in flips if line not in found]
-    stance = SpatialModel(robot.model).of_pinocchio(stance_configuration(robot)[None])[0]
-    body, limits, weights = Body(robot), Limits(), Weights()
-    given = {"stance": stance, "yaw": 2 * np.pi, "takeoff_speed": TARGET.takeoff_speed}
-    for contacts in (jump_contacts(limits, SPATIAL_MESH), Contacts.hop(robot)):
-        found += lines(Schedule(body, contacts, limits, weights).problem(), given)
     for name, options in (("joint qp", Options()), ("joint qp, gentle", GENTLE)):
         for part, fields in asdict(options).items():
             rows = fields.items() if isinstance(fields, dict) else [("", fields)]
@@ -93,19 +104,21 @@ def test_every_term_is_as_the_table_says():
 
 
 def test_the_table_is_whole():
-    stages = [line.partition("/")[0] for line in TABLE.read_text().splitlines()]
-    assert (
-        stages.count("SRMP") > 60
-        and stages.count("whole body") > 60
-        and stages.count("joint qp") > 30
-        and stages.count("spatial") > 60
-    )
+    stages = [re.split("[/|]", line)[0].strip() for line in TABLE.read_text().splitlines()]
+    least = {"SRMP": 60, "joint qp": 30, "direct": 60, "whole body": 75, "spatial": 150}
+    assert {name: stages.count(name) > count for name, count in least.items()} == dict.fromkeys(least, True)
+    assert {f"of a flip: {name}" for name in ("SRMP", *PROGRAMS)} <= set(stages)
 
 
-# the paper's equations that stages 1 and 3 keep, relax or weigh; SL-D1 and WL-K1 are how their models are built
-EQUATIONS = {"SRMP": "SL-J1..J5, SL-E1..E6, SL-P1..P5, SL-B1, SF-J1, SF-D1, SF-E1, SF-L1..L4, SF-B1",
-             "whole body": "WL-J1..J3, WL-D1, WL-K2, WL-E1, WF-J1..J2, WF-D1, WF-L1..L3, WF-E1..E2, SL-E1..E4, SL-E6, "
-             "SL-P2"}  # fmt: skip
+# the paper's equations that stages keep, relax or weigh; SL-D1 and WL-K1 are how their models are built. Of stage 3's,
+# WF-L1..L3 are how phases share their nodes, SL-E2 is a constant of the flight, SL-P2 is where forces act on the sole.
+OF_BODY = "WL-J2, WL-K2, WL-E1, WF-J2, WF-D1, WF-E1..E2, SL-E1, SL-E3..E4, SL-E6"
+EQUATIONS = {
+    "SRMP": "SL-J1..J5, SL-E1..E6, SL-P1..P5, SL-B1, SF-J1, SF-D1, SF-E1, SF-L1..L4, SF-B1",
+    "direct": OF_BODY,
+    "whole body": f"{OF_BODY}, WL-J1, WL-J3, WL-D1, WF-J1",
+    "spatial": OF_BODY,
+}
 
 
 def equations(text: str) -> set[str]:
@@ -118,9 +131,20 @@ def equations(text: str) -> set[str]:
     return found
 
 
+def test_phases_share_their_nodes_and_the_flight_has_the_speed_of_the_target():
+    """WF-L1..L3 and SL-E2, WL-E1, for which there are no terms."""
+    body = Body(Robot.load())
+    for name in PROGRAMS:
+        flat, toe, flight = program(body, name).phases
+        assert (flat.shared, toe.shared, flight.shared) == ("", "qvaz", "qvaz")
+        low, high, *_ = flight.constants["vel_z"]
+        assert low({"takeoff_speed": 2.5}) == high({"takeoff_speed": 2.5}) == 2.5
+
+
 def test_equations_of_the_paper_and_terms_in_force_belong_together():
     """No equation without a term that weighs or binds something, and no term of an equation that is not known."""
-    for problem in (srmp.build_problem(Robot.load()), whole_body.build_problem(Robot.load())):
+    body = Body(Robot.load())
+    for problem in (srmp.build_problem(body.robot), *(program(body, name) for name in PROGRAMS)):
         named, in_force = set(), set()
         for _, x in (*problem.terms(), *problem.bounds()):
             named |= equations(x.equation)

@@ -27,7 +27,8 @@ SHORTEST_STEP = 0.05  # share of a sample; a shorter last step is joined to the 
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 JOINING_S = 0.05  # over which a phase passes from where the one before ended on the tape to its own plan
 LANDINGS, LANDED_RAD = 10, 1e-6  # corrections of a flight's end at most, in a jump two or three; the last is less
-SLOW, DIFFERENCE = 0.5, 1e-5  # a correction that leaves more than that share; for a derivative [rad, rad/s]
+EVEN = 1e-9  # [kg m^2/s, kg m^2, rad] up to which nothing turns the base but about its pitch axis
+SLOW, DIFFERENCE = 1.0, 1e-5  # a correction that leaves more than that share; for a derivative [rad, rad/s]
 WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, where a missing wrench is shared out
 FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
@@ -149,14 +150,15 @@ def _pressed_outside(tape: Tape, robot: Robot) -> np.ndarray:
 def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
     """How far the middle between the soles moves (3,) [m], and by how much the feet turn about the vertical [rad]."""
     model, data = robot.model, robot.model.createData()
-    ends, turn = [], []
-    for x in q:
+    ids = [model.getFrameId(name) for name in robot.foot.frames]
+    left, ends = np.zeros((len(q), 3)), []
+    for k, x in enumerate(q):
         pin.framesForwardKinematics(model, data, x)
-        frames = [data.oMf[model.getFrameId(name)] for name in robot.foot.frames]
-        ends.append(np.mean([f.act(robot.foot.center) for f in frames], axis=0))
-        left = np.mean([f.rotation[:, 1] for f in frames], axis=0)  # it stays level in a flip, too
-        turn.append(np.arctan2(-left[0], left[1]))
-    turned = np.unwrap(turn)
+        for i in ids:
+            left[k] += data.oMf[i].rotation[:, 1]  # it stays level in a flip, too
+        if k in (0, len(q) - 1):
+            ends.append(sum(data.oMf[i].act(robot.foot.center) for i in ids) / len(ids))
+    turned = np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
     return {"soles_travel": ends[-1] - ends[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
@@ -372,6 +374,9 @@ def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, 
     for k, (qj, vj) in enumerate(zip(*joints[:2], strict=True)):
         pin.ccrba(model.model, data, np.concatenate([neutral, qj]), np.concatenate([zero, vj]))
         own[k], carried[k] = data.Ag[3:, 3:6], data.hg.angular
+    n = len(t)
+    if max(np.abs(x).max() for x in (spin[[0, 2]], carried[:, [0, 2]], own[:, 1, [0, 2]], chart0[:2])) < EVEN:
+        return _pitching((spin[1] - carried[:, 1]) / own[:, 1, 1], chart0, t)
     own, (x, y, z) = np.linalg.inv(own), spin.tolist()
 
     def rate(angles, k):
@@ -383,7 +388,7 @@ def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, 
         yaw = (cp * wz - sp * wx) / cr
         return np.array([yaw, cp * wx + sp * wz, wy - sr * yaw])
 
-    n, chart = len(t), np.empty((len(t), 3))
+    chart = np.empty((n, 3))
     chart[0] = chart0
     for k in range(n - 1):  # Runge and Kutta, fourth order
         h, here, mid = t[k + 1] - t[k], chart[k], n + k
@@ -392,6 +397,16 @@ def _turning(model: SpatialModel, joints, chart0: np.ndarray, spin: np.ndarray, 
         k3 = rate(here + h / 2 * k2, mid)
         chart[k + 1] = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(here + h * k3, k + 1))
     return chart, np.array([rate(angles, k) for k, angles in enumerate(chart)])
+
+
+def _pitching(rate: np.ndarray, chart0: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same where only the pitch turns: its ``rate`` at times ``t`` and half-way, which asks for no attitude."""
+    n = len(t)
+    chart, rates = np.tile(chart0, (n, 1)), np.zeros((n, 3))
+    rates[:, 2] = rate[:n]
+    gained = np.diff(t) / 6 * (rate[: n - 1] + 4 * rate[n:] + rate[1:n])
+    chart[1:, 2] += np.cumsum(gained)
+    return chart, rates
 
 
 def _missed(body: Body, flight: PhaseSolution, last, sides: list[int]) -> tuple[np.ndarray, np.ndarray]:
