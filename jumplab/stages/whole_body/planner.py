@@ -287,7 +287,16 @@ class WholeBodyPlanner:
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
         if (less := self._even_one(task, weights or {}, stance)) is not None:
-            return less.plan(task, srmp, begin=begin, weights=weights, near=near, stance=stance)
+            how: dict[str, Any] = {"begin": begin, "weights": weights, "near": near, "stance": stance}
+            if less.free.plane:
+                return less.plan(task, srmp, **how)
+            explained = EXPLAINED.set(False)
+            try:
+                return less.plan(task, srmp, **how)
+            except SolverError:
+                pass  # perhaps an uneven motion does it
+            finally:
+                EXPLAINED.reset(explained)
         weights = self.changes.spread(self.nlp.problem, weights or {})
         asked = Asked(task, self.parameters(task, stance, srmp), weights, self._references(srmp), [], srmp)
         best, failure = None, None
