@@ -13,11 +13,13 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, replace
 
 import pytest
+from test_terms_table import program
 
 from jumplab.ocp import Problem
 from jumplab.robot import Robot
-from jumplab.stages import srmp, whole_body
+from jumplab.stages import srmp
 from jumplab.stages.joint_qp.settings import FlightWeights, LaunchWeights, Options
+from jumplab.stages.whole_body.terms import Body
 
 TESTS = ("tests/test_terms_table.py", "tests/test_terms_values.py")
 FACTOR, LEAST = 10.0, 0.95
@@ -64,9 +66,13 @@ def dearer(weights: LaunchWeights | FlightWeights, name: str) -> Iterator[None]:
 
 
 def mutants() -> Iterator[tuple[str, Callable]]:
-    """(name, what makes it) of each mutant of the three stages."""
-    robot = Robot.load()
-    for problem in (srmp.build_problem(robot), whole_body.build_problem(robot)):
+    """(name, what makes it) of each mutant of the three stages, of the last one in the plane and in space.
+
+    The direct planner's terms are those of "whole body": a test compares them one by one.
+    """
+    body = Body(Robot.load())
+    programs = (program(body, name) for name in ("whole body", "spatial"))
+    for problem in (srmp.build_problem(body.robot), *programs):
         for owner, x in (*problem.terms(), *problem.bounds()):
             yield f"{problem.place(owner)}/{x.name}", lambda a=(problem.name, owner, x.name): changed(*a)
     for part in ("launch", "flight"):

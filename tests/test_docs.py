@@ -118,12 +118,14 @@ def test_readme_points_at_files_that_exist():
 
 def test_readme_says_the_friction_that_plans_obey():
     """Each stage's, at its nodes; and what the audit refuses between them is the least that trials simulate."""
-    sentence = r"Plans count on a friction of ([\d.]+) at their nodes, and between them stay below ([\d.]+)"
+    sentence = r"Stage 3 counts on a friction of ([\d.]+) at its nodes, stages 1 and 2 on ([\d.]+); "
+    sentence += r"between nodes plans stay below ([\d.]+)"
     said = re.search(sentence, " ".join(README.split()))  # lines may break anywhere
-    settings = srmp.settings.SrmpSettings, joint_qp.settings.Limits, whole_body.Limits
-    assert {s().friction for s in settings} == {FRICTION} and whole_body.Limits().of_flip().friction == FRICTION
-    assert float(said[1]) == FRICTION
-    assert float(said[2]) == LIMITS["friction used"].limit == Ranges().friction[0]
+    assert {s().friction for s in (srmp.settings.SrmpSettings, joint_qp.settings.Limits)} == {FRICTION}
+    limits = whole_body.Limits()
+    assert float(said[1]) == limits.friction == limits.of_flip().friction < float(said[2])
+    assert float(said[2]) == FRICTION
+    assert float(said[3]) == LIMITS["friction used"].limit == Ranges().friction[0]
 
 
 def test_these_checks_can_fail():

@@ -43,7 +43,9 @@ def random_motion(n=5, seed=0):
 
 # sampling -------------------------------------------------------------------------------------------------------
 def test_sampling_at_one_kilohertz(plan):
-    t, i, body = plan.tape.t, plan.tape.takeoff_index, plan.whole_body
+    t = plan.tape.t
+    i = plan.tape.takeoff_index
+    body = plan.whole_body
     assert t[0] == 0.0 and t[i] == t[i - 1]
     step = np.diff(t)
     np.testing.assert_allclose(np.delete(step, [i - 1, len(step) - 1]), 1e-3, atol=1e-12)
@@ -54,7 +56,8 @@ def test_sampling_at_one_kilohertz(plan):
 
 def within(plan, name):
     """Rows of the tape within a phase, its solution, and times since it began."""
-    phases, tape = plan.whole_body.phases, plan.tape
+    phases = plan.whole_body.phases
+    tape = plan.tape
     start = tape.takeoff_time - plan.whole_body.launch_s
     for other, phase in phases.items():
         if other == name:
@@ -71,7 +74,8 @@ def test_samples_on_the_ground_are_the_planners_own_interpolant(chart, plan, nam
     """Base, arms and the pitch of the foot on all three levels; legs follow. On the toes the base moves a little."""
     rows, phase, at = within(plan, name)
     arms = [BASE + plan.robot.joint_names.index(n) for n in plan.robot.joints["shoulder_pitch"]]
-    planned, n = phase.sample(at), chart[0].shape[1]
+    planned = phase.sample(at)
+    n = chart[0].shape[1]
     for mine, theirs, foot in zip(chart, planned, ("angles", "rates", "accels"), strict=True):
         columns = [0, *arms] if name == "flat" else arms
         columns = [1, 2, 3, 4, 5, *columns]
@@ -93,7 +97,8 @@ def test_samples_in_flight_are_the_planners_own_interpolant(chart, plan):
 
 
 def test_flat_foot_is_flat_and_the_toe_stands(plan):
-    extra, launch = plan.tape.extra, plan.tape.phase == "launch"
+    extra = plan.tape.extra
+    launch = plan.tape.phase == "launch"
     flat = plan.tape.t < float(extra["planar_toe_phase_start"])
     assert np.abs(extra["planar_angles"][flat, 0]).max() < 1e-9 and flat.sum() > 100
     for name in ("toe", "toe_velocity", "toe_acceleration"):
@@ -102,8 +107,10 @@ def test_flat_foot_is_flat_and_the_toe_stands(plan):
 
 def test_toe_follows_from_the_parabola(plan, bhr):
     """That of the plan but for what it misses between the nodes; and nothing but gravity moves the CoM on the tape."""
-    extra, flying = plan.tape.extra, plan.tape.phase == "flight"
-    c, t = plan.whole_body.phases["flight"].constants, plan.tape.t[flying] - plan.tape.takeoff_time
+    extra = plan.tape.extra
+    flying = plan.tape.phase == "flight"
+    c = plan.whole_body.phases["flight"].constants
+    t = plan.tape.t[flying] - plan.tape.takeoff_time
     columns = ("angles", "rates", "accels", "toe_acceleration")
     rel = planar_quantities(bhr, *(extra[f"planar_{k}"][flying] for k in columns), 9.8)
     com = extra["planar_toe"][flying] + rel["com"] - bhr.sagittal.sole_center  # from the middle of the soles
@@ -116,26 +123,34 @@ def test_toe_follows_from_the_parabola(plan, bhr):
 @pytest.mark.parametrize("flat_s, toe_s", [(0.5, 0.1), (0.5004, 0.1), (0.49999, 0.10001), (0.2501, 0.0609)])
 def test_takeoff_falls_on_a_sample_for_any_duration(bhr, flat_s, toe_s):
     """Durations that are no multiple of a millisecond: still 1 kHz, at rest before the start, exact at the end."""
-    body, durations = Body(bhr), {"flat": flat_s, "toe": toe_s, "flight": 0.3337}
+    body = Body(bhr)
+    durations = {"flat": flat_s, "toe": toe_s, "flight": 0.3337}
     named = [ContactPhase(f, (0.05, 1.5), s, 3, n) for f, (n, s) in zip(FEET, durations.items(), strict=True)]
     schedule = Schedule(body, Contacts(tuple(named), ends="touchdown"), Limits(), Weights())
     still = [np.tile(body.stance, (4, 1)) for _ in named]
     guess = starts.guess(schedule, starts.Motion(np.array(list(durations.values())), still))
     phases = {}
     for name, g in guess.items():
-        t, q, v, a = np.linspace(0, g.duration, 4), g.q.copy(), 0 * g.q, 0 * g.q
+        t = np.linspace(0, g.duration, 4)
+        q = g.q.copy()
+        v = 0 * g.q
+        a = 0 * g.q
         if name == "flight":  # let go, it falls
-            q[:, 2], v[:, 2], a[:, 2] = q[:, 2] - 4.9 * t**2, -9.8 * t, -9.8
+            q[:, 2] = q[:, 2] - 4.9 * t**2
+            v[:, 2] = -9.8 * t
+            a[:, 2] = -9.8
         phases[name] = PhaseSolution(t, q, v, a, 0 * q[1:], g.z, g.duration, g.constants, exact=False)
     tape = make_tape(schedule, phases, 9.8)
-    i, t = tape.takeoff_index, tape.t
+    i = tape.takeoff_index
+    t = tape.t
     assert t[0] == 0.0 and t[i] == t[i - 1]
     np.testing.assert_allclose(np.diff(t[:i]), 1e-3, atol=1e-12)
     assert flat_s + toe_s - 1e-12 <= t[i] < flat_s + toe_s + 1e-3
     assert np.all(np.diff(t[i:]) > 0.05e-3 - 1e-12) and t[-1] - t[i] == pytest.approx(0.3337, abs=1e-12)
     flat = t[:i] < flat_s  # on its toes it tips over
     np.testing.assert_allclose(tape.q[:i][flat], tape.q[:1].repeat(flat.sum(), axis=0), atol=1e-12)
-    since, com = (t[i:] - t[i])[:, None], tape.extra["com"][i:]
+    since = (t[i:] - t[i])[:, None]
+    com = tape.extra["com"][i:]
     fallen = com[0] + since * tape.extra["com_velocity"][i] - [0.0, 0.0, 4.9] * since**2
     np.testing.assert_allclose(com, fallen, atol=1e-9)
 
@@ -190,7 +205,8 @@ def test_gravity_of_the_task_reaches_the_torques(bhr):
 
 def test_the_tape_comes_back_from_its_planar_columns(plan):
     """Link angles and the toe's path are the whole motion."""
-    tape, extra = plan.tape, plan.tape.extra
+    tape = plan.tape
+    extra = plan.tape.extra
     links = [extra[f"planar_{name}"] for name in ("angles", "rates", "accels")]
     toes = [extra[f"planar_{name}"] for name in ("toe", "toe_velocity", "toe_acceleration")]
     toes[0] = toes[0] - plan.robot.sagittal.sole_center

@@ -1,8 +1,8 @@
-"""Flips: the guess turns, the plan turns, its physics is looked at by other code, and the robot lands it."""
+"""Flips: the start turns, the plan turns, its physics is looked at by other code, and the robot lands it."""
 
+import time
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -17,18 +17,20 @@ from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
 from jumplab.sim.kinematics import Gauge, rotation, turned
 from jumplab.sim.playback import Actuators
 from jumplab.sim.reaim import FROM_SHARE, LATER_S, SOONER_S, Tuck, is_flip
-from jumplab.stages.changes import StageChanges
 from jumplab.stages.planner import Planner
-from jumplab.stages.reconstruction import planar_quantities
-from jumplab.stages.whole_body import FlipPlanner, Limits, Mesh, Weights, WholeBodyPlan
-from jumplab.stages.whole_body.flips import CLIMB_M, EASY_M, climb
+from jumplab.stages.reconstruction import planar_quantities, to_link_angles
+from jumplab.stages.whole_body import Limits, Mesh, Weights, WholeBodyPlanner, starts
+from jumplab.stages.whole_body.coordinates import even
+from jumplab.stages.whole_body.planner import GIVEN
+from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
-from jumplab.stages.whole_body.terms import relative
+from jumplab.stages.whole_body.terms import Body
 from jumplab.studies import robust
 from jumplab.studies.trials import TrialKey
 from jumplab.task import JumpTask
 
 TURN = 2 * np.pi
+STANCE_PITCH_RAD = 0.05  # of the trunk
 
 
 @lru_cache
@@ -42,62 +44,49 @@ def backflip():
 
 
 @pytest.mark.parametrize("turns", (-2, -1, 1, 2))
-def test_guess_turns_as_asked_and_goes_where_it_should(turns):
-    """The foot of the guess ends flat after whole turns, and its toe ends near the target."""
+def test_start_turns_as_asked_and_goes_where_it_should(turns):
+    """The trunk ends after whole turns, near upright; the sole nearly flat and near the target; nothing jumps.
+
+    Legs are those of the stance, turned over with the trunk: they end as far off as it leans.
+    """
     flips = planner().stage("direct flip")
     task = JumpTask(0.2, 0.5, rotation_rad=turns * TURN)
-    guess = flips.naive_guess(task)
-    assert abs(guess["flight"].q[-1, 0] - turns * TURN) < 0.01
-    assert np.abs(np.diff(guess["flight"].q, axis=0)).max() < 1.0  # no jump on the way
+    schedule = Schedule(flips.body, flips.contacts, flips.limits, flips.weights, free=flips.free)
+    motion = starts.along(schedule, task)
+    guess = starts.guess(schedule, motion)
+    flown = motion.charts[-1]
+    lean = flown[-1, 5] - turns * TURN
+    assert 0.0 < lean < 0.3
+    assert np.abs(np.diff(flown, axis=0)).max() < 1.0  # no jump on the way
     assert {n: len(g.q) - 1 for n, g in guess.items()} == flips.mesh.intervals()
-    np.testing.assert_allclose(guess["flat"].q[0], flips.stance[1:])
+    np.testing.assert_allclose(guess["flat"].q[0], flips.free.taken(flips.body.stance))
+    robot = flips.robot
+    model = robot.model
+    data = model.createData()
+    frame = model.getFrameId(robot.foot.frames[0])
+    q = flips.body.model.to_pinocchio(flown[-1:], 0 * flown[-1:], 0 * flown[-1:])[0][0]
+    pin.framesForwardKinematics(model, data, q)
+    foot = data.oMf[frame]
+    assert np.arctan2(-foot.rotation[2, 0], foot.rotation[0, 0]) == pytest.approx(lean - STANCE_PITCH_RAD, abs=1e-6)
+    np.testing.assert_allclose(foot.act(robot.foot.tip) - flips.body.places[0], [0.2, 0.0, 0.0], atol=0.15)
 
 
 def test_a_jump_keeps_its_own_limits():
     """What flips need is a copy: jumps without rotation have another planner and the settings of before."""
-    assert Limits().capture_moment is None and Limits().jerk_step is None and Limits().cop_reserve_m == 0
+    assert Limits().capture_moment is None and Limits().cop_reserve_m == 0 and Limits().least_push == 0
     assert Limits().touchdown_ankle_stroke is None
     assert Limits().touchdown_trunk_rate == 1.0 and Limits().of_flip().touchdown_trunk_rate == 5.0
     assert Limits().of_flip().torque_share == Limits().torque_share == 0.85  # the stated margin
-    assert Mesh() == Mesh(25, 20, 30) and Weights().jerk < Weights().of_flip().jerk
-    assert isinstance(planner().stage("direct flip"), FlipPlanner)
-    assert not isinstance(planner().stage("direct"), FlipPlanner)
-
-
-def test_a_high_flip_is_reached_by_lower_ones():
-    task = JumpTask(0.2, 0.7, rotation_rad=TURN)
-    way = climb(task)
-    assert way[0].height_m == EASY_M and way[-1] is task
-    assert max(b.height_m - a.height_m for a, b in pairwise(way)) <= CLIMB_M + 1e-9
-    assert all((t.distance_m, t.rotation_rad) == (0.2, TURN) for t in way)
-    assert climb(JumpTask(0.2, EASY_M, rotation_rad=TURN)) == [JumpTask(0.2, EASY_M, rotation_rad=TURN)]
-
-
-def test_changes_begin_with_the_flip_without_them(monkeypatch):
-    """The usual flip first; only where that leads nowhere, and no guess is given, a search with the changes."""
-    mesh, calls, task = Mesh(4, 4, 4), [], JumpTask(0.0, 0.5, rotation_rad=TURN)
-    same, other = (StageChanges(weights={"torque": w}) for w in (Weights().torque, 1.0))
-    assert FlipPlanner(Robot.load(), mesh, changes=same)._usual is None
-    flips = FlipPlanner(Robot.load(), mesh, tracking=False, changes=other)
-    usual, nothing = flips._usual, SolverError("no way", stage="direct")
-    near = WholeBodyPlan(task, "usual")
-
-    def found(self, task, srmp, guess, weights, off, stage1):
-        calls.append("usual" if self is usual else "search")
-        if guess is not None:
-            raise nothing
-        return near
-
-    monkeypatch.setattr(FlipPlanner, "_searched", found)
-    monkeypatch.setattr(FlipPlanner, "_run", lambda self, solve, asked, start, **how: f"from {start}")
-    assert flips.plan(task).solution == "from usual" and calls == ["usual"]
-    assert usual.plan(task).solution == "usual" and usual.plan(task, weights={"jerk": 1.0}).solution == "from usual"
-    calls.clear()
-    with pytest.raises(SolverError, match="no way"):
-        flips.plan(task, guess="lost")
-    assert calls == ["usual"]
-    monkeypatch.setattr(FlipPlanner, "_run", lambda *a, **k: (_ for _ in ()).throw(nothing))
-    assert flips.plan(task).solution == "usual" and calls == ["usual", "usual", "search"]
+    finer = Mesh().of_flip().intervals()
+    assert all(finer[name] >= 2 * n for name, n in Mesh().intervals().items())
+    lighter = {k for k, w in vars(Weights().of_flip()).items() if w < vars(Weights())[k]}
+    assert lighter == {"track_inertia", "track_inertia_rate", "track_flight_inertia_rate"}
+    for kind in ("direct", "whole body", "spatial"):
+        usual = planner().stage(kind)
+        flips = planner().stage(f"{kind} flip")
+        assert (usual.limits, usual.weights, usual.mesh) == (Limits(), Weights(), Mesh())
+        assert (flips.limits, flips.weights) == (Limits().of_flip(), Weights().of_flip())
+        assert flips.mesh == Mesh().of_flip()
 
 
 def test_rotation_is_whole_turns():
@@ -115,19 +104,21 @@ def test_backflip_passes_the_audit():
 
 
 @pytest.mark.slow
-def test_launch_keeps_its_cop_off_the_edges_and_its_jerks_even():
-    """From the solution's own nodes: 3 cm while nothing else holds the robot, and bounded steps of jerk."""
+def test_launch_keeps_its_cop_off_the_edges():
+    """From the motion at the solution's own nodes: 3 cm while nothing else holds the robot."""
     plan = backflip()
-    limits, phases, sagittal = Limits().of_flip(), plan.whole_body.solution.phases, plan.robot.sagittal
-    n = len(phases["flat"].j)
-    angles, rates, accels = (np.insert(getattr(phases["flat"], k), 0, 0.0, axis=1) for k in "qva")
-    wrench = planar_quantities(plan.robot, angles, rates, accels, np.zeros((n + 1, 2)), 9.8)["ground_wrench"]
+    limits = Limits().of_flip()
+    flat = plan.whole_body.phases["flat"]
+    robot = plan.robot
+    n = len(flat.t) - 1
+    model = plan.whole_body.schedule.body.model
+    links = to_link_angles(robot, *model.to_pinocchio(flat.q, flat.v, flat.a))
+    wrench = planar_quantities(robot, *links, np.zeros((n + 1, 2)), 9.8)["ground_wrench"]
     cop = -wrench[:, 2] / wrench[:, 1]  # from the toe
     held = slice(int(RESERVE_SHARE[0] * n) + 1, int((1 - RESERVE_SHARE[1]) * n))
     assert cop[held].max() < -limits.cop_reserve_m + 1e-4
-    assert cop[held].min() > sagittal.heel[0] + limits.cop_margin_m + limits.cop_reserve_m - 1e-4
-    jerks = np.concatenate([np.insert(phases["flat"].j, 0, 0.0, axis=1), phases["toe"].j, phases["flight"].j])
-    assert np.abs(np.diff(relative(jerks.T))).max() <= limits.jerk_step * 1.001
+    assert cop[held].min() > robot.sagittal.heel[0] + limits.cop_margin_m + limits.cop_reserve_m - 1e-4
+    assert wrench[:-1, 1].min() > limits.least_push * robot.total_mass * 9.8 - 0.1
 
 
 @pytest.mark.slow
@@ -272,12 +263,15 @@ def test_backflip_is_captured_beyond_the_toes():
     sagittal, L = plan.robot.sagittal, float(np.ravel(tape.extra["planar_L"])[-1])
     assert L < -15  # backward
     point = dx + (L / sagittal.total_mass + z * speed[0] - dx * speed[1]) / np.sqrt(9.8 * z)
-    point += limits.capture_beyond_slope_s * plan.task.takeoff_speed
-    low, high = limits.capture_beyond_toes_m
+    leg = plan.whole_body.schedule.body.leg_m
+    point += limits.capture_backward_slope * np.sqrt(leg / 9.8) * plan.task.takeoff_speed
+    low, high = leg * np.array(limits.capture_backward)
     assert low - 1e-3 <= point <= high + 1e-3
     stroke = float(np.ravel(tape.extra["planar_joints"][-1])[2]) - sagittal.lower[2]
     assert stroke >= Limits().of_flip().touchdown_ankle_stroke - 1e-3
-    assert abs(plan.whole_body.solution.phases["flight"].v[-1, 3]) <= 5.0 + 1e-6
+    assert abs(plan.whole_body.phases["flight"].v[-1, 5]) <= 5.0 + 1e-4  # as closely as the solver meets its rows
+    # on the tape L is kept between the nodes too, and legs that arrive make up for what the plan misses of it
+    assert abs(plan.tape.v[-1, 4]) <= 5.0 + 5e-3
 
 
 @pytest.mark.slow
@@ -294,8 +288,9 @@ def test_backflip_lands(mode):
 
 @pytest.mark.slow
 def test_three_steps_say_what_they_skipped():
-    plan = planner().plan(JumpTask(0.0, 0.5, rotation_rad=-TURN))
-    assert plan.srmp is not None
+    plan = planner().plan(JumpTask(0.0, 0.5, rotation_rad=-TURN), "three-step")
+    assert plan.srmp is not None and passport.audit(plan.tape, plan.robot, plan.task).passed
+    assert plan.whole_body.began(GIVEN[0].name) == (plan.skipped is None)
     assert (plan.joints is None) == bool(plan.skipped) == ("skipped" in plan.summary)
     if plan.skipped:
         assert plan.skipped.startswith("stage 2: ") and "stage 3 began from postures of a flip" in plan.skipped
@@ -303,18 +298,26 @@ def test_three_steps_say_what_they_skipped():
     assert abs(L / plan.srmp.launch.L[-1] - 1) <= Limits().of_flip().momentum_share + 0.01
 
 
+def flips_of(robot, **how):
+    """The direct planner of a robot's flips."""
+    body = Body(robot)
+    settings = Mesh().of_flip(), Limits().of_flip(), Weights().of_flip()
+    return WholeBodyPlanner(robot, *settings, body=body, free=even(body), **how)
+
+
 @pytest.mark.slow
 def test_a_flip_beyond_the_robot_is_refused_in_words():
     """Little effort stands for a hard target: no plan, and no minute of searching."""
-    flips = FlipPlanner(Robot.load(), tracking=False, options={"max_iter": 3})
-    with pytest.raises(SolverError, match="every search from a flip's postures ended so"):
-        flips.plan(JumpTask(0.0, 0.5, rotation_rad=TURN))
+    began = time.process_time()
+    with pytest.raises(SolverError, match=r"whole body: no plan \(Maximum_\w+_Exceeded after \d+ iterations\): "):
+        flips_of(Robot.load(), options={"max_iter": 3}).plan(JumpTask(0.0, 0.5, rotation_rad=TURN))
+    assert time.process_time() - began < 60
 
 
 @pytest.mark.slow
 def test_a_flip_that_motors_forbid_says_what_is_missing():
     """With a third of its efforts it does not come round: the rows that are missed are named, and by how much."""
-    weak = FlipPlanner(Robot.load().with_limits(effort=0.3), tracking=False, options={"max_iter": 50})
-    with pytest.raises(SolverError, match=r"the best compromise still violates .+ by .+; every search") as caught:
+    weak = flips_of(Robot.load().with_limits(effort=0.3), options={"max_iter": 50})
+    with pytest.raises(SolverError, match=r"the best compromise still violates .+ by .+; they leave") as caught:
         weak.plan(JumpTask(0.0, 0.5, rotation_rad=-TURN))
     assert caught.value.violations

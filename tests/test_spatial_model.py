@@ -221,7 +221,8 @@ def test_free_base_is_needed():
 # even motions -----------------------------------------------------------------------------------------------------
 def canted_shoulders(urdf: str = robots.GOOD, config: str = robots.config("canted_shoulders")) -> Robot:
     """A robot with shoulders that turn about axes 0.3 rad off the pitch axis, as mirror images."""
-    robot, angle = ET.fromstring(urdf), 0.3
+    robot = ET.fromstring(urdf)
+    angle = 0.3
     for side, sign in (("left", 1), ("right", -1)):
         axis = f"0 {math.cos(angle):.12f} {sign * math.sin(angle):.12f}"
         robots.joint(robot, f"{side}_shoulder_pitch").find("axis").set("xyz", axis)
@@ -264,12 +265,15 @@ def mirrored(x: np.ndarray, moment: bool = False) -> np.ndarray:
 def test_the_left_half_of_an_even_motion_stands_for_the_whole_tree(name):
     """Dynamics with a wrench on each foot, momentum and CoM; torques of the left half and of the middle."""
     body, kind, size = body_of(name), *EVEN[name][:2]
-    free, tree = coordinates.even(body), body.robot.model.copy()
+    free = coordinates.even(body)
+    tree = body.robot.model.copy()
     assert (free.kind, free.size, free.even) == (kind, size, True)
     tree.armature[6:] = 0.02
     model = SpatialModel(tree)
-    n, kept = len(model.names), [k - 1 for k in model.left_half if k]
-    (left, right), rng = body.feet, np.random.default_rng(2)
+    n = len(model.names)
+    kept = [k - 1 for k in model.left_half if k]
+    left, right = body.feet
+    rng = np.random.default_rng(2)
     assert left in model.left_half and right not in model.left_half
     q, v, a, loads = (ca.SX.sym(k, size) for k, size in (("q", n), ("v", n), ("a", n), ("loads", 12)))
     push = {left: (loads[:3], loads[3:6]), right: (loads[6:9], loads[9:])}
@@ -282,7 +286,8 @@ def test_the_left_half_of_an_even_motion_stands_for_the_whole_tree(name):
     turns = ca.Function("turns", [q], [whole.rotation(k) for k in (left, right)])
     for motion in zip(*even_motion(free), strict=True):
         chart = [free.charts(x[None], level)[0] for level, x in enumerate(motion)]
-        force, moment = 100 * rng.normal(size=3), 20 * rng.normal(size=3)
+        force = 100 * rng.normal(size=3)
+        moment = 20 * rng.normal(size=3)
         axes = [x.full() for x in turns(chart[0])]
         given = [axes[0].T @ force, axes[0].T @ moment]
         given += [axes[1].T @ mirrored(force), axes[1].T @ mirrored(moment, True)]
@@ -296,7 +301,9 @@ def test_the_left_half_of_an_even_motion_stands_for_the_whole_tree(name):
 def test_even_motions_are_mirror_images(name):
     """Through Pinocchio: the CoM stays in the plane, momentum too; feet are in mirrored places at mirrored speeds."""
     body = body_of(name)
-    free, tree, data = coordinates.even(body), body.robot.model, body.robot.model.createData()
+    free = coordinates.even(body)
+    tree = body.robot.model
+    data = body.robot.model.createData()
     charts = [free.charts(x, level) for level, x in enumerate(even_motion(free))]
     axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     frames = [tree.getFrameId(frame) for frame in body.robot.foot.frames]
@@ -336,15 +343,18 @@ def test_charts_are_the_same_in_symbols_and_in_numbers(name, kind):
 def test_bounds_of_free_coordinates_are_the_tighter_of_both_sides(name):
     """Just inside, the whole chart is inside its bounds; just outside, it is not."""
     body = body_of(name)
-    free, rng = coordinates.even(body), np.random.default_rng(3)
+    free = coordinates.even(body)
+    rng = np.random.default_rng(3)
     n = len(body.model.names)
-    low, high = -rng.uniform(1, 2, n), rng.uniform(1, 2, n)
+    low = -rng.uniform(1, 2, n)
+    high = rng.uniform(1, 2, n)
     least, most = free.within(low, high)
     moved = np.abs(free.spread).any(axis=1)
     for end, way in ((least, 1), (most, -1)):
         for k in range(free.size):
             inside, outside = (np.zeros(free.size) for _ in range(2))
-            inside[k], outside[k] = end[k] + 1e-9 * way, end[k] - 1e-9 * way
+            inside[k] = end[k] + 1e-9 * way
+            outside[k] = end[k] - 1e-9 * way
             for x, kept in ((inside, True), (outside, False)):
                 chart = (free.charts(x[None], 1)[0])[moved]
                 assert np.all((low[moved] <= chart) & (chart <= high[moved])) == kept
@@ -356,20 +366,24 @@ def along(phase, solution, parameters) -> dict[str, tuple[np.ndarray, np.ndarray
 
     References are zeros: soles in the air are asked to be above the ground, by nothing more.
     """
-    count, out = phase.intervals, {}
+    count = phase.intervals
+    out = {}
     sizes = {"q": solution.q.shape[1], "v": solution.q.shape[1], "a": solution.q.shape[1], "z": solution.z.shape[1]}
     x = {name: ca.SX.sym(name, size) for name, size in (*sizes.items(), ("s", 1))}
     given = solution.constants, parameters, {name: np.zeros(n) for name, n in phase.references.items()}
     spaces = (SimpleNamespace(**{n: ca.SX(ca.DM(np.atleast_1d(y))) for n, y in z.items()}) for z in given)
-    moved, duration = [x[k] for k in "qva"], ca.SX(solution.duration)
+    moved = [x[k] for k in "qva"]
+    duration = ca.SX(solution.duration)
     point = Point(*moved, None, x["z"], duration, x["s"], *spaces, view=phase.view)
     for term in phase.terms:
         if term.is_cost or term.at not in ("node", "end"):
             continue
         first, last = (term.skip[0], count - term.skip[1]) if term.at == "node" else (count, count)
-        told, nodes = ca.Function("told", list(x.values()), [term.expression(point)]), range(first, last + 1)
+        told = ca.Function("told", list(x.values()), [term.expression(point)])
+        nodes = range(first, last + 1)
         columns = [told(*(getattr(solution, k)[n] for k in sizes), n / count).full().ravel() for n in nodes]
-        values, ends = np.array(columns).T, []
+        values = np.array(columns).T
+        ends = []
         for end in (term.lower, term.upper):
             end = end(parameters) if callable(end) else end
             ends.append(np.broadcast_to(np.asarray(end, float).ravel(), len(values))[:, None])
@@ -380,7 +394,8 @@ def along(phase, solution, parameters) -> dict[str, tuple[np.ndarray, np.ndarray
 @pytest.mark.parametrize("target", [(1.0, 0.5, 0.0, "direct"), (0.6, 0.5, 0.3, "three-step")], ids=str)
 def test_the_phases_of_a_planar_plan_meet_the_rows_of_the_whole_program(target):
     """With every coordinate of both sides: contact, dynamics and flight as exactly as in the plane, limits too."""
-    body, stages = jump(*target).whole_body, planner()
+    body = jump(*target).whole_body
+    stages = planner()
     assert body.schedule.free.plane and not body.schedule.whole.free.even
     data = stages.stage("spatial").parameters(body.task)
     own = stages.stage("direct").parameters(body.task) | dict(momentum=0.0, launch_s=np.zeros(2))

@@ -32,9 +32,13 @@ PROGRAMS = "direct", "whole body", "spatial"  # the whole-body program in the pl
 
 def program(body: Body, name: str, contacts: Contacts | None = None, *, flip: bool = False) -> Problem:
     """The whole-body program under the name of a stage; of a standing jump without ``contacts``."""
-    limits, weights, mesh = Limits(), Weights(), Mesh()
+    limits = Limits()
+    weights = Weights()
+    mesh = Mesh()
     if flip:
-        limits, weights, mesh = limits.of_flip(), weights.of_flip(), mesh.of_flip()
+        limits = limits.of_flip()
+        weights = weights.of_flip()
+        mesh = mesh.of_flip()
     free = coordinates.whole(body) if name == "spatial" else coordinates.even(body)
     contacts = contacts or jump_contacts(limits, mesh)
     how = dict(name=name, free=free, tracking=name == "whole body")
@@ -79,7 +83,8 @@ def lines(problem: Problem, parameters: dict) -> Iterator[str]:
 def table() -> str:
     """The file's text."""
     robot = Robot.load()
-    body, rod = Body(robot), srmp.parameters(TARGET, reach(robot))
+    body = Body(robot)
+    rod = srmp.parameters(TARGET, reach(robot))
     found = [*lines(srmp.build_problem(robot), rod)]
     flips = [*lines(srmp.build_problem(robot, SrmpSettings().of_flip()), rod)]
     for name in PROGRAMS:

@@ -1,6 +1,7 @@
-"""Each term's expression at a random state: stage 3's against Pinocchio, stage 1's against formulas written out here.
+"""Each term's expression at a random state: the whole-body program's against Pinocchio, stage 1's against formulas.
 
-Every term of both stages is looked at, its weight and all boxes too, and so is all that an own term sees by name.
+Every term of both is looked at, in the plane and in space, its weight and all boxes too, and so is all that an own term
+sees by name.
 """
 
 from types import SimpleNamespace
@@ -9,18 +10,22 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import full_state, inverse_dynamics, turned
+from fixtures_core import LIMBS, full_state
+from test_terms_table import program
 
 from jumplab.ocp import Problem, Term
 from jumplab.ocp.problem import Phase, Point
-from jumplab.robot import Robot
 from jumplab.robot.reach import reach
-from jumplab.stages import srmp, whole_body
+from jumplab.stages import srmp
 from jumplab.stages.srmp import SrmpSettings
-from jumplab.stages.whole_body import Limits, Weights
+from jumplab.stages.whole_body import Contacts, Limits, Weights, coordinates
+from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE, Mesh
+from jumplab.stages.whole_body.terms import Body
 
 G, LIM, S = 9.8, Limits(), SrmpSettings()
-SIDES = np.array([1.0, -1.0])
+BOTH = np.array([1.0, -1.0])
 
 
 def point(phase: Phase, rng: np.random.Generator, parameters: dict, **fixed) -> Point:
@@ -46,214 +51,533 @@ def check(terms: dict[str, Term], expected: dict, *seen) -> None:
     assert set(terms) == set(expected)
     for name, value in expected.items():
         found = numbers(terms[name].expression(*seen))
-        np.testing.assert_allclose(found, np.ravel(value), rtol=1e-8, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(found, flat(value), rtol=1e-8, atol=1e-7, err_msg=name)
+
+
+def flat(x) -> np.ndarray:
+    """Numbers and arrays in lists, in a row."""
+    return np.concatenate([flat(y) for y in x]) if isinstance(x, list | tuple) else np.ravel(x)
 
 
 def of(problem: Problem, phase: str, *places: str) -> dict[str, Term]:
     return {t.name: t for owner, t in problem.terms() if owner == phase and t.at in places}
 
 
-# stage 3 --------------------------------------------------------------------------------------------------------
-class Body:
-    """The full robot in the state of a point, through Pinocchio alone."""
-
-    def __init__(self, robot: Robot, p: Point, flying: bool):
-        q, self.v, self.a = (numbers(x) for x in (p.q, p.v, p.a))
-        self.q, self.v, self.a = (np.pad(x, (5 - len(x), 0)) for x in (q, self.v, self.a))
-        self.robot, self.m, self.c = robot, robot.sagittal, {k: float(v) for k, v in vars(p.c).items()}
-        first = self._place(np.zeros(2), np.zeros(2), np.zeros(2))
-        self.relative = first
-        if not flying:
-            self.toe, self.toe_velocity = np.zeros(2), np.zeros(2)
-            self._take(first)
-            self.force = robot.total_mass * (first["acceleration"] + np.array([0.0, G]))
-            x, z = first["com"]
-            moment = first["L_rate"] + z * self.force[0] - x * self.force[1]
-            self.wrench = np.array([*self.force, moment])
-            left = inverse_dynamics(robot, *first["state"], self.wrench, (0.0, 0.0))
-        else:
-            t, c = float(p.time), self.c
-            com = np.array([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - G * t * t / 2])
-            self.toe = com - first["com"]
-            self.toe_velocity = np.array([c["vel_x"], c["vel_z"] - G * t]) - first["com_velocity"]
-            self._take(self._place(self.toe, self.toe_velocity, np.array([0.0, -G]) - first["acceleration"]))
-            self.wrench = np.zeros(3)
-            left = inverse_dynamics(robot, *self.state, self.wrench, self.toe)
-            # a robot in free fall whose L changes needs a moment from nowhere; joint torques do not see it
-        model, tau = robot.model, np.zeros(4)
-        for name, row, sign in robot.role_signs():
-            tau[row] += sign * left[model.idx_vs[model.getJointId(name)]]
-        self.torques, self.base_left = tau, left[:6]
-        self.joints, self.rates, self.accels = (self.m.joint_angles(x) for x in (self.q, self.v, self.a))
-
-    def _take(self, found: dict) -> None:
-        for key, value in found.items():
-            setattr(self, key, value)
-
-    def _place(self, toe, velocity, acceleration) -> dict:
-        robot, model = self.robot, self.robot.model
-        q, v, a = full_state(robot, self.q, self.v, self.a, toe, velocity, acceleration)
-        data = model.createData()
-        pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
-        pin.ccrba(model, data, q, v)
-        mass = robot.total_mass
-        found = dict(state=(q, v, a), com=data.com[0][[0, 2]].copy(), L=data.hg.angular[1], L_rate=data.dhg.angular[1])
-        found |= dict(com_velocity=data.hg.linear[[0, 2]] / mass, acceleration=data.dhg.linear[[0, 2]] / mass)
-
-        def inertia(h):
-            pin.ccrba(model, data, pin.integrate(model, q, h * v), v)
-            return float(data.Ig.inertia[1, 1])
-
-        return found | dict(rho=inertia(0.0), rho_rate=(inertia(1e-5) - inertia(-1e-5)) / 2e-5)
-
-    def point(self, link: int, arm) -> np.ndarray:
-        """(x, z) of a point fixed in a link: the chain of spans below it, each turned by its own angle."""
-        below = [turned(self.q[i], self.m.span[i]) for i in range(link)]
-        return self.toe + sum(below, np.zeros(2)) + turned(self.q[link], arm)
-
-    def named(self, name: str) -> np.ndarray:
-        return self.point(*self.m.points[name])
-
-    def velocity(self, name: str) -> np.ndarray:
-        link, arm = self.m.points[name]
-        parts = [*(self.m.span[i] for i in range(link)), arm]
-        turn = [turned(self.q[i], d) for i, d in enumerate(parts)]
-        return self.toe_velocity + sum(w * np.array([r[1], -r[0]]) for w, r in zip(self.v, turn, strict=False))
-
-
-PARAMETERS = dict(stance=np.zeros(5), distance=0.6, platform=0.2, edge=0.35, takeoff_speed=2.8, rotation=0.0, gravity=G,
-                  momentum=-3.0, launch_s=[0.7, 0.1])  # fmt: skip
-CONSTANTS = dict(com_x=0.15, com_z=0.7, vel_x=0.9, vel_z=2.7)
+# the whole-body program -----------------------------------------------------------------------------------------
+PLANE = dict(distance=0.6, side=0.0, yaw=0.0, platform=0.2, edge=0.35, along=[1.0, 0.0], takeoff_speed=2.8,
+             rotation=0.0, gravity=G, straight=1.0, momentum=-3.0, launch_s=[0.7, 0.1])  # fmt: skip
+SPACE = PLANE | dict(side=0.2, yaw=0.4, along=[0.8, 0.6], rotation=0.1)
 SEEDS = range(3)
-
-
-def ground(x: float) -> float:
-    return 0.2 * (1 + np.tanh((x - 0.35) / LIM.edge_smoothing_m)) / 2
-
-
-def motor(m, tau, rate):
-    slope = m.effort / (m.speed - m.corner_speed) * LIM.torque_share
-    return [*(tau + slope * rate), *(-tau - slope * rate)]
-
-
-def common(b: Body, p: Point) -> dict:
-    x = {"joint acceleration": [*b.accels, b.a[3]], "torque": b.torques, "joint range": b.joints}
-    x |= {"joint speed": b.rates, "joint torque": b.torques, "torque-speed": motor(b.m, b.torques, b.rates)}
-    rho, rate = (numbers(getattr(p.ref, k)) for k in ("rho", "rho_rate"))
-    x |= {"track inertia": b.rho - rho, "track inertia rate": b.rho_rate - rate}
-    places = (b.named(n) for n in ("hand", "mid-arm", "knee"))
-    return x | {"body clearance": [z - ground(x + LIM.edge_clearance_m) for x, z in places]}
+# program and phase -> side of each foot that carries there, and how; of a jump in the plane and in space, and of a hop
+LAUNCH = {"flat": {0: "flat", 1: "flat"}, "toe": {0: "toe", 1: "toe"}}
+MODES = {(name, phase): modes for name in ("whole body", "spatial") for phase, modes in LAUNCH.items()}
+MODES |= {("hop", "2 L"): {0: "flat"}, ("hop", "3 l"): {0: "toe"}}
+EDGES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # of a friction pyramid
 
 
 @pytest.fixture(scope="module")
 def body(bhr):
-    return whole_body.build_problem(bhr)
+    return Body(bhr)
+
+
+@pytest.fixture(scope="module")
+def programs(body):
+    out = {name: program(body, name) for name in ("direct", "whole body", "spatial")}
+    return out | {"hop": program(body, "spatial", Contacts.hop(body.robot))}
+
+
+def turn_about_z(yaw: float) -> np.ndarray:
+    return pin.rpy.rpyToMatrix(0.0, 0.0, float(yaw))
+
+
+def random_point(problem: Problem, name: str, seed: int, parameters: dict, **how) -> tuple[Phase, Point]:
+    """A phase of the program, and a point of it: random motion, forces that push, random footholds and constants."""
+    rng, phase = np.random.default_rng(seed), next(p for p in problem.phases if p.name == name)
+    push = [name.startswith("force") for name in phase.states]
+    z = np.where(push, rng.uniform(0, 150, len(push)), 40 * rng.normal(size=len(push)))
+    constants = {k: 0.4 * rng.normal() for k in phase.constants}
+    return phase, point(phase, rng, parameters, **({"z": z, "c": constants} | how))
+
+
+class Seen:
+    """The full robot in the state of a point of the whole-body program, through Pinocchio alone."""
+
+    def __init__(self, body: Body, phase: Phase, p: Point, modes: dict[int, str]):
+        self.body, self.robot, self.tree, self.p = body, body.robot, body.robot.model, p
+        self.plane, self.names = "y" not in phase.coordinates, self.robot.joint_names
+        self.modes, self.sides = modes, [k for k in modes if not self.plane or k == 0]
+        self.par = {k: np.squeeze(numbers(v)) for k, v in vars(p.p).items()}
+        self.c = {k: float(v) for k, v in vars(p.c).items()}
+        self.ref = {k: numbers(v) for k, v in vars(p.ref).items()}
+        x = [numbers(getattr(p, k)) for k in "qva"]
+        self.chart, self.rates, self.accels = (self.full(y) for y in x)
+        n = 7 if self.plane else len(self.chart)
+        raised = [k for k in self.sides if self.modes[k] == "toe"]
+        self.pitch = {k: [y[n + raised.index(k)] if k in raised else 0.0 for y in x] for k in self.sides}
+        self.jerks, self.z = numbers(p.j), numbers(p.z)
+        self._move()
+        self._forces()
+
+    def full(self, x: np.ndarray) -> np.ndarray:
+        """All coordinates (20,) from those of the phase: in the plane the right side moves as the left one."""
+        if not self.plane:
+            return x[: 6 + len(self.names)]
+        out = np.zeros(6 + len(self.names))
+        out[[0, 2, 5]] = x[:3]
+        for i, role in enumerate(LIMBS):
+            for name, sign in zip(self.robot.joints[role], self.robot.sagittal.signs[i], strict=True):
+                out[6 + self.names.index(name)] = x[3 + i] * sign * self.robot.sagittal.signs[i, 0]
+        return out
+
+    def _move(self) -> None:
+        tree = self.tree
+        motion = (x[None] for x in (self.chart, self.rates, self.accels))
+        self.q, self.v, self.a = (x[0] for x in self.body.model.to_pinocchio(*motion))
+        self.data = data = tree.createData()
+        pin.ccrba(tree, data, self.q, self.v)
+        self.rho, self.momentum = float(data.Ig.inertia[1, 1]), data.hg.angular.copy()
+        self.com, self.com_velocity = data.com[0].copy(), data.hg.linear / self.robot.total_mass
+        other, h = tree.createData(), 1e-5
+        around = []
+        for step in (-h, h):
+            pin.ccrba(tree, other, pin.integrate(tree, self.q, step * self.v), self.v)
+            around.append(float(other.Ig.inertia[1, 1]))
+        self.rho_rate = (around[1] - around[0]) / (2 * h)
+        pin.computeJointJacobians(tree, data, self.q)
+        pin.forwardKinematics(tree, data, self.q, self.v, self.a)
+        pin.updateFramePlacements(tree, data)
+        self.frames = [tree.getFrameId(name) for name in self.robot.foot.frames]
+        self.base = data.oMi[1]
+
+    def foot(self, side: int) -> pin.SE3:
+        return self.data.oMf[self.frames[side]]
+
+    def tip(self, side: int) -> np.ndarray:
+        return self.foot(side).act(self.robot.foot.tip)
+
+    def middle(self, side: int) -> np.ndarray:
+        return self.foot(side).act(self.robot.foot.center)
+
+    def rates_of(self, side: int, local) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity of a point of the foot, and angular velocity, in the foot's axes."""
+        rate = pin.getFrameVelocity(self.tree, self.data, self.frames[side], pin.ReferenceFrame.LOCAL)
+        return rate.linear + np.cross(rate.angular, local), rate.angular
+
+    def gains_of(self, side: int, local) -> tuple[np.ndarray, np.ndarray]:
+        """Acceleration of a point of the foot, and angular acceleration, in the foot's axes."""
+        axes, frame = pin.ReferenceFrame.LOCAL, self.frames[side]
+        gain, spin = (f(self.tree, self.data, frame, axes) for f in (pin.getFrameClassicalAcceleration,
+                                                                      pin.getFrameVelocity))  # fmt: skip
+        w, b = spin.angular, gain.angular
+        return gain.linear + np.cross(b, local) + np.cross(w, np.cross(w, local)), b
+
+    def _forces(self) -> None:
+        """Forces at the soles from the edges of the friction pyramids, and what inverse dynamics has left over."""
+        foot, width = self.robot.foot, self.robot.foot.half_width - LIM.side_margin_m
+        edges = EDGES[:2] if self.plane else EDGES
+        z = iter(self.z)
+        self.pushed, self.local, wrench = {}, {}, {}
+        for side in self.sides:
+            back = (0.0, -(foot.toe - foot.heel - LIM.cop_margin_m)) if self.modes[side] == "flat" else (0.0,)
+            across = (0.0,) if self.plane else (width, -width)
+            self.local[side] = [np.array([x, y, 0.0]) for x in back for y in across]
+            self.pushed[side] = []
+            total, about = np.zeros(3), np.zeros(3)  # of a standing foot: in the axes of its foothold, about its tip
+            for _ in self.local[side]:
+                along = np.array([next(z) for _ in edges])
+                self.pushed[side].append(np.append(LIM.friction * along @ edges, along.sum()))
+            turn = self.foot(side).rotation @ pin.rpy.rpyToMatrix(0.0, self.pitch[side][0], 0.0).T
+            for place, force in zip(self.local[side], self.pushed[side], strict=True):
+                total += turn @ force
+                about += np.cross(self.foot(side).rotation @ place, turn @ force)
+            wrench[side] = total, about
+        if self.plane and self.sides:
+            wrench[1] = wrench[0]  # all in the plane, so its mirror image too
+        self.tau = np.array(list(z))
+        model = self.tree.copy()
+        model.gravity.linear = np.array([0.0, 0.0, -G])
+        left = pin.rnea(model, model.createData(), self.q, self.v, self.a)
+        for side, (force, moment) in wrench.items():
+            moment = moment + np.cross(self.tip(side) - self.foot(side).translation, force)
+            slope = pin.getFrameJacobian(self.tree, self.data, self.frames[side], pin.LOCAL_WORLD_ALIGNED)
+            left = left - slope.T @ np.concatenate([force, moment])
+        self.wrench = wrench
+        self.base_force, self.base_moment = self.base.rotation @ left[:3], self.base.rotation @ left[3:6]
+        self.needed = left[6:]
+
+    # what is the same in all phases -----------------------------------------------------------------------------
+    @property
+    def joints(self) -> list[int]:
+        """Joints that are free."""
+        if not self.plane:
+            return list(range(len(self.names)))
+        return [self.names.index(self.robot.joints[role][0]) for role in LIMBS]
+
+    @property
+    def moving(self) -> list[int]:
+        """Joints that move, those of the right side included."""
+        if not self.plane:
+            return self.joints
+        return sorted(self.names.index(name) for role in LIMBS for name in self.robot.joints[role])
+
+    def motor(self, key: str) -> np.ndarray:
+        return np.array([self.robot.actuators[self.names[k]][key] for k in self.joints])
+
+    def sagittal(self, x: np.ndarray) -> np.ndarray:
+        """Hip, knee, ankle, shoulder of the left side in sagittal signs, from angles or rates (20,)."""
+        left = [self.names.index(self.robot.joints[role][0]) for role in LIMBS]
+        return self.robot.sagittal.signs[:, 0] * x[[6 + k for k in left]]
+
+    def ground(self, x: np.ndarray, nearer: float = 0.0) -> float:
+        beyond = self.par["along"] @ x[:2] - self.par["edge"] + nearer * np.sign(self.par["platform"])
+        return self.par["platform"] * (1 + np.tanh(beyond / LIM.edge_smoothing_m)) / 2
+
+    def joint(self, name: str) -> pin.SE3:
+        return self.data.oMi[self.tree.getJointId(name)]
+
+    def hand(self, side: int) -> np.ndarray:
+        x, z = self.robot.sagittal.points["hand"][1]
+        return self.joint(self.robot.joints["shoulder_pitch"][side]).act(np.array([x, 0.0, z]))
+
+    @property
+    def both(self) -> list[int]:
+        return [0] if self.plane else [0, 1]
+
+    def common(self) -> dict:
+        """Terms at the nodes of every phase."""
+        attitude = [5] if self.plane else [3, 4, 5]
+        free = [6 + k for k in self.joints]
+        tau = np.zeros(len(self.names))
+        for k, torque in zip(self.joints, self.tau, strict=True):
+            tau[k] = torque
+        if self.plane:
+            tau = self.full(np.concatenate([np.zeros(3), self.tau]))[6:]
+        effort, slope = self.motor("effort"), LIM.torque_share * self.motor("effort")
+        slope = slope / (self.motor("no_load_speed") - self.motor("corner_speed"))
+        x = {"acceleration": self.accels[attitude + [6 + k for k in self.moving]], "torque": tau}
+        x["joint dynamics"] = (self.needed[self.joints] - self.tau) / effort
+        x["base forces"] = self.base_force[[0, 2] if self.plane else [0, 1, 2]]
+        x["base moments"] = self.base_moment[[1] if self.plane else [0, 1, 2]]
+        x["torque-speed"] = (self.tau + slope * self.rates[free]) / effort
+        places = [self.joint(self.robot.joints["knee"][k]).translation for k in self.both]
+        places += [self.hand(k) for k in self.both]
+        x["body clearance"] = [y[2] - self.ground(y, LIM.edge_clearance_m) for y in places]
+        if not self.plane:
+            x["sides apart"] = self.apart()
+        for side in self.sides:
+            x |= self.standing(side)
+        for side in self.both:
+            if side not in self.modes:
+                x[f"clearance of {('left', 'right')[side]} sole"] = self.swinging(side)
+        if self.sides:
+            x["force"] = self.z[: len(self.z) - len(self.tau)]
+        return x
+
+    def apart(self) -> list[float]:
+        """Distances across of knees, ankles, toes and heels, and of the hands from the middle, seen from the trunk."""
+        heel = np.array([self.robot.foot.heel, 0.0, self.robot.foot.sole_z])
+        pairs = [[self.joint(name).translation for name in self.robot.joints["knee"]]]
+        pairs.append([self.data.oMi[self.body.feet[k] + 1].translation for k in (0, 1)])
+        pairs += [[self.foot(k).act(x) for k in (0, 1)] for x in (self.robot.foot.tip, heel)]
+        rows = [self.base.actInv(left)[1] - self.base.actInv(right)[1] for left, right in pairs]
+        return [*rows, *(sign * self.base.actInv(self.hand(k))[1] for k, sign in enumerate((1, -1)))]
+
+    def standing(self, side: int) -> dict:
+        """Rows of a foot that carries: its place, heading, roll and pitch, on all three levels."""
+        name, axes, tip = ("left", "right")[side], self.foot(side).rotation, self.robot.foot.tip
+        at, yaw = np.array([self.c[f"{name}_{k}"] for k in "xyz"]), self.c[f"{name}_yaw"]
+        phi, rate, gain = self.pitch[side]
+        ahead = turn_about_z(yaw).T @ axes[:, 0]
+        place = [*(self.tip(side) - at), ahead[1], axes[2, 1], axes[2, 0] + np.sin(phi)]
+        levels = [place]
+        for (linear, angular), tipping in ((self.rates_of(side, tip), rate), (self.gains_of(side, tip), gain)):
+            levels.append([*linear, angular[2], angular[0], angular[1] - tipping])
+        rows = [0, 2, 5] if self.plane else list(range(6))
+        words = "in place", "still", "held"
+        return {f"{name} foot {k}": np.array(x)[rows] for k, x in zip(words, levels, strict=True)}
+
+    def swinging(self, side: int) -> list[float]:
+        """How high a sole in the air is above what is asked for, and its ankle above where it stands."""
+        foot = self.robot.foot
+        if self.plane:
+            length = foot.toe - foot.heel
+            local = [[foot.toe - share * length, 0.0, foot.sole_z] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        else:
+            local = [[x, y, foot.sole_z] for x in (foot.toe, foot.heel) for y in (foot.half_width, -foot.half_width)]
+        asked = self.ref[f"{('left', 'right')[side]}_clearance"][0]
+        places = [self.foot(side).act(np.array(x)) for x in local]
+        ankle = self.data.oMi[self.body.feet[side] + 1].translation
+        least = LIM.ankle_margin_m - foot.sole_z  # the ankle of a flat sole is that high
+        return [*(x[2] - self.ground(x) - asked for x in places), ankle[2] - self.ground(ankle) - least]
+
+    def constant(self, kind: str) -> np.ndarray:
+        """A vector among the flight's constants."""
+        return np.array([self.c.get(f"{kind}_{x}", 0.0) for x in "xyz"])
+
+    @property
+    def places(self) -> list[int]:
+        return [0, 2] if self.plane else [0, 1, 2]
+
+    @property
+    def spins(self) -> list[int]:
+        return [1] if self.plane else [0, 1, 2]
+
+    def flying(self) -> dict:
+        """Rows of a flight at its nodes."""
+        t = float(numbers(self.p.time)[0])
+        com = self.constant("com") + t * self.constant("vel") - [0.0, 0.0, G * t * t / 2]
+        speed = self.constant("vel") - [0.0, 0.0, G * t]
+        rows = {"ballistic CoM": (self.com - com)[self.places]}
+        rows["ballistic CoM velocity"] = (self.com_velocity - speed)[self.places]
+        return rows | {"angular momentum": (self.momentum - self.constant("L"))[self.spins]}
+
+    def touchdown(self) -> dict:
+        """Rows at the end of a jump."""
+        yaw, turn = self.par["yaw"], turn_about_z(self.par["yaw"])
+        way = np.array([self.par["distance"], self.par["side"], self.par["platform"]])
+        feet, spins, sticking = [], [], []
+        for side in self.both:
+            first = self.body.places[side] - [(self.robot.foot.toe - self.robot.foot.heel) / 2, 0.0, 0.0]
+            axes = self.foot(side).rotation
+            off = self.middle(side) - turn @ first - way
+            row = np.array([*off, turn[:, 0] @ axes[:, 1], axes[2, 1], axes[2, 0]])
+            feet.append(row[[0, 2, 5]] if self.plane else row)
+            linear, angular = self.rates_of(side, self.robot.foot.center)
+            speed = axes @ linear
+            spins.append((axes @ angular)[self.spins])
+            sticking.append(EDGES @ speed[:2] - LIM.touchdown_slope * speed[2])
+        attitude = [5] if self.plane else [3, 4, 5]
+        asked = np.array([0.0, 0.0, 0.0, yaw, 0.0, self.par["rotation"]])
+        knees = [self.robot.joints["knee"][k] for k in self.both]
+        rows = {"touchdown of the feet": feet, "foot rates at touchdown": spins}
+        if not self.plane:
+            rows["soles that stick at touchdown"] = sticking
+        rows["attitude at touchdown"] = (self.chart[:6] - asked)[attitude]
+        rows["knees at touchdown"] = [self.chart[6 + self.names.index(name)] for name in knees]
+        rows["joint rates at touchdown"] = self.rates[[6 + k for k in self.joints]]
+        return rows | {"trunk rates at touchdown": self.rates[attitude], "capture window": self.caught()}
+
+    def caught(self) -> np.ndarray:
+        ahead = turn_about_z(self.par["yaw"]) @ [LIM.capture_offset_m, 0.0, 0.0]
+        middle = np.mean([self.middle(side) for side in self.both], axis=0)
+        off = middle - self.com - ahead - LIM.capture_slope_s * self.constant("vel")
+        return off[[0] if self.plane else [0, 1]]
+
+    def tracking(self) -> dict:
+        """How far the motion is from stage 1's; velocities are seen from the toe, which stands."""
+        rows = {"track inertia": self.rho - self.ref["rho"], "track inertia rate": self.rho_rate - self.ref["rho_rate"]}
+        if not self.modes:
+            return rows | {"ankle rate": self.sagittal(self.rates)[2]}
+        toe = self.foot(0).rotation @ self.rates_of(0, self.robot.foot.tip)[0]
+        rows["track velocity"] = (self.com_velocity - toe)[[0, 2]] - self.ref["velocity"]
+        rows["track momentum"] = self.momentum[1] - self.ref["L"]
+        if self.modes[0] == "toe":
+            heel = np.array([self.robot.foot.heel, 0.0, self.robot.foot.sole_z])
+            rows["heel velocity"] = (self.foot(0).rotation @ self.rates_of(0, heel)[0] - toe)[2]
+        return rows
+
+
+def looked_at(programs, body, place, seed):
+    """Phase, point, and what is expected there, of a program's phase on the ground."""
+    name, phase = place
+    phase, p = random_point(programs[name], phase, seed, PLANE if name == "whole body" else SPACE)
+    return phase, p, Seen(body, phase, p, MODES[place])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", ["flat", "toe"])
-def test_terms_of_the_whole_body_in_launch(bhr, body, name, seed):
-    phase = next(p for p in body.phases if p.name == name)
-    p = point(phase, np.random.default_rng(seed), PARAMETERS)
-    b, mu = Body(bhr, p, False), LIM.friction
-    (fx, fz, moment), expected = b.wrench, common(b, p)
-    pushed = {"unilateral": fz, "friction": [mu * fz - fx, mu * fz + fx]}
-    if name == "flat":
-        pushed["CoP in the sole"] = [moment, (-b.m.heel[0] - LIM.cop_margin_m) * fz - moment]
-    else:
-        pushed["CoP at the toe"] = moment
-        expected["heel velocity"] = b.velocity("heel")[1]
-    expected |= pushed
-    expected |= {"track velocity": b.com_velocity - numbers(p.ref.velocity)}
-    expected |= {"track momentum": b.L - numbers(p.ref.L)}
-    check(of(body, name, "node"), expected, p)
-    middle = {f"{k} (mid)": v for k, v in {**pushed, "joint torque": b.torques}.items()}
-    check(of(body, name, "mid"), middle | {"jerk": numbers(p.j)}, p)
-    slack = max(LIM.momentum_share * 3.0, LIM.momentum_slack)
-    if name == "toe":
-        end = {"zero wrench at take-off": b.wrench, "vertical take-off speed": b.com_velocity[1] - 2.8}
-        end["L at take-off"] = slack - SIDES * (b.L + 3.0)
-        check(of(body, name, "end"), end, p)
-    np.testing.assert_allclose(b.base_left, 0.0, atol=1e-8)  # the wrench is all that the base needs
+@pytest.mark.parametrize("place", MODES, ids=str)
+def test_terms_of_the_whole_body_on_the_ground(programs, body, place, seed):
+    phase, p, x = looked_at(programs, body, place, seed)
+    problem, expected = programs[place[0]], x.common()
+    if place[0] == "whole body":
+        expected |= x.tracking()
+    elif place[1] == "flat":
+        expected["load of each foot"] = [sum(f[2] for f in x.pushed[side]) for side in x.sides]
+    if len(x.modes) == 1:
+        mg, pushes = body.mg, list(zip(x.local[0], x.pushed[0], strict=True))
+        total = sum(f for _, f in pushes) / mg
+        about = sum(np.cross(at, f) for at, f in pushes) / mg
+        arm = LIM.friction * LIM.torsion_arm_m * total[2] ** 2
+        expected["spin of left foot"] = arm - BOTH * (total @ about)
+    check(of(problem, phase.name, "node"), expected, p)
+    jerks = x.full(x.jerks)
+    attitude = [5] if x.plane else [3, 4, 5]
+    check(of(problem, phase.name, "mid"), {"jerk": jerks[attitude + [6 + k for k in x.moving]]}, p)
+    end = {}
+    if place == ("whole body", "toe"):
+        slack = max(LIM.momentum_share * 3.0, LIM.momentum_slack)
+        end["L at take-off"] = slack - BOTH * (x.momentum[1] + 3.0)
+    check(of(problem, phase.name, "start", "end", "interval"), end, p)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_terms_of_the_whole_body_in_flight(bhr, body, seed):
-    phase = next(p for p in body.phases if p.name == "flight")
-    p = point(phase, np.random.default_rng(seed), PARAMETERS, c=CONSTANTS)
-    b, m = Body(bhr, p, True), bhr.sagittal
-    np.testing.assert_allclose(b.acceleration, [0.0, -G], atol=1e-9)
-    # joint torques of an inverse dynamics that holds the CoM's fall, whatever moment the base lacks
-    expected = common(b, p) | {"ankle rate": b.rates[2], "angular momentum": b.L_rate}
-    for name in ("torque", "joint torque", "torque-speed"):
-        expected.pop(name)
-    shape, sole = (4 * 0.35 * 0.65) ** 3, [b.point(0, share * m.heel) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    expected["sole clearance"] = [z - ground(x) - LIM.clearance_m * shape for x, z in sole]
-    terms = of(body, "flight", "node")
-    torques = {name: terms.pop(name) for name in ("torque", "joint torque", "torque-speed")}
-    check(terms, expected, p)
-    tau = numbers(torques["torque"].expression(p))
-    # without ground the joints' torques turn the links; what they do to each is Newton's and Euler's
-    np.testing.assert_allclose(tau, free_torques(b), rtol=1e-8, atol=1e-7)
-    np.testing.assert_allclose(numbers(torques["joint torque"].expression(p)), tau)
-    np.testing.assert_allclose(numbers(torques["torque-speed"].expression(p)), motor(m, tau, b.rates))
-    middle = {"jerk": numbers(p.j), "joint torque (mid)": tau, "angular momentum (mid)": b.L_rate}
-    check(of(body, "flight", "mid"), middle, p)
-    end = {"touchdown place": b.toe - [0.6, 0.2], "foot flat at touchdown": b.q[0], "knee at touchdown": b.joints[1]}
-    end |= {"trunk at touchdown": b.q[3], "joint rates at touchdown": b.rates, "trunk rate at touchdown": b.v[3]}
-    ahead = b.point(0, m.sole_center)[0] - b.com[0]
-    end |= {"foot rate at touchdown": b.v[0]}
-    end |= {"capture window": ahead - LIM.capture_offset_m - LIM.capture_slope_s * 0.9}
-    check(of(body, "flight", "end"), end, p)
+@pytest.mark.parametrize("name", ["whole body", "spatial"])
+def test_terms_of_the_whole_body_in_flight(programs, body, name, seed):
+    problem = programs[name]
+    phase, p = random_point(problem, "flight", seed, PLANE if name == "whole body" else SPACE)
+    x = Seen(body, phase, p, {})
+    expected = x.common() | x.flying()
+    if name == "whole body":
+        expected |= x.tracking()
+    check(of(problem, "flight", "node"), expected, p)
+    attitude = [5] if x.plane else [3, 4, 5]
+    check(of(problem, "flight", "mid"), {"jerk": x.full(x.jerks)[attitude + [6 + k for k in x.moving]]}, p)
+    check(of(problem, "flight", "end"), x.touchdown(), p)
+    check(of(problem, "flight", "start"), {}, p)
+    # angles of the base from node to node: cubic accelerations, so that rates need no rows
+    h, at = 0.02, [2] if x.plane else [3, 4, 5]
+    _, right = random_point(problem, "flight", seed + 10, PLANE)
+    (q0, v0, a0), (q1, v1, a1) = ([numbers(getattr(y, k))[at] for k in "qva"] for y in (p, right))
+    turned_by = q1 - q0 - h * (v0 + v1) / 2 - h * h * (a0 - a1) / 12
+    check(of(problem, "flight", "interval"), {"base turns": turned_by}, p, right, ca.SX(h))
 
 
-def free_torques(b: Body) -> np.ndarray:
-    """Hip, knee, ankle, shoulder torques from each link's own balance of moments, CoM in free fall [N m]."""
-    m, com_rel = b.m, b.relative["acceleration"]
-    force, moment, places = np.zeros((5, 2)), np.zeros(5), np.zeros((5, 2))
-    lower = np.zeros((5, 2))
-    for i in range(5):
-        turns = [turned(b.q[j], d) for j, d in enumerate([*m.span[:i], m.com[i]])]
-        places[i] = sum(turns)
-        lower[i] = sum(turns[:-1], np.zeros(2))
-        acc = sum(w1 * np.array([r[1], -r[0]]) - w * w * r for w, w1, r in zip(b.v, b.a, turns, strict=False))
-        force[i], moment[i] = m.mass[i] * (acc - com_rel), m.inertia[i] * b.a[i]
-
-    def needed(joint, links):  # moment of the inertial forces of these links about the joint
-        arm = places[links] - lower[joint]
-        return float(np.sum(moment[links] + arm[:, 1] * force[links, 0] - arm[:, 0] * force[links, 1]))
-
-    return np.array([-needed(3, [3, 4]), -needed(2, [2, 3, 4]), -needed(1, [1, 2, 3, 4]), needed(4, [4])])
+def test_the_direct_program_is_the_tracking_one_without_what_follows_stage_1(programs, body):
+    """Term by term the same values; so what is said of the one holds for the other."""
+    for name in ("flat", "toe", "flight"):
+        more = {t.name: t for t in next(p for p in programs["whole body"].phases if p.name == name).terms}
+        phase, p = random_point(programs["direct"], name, 0, PLANE)
+        assert {t.name for t in phase.terms} < set(more)
+        for t in phase.terms:
+            if t.at not in ("interval", "problem"):
+                other = more[t.name]
+                assert numbers(t.expression(p)) == pytest.approx(numbers(other.expression(p)), abs=1e-12), t.name
+                assert (t.weight, t.at, t.skip, t.scale) == (other.weight, other.at, other.skip, other.scale)
 
 
-def test_terms_that_join_the_whole_body(bhr, body):
+def test_terms_that_join_the_whole_body(programs):
     rng, ends = np.random.default_rng(5), {}
-    for phase in body.phases:
-        c = CONSTANTS if phase.name == "flight" else {}
-        pair = (point(phase, rng, PARAMETERS, c=c, s=s, duration=0.3 + rng.random()) for s in (0.0, 1.0))
+    for phase in programs["whole body"].phases:
+        c = dict.fromkeys(phase.constants, 0.1)
+        pair = (point(phase, rng, PLANE, c=c, s=s, duration=0.3 + rng.random()) for s in (0.0, 1.0))
         ends[phase.name] = SimpleNamespace(start=next(pair), end=next(pair))
-    scales, expected = {"q": 1.0, "v": 10.0, "a": 100.0}, {}
-    for one, two in (("flat", "toe"), ("toe", "flight")):
-        a, b = ends[one].end, ends[two].start
-        left = {k: np.pad(numbers(getattr(a, k)), (5 - len(numbers(a.q)), 0)) for k in "qva"}
-        expected[f"{one} to {two}"] = [(left[k] - numbers(getattr(b, k))) / scales[k] for k in "qva"]
-    b = Body(bhr, ends["toe"].end, False)
-    expected["ballistic CoM"] = [*(b.com - [0.15, 0.7]), *(b.com_velocity - [0.9, 2.7])]
-    expected["track durations"] = [float(ends[k].end.duration) - x for k, x in (("flat", 0.7), ("toe", 0.1))]
-    check(of(body, "whole body", "problem"), expected, ends)
+    expected = {"track durations": [float(ends[k].end.duration) - x for k, x in (("flat", 0.7), ("toe", 0.1))]}
+    check(of(programs["whole body"], "whole body", "problem"), expected, ends)
+    assert not programs["direct"].joints and not programs["spatial"].joints
+
+
+# what flips have besides ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", ["whole body", "spatial"])
+@pytest.mark.parametrize("share", [0.05, 0.35, 0.94])
+def test_flips_keep_their_pressure_off_both_ends_of_the_sole(body, name, share):
+    """In the middle of the phase by three centimetres, at its ends by less; of each foot by its own load."""
+    problem, reserve = program(body, name, flip=True), Limits().of_flip().cop_reserve_m
+    phase, p = random_point(problem, "flat", 4, PLANE, s=share)
+    x, expected = Seen(body, phase, p, LAUNCH["flat"]), []
+    reserve *= np.clip(min(share / RESERVE_SHARE[0], (1 - share) / RESERVE_SHARE[1]), 0, 1)
+    length = body.robot.foot.toe - body.robot.foot.heel - LIM.cop_margin_m
+    for side in x.sides:
+        load = sum(f[2] for f in x.pushed[side]) / body.mg
+        behind = sum(-at[0] * f[2] for at, f in zip(x.local[side], x.pushed[side], strict=True)) / body.mg
+        expected += [behind - reserve * load, (length - reserve) * load - behind]
+    found = of(problem, "flat", "node")
+    check({"CoP reserve": found["CoP reserve"]}, {"CoP reserve": expected}, p)
+    loads = [sum(f[2] for f in x.pushed[side]) for side in x.sides]
+    check({"load of each foot": found["load of each foot"]}, {"load of each foot": loads}, p)
+    least = Limits().of_flip().least_push / 2 if name == "whole body" else LIM.foot_share
+    assert found["load of each foot"].lower == pytest.approx(least * body.mg)
+
+
+@pytest.mark.parametrize("turns", [1, -1])
+def test_flips_are_caught_by_their_momentum(body, turns):
+    """Forward by L about the middle of the sole, backward by the capture point ahead of the toes."""
+    limits, problem = Limits().of_flip(), program(body, "whole body", flip=True)
+    given = PLANE | {"rotation": turns * 2 * np.pi}
+    q = np.array([0.6, 1.0, 2 * np.pi * turns, -1.0, 1.2, -0.3, 0.2])
+    phase, p = random_point(problem, "flight", 2, given, q=q)
+    x, t = Seen(body, phase, p, {}), float(numbers(p.time)[0])
+    speed, mass = x.constant("vel") - [0.0, 0.0, G * t], body.robot.total_mass
+
+    def about(place):
+        return x.c["L_y"] + mass * np.cross(x.com - place, speed)[1]
+
+    length = body.leg_m  # of the legs in the stance
+    unit = mass * length * np.sqrt(G * length)
+    end, toes = of(problem, "flight", "end"), x.com - x.tip(0)
+    ahead = toes[0] + about(x.tip(0)) / mass / np.sqrt(G * toes[2])
+    ahead += limits.capture_backward_slope * np.sqrt(length / G) * given["takeoff_speed"]
+    bounds = {"capture by momentum": unit * np.array(limits.capture_forward),
+              "capture beyond the toes": length * np.array(limits.capture_backward)}  # fmt: skip
+    expected = {"capture by momentum": about(x.middle(0)), "capture beyond the toes": ahead}
+    idle = "capture beyond the toes" if turns > 0 else "capture by momentum"
+    expected[idle] = np.mean(bounds[idle])  # a flip of the other direction is not asked
+    check({name: end[name] for name in expected}, expected, p)
+    for name, (low, high) in bounds.items():
+        assert (end[name].lower, end[name].upper) == pytest.approx((low, high))
+    stroke = {"ankles at touchdown": x.sagittal(x.chart)[2]}
+    check({name: end[name] for name in stroke}, stroke, p)
+    least = body.robot.sagittal.lower[2] + limits.touchdown_ankle_stroke
+    assert end["ankles at touchdown"].lower == pytest.approx(least)
+
+
+def test_flips_in_space_are_caught_by_their_momentum(body):
+    """About both axes along the ground through the middle between the soles."""
+    limits, problem = Limits().of_flip(), program(body, "spatial", flip=True)
+    phase, p = random_point(problem, "flight", 3, SPACE)
+    x, t = Seen(body, phase, p, {}), float(numbers(p.time)[0])
+    arm = x.com - np.mean([x.middle(side) for side in (0, 1)], axis=0)
+    speed = x.constant("vel") - [0.0, 0.0, G * t]
+    expected = {"capture by momentum": (x.constant("L") + body.robot.total_mass * np.cross(arm, speed))[:2]}
+    term = of(problem, "flight", "end")["capture by momentum"]
+    check({"capture by momentum": term}, expected, p)
+    unit = body.robot.total_mass * body.leg_m * np.sqrt(G * body.leg_m)
+    assert (term.lower, term.upper) == pytest.approx((-limits.capture_moment * unit, limits.capture_moment * unit))
+
+
+@pytest.mark.parametrize("share, begun", [(0.5, 0.0), (1 - LATE_SHARE + 0.05, 0.5), (0.9, 1.0)])
+def test_a_tuck_opens_slowly_if_asked(body, share, begun):
+    limits = Limits(opening_speed_share=0.5)
+    problem = Schedule(body, jump_contacts(limits, Mesh()), limits, Weights(), free=coordinates.even(body)).problem()
+    phase, p = random_point(problem, "flight", 1, PLANE, s=share)
+    term, x = of(problem, "flight", "node")["opening speed"], Seen(body, phase, p, {})
+    check({"opening speed": term}, {"opening speed": begun * x.rates[[6 + k for k in x.joints]]}, p)
+    assert term.upper == pytest.approx(0.5 * x.motor("speed")) and term.lower == pytest.approx(-term.upper)
+
+
+# what an own term sees --------------------------------------------------------------------------------------------
+def standing_point(body, phase, seed=7) -> Point:
+    """A point at which the toes stand in their place, and the foot is as flat as its phase says."""
+    rng, robot = np.random.default_rng(seed), body.robot
+    angles, rates, accels = 0.4 * rng.normal(size=5), 2.0 * rng.normal(size=5), 8.0 * rng.normal(size=5)
+    if phase.name == "flat":
+        angles[0] = rates[0] = accels[0] = 0.0
+    place = body.places[0][[0, 2]]
+    charts = body.model.charts(*(x[None] for x in full_state(robot, angles, rates, accels, place)))
+    foot = [] if phase.name == "flat" else [[angles[0]], [rates[0]], [accels[0]]]
+    free = [coordinates.even(body).taken(x)[0] for x in charts]
+    q, v, a = (np.append(x, y) for x, y in zip(free, foot or 3 * [[]], strict=True))
+    push = [name.startswith("force") for name in phase.states]
+    z = np.where(push, rng.uniform(0, 150, len(push)), 40 * rng.normal(size=len(push)))
+    return point(phase, rng, PLANE, q=q, v=v, a=a, z=z, c=dict.fromkeys(phase.constants, 0.1))
 
 
 @pytest.mark.parametrize("name", ["flat", "toe", "flight"])
-def test_what_a_term_of_the_whole_body_sees(bhr, body, name):
-    phase = next(p for p in body.phases if p.name == name)
-    p = point(phase, np.random.default_rng(7), PARAMETERS, c=CONSTANTS if name == "flight" else {})
-    b = Body(bhr, p, name == "flight")
-    torques = free_torques(b) if name == "flight" else b.torques
+def test_what_a_term_of_the_whole_body_sees(programs, body, name):
+    phase = next(p for p in programs["whole body"].phases if p.name == name)
+    if name == "flight":  # the CoM as its parabola has it
+        _, p = random_point(programs["whole body"], name, 7, PLANE)
+        x = Seen(body, phase, p, {})
+        c = x.c | {"vel_x": x.com_velocity[0], "vel_z": x.com_velocity[2] + G * 0.35 * 0.6}
+        _, p = random_point(programs["whole body"], name, 7, PLANE, c=c)
+    else:
+        p = standing_point(body, phase)
+    x, first = Seen(body, phase, p, LAUNCH.get(name, {})), body.places[0][[0, 2]]
+    shoulder = x.joint(body.robot.joints["shoulder_pitch"][0])
+    axes, local = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, x.tree.getJointId(body.robot.joints["shoulder_pitch"][0])
+    twist = pin.getVelocity(x.tree, x.data, local, axes)
+    hand = twist.linear + np.cross(twist.angular, x.hand(0) - shoulder.translation)
+    torques = 2 * body.robot.sagittal.signs[:, 0] * x.tau
+    wrench = np.zeros(3)
+    if name != "flight":
+        force, moment = x.wrench[0]
+        wrench = 2 * np.array([force[0], force[2], moment[1]])
     for seen, value in (
-        (p.joints, b.joints), (p.joint_rates, b.rates), (p.torques, torques), (p.posture, b.q[3]), (p.com, b.com),
-        (p.com_velocity, b.com_velocity), (p.L, b.L), (p.inertia, b.rho), (p.inertia_rate, b.rho_rate),
-        (p.wrench, b.wrench), (p.point("hand"), b.named("hand")), (p.point_velocity("hand"), b.velocity("hand")),
-        (p.joint_rates.knee, b.rates[1]), (p.torques.ankle, torques[2]), (p.time, 0.35 * 0.6),
+        (p.joints, x.sagittal(x.chart)), (p.joint_rates, x.sagittal(x.rates)), (p.torques, torques),
+        (p.posture, x.chart[5]), (p.com, x.com[[0, 2]] - first), (p.com_velocity, x.com_velocity[[0, 2]]),
+        (p.L, x.momentum[1]), (p.inertia, x.rho), (p.inertia_rate, x.rho_rate), (p.wrench, wrench),
+        (p.point("hand"), x.hand(0)[[0, 2]] - first), (p.point("toe"), x.tip(0)[[0, 2]] - first),
+        (p.point_velocity("hand"), hand[[0, 2]]), (p.joint_rates.knee, x.sagittal(x.rates)[1]),
+        (p.torques.ankle, torques[2]), (p.moved(body.robot.sagittal).inertia, x.rho), (p.time, 0.35 * 0.6),
     ):  # fmt: skip
         np.testing.assert_allclose(numbers(seen), np.ravel(value), rtol=1e-8, atol=1e-7)
 
@@ -399,39 +723,97 @@ ROD_WEIGHTS = {
 }
 
 
-def test_every_weight_is_the_setting_of_its_name(body, rod):
-    """Those of jerk and inertia are the same in all phases; in flight the inertia rate may have its own."""
-    w, same = vars(Weights()) | {"track_durations": Weights().track_duration}, {}
-    for owner, t in body.terms():
-        if t.is_cost and (t.name == "jerk" or "inertia" in t.name):
-            same.setdefault(t.name, {})[owner] = t.weight
-        else:
-            assert not t.is_cost or t.weight == w[t.name.replace(" ", "_")], (owner, t.name)
-    del same["track inertia rate"]["flight"]
-    assert len(same) == 3 and all(len(set(of_phases.values())) == 1 for of_phases in same.values())
+def test_every_weight_is_the_setting_of_its_name(body, programs, rod):
+    """The same in all phases; those of inertias are of its share of the stance's, in flight its rate has its own."""
+    w, model = vars(Weights()), body.robot.model
+    w = w | {"track_durations": w["track_duration"]}
+    q = body.model.to_pinocchio(body.stance[None], *np.zeros((2, 1, 20)))[0][0]
+    data = model.createData()
+    pin.ccrba(model, data, q, np.zeros(model.nv))
+    stood = data.Ig.inertia[1, 1]
+    for name in ("direct", "whole body", "spatial"):
+        costs = [(owner, t) for owner, t in programs[name].terms() if t.is_cost]
+        for owner, t in costs:
+            key = "track_flight_inertia_rate" if (owner, t.name) == ("flight", "track inertia rate") else None
+            want = w[key or t.name.replace(" ", "_")] / (stood**2 if "inertia" in t.name else 1.0)
+            assert t.weight == pytest.approx(want, rel=1e-9), (owner, t.name)
+    assert set(w) == {"mirror", "track_flight_inertia_rate", "track_duration"} | {
+        t.name.replace(" ", "_") for _, t in programs["whole body"].terms() if t.is_cost
+    }
     for owner, t in rod.terms():
         assert not t.is_cost or t.weight == ROD_WEIGHTS[t.name], (owner, t.name)
 
 
-def test_boxes_are_rest_stance_and_ranges(bhr, body, rod):
-    e, wide, data = reach(bhr), 8.0, {"stance": 0.1 * np.arange(5), "start": 0.2 * np.arange(4)}
+def same_boxes(problem, expected, data):
+    """Every bound of a problem as it is expected: (phase, name) -> on, where, lower, upper."""
+    found = {(owner, b.name): b for owner, b in problem.bounds()}
+    assert set(found) == set(expected)
+    for name, (on, where, *ends) in expected.items():
+        b = found[name]
+        assert (b.on, b.where) == (on, where), name
+        for x, end in zip((b.lower, b.upper), ends, strict=True):
+            np.testing.assert_allclose(x(data) if callable(x) else x, end, err_msg=str(name))
+
+
+@pytest.mark.parametrize("name", ["direct", "whole body", "spatial"])
+def test_boxes_of_the_whole_body_are_rest_stance_and_limits(bhr, body, programs, name):
+    """Joints, speeds and torques within shares of their limits, forces that push, heels that rise from rest."""
+    plane, inf = name != "spatial", np.inf
+    joints = bhr.joint_names if not plane else [bhr.joints[role][0] for role in LIMBS]
+    low, high, speed, effort = (
+        np.array([bhr.actuators[joint][key] for joint in joints]) for key in ("lower", "upper", "speed", "effort")
+    )
+    knees = np.array(["knee" in joint for joint in joints])
+    base = np.full(3 if plane else 6, 15.0)
+    if not plane:
+        base[4] = LIM.roll_rad
+    low, high = low + LIM.range_margin_rad, high - LIM.range_margin_rad
+    high = high if plane else np.where(knees, np.minimum(high, LIM.knee_rad), high)
+    data = {"stance": 0.1 * np.arange(len(base) + len(joints))}
+    edges, feet = (2, 1) if plane else (8, 2)  # edges of the pyramids at the toes of one foot, or at its heel
+    expected = {("flat", "stance"): ("q", "start", data["stance"], data["stance"])}
+    expected |= {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}
+    for phase, heels, pushes in (("flat", 0, 2 * edges * feet), ("toe", feet, edges * feet), ("flight", 0, 0)):
+        least = low if phase == "flight" else np.where(knees, np.maximum(low, LIM.straight_knee_rad), low)
+        up, free = np.zeros(heels), np.full(heels, inf)
+        expected[phase, "joint range"] = (
+            "q", "all", [*-base, *least, *up], [*base, *high, *np.full(heels, LIM.heel_up_rad)])  # fmt: skip
+        rates = np.array([*np.full(len(base), 60.0), *LIM.speed_share * speed, *free])
+        expected[phase, "joint speed"] = "v", "all", -rates, rates
+        torques = LIM.torque_share * effort
+        push = np.zeros(pushes)
+        expected[phase, "forces and torques"] = "z", "all", [*push, *-torques], [*(push + inf), *torques]
+    rising = np.array([*np.full(len(base) + len(joints), inf), *np.zeros(feet)])
+    for on in "qva":
+        expected["toe", f"heels rise from rest ({on})"] = on, "start", -rising, rising
+    none = {"flat": [*([inf] * edges + [0.0] * edges) * feet], "toe": [0.0] * edges * feet}
+    for phase, forces in none.items():
+        most = np.array([*forces, *np.full(len(joints), inf)])
+        expected[phase, "no force where contact ends"] = "z", "end", -most, most
+    same_boxes(programs[name], expected, data)
+
+
+def test_footholds_of_the_whole_body_are_those_of_the_stance(body, programs):
+    """In a standing jump, for which the places of the toe edges are constants that cannot move."""
+    for name, sides in (("direct", ["left"]), ("spatial", ["left", "right"])):
+        for phase in programs[name].phases[:2]:
+            wanted = {}
+            for k, side in enumerate(sides):
+                names = [f"{side}_{x}" for x in ("x", "y", "z", "yaw")]
+                wanted |= dict(zip(names, [*body.places[k], 0.0], strict=True))
+            for end in (0, 1):
+                assert {x: box[end] for x, box in phase.constants.items()} == pytest.approx(wanted)
+
+
+def test_boxes_of_the_rod_are_rest_start_and_ranges(bhr, rod):
+    e, data = reach(bhr), {"start": 0.2 * np.arange(4)}
     low, high = np.transpose([S.takeoff_lean, e.length, S.turn_rad, S.radius_m])
     margin = S.inertia_margin * (e.inertia[1] - e.inertia[0])
-    rest = {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}
-    links = rest | {("flat", "stance"): ("q", "start", data["stance"][1:], data["stance"][1:])}
-    links["flight", "link angles"] = "q", "all", -wide, wide
-    links["toe", "heel not below ground"] = "q", "inner", [0, *4 * [-wide]], [LIM.heel_up_rad, *4 * [wide]]
-    rods = rest | {("flat", "start posture"): ("q", "start", data["start"], data["start"])}
+    rods = {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}
+    rods |= {("flat", "start posture"): ("q", "start", data["start"], data["start"])}
     rods |= {(phase, "state box"): ("q", "inner", low, high) for phase in ("flat", "toe")}
     most = e.inertia[0] + S.flight_inertia * (e.inertia[1] - e.inertia[0])  # nearer than the margin
     rods["flight", "inertia range"] = "q", "all", e.inertia[0] + margin, most
     rods["flight", "inertia rate range"] = "v", "all", -S.inertia_rate, S.inertia_rate
     rods["flight", "inertia acceleration range"] = "a", "all", -S.inertia_accel, S.inertia_accel
-    for problem, expected in ((body, links), (rod, rods)):
-        found = {(owner, b.name): b for owner, b in problem.bounds()}
-        assert set(found) == set(expected)
-        for name, (on, where, *ends) in expected.items():
-            b = found[name]
-            assert (b.on, b.where) == (on, where), name
-            for x, end in zip((b.lower, b.upper), ends, strict=True):
-                np.testing.assert_allclose(x(data) if callable(x) else x, end, err_msg=str(name))
+    same_boxes(rod, rods, data)

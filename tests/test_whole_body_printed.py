@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, turned
+from paper.expansion import expand
 from paper.lagrange import five_links
 from paper.violations import violations
 from paper.whole_body_printed import (
@@ -23,7 +24,6 @@ from paper.whole_body_printed import (
 from jumplab.errors import InputError
 from jumplab.ocp.problem import Point
 from jumplab.robot.stance import stance_configuration
-from jumplab.stages.reconstruction import expand
 from jumplab.stages.whole_body.settings import Weights
 
 G, MASS = 9.8, 42.0

@@ -453,7 +453,7 @@ class Planner:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
         if not (task.in_plane and self.robot.planar):
             near = previous.whole_body if isinstance(previous.whole_body, WholeBodyPlan) else None
-            if near is None:
+            if near is None or previous.method != "direct":
                 return self.plan(task, previous.method, start=start)
             try:
                 stance = None if start is None else self._standing(start)

@@ -46,7 +46,7 @@ class Limits:
     capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02
-    # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l) with the leg's length l
+    # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l), l the leg's length
     capture_moment: float | None = None
     # in the plane instead: that L of a flip forward; and of one backward the capture point + slope * take-off speed,
     # ahead of the toes, in shares of l and of sqrt(l / g) (measured)

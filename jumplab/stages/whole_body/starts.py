@@ -133,16 +133,21 @@ def along(schedule: Schedule, task: JumpTask) -> Motion:
             _flown(fine, starts[k], starts[k + 1], leg, gravity, height, pitch)
             arms += _swung(fine, starts[k], starts[k + 1])
     turned = np.interp(fine, [starts[last], starts[-1]], [0.0, task.rotation_rad])
-    curves = [*smooth[:2], height, smooth[2], pitch + turned]
-    shoulders = body.shoulders
+    curves = [*smooth[:2], height, smooth[2], np.full_like(fine, base[4]), pitch + turned, arms]
+    return _reached(schedule, task, times, holds, lambda t: [np.interp(t, fine, c) for c in curves])
+
+
+def _reached(schedule: Schedule, task: JumpTask, times: np.ndarray, holds: list[np.ndarray], curves) -> Motion:
+    """The motion whose base and arms follow ``curves`` (time [s] -> x, y, z, yaw, roll, pitch, swing of the arms)."""
+    contacts, body = schedule.contacts, schedule.body
+    starts, leg = np.concatenate([[0.0], np.cumsum(times)]), leg_length(body.robot)
     reach, chart, missed, charts = Reach(body, schedule.limits.range_margin_rad), body.stance.copy(), 0.0, []
     for k, p in enumerate(contacts.phases):
         rows = []
         for t in np.linspace(starts[k], starts[k + 1], p.intervals + 1):
-            x, y, z, yaw, lean = (np.interp(t, fine, c) for c in curves)
-            chart[:BASE] = [x, y, z, yaw, base[4], lean]
-            for column, sign in shoulders:
-                chart[column] = body.stance[column] + sign * np.interp(t, fine, arms)
+            *chart[:BASE], swing = curves(t)
+            for column, sign in body.shoulders:
+                chart[column] = body.stance[column] + sign * swing
             if p.flying and task.rotation_rad:
                 rows.append(_folded(body, chart, (t - starts[k]) / (starts[k + 1] - starts[k])))
                 continue
