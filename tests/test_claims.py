@@ -251,14 +251,9 @@ def test_the_same_words_everywhere():
         cells = json.loads((root / "notebooks" / f"{stem}.ipynb").read_text(encoding="utf-8"))["cells"]
         text = " ".join("".join(s for c in cells if c["cell_type"] == "markdown" for s in [*c["source"], "\n"]).split())
         assert said in text, stem
-    counts = {row["cases"]: row for row in hard_cases.compared(hard_cases.read())}
-    every, flips = counts["all"], counts["flips"]
-    assert flips["three-step, clean"] > flips["direct, clean"]
+    every = next(row for row in hard_cases.compared(hard_cases.read()) if row["cases"] == "all")
     counted = (
-        f"Of {every['number']} harder cases three steps end in a clean plan in {every['three-step, clean']}, the "
-        f"direct program in {every['direct, clean']}, of the {flips['number']} flips among them in "
-        f"{flips['three-step, clean']} and {flips['direct, clean']}; where both do, three steps take "
-        f"{every['cpu_s, ratio']:.1f} "
-        f"times the CPU time and {every['effort, ratio']:.1f} times the effort (medians; `10_benchmark` draws them)."
+        f"With that program three steps ended in a clean plan in {every['three-step, clean']} of {every['number']} "
+        f"harder cases, the direct program in {every['direct, clean']}."
     )
-    assert counted in readme
+    assert counted in readme and "made with the five-link program" in readme

@@ -110,7 +110,8 @@ def test_a_solve_begins_with_feet_that_stay_and_land_where_they_should(name, req
     tip = np.array([(robot.foot.toe - robot.foot.heel) / 2, 0.0, 0.0])
     launch = np.array([[s.act(tip) for s in soles(robot, q)] for q in (*flat, *toe)])
     off = np.abs(launch - launch[0]).max()
-    assert off < (0.08 if name == "robot" else 1e-6)  # canted hips turn in less far
+    # canted hips turn in less far; others are moved until they are near enough for a start
+    assert off < (0.08 if name == "robot" else beginning.NEAR_M)
     assert (motion.missed > 1e-3) == (off > 1e-3) and motion.missed < beginning.REACHED
     com = [pin.centerOfMass(robot.model, robot.model.createData(), q)[2] for q in air]
     assert max(com) - com[0] == pytest.approx(0.2, abs=0.05)
@@ -135,7 +136,8 @@ def test_start_values_of_a_motion_share_nodes_and_carry_the_robot(short):
     for one, other in pairwise(parts):
         for k in "qva":
             left, right = getattr(one, k)[-1, :nv], getattr(other, k)[0, :nv]
-            np.testing.assert_allclose(right, left, atol=1e-9)
+            # both postures of a shared node are near enough for a start, found from another side each
+            np.testing.assert_allclose(right, left, atol=beginning.NEAR_M if k == "q" else 1e-9)
     for k, (part, duration) in enumerate(zip(parts, motion.durations, strict=True)):
         b = schedule.of(k)
         assert part.duration == duration and part.z.shape == (len(part.q), len(b.states))
@@ -143,7 +145,7 @@ def test_start_values_of_a_motion_share_nodes_and_carry_the_robot(short):
         assert push.sum(axis=1) == pytest.approx(0.0 if b.flying else b.mg) and not torques.any()
     heels = parts[1].q[:, nv:]
     assert heels[0] == pytest.approx(0.0, abs=1e-6) and np.all(np.diff(heels, axis=0) > 0)
-    model, q = short.model, seen(schedule, motion)[2][0]
+    model, q = short.model, seen(schedule, motion)[1][-1]
     com = pin.centerOfMass(model, model.createData(), q)
     assert [parts[2].constants[f"com_{x}"] for x in "xyz"] == pytest.approx(com, abs=1e-9)
 

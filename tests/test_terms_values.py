@@ -92,7 +92,8 @@ def turn_about_z(yaw: float) -> np.ndarray:
 
 def random_point(problem: Problem, name: str, seed: int, parameters: dict, **how) -> tuple[Phase, Point]:
     """A phase of the program, and a point of it: random motion, forces that push, random footholds and constants."""
-    rng, phase = np.random.default_rng(seed), next(p for p in problem.phases if p.name == name)
+    rng = np.random.default_rng(seed)
+    phase = next(p for p in problem.phases if p.name == name)
     push = [name.startswith("force") for name in phase.states]
     z = np.where(push, rng.uniform(0, 150, len(push)), 40 * rng.normal(size=len(push)))
     constants = {k: 0.4 * rng.normal() for k in phase.constants}
@@ -103,9 +104,14 @@ class Seen:
     """The full robot in the state of a point of the whole-body program, through Pinocchio alone."""
 
     def __init__(self, body: Body, phase: Phase, p: Point, modes: dict[int, str]):
-        self.body, self.robot, self.tree, self.p = body, body.robot, body.robot.model, p
-        self.plane, self.names = "y" not in phase.coordinates, self.robot.joint_names
-        self.modes, self.sides = modes, [k for k in modes if not self.plane or k == 0]
+        self.body = body
+        self.robot = body.robot
+        self.tree = body.robot.model
+        self.p = p
+        self.plane = "y" not in phase.coordinates
+        self.names = self.robot.joint_names
+        self.modes = modes
+        self.sides = [k for k in modes if not self.plane or k == 0]
         self.par = {k: np.squeeze(numbers(v)) for k, v in vars(p.p).items()}
         self.c = {k: float(v) for k, v in vars(p.c).items()}
         self.ref = {k: numbers(v) for k, v in vars(p.ref).items()}
@@ -114,7 +120,8 @@ class Seen:
         n = 7 if self.plane else len(self.chart)
         raised = [k for k in self.sides if self.modes[k] == "toe"]
         self.pitch = {k: [y[n + raised.index(k)] if k in raised else 0.0 for y in x] for k in self.sides}
-        self.jerks, self.z = numbers(p.j), numbers(p.z)
+        self.jerks = numbers(p.j)
+        self.z = numbers(p.z)
         self._move()
         self._forces()
 
@@ -135,9 +142,12 @@ class Seen:
         self.q, self.v, self.a = (x[0] for x in self.body.model.to_pinocchio(*motion))
         self.data = data = tree.createData()
         pin.ccrba(tree, data, self.q, self.v)
-        self.rho, self.momentum = float(data.Ig.inertia[1, 1]), data.hg.angular.copy()
-        self.com, self.com_velocity = data.com[0].copy(), data.hg.linear / self.robot.total_mass
-        other, h = tree.createData(), 1e-5
+        self.rho = float(data.Ig.inertia[1, 1])
+        self.momentum = data.hg.angular.copy()
+        self.com = data.com[0].copy()
+        self.com_velocity = data.hg.linear / self.robot.total_mass
+        other = tree.createData()
+        h = 1e-5
         around = []
         for step in (-h, h):
             pin.ccrba(tree, other, pin.integrate(tree, self.q, step * self.v), self.v)
@@ -165,24 +175,30 @@ class Seen:
 
     def gains_of(self, side: int, local) -> tuple[np.ndarray, np.ndarray]:
         """Acceleration of a point of the foot, and angular acceleration, in the foot's axes."""
-        axes, frame = pin.ReferenceFrame.LOCAL, self.frames[side]
+        axes = pin.ReferenceFrame.LOCAL
+        frame = self.frames[side]
         gain, spin = (f(self.tree, self.data, frame, axes) for f in (pin.getFrameClassicalAcceleration,
                                                                       pin.getFrameVelocity))  # fmt: skip
-        w, b = spin.angular, gain.angular
+        w = spin.angular
+        b = gain.angular
         return gain.linear + np.cross(b, local) + np.cross(w, np.cross(w, local)), b
 
     def _forces(self) -> None:
         """Forces at the soles from the edges of the friction pyramids, and what inverse dynamics has left over."""
-        foot, width = self.robot.foot, self.robot.foot.half_width - LIM.side_margin_m
+        foot = self.robot.foot
+        width = self.robot.foot.half_width - LIM.side_margin_m
         edges = EDGES[:2] if self.plane else EDGES
         z = iter(self.z)
-        self.pushed, self.local, wrench = {}, {}, {}
+        self.pushed = {}
+        self.local = {}
+        wrench = {}
         for side in self.sides:
             back = (0.0, -(foot.toe - foot.heel - LIM.cop_margin_m)) if self.modes[side] == "flat" else (0.0,)
             across = (0.0,) if self.plane else (width, -width)
             self.local[side] = [np.array([x, y, 0.0]) for x in back for y in across]
             self.pushed[side] = []
-            total, about = np.zeros(3), np.zeros(3)  # of a standing foot: in the axes of its foothold, about its tip
+            total = np.zeros(3)
+            about = np.zeros(3)  # of a standing foot: in the axes of its foothold, about its tip
             for _ in self.local[side]:
                 along = np.array([next(z) for _ in edges])
                 self.pushed[side].append(np.append(LIM.friction * along @ edges, along.sum()))
@@ -202,7 +218,8 @@ class Seen:
             slope = pin.getFrameJacobian(self.tree, self.data, self.frames[side], pin.LOCAL_WORLD_ALIGNED)
             left = left - slope.T @ np.concatenate([force, moment])
         self.wrench = wrench
-        self.base_force, self.base_moment = self.base.rotation @ left[:3], self.base.rotation @ left[3:6]
+        self.base_force = self.base.rotation @ left[:3]
+        self.base_moment = self.base.rotation @ left[3:6]
         self.needed = left[6:]
 
     # what is the same in all phases -----------------------------------------------------------------------------
@@ -252,7 +269,8 @@ class Seen:
             tau[k] = torque
         if self.plane:
             tau = self.full(np.concatenate([np.zeros(3), self.tau]))[6:]
-        effort, slope = self.motor("effort"), LIM.torque_share * self.motor("effort")
+        effort = self.motor("effort")
+        slope = LIM.torque_share * self.motor("effort")
         slope = slope / (self.motor("no_load_speed") - self.motor("corner_speed"))
         x = {"acceleration": self.accels[attitude + [6 + k for k in self.moving]], "torque": tau}
         x["joint dynamics"] = (self.needed[self.joints] - self.tau) / effort
@@ -284,8 +302,11 @@ class Seen:
 
     def standing(self, side: int) -> dict:
         """Rows of a foot that carries: its place, heading, roll and pitch, on all three levels."""
-        name, axes, tip = ("left", "right")[side], self.foot(side).rotation, self.robot.foot.tip
-        at, yaw = np.array([self.c[f"{name}_{k}"] for k in "xyz"]), self.c[f"{name}_yaw"]
+        name = ("left", "right")[side]
+        axes = self.foot(side).rotation
+        tip = self.robot.foot.tip
+        at = np.array([self.c[f"{name}_{k}"] for k in "xyz"])
+        yaw = self.c[f"{name}_yaw"]
         phi, rate, gain = self.pitch[side]
         ahead = turn_about_z(yaw).T @ axes[:, 0]
         place = [*(self.tip(side) - at), ahead[1], axes[2, 1], axes[2, 0] + np.sin(phi)]
@@ -333,9 +354,12 @@ class Seen:
 
     def touchdown(self) -> dict:
         """Rows at the end of a jump."""
-        yaw, turn = self.par["yaw"], turn_about_z(self.par["yaw"])
+        yaw = self.par["yaw"]
+        turn = turn_about_z(self.par["yaw"])
         way = np.array([self.par["distance"], self.par["side"], self.par["platform"]])
-        feet, spins, sticking = [], [], []
+        feet = []
+        spins = []
+        sticking = []
         for side in self.both:
             first = self.body.places[side] - [(self.robot.foot.toe - self.robot.foot.heel) / 2, 0.0, 0.0]
             axes = self.foot(side).rotation
@@ -388,13 +412,15 @@ def looked_at(programs, body, place, seed):
 @pytest.mark.parametrize("place", MODES, ids=str)
 def test_terms_of_the_whole_body_on_the_ground(programs, body, place, seed):
     phase, p, x = looked_at(programs, body, place, seed)
-    problem, expected = programs[place[0]], x.common()
+    problem = programs[place[0]]
+    expected = x.common()
     if place[0] == "whole body":
         expected |= x.tracking()
     elif place[1] == "flat":
         expected["load of each foot"] = [sum(f[2] for f in x.pushed[side]) for side in x.sides]
     if len(x.modes) == 1:
-        mg, pushes = body.mg, list(zip(x.local[0], x.pushed[0], strict=True))
+        mg = body.mg
+        pushes = list(zip(x.local[0], x.pushed[0], strict=True))
         total = sum(f for _, f in pushes) / mg
         about = sum(np.cross(at, f) for at, f in pushes) / mg
         arm = LIM.friction * LIM.torsion_arm_m * total[2] ** 2
@@ -425,7 +451,8 @@ def test_terms_of_the_whole_body_in_flight(programs, body, name, seed):
     check(of(problem, "flight", "end"), x.touchdown(), p)
     check(of(problem, "flight", "start"), {}, p)
     # angles of the base from node to node: cubic accelerations, so that rates need no rows
-    h, at = 0.02, [2] if x.plane else [3, 4, 5]
+    h = 0.02
+    at = [2] if x.plane else [3, 4, 5]
     _, right = random_point(problem, "flight", seed + 10, PLANE)
     (q0, v0, a0), (q1, v1, a1) = ([numbers(getattr(y, k))[at] for k in "qva"] for y in (p, right))
     turned_by = q1 - q0 - h * (v0 + v1) / 2 - h * h * (a0 - a1) / 12
@@ -461,9 +488,11 @@ def test_terms_that_join_the_whole_body(programs):
 @pytest.mark.parametrize("share", [0.05, 0.35, 0.94])
 def test_flips_keep_their_pressure_off_both_ends_of_the_sole(body, name, share):
     """In the middle of the phase by three centimetres, at its ends by less; of each foot by its own load."""
-    problem, reserve = program(body, name, flip=True), Limits().of_flip().cop_reserve_m
+    problem = program(body, name, flip=True)
+    reserve = Limits().of_flip().cop_reserve_m
     phase, p = random_point(problem, "flat", 4, PLANE, s=share)
-    x, expected = Seen(body, phase, p, LAUNCH["flat"]), []
+    x = Seen(body, phase, p, LAUNCH["flat"])
+    expected = []
     reserve *= np.clip(min(share / RESERVE_SHARE[0], (1 - share) / RESERVE_SHARE[1]), 0, 1)
     length = body.robot.foot.toe - body.robot.foot.heel - LIM.cop_margin_m
     for side in x.sides:
@@ -481,19 +510,23 @@ def test_flips_keep_their_pressure_off_both_ends_of_the_sole(body, name, share):
 @pytest.mark.parametrize("turns", [1, -1])
 def test_flips_are_caught_by_their_momentum(body, turns):
     """Forward by L about the middle of the sole, backward by the capture point ahead of the toes."""
-    limits, problem = Limits().of_flip(), program(body, "whole body", flip=True)
+    limits = Limits().of_flip()
+    problem = program(body, "whole body", flip=True)
     given = PLANE | {"rotation": turns * 2 * np.pi}
     q = np.array([0.6, 1.0, 2 * np.pi * turns, -1.0, 1.2, -0.3, 0.2])
     phase, p = random_point(problem, "flight", 2, given, q=q)
-    x, t = Seen(body, phase, p, {}), float(numbers(p.time)[0])
-    speed, mass = x.constant("vel") - [0.0, 0.0, G * t], body.robot.total_mass
+    x = Seen(body, phase, p, {})
+    t = float(numbers(p.time)[0])
+    speed = x.constant("vel") - [0.0, 0.0, G * t]
+    mass = body.robot.total_mass
 
     def about(place):
         return x.c["L_y"] + mass * np.cross(x.com - place, speed)[1]
 
     length = body.leg_m  # of the legs in the stance
     unit = mass * length * np.sqrt(G * length)
-    end, toes = of(problem, "flight", "end"), x.com - x.tip(0)
+    end = of(problem, "flight", "end")
+    toes = x.com - x.tip(0)
     ahead = toes[0] + about(x.tip(0)) / mass / np.sqrt(G * toes[2])
     ahead += limits.capture_backward_slope * np.sqrt(length / G) * given["takeoff_speed"]
     bounds = {"capture by momentum": unit * np.array(limits.capture_forward),
@@ -512,9 +545,11 @@ def test_flips_are_caught_by_their_momentum(body, turns):
 
 def test_flips_in_space_are_caught_by_their_momentum(body):
     """About both axes along the ground through the middle between the soles."""
-    limits, problem = Limits().of_flip(), program(body, "spatial", flip=True)
+    limits = Limits().of_flip()
+    problem = program(body, "spatial", flip=True)
     phase, p = random_point(problem, "flight", 3, SPACE)
-    x, t = Seen(body, phase, p, {}), float(numbers(p.time)[0])
+    x = Seen(body, phase, p, {})
+    t = float(numbers(p.time)[0])
     arm = x.com - np.mean([x.middle(side) for side in (0, 1)], axis=0)
     speed = x.constant("vel") - [0.0, 0.0, G * t]
     expected = {"capture by momentum": (x.constant("L") + body.robot.total_mass * np.cross(arm, speed))[:2]}
@@ -529,7 +564,8 @@ def test_a_tuck_opens_slowly_if_asked(body, share, begun):
     limits = Limits(opening_speed_share=0.5)
     problem = Schedule(body, jump_contacts(limits, Mesh()), limits, Weights(), free=coordinates.even(body)).problem()
     phase, p = random_point(problem, "flight", 1, PLANE, s=share)
-    term, x = of(problem, "flight", "node")["opening speed"], Seen(body, phase, p, {})
+    term = of(problem, "flight", "node")["opening speed"]
+    x = Seen(body, phase, p, {})
     check({"opening speed": term}, {"opening speed": begun * x.rates[[6 + k for k in x.joints]]}, p)
     assert term.upper == pytest.approx(0.5 * x.motor("speed")) and term.lower == pytest.approx(-term.upper)
 
@@ -537,8 +573,11 @@ def test_a_tuck_opens_slowly_if_asked(body, share, begun):
 # what an own term sees --------------------------------------------------------------------------------------------
 def standing_point(body, phase, seed=7) -> Point:
     """A point at which the toes stand in their place, and the foot is as flat as its phase says."""
-    rng, robot = np.random.default_rng(seed), body.robot
-    angles, rates, accels = 0.4 * rng.normal(size=5), 2.0 * rng.normal(size=5), 8.0 * rng.normal(size=5)
+    rng = np.random.default_rng(seed)
+    robot = body.robot
+    angles = 0.4 * rng.normal(size=5)
+    rates = 2.0 * rng.normal(size=5)
+    accels = 8.0 * rng.normal(size=5)
     if phase.name == "flat":
         angles[0] = rates[0] = accels[0] = 0.0
     place = body.places[0][[0, 2]]
@@ -561,9 +600,11 @@ def test_what_a_term_of_the_whole_body_sees(programs, body, name):
         _, p = random_point(programs["whole body"], name, 7, PLANE, c=c)
     else:
         p = standing_point(body, phase)
-    x, first = Seen(body, phase, p, LAUNCH.get(name, {})), body.places[0][[0, 2]]
+    x = Seen(body, phase, p, LAUNCH.get(name, {}))
+    first = body.places[0][[0, 2]]
     shoulder = x.joint(body.robot.joints["shoulder_pitch"][0])
-    axes, local = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, x.tree.getJointId(body.robot.joints["shoulder_pitch"][0])
+    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    local = x.tree.getJointId(body.robot.joints["shoulder_pitch"][0])
     twist = pin.getVelocity(x.tree, x.data, local, axes)
     hand = twist.linear + np.cross(twist.angular, x.hand(0) - shoulder.translation)
     torques = 2 * body.robot.sagittal.signs[:, 0] * x.tau
@@ -725,7 +766,8 @@ ROD_WEIGHTS = {
 
 def test_every_weight_is_the_setting_of_its_name(body, programs, rod):
     """The same in all phases; those of inertias are of its share of the stance's, in flight its rate has its own."""
-    w, model = vars(Weights()), body.robot.model
+    w = vars(Weights())
+    model = body.robot.model
     w = w | {"track_durations": w["track_duration"]}
     q = body.model.to_pinocchio(body.stance[None], *np.zeros((2, 1, 20)))[0][0]
     data = model.createData()
@@ -758,7 +800,8 @@ def same_boxes(problem, expected, data):
 @pytest.mark.parametrize("name", ["direct", "whole body", "spatial"])
 def test_boxes_of_the_whole_body_are_rest_stance_and_limits(bhr, body, programs, name):
     """Joints, speeds and torques within shares of their limits, forces that push, heels that rise from rest."""
-    plane, inf = name != "spatial", np.inf
+    plane = name != "spatial"
+    inf = np.inf
     joints = bhr.joint_names if not plane else [bhr.joints[role][0] for role in LIMBS]
     low, high, speed, effort = (
         np.array([bhr.actuators[joint][key] for joint in joints]) for key in ("lower", "upper", "speed", "effort")
@@ -767,7 +810,8 @@ def test_boxes_of_the_whole_body_are_rest_stance_and_limits(bhr, body, programs,
     base = np.full(3 if plane else 6, 15.0)
     if not plane:
         base[4] = LIM.roll_rad
-    low, high = low + LIM.range_margin_rad, high - LIM.range_margin_rad
+    low = low + LIM.range_margin_rad
+    high = high - LIM.range_margin_rad
     high = high if plane else np.where(knees, np.minimum(high, LIM.knee_rad), high)
     data = {"stance": 0.1 * np.arange(len(base) + len(joints))}
     edges, feet = (2, 1) if plane else (8, 2)  # edges of the pyramids at the toes of one foot, or at its heel
@@ -775,7 +819,8 @@ def test_boxes_of_the_whole_body_are_rest_stance_and_limits(bhr, body, programs,
     expected |= {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}
     for phase, heels, pushes in (("flat", 0, 2 * edges * feet), ("toe", feet, edges * feet), ("flight", 0, 0)):
         least = low if phase == "flight" else np.where(knees, np.maximum(low, LIM.straight_knee_rad), low)
-        up, free = np.zeros(heels), np.full(heels, inf)
+        up = np.zeros(heels)
+        free = np.full(heels, inf)
         expected[phase, "joint range"] = (
             "q", "all", [*-base, *least, *up], [*base, *high, *np.full(heels, LIM.heel_up_rad)])  # fmt: skip
         rates = np.array([*np.full(len(base), 60.0), *LIM.speed_share * speed, *free])
@@ -806,7 +851,8 @@ def test_footholds_of_the_whole_body_are_those_of_the_stance(body, programs):
 
 
 def test_boxes_of_the_rod_are_rest_start_and_ranges(bhr, rod):
-    e, data = reach(bhr), {"start": 0.2 * np.arange(4)}
+    e = reach(bhr)
+    data = {"start": 0.2 * np.arange(4)}
     low, high = np.transpose([S.takeoff_lean, e.length, S.turn_rad, S.radius_m])
     margin = S.inertia_margin * (e.inertia[1] - e.inertia[0])
     rods = {("flat", "at rest"): ("v", "start", 0, 0), ("flat", "at rest (acceleration)"): ("a", "start", 0, 0)}

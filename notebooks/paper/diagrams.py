@@ -60,7 +60,7 @@ def framework() -> Figure:
     stages = (
         ("1  SRMP", "Sec. III", "launch: rod, barbell,\nCoP in the sole", "flight: inertia $\\rho$\nturns the body"),
         ("2  joint space", "Sec. IV", "launch QP: 9 links,\nmomentum, tiptoes", "flight QP: inertia,\nfoot placement"),
-        ("3  whole body", "Sec. V", "launch: in the plane,\nflat foot, then toe", "flight: ballistic\nCoM, foot at target"),
+        ("3  whole body", "Sec. V", "launch: flat foot,\nthen toe", "flight: ballistic\nCoM, foot at target"),
     )
     first, width, gap = 2.35, 2.45, 0.85
     for k, (name, section, launch, flight) in enumerate(stages):

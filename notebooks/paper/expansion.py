@@ -21,8 +21,9 @@ def expand(
     extra: dict | None = None,
     wrench: np.ndarray | None = None,
 ) -> Tape:
-    """Full-robot tape from a sampled planar motion (t, angles, rates, accels (n, 5), toe with derivatives (n, 2), flying); x is zero mid-sole at the start.
+    """Full-robot tape from a sampled planar motion; x is zero mid-sole at the start.
 
+    ``motion`` has t, flying (n,), angles, rates, accels (n, 5), toe, toe_velocity, toe_acceleration (n, 2).
     ``wrench`` (n, 3) is the planar ground wrench if it is known already; in flight it is not looked at.
     Foot wrenches are half of the planar ground wrench each; joint torques follow from inverse dynamics of the full
     robot, whose base rows are left for the audit to judge.

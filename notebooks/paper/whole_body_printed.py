@@ -1,7 +1,8 @@
 """Stage 3 exactly as the paper prints it: launch, then flight, in the paper's own coordinates (Sec. V).
 
-Kept to be compared with :mod:`jumplab.stages.whole_body.problem`, never to plan with. theta = [x; z; pitch; q_hip; q_knee;
-q_ankle; q_shoulder]; (x, z) is the paper's base, the top of the trunk, seen from the middle of the sole's first place.
+Kept to be compared with :mod:`jumplab.stages.whole_body.problem`, never to plan with. theta = [x; z; pitch; q_hip;
+q_knee; q_ankle; q_shoulder]; (x, z) is the paper's base, the top of the trunk, seen from the middle of the sole's first
+place.
 Weights are those of ours, so that only the formulation differs. Where the paper is silent the kindest reading is taken:
 the boxes hold the robot's joint ranges and speeds, no force pulls at a node, and the search stays near stage 2's
 motion; other local solutions of the launch are cheaper, with the foot on end.
@@ -21,13 +22,13 @@ from jumplab.models.planar import PlanarState, evaluator, symbols
 from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
-from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.reach import rod_of
+from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.stance import stance_angles
 from jumplab.robot_import.config import ROLES
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.srmp import SrmpPlan
-from jumplab.stages.whole_body import Weights
+from jumplab.stages.whole_body.settings import Weights
 from jumplab.task import GRAVITY, JumpTask
 
 COORDINATES = ("x", "z", "pitch", *SAGITTAL_JOINTS)

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from jumplab.errors import InfeasibleError, JumplabError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.stance import configuration, stance_configuration
+from jumplab.robot.stance import configuration, stance_angles, stance_configuration
 from jumplab.sim import STEP_S
 from jumplab.sim.kinematics import Gauge, headed, pitch_of
 from jumplab.sim.landing import PERIOD_STEPS, LandingController
@@ -138,7 +138,7 @@ class Foresight:
         self._missed: dict[int, np.ndarray] = {}  # jump: by how much way and turn (3,) fell short
         self._misjudged: list[np.ndarray] = []  # by how much poses (3,) foretold in the air were too far
         self._zero: np.ndarray | None = None  # where the chain began, by its own measurement
-        self._crouch = planner.stage("whole body" if method == "three-step" else "direct").stance
+        self._crouch = stance_angles(planner.robot)
 
     def learn_posture(self, q: np.ndarray) -> None:
         """Plans begin as far off the crouch as the robot, heavier perhaps, stands still in ``q``."""
