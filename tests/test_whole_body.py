@@ -384,7 +384,6 @@ def test_a_robot_too_weak_is_told_so(refusal):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="torques and take-off speed are boxes, which the least violation keeps")
 def test_a_robot_too_weak_is_told_that_its_torques_are(refusal):
     """Not that its feet are off their places, which is what the best compromise gives up instead."""
     assert "torque" in str(refusal) or "take-off" in str(refusal)

@@ -326,7 +326,7 @@ class SpatialState:
         """Inverse dynamics: (force, moment about the base's origin, joint torques) that the motion needs besides.
 
         ``wrenches`` act from outside: body -> (force, moment about the body's origin), in the body's axes. In an even
-        motion those on the left half stand for those on the right one too, and torques of the right half are zeros.
+        motion those on the left half stand for those on the right one too, and torques of the right half mean nothing.
         """
         parts = {}
         for k in self._counted:

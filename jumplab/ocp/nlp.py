@@ -1,4 +1,4 @@
-"""Solving an assembled problem, with ipopt or by a few Gauss-Newton steps, and saying what came out.
+"""Solving an assembled problem, with ipopt, and saying what came out.
 
 Where no plan comes out, it says why: terms that are no number, or terms that cannot be met together, by an elastic
 re-solve.

@@ -59,7 +59,7 @@ class Planner:
         out of the plane "spatial", have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight;
         "srmp" or "whole body" alone takes those at "problem". An expression sees a point with joints, joint_rates,
         torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
-        :class:`jumplab.stages.whole_body.view.BodyView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
+        :class:`jumplab.stages.whole_body.view.PlaneView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
         posture, time, see :class:`jumplab.stages.srmp.view.RodView`; out of the plane
         :class:`jumplab.stages.whole_body.view.SpatialView`. The direct planner takes those of "whole body", out of the
         plane of "spatial".
@@ -73,8 +73,7 @@ class Planner:
     atlas : of plans with the same robot, terms and limits: a :class:`jumplab.Atlas`. Direct plans begin with it where
         it has something close by; other methods refuse it.
 
-    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too. With own
-    terms, weights or switches a flip is solved from the one without: it stays the same of several local solutions.
+    Flips have other limits, settings, weights and a finer mesh; whatever is given here wins over those too.
 
     Raises
     ------
@@ -172,8 +171,7 @@ class Planner:
         return asked
 
     def chosen(self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False) -> str:
-        """The method that is meant: "usual" is "three-step" for a flip in the plane, and where something is changed
-        that only that has; else "direct".
+        """The method that is meant: "usual" is "direct", but "three-step" where something is changed that only it has.
 
         Raises :class:`InputError` for a method that does not exist, and for one that this planner cannot follow.
         """
@@ -243,12 +241,10 @@ class Planner:
         Parameters
         ----------
         task : the target.
-        method : "direct" (the whole body alone, from a crouch; with side or yaw the spatial program, begun from a jump
-            ahead with ramps) or "three-step" (SRMP, joint-space QPs, whole body; what the paper does), for targets in
-            the plane. "usual" is "direct", which takes less time and finds a plan at least as often
-            (``notebooks/10_benchmark``), but "three-step" for flips in the plane, of which the direct one leaves more
-            outside the audit's limits (``10_benchmark``), and where something of stages 1 and 2, or of stage 3's
-            tracking, is changed.
+        method : "direct" (the whole body alone) or "three-step" (SRMP, joint-space QPs, whole body; as in the paper),
+            for targets in the plane. "usual" is "direct", which takes less time and ends in jumps of less effort
+            (``notebooks/10_benchmark``), but "three-step" where something of stages 1 and 2, or of stage 3's tracking,
+            is changed.
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if

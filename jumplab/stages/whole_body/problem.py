@@ -186,8 +186,6 @@ class Schedule:
         if b.flying:
             boxes = {"com": PLACE_BOX, "vel": SPEED_BOX, "L": SPIN_BOX}
             out |= {name: boxes[name.partition("_")[0]] for name in b.constants}
-            if self.contacts.ends == "touchdown" and k == len(self.contacts.phases) - 1:
-                out["vel_z"] = (_takeoff_speed, _takeoff_speed, 1.0)
         for side in b.sides:
             contact = self.contacts.contact_of(k, side)
             for x, (low, high) in zip(("x", "y", "z", "yaw"), self.foothold(contact), strict=True):
@@ -293,7 +291,3 @@ class Schedule:
 
 def _stance(parameters):
     return parameters["stance"]
-
-
-def _takeoff_speed(parameters):
-    return parameters["takeoff_speed"]

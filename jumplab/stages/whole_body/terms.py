@@ -123,7 +123,8 @@ class Body:
         from scipy.linalg import qr  # slow to import
 
         tree, data = self.model.model, self.model.model.createData()
-        columns = [BASE - 1 + j for j in self.chain(self.feet[side])]
+        shared = set(self.chain(self.feet[1 - side]))  # a waist above both hips, where the base is the trunk
+        columns = [BASE - 1 + j for j in self.chain(self.feet[side]) if j not in shared]
         pin.computeJointJacobians(tree, data, q)
         slope = pin.getJointJacobian(tree, data, self.feet[side] + 1, pin.ReferenceFrame.LOCAL)[:, columns]
         best = qr(slope, pivoting=True)[2][:6]
@@ -543,7 +544,9 @@ class WholeBodyTerms:
         levels = ("in place", "m, 1", place, 1.0, first), ("still", "m/s, rad/s", rates, 1.0, first)
         levels += (("held", "m/s^2, rad/s^2", accelerations, ACCELERATION_SCALE, int(joined)),)
         return [
-            row(f"{name} foot {said}", "ours: contact", unit, of, scale=scale, skip=(skip, 0), group=name)
+            row(
+                f"{name} foot {said}", "ours: contact", unit, of, identity=True, scale=scale, skip=(skip, 0), group=name
+            )
             for said, unit, of, scale, skip in levels
         ]
 
@@ -773,6 +776,9 @@ class WholeBodyTerms:
         def end(name, equation, unit, of, lower=0.0, upper=0.0, **how):
             return row(name, equation, unit, of, lower, upper, at="end", **how)
 
+        def speed(p):
+            return p.c.vel_z - p.p.takeoff_speed
+
         turning = [1] if self.free.plane else [0, 1, 2]
         angles = [self.free.free[k] - 3 for k in self.free.turns]
         sticks = "soles that stick at touchdown", "ours: friction", "m/s"
@@ -780,6 +786,7 @@ class WholeBodyTerms:
         high = np.array([lim.touchdown_yaw, lim.touchdown_roll, lim.touchdown_pitch[1]])[angles]
         about = np.tile(np.array([0.0, 0.0, 1.0])[turning], len(self.free.sides))
         return [
+            row("vertical take-off speed", "SL-E2, WL-E1", "m/s", speed, at="start"),
             end("touchdown of the feet", "WL-E1, SL-E1: place and heading", "m, 1", self.feet_at_goal),
             end("foot rates at touchdown", "ours", "rad/s", spins, *within(foot, about)),
             *([] if self.free.plane else [end(*sticks, self.sliding, *POSITIVE)]),
