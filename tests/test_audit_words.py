@@ -150,7 +150,7 @@ def test_every_fault_of_form_is_counted():
     assert faults(**short) == [0, 0]  # ten of each are enough
     for rows in (slice(3, None), slice(None, -4)):
         assert faults(**{n: getattr(tape, n)[rows] for n in short}) == [0, 1]
-    assert faults(phase=np.full(25, "launch")) == [0, 3]  # no flight, no switch, an instant twice within the launch
+    assert faults(phase=np.full(25, "launch")) == [0, 2]  # no switch to a flight, an instant twice within the launch
     t = np.array(tape.t)
     t[5] = t[4]
     assert faults(t=t) == [0, 1]

@@ -119,8 +119,8 @@ def test_bad_options(options, sentence):
 
 @pytest.mark.slow
 def test_a_simulated_robot_hits_its_goal(bhr):
-    """The robot of seed 1 misses a metre by more than 2 % and hits it with a bias."""
-    found = reach_goal(GOAL, planner(), perturbation=Perturbation.draw(bhr, 1))
+    """The robot of seed 7 misses a metre by more than 2 % and hits it with a bias."""
+    found = reach_goal(GOAL, planner(), perturbation=Perturbation.draw(bhr, 7))
     first, last = found.jumps[0], found.jumps[-1]
     assert not first.hit and abs(first.distance_error_m) > 0.02
     assert last.hit and found.result.landed and found.plan.task == last.target

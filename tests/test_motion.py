@@ -70,7 +70,8 @@ def test_velocities_are_those_of_the_resampled_motion(bhr):
         x = motion.every(hz)
         rate = [pin.difference(bhr.model, a, b) * hz for a, b in zip(x.q[:-1], x.q[1:], strict=True)]
         worst.append(np.abs(np.array(rate) - (x.v[:-1] + x.v[1:]) / 2).max())
-    assert worst[0] < 0.05 and worst[1] < worst[0] / 3
+    # accelerations are linear between the plan's nodes, and a kink between two samples costs some of the second order
+    assert worst[0] < 0.025 and worst[1] < worst[0] / 2.5
 
 
 @pytest.mark.parametrize("rate", [0.0, -50.0, np.nan, np.inf, 1e9])

@@ -96,7 +96,8 @@ def test_exact_sensors_tell_the_truth(result, bhr, tape):
     assert set(exact.phase) == {"launch", "flight"} and n == int((result.phase != "landing").sum())
     assert exact.rho == pytest.approx(result.rho[:n], abs=1e-9)
     assert exact.L == pytest.approx(result.L[:n], abs=5e-8)  # the spin that is estimated is off by 2e-9 rad/s
-    assert np.abs(exact.com - result.com[:n][:, [0, 2]]).max() < 3e-4
+    # half a step of 1 ms at the CoM's speed changes in launch, up to 40 m/s^2 for tenths of a second
+    assert np.abs(exact.com - result.com[:n][:, [0, 2]]).max() < 4e-4
     fig = pictures.measured_jump(exact, tape, bhr)
     assert len(fig.axes) == 4 and smallest_font(fig) >= MIN_FONT_PT
     shown = np.concatenate([line.get_ydata() for line in fig.axes[3].lines[:2]])
