@@ -170,9 +170,7 @@ def test_the_whole_body_is_tried_where_a_straight_push_is_not_enough(bhr):
     planner, doubted = Planner(bhr), JumpTask(0.0, 0.8)
     message(doubted)
     assert audit(planner.plan(doubted).tape, bhr, doubted).passed
-    with pytest.raises(
-        InfeasibleError, match=r"enough for 0\.\d\d m; the whole body.* was tried: no plan found$"
-    ) as e:
+    with pytest.raises(InfeasibleError, match=r"enough for 0\.\d\d m; the whole body.* was tried: no plan found$") as e:
         planner.plan(JumpTask(0.0, 1.2))
     assert e.value.number == "height_m" and e.value.bound == pytest.approx(highest(can()))
     with pytest.raises(InfeasibleError, match=r"by a straight push enough for 0\.\d\d m$"):  # stage 1 is that push
