@@ -212,9 +212,6 @@ class Echo:
     def __init__(self):
         self.asked = []
 
-    def stage(self, name):
-        return type("Stage", (), {"stance": np.zeros(5)})
-
     def plan(self, task, method, start):
         self.asked.append((task, start))
         return type("Plan", (), {"task": task})
@@ -241,10 +238,10 @@ def test_what_is_measured_enters_the_next_plan(bhr):
 
 def test_posture_off_the_crouch_enters_within_reason(bhr):
     see = Foresight(Course.of([0.6], 0.3), bhr, echo := Echo(), None)
-    q = configuration(bhr, np.array([0.0, 0.02, -0.03, 0.5, 0.04]))
-    see.learn_posture(q)
+    off = np.array([0.0, 0.02, -0.03, 0.5, 0.04])
+    see.learn_posture(configuration(bhr, stance_angles(bhr) + off))
     see.look(0, 0.5, np.zeros(3))
-    assert echo.asked[0][1] == pytest.approx([0.0, 0.02, -0.03, 0.1, 0.04])
+    assert echo.asked[0][1] - stance_angles(bhr) == pytest.approx([0.0, 0.02, -0.03, 0.1, 0.04])
 
 
 def test_the_trunk_moves_as_planned_over_feet_that_stand_unevenly(bhr):

@@ -349,6 +349,11 @@ def armed(weight: float, **how) -> jl.Planner:
     return jl.Planner(jl.Robot.load(), terms={"whole body/flight": [calm(weight)]}, **how)
 
 
+@cache
+def plain(mesh: Mesh) -> jl.Planner:
+    return jl.Planner(jl.Robot.load(), mesh=mesh)
+
+
 def falls(values: list[float]) -> bool:
     return all(b <= a * (1 + SLACK) for a, b in pairwise(values)) and values[-1] < values[0]
 
@@ -451,8 +456,9 @@ def test_a_growing_weight_straightens_stage_one(target):
     assert falls([turning(stage.plan(jl.JumpTask(*target)).solution.phases) for stage in how])
 
 
+FINE = Mesh(72, 32, 30)
 # targets, each with one of the methods
-FLIPS = [("three-step", 0.0, 0.5, -1), ("direct", 0.2, 0.5, -1), ("direct", 0.0, 0.4, -1)]
+FLIPS = [("three-step", 0.0, 0.5, -1), ("direct", 0.2, 0.5, -1), ("direct", 0.0, 0.5, -1)]
 FLIPS += [("three-step", 0.0, 0.5, 1), ("three-step", 0.2, 0.5, 1), ("direct", 0.2, 0.4, 1)]
 
 
@@ -461,11 +467,12 @@ FLIPS += [("three-step", 0.0, 0.5, 1), ("three-step", 0.2, 0.5, 1), ("direct", 0
 def test_a_growing_weight_calms_the_arms_of_flips(method, distance_m, height_m, turns):
     """A flip has several local solutions; where each weight begins with the plan of the one before, it stays the same.
 
-    The first one begins with the plan without the term.
+    The first one begins with the plan without the term. The mesh is so fine that limits hold between its nodes too,
+    however heavy the arms are.
     """
     task = jl.JumpTask(distance_m, height_m, rotation_rad=2 * np.pi * turns)
-    stage = armed(0.1).stage("direct flip" if method == "direct" else "whole body flip")
-    usual = planner().plan(task, method)
+    usual = plain(FINE).plan(task, method)
+    stage = armed(0.1, mesh=FINE).stage("direct flip" if method == "direct" else "whole body flip")
     bodies = [usual.whole_body]
     for w in GROWING[1:]:
         more = {"near": bodies[-1], "weights": {"flight/calm arms": w}}

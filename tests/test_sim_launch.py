@@ -10,7 +10,7 @@ from fixtures_core import jump
 from jumplab.errors import InputError
 from jumplab.sim import INSTALLED, STEP_S, Disturbance, Perturbation, Ranges, SensorNoise, Shove, simulate_jump
 from jumplab.sim.kinematics import Gauge
-from jumplab.sim.launch import LaunchFeedback
+from jumplab.sim.launch import ROLLING_S, LaunchFeedback
 from jumplab.sim.playback import Playback
 from jumplab.studies.basin import landing_basin
 from jumplab.studies.trials import TrialSettings
@@ -36,7 +36,7 @@ def wrong_start(bhr, tape):
 
 def test_what_is_followed_obeys_newton_and_euler(feedback):
     """The planned CoM's derivatives and L's rate come from the wrenches; differences say the same."""
-    com, speed, push, momentum, spin = np.moveaxis(feedback._rows, 1, 0)
+    com, speed, push, momentum, spin, _ = np.moveaxis(feedback._rows, 1, 0)
     assert np.diff(com, axis=0) / STEP_S == pytest.approx((speed[1:] + speed[:-1]) / 2, abs=2e-3)
     between = (push[1:] + push[:-1]) / 2
     assert np.diff(speed, axis=0) / STEP_S == pytest.approx(between, abs=0.3)  # phases end between rows
@@ -81,15 +81,15 @@ def test_the_planned_robot_launches_as_planned(bhr, tape):
         assert getattr(led.metrics, name) == pytest.approx(getattr(plain.metrics, name), abs=0.015)
 
 
-@pytest.mark.parametrize("place_m", [(0.09, 0.0, 0.1), (-0.09, 0.0, 0.2)])
+@pytest.mark.parametrize("place_m", [(0.09, 0.0, 0.1), (-0.09, 0.0, 0.0)])
 def test_feet_tell_where_the_com_is(bhr, tape, place_m):
-    """A payload before or behind the trunk: the true CoM, by Pinocchio, against the one that is felt."""
+    """A payload before or behind the trunk: the true CoM, by Pinocchio, against the one that is felt last."""
     loaded = Perturbation(payload_kg=4.0, payload_m=place_m, noise=NOISY)
     run = simulate_jump(tape, bhr, perturbation=loaded, feedback=True, stand_s=BRIEF_S)
     real = loaded.robot(bhr)
-    last = round(0.75 * tape.takeoff_time / STEP_S)
+    last = round((float(tape.extra["toe_phase_start"]) - ROLLING_S) / STEP_S)
     model, truth = (Gauge(robot).com(run.q[last])[0] for robot in (bhr, real))
-    assert abs(truth - model) > 0.004
+    assert abs(truth - model) > 0.003
     assert run.settings["feedback"]["com_ahead_m"] == pytest.approx(truth - model, abs=0.004)
 
 
@@ -103,8 +103,9 @@ def pitch_at_takeoff(run, tape):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", INSTALLED)
-def test_a_payload_tips_less(bhr, tape, engine):
-    """5 kg on the trunk's front: open loop the robot falls on over its toes."""
+def test_a_payload_tips_less(bhr, engine):
+    """5 kg on the trunk's front: open loop the robot falls on over its toes, with torque to spare it need not."""
+    tape = jump(0.6, 0.3, method="direct").tape
     loaded = Perturbation(payload_kg=5.0, payload_m=(0.09, 0.0, 0.25), noise=NOISY)
     tipped = {}
     for on in (False, True):
@@ -112,7 +113,7 @@ def test_a_payload_tips_less(bhr, tape, engine):
         assert run.metrics.max_torque_ratio <= 1 + 1e-9
         tipped[on] = abs(pitch_at_takeoff(run, tape))
     assert run.checks_passed
-    assert tipped[True] < tipped[False] / 1.5
+    assert tipped[True] < tipped[False] / 2
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ def test_on_ground_that_gives_way_the_launch_tips_less(bhr, tape):
     led = dict(perturbation=soft, stand_s=BRIEF_S)
     runs = [simulate_jump(tape, bhr, feedback=on, **led) for on in (False, True)]
     tipped = [abs(pitch_at_takeoff(run, tape)) for run in runs]
-    assert tipped[1] < tipped[0] / 2 and runs[1].metrics.com_rise_m > runs[0].metrics.com_rise_m + 0.05
+    assert tipped[1] < tipped[0] / 2 and runs[1].metrics.com_rise_m > runs[0].metrics.com_rise_m + 0.02
 
 
 def test_in_a_short_flight_the_changes_are_gone_before_legs_are_re_aimed(bhr):

@@ -217,9 +217,12 @@ def test_a_toe_that_pushes_off_stays_on_the_ground(engine, bhr, front_flip):
     """Turning legs pull at the contact (J' v): the ground must neither let go of a loaded toe nor give way to it."""
     tape, toe = front_flip, Gauge(bhr).toe
     run, takeoff = simulate_jump(tape, bhr, mode="pd", engine=engine.name, stand_s=0.01), round(1e3 * tape.takeoff_time)
-    push = run.foot_wrench[takeoff - 150 : takeoff - 15, :, 2].sum(axis=1)
-    assert push.min() > 2 * 42 * 9.8 and np.abs(np.diff(push)).max() < 100
-    assert abs(toe(run.q[takeoff - 5])[0] - toe(run.q[0])[0]) < 5e-4
+    late = np.arange(takeoff - 150, takeoff - 5)
+    push = run.foot_wrench[late, :, 2].sum(axis=1)
+    planned = np.interp(late * 1e-3, tape.t[: tape.takeoff_index], tape.f[: tape.takeoff_index, :, 2].sum(axis=1))
+    assert planned.max() > 3 * 42 * 9.8 and np.abs(push - planned).max() < 0.05 * 42 * 9.8
+    creep_m_s = abs(toe(run.q[takeoff - 5])[0] - toe(run.q[0])[0]) / (tape.takeoff_time - tape.extra["toe_phase_start"])
+    assert creep_m_s < 3e-3  # engines' friction gives way slowly; a toe that slips is faster by far
     assert run.metrics.takeoff_momentum == pytest.approx(tape.extra["planar_L"][tape.takeoff_index], abs=0.15)
 
 

@@ -6,8 +6,9 @@ accelerations and foot wrenches are chosen that obey the base dynamics, friction
 torques, and come closest to the planned CoM, its velocity, the angular momentum and the planned joints, with the feet
 still. What the joints' accelerations differ by from the tape's is integrated and added to it.
 
-Feet that stand flat tell where the CoM really is: what they feel beyond the moment that the motion takes is the weight
-times how far it is off. So it is the real CoM that is led along the planned one's way.
+Feet that stand flat tell where the CoM really is: a load that the trunk carries besides pushes them by its mass times
+the acceleration of the trunk, and turns them by that push about where it is. Its mass and place are filtered from the
+wrenches, and the real CoM is led along the planned one's way.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ LENGTH_SHARE = 0.95  # of the sole for the CoP
 LEAST_LOAD = 0.5  # [1] of the weight; with less on the feet nothing is changed any more
 FELT_LOAD = 0.7  # [1] of the weight, with which feet tell where the CoM is ...
 STILL_RAD = 0.01  # ... unless they are tilted by so much
+ROLLING_S = 0.1  # before the heels rise: the CoP is on its way to the toes, and soles begin to tip
 MOST_OFF_M = 0.025  # that the CoM is believed to be off
 FADE_SHARE, FADED = 0.4, 5.0  # of the flight, in which what was changed fades; natural times of that, to 4 %
 LEAST, LEAST_WRENCH = 1e-8, 1e-4  # weights of base accelerations and of wrenches / 100 N, so that the answer is one
@@ -57,11 +59,11 @@ class LaunchGains:
     foot_weight: float = 1e4
     posture_weight: float = 0.02
     most: float = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
-    # standard deviations of how far the CoM is off the model's: before anything is felt; of one reading, in which all
-    # that moves unlike the model errs too; of what it changes by within a second
-    prior_m: float = 0.008
-    reading_m: float = 0.03
-    drift_m: float = 0.005
+    # standard deviations, in shares of the robot's weight. Of the load on the trunk before anything is felt: its mass,
+    # and that times how far it is ahead of and above the base [m]
+    prior: tuple[float, float, float] = (0.1, 0.02, 0.03)
+    # of one reading, in which all that moves unlike the model errs too: push up, and moment [m]
+    reading: tuple[float, float] = (0.07, 0.03)
 
 
 def check_mode(mode: str) -> None:
@@ -89,7 +91,8 @@ class LaunchFeedback:
         self._fade_rate = max(gains.fade_rate, FADED / (FADE_SHARE * float(tape.t[-1] - tape.takeoff_time)))
         self._angles, self._rates, self._changes, self._farthest = np.zeros((4, len(robot.joint_names)))
         self.off_m, self.qp = 0.0, BodyQp(robot, self._terms)
-        self._place, self._spread = np.zeros(2), gains.prior_m**2 * np.eye(2)  # of the CoM's offset in trunk axes, x, z
+        self._load = np.zeros(3)  # mass on the trunk [kg], and that times its place ahead of and above the base [kg m]
+        self._spread = np.diag(np.square(gains.prior)) * robot.total_mass**2
         self._first, self._rows = tape.q[0], self._planned(tape)
         self._spin = self._rows[0, 4]  # rate of L that the last command takes
         half = LENGTH_SHARE * (robot.foot.toe - robot.foot.heel) / 2
@@ -99,18 +102,19 @@ class LaunchFeedback:
         }
 
     def _planned(self, tape: Tape) -> np.ndarray:
-        """CoM, its velocity and acceleration, L and its rate (steps, 5, 3) of the launch."""
+        """CoM, its velocity and acceleration, L, its rate, and the base's acceleration (steps, 6, 3) of the launch."""
         gauge, rows, last = self._gauge, [], tape.takeoff_index  # the rows before take-off
         model, data, mass = gauge.model, gauge.data, self._robot.total_mass
-        for q, v, f in zip(tape.q[:last], tape.v[:last], tape.f[:last], strict=True):
+        for q, v, a, f in zip(tape.q[:last], tape.v[:last], tape.a[:last], tape.f[:last], strict=True):
+            base = rotation(q[3:7]) @ (a[:3] + np.cross(v[3:6], v[:3]))
             pin.ccrba(model, data, q, v)
             pin.updateFramePlacements(model, data)
             feet = [data.oMf[frame].translation for frame in gauge.frames]
             push = f[:, :3].sum(axis=0) / mass + model.gravity.linear
             moment = self._moment(feet, data.com[0], f)
-            rows.append(np.concatenate([data.com[0], data.hg.linear / mass, push, data.hg.angular, moment]))
+            rows.append(np.concatenate([data.com[0], data.hg.linear / mass, push, data.hg.angular, moment, base]))
         grid = np.arange(round(tape.takeoff_time / STEP_S)) * STEP_S
-        return np.stack([np.interp(grid, tape.t[:last], c) for c in np.array(rows).T], axis=1).reshape(-1, 5, 3)
+        return np.stack([np.interp(grid, tape.t[:last], c) for c in np.array(rows).T], axis=1).reshape(-1, 6, 3)
 
     def to_json(self) -> dict:
         """What the settings of a result say."""
@@ -128,7 +132,7 @@ class LaunchFeedback:
         moved = pin.computeCentroidalMap(model, data, self._first) @ pin.difference(model, self._first, q)
         com, turned = moved[:3] / self._robot.total_mass, moved[3:]
         ways = (left, com), (rate, com), (acceleration, com), (rate, turned), (acceleration, turned)
-        for rows, (share, off) in zip(np.moveaxis(self._rows, 1, 0), ways, strict=True):
+        for rows, (share, off) in zip(np.moveaxis(self._rows[:, :5], 1, 0), ways, strict=True):
             rows[: len(share)] += share[:, None] * off
 
     def __call__(self, step: int, command: Command, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Command:
@@ -138,8 +142,8 @@ class LaunchFeedback:
         if stand == AIR or due >= len(self._rows):
             self._changes = -(self._fade_rate**2) * self._angles - 2 * self._fade_rate * self._rates
         elif step % PERIOD_STEPS == 0:
-            if self._playback.stands(step) == FLAT:
-                self._feel(q, wrench)
+            if self._playback.stands(step + round(ROLLING_S / STEP_S)) == FLAT:
+                self._feel(q, wrench, self._rows[step])
             if self._rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
                 self._changes = -2 * g.posture_rate * self._rates
             else:
@@ -150,18 +154,27 @@ class LaunchFeedback:
         moves = dict(q=command.q + self._angles, rate=command.rate + self._rates)
         return replace(command, **moves, acceleration=command.acceleration + self._changes)
 
-    def _feel(self, q: np.ndarray, wrench: np.ndarray) -> None:
-        """Learn from the feet's wrenches (2, 6) where the CoM is, unless they carry little or are tilted."""
-        load, feet = wrench[:, 2].sum(), self._gauge.places(q)
-        if load < FELT_LOAD * self._weight_n or max(abs(foot.rotation[2, 0]) for foot in feet) > STILL_RAD:
+    def _feel(self, q: np.ndarray, wrench: np.ndarray, planned: np.ndarray) -> None:
+        """Learn from the feet's wrenches (2, 6) where the CoM is, unless they carry little or are tilted.
+
+        ``planned`` (6, 3) is the row of what is followed now. A load of mass m at p pushes by F = m (a - g), with a the
+        base's acceleration, and turns by p x F: linear in m and m p, of which a Kalman filter keeps the mean.
+        """
+        push, feet = wrench[:, 2].sum(), self._gauge.places(q)
+        if push < FELT_LOAD * self._weight_n or max(abs(foot.rotation[2, 0]) for foot in feet) > STILL_RAD:
             return
-        felt = self._moment([foot.translation for foot in feet], self._gauge.com(q), wrench) - self._spin
-        g, sense = self._gains, rotation(q[3:7])[0, [0, 2]]
-        spread = self._spread + g.drift_m**2 * PERIOD_STEPS * STEP_S * np.eye(2)
-        gain = spread @ sense / (sense @ spread @ sense + g.reading_m**2)
-        self._place = np.clip(self._place + gain * (-felt[1] / load - sense @ self._place), -MOST_OFF_M, MOST_OFF_M)
-        self._spread = spread - np.outer(gain, sense @ spread)
-        self.off_m = float(sense @ self._place)
+        com, axes, mass = self._gauge.com(q), rotation(q[3:7]), self._robot.total_mass
+        felt = self._moment([foot.translation for foot in feet], com, wrench) - self._spin
+        pull = planned[5] - self._gauge.model.gravity.linear
+        arms = np.column_stack([q[:3] - com, axes[:, 0], axes[:, 2]])
+        sense = np.array([[pull[2], 0.0, 0.0], np.cross(arms, pull, axisa=0)[:, 1]])
+        readings = np.array([push - mass * (planned[2, 2] + self._robot.gravity), felt[1]])
+        noise = np.diag(np.square(np.multiply(self._gains.reading, push)))
+        gain = np.linalg.solve(sense @ self._spread @ sense.T + noise, sense @ self._spread).T
+        self._load = self._load + gain @ (readings - sense @ self._load)
+        self._spread = self._spread - gain @ sense @ self._spread
+        ahead = float(arms[0] @ self._load) / (mass + float(self._load[0]))
+        self.off_m = float(np.clip(ahead, -MOST_OFF_M, MOST_OFF_M))
 
     def _solved(self, due: int, stand: str, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step ``due``."""
@@ -169,7 +182,7 @@ class LaunchFeedback:
         point = foot.center if stand == FLAT else foot.tip
         body.update(q, v, point)
         body.set_contact(np.ones(2, bool))
-        com, speed, push, momentum, spin = self._rows[due]
+        com, speed, push, momentum, spin, _ = self._rows[due]
         off = np.array([self.off_m, 0.0, 0.0])
         beyond = np.cross(off, body.mass * (push - body.gravity))  # moment that the real CoM takes besides
         shift = g.com_rate**2 * (com - off - body.com) + 2 * g.com_rate * (speed - body.com_velocity)

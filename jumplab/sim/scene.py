@@ -18,6 +18,7 @@ REACH_M = 20.0  # half-size of "endless" ground, far beyond any jump
 THICKNESS_M = 1.0  # deeper than any contact can push a foot in one step
 UNEVEN_M = 5e-3  # by how much the ground may miss a corner of a sole at the start
 GRAVEL_WIDE_M = 1.0  # to both sides together
+STRAIGHT_RAD = 1e-9  # a heading that differs from +x by rounding alone is straight ahead
 GAP_M = 0.02  # least room between the soles at the start and at the landing, where the ground of one is to differ
 
 
@@ -171,7 +172,7 @@ class Scene:
 
     def seen_along(self, heading_rad: float, robot: Robot, q: np.ndarray) -> Scene:
         """The ground seen along a heading: itself if all is straight ahead, else what is under the soles of ``q``."""
-        if heading_rad == self.along_rad == 0:
+        if max(abs(heading_rad), abs(self.along_rad)) < STRAIGHT_RAD:
             return self
         soles = Gauge(robot).soles(q)
         x = float(np.cos(self.along_rad) * soles[0] + np.sin(self.along_rad) * soles[1])

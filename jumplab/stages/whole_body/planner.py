@@ -183,7 +183,7 @@ def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
     """The schedule of a standing jump, which ends at touchdown."""
     phases = (
         ContactPhase("LR", limits.flat_s, 0.6, mesh.flat, "flat"),
-        ContactPhase("lr", limits.toe_s, 0.12, mesh.toe, "toe"),
+        ContactPhase("lr", limits.toe_s, 0.1, mesh.toe, "toe"),
         ContactPhase("-", limits.flight_s, 0.5, mesh.flight, "flight"),
     )
     return Contacts(phases, ends="touchdown")

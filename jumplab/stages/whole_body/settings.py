@@ -21,13 +21,14 @@ class Limits:
     friction: float = 0.42  # below the lowest friction that trials have (0.5), so that it holds between the nodes too
     range_margin_rad: float = 0.03  # to the joint stops
     cop_margin_m: float = 0.01  # ahead of the heel; at the toe none, it ends there before the heel rises
-    cop_reserve_m: float = 0.0  # kept from both ends of the sole besides, until the last of the flat-foot phase
+    # of the sole, kept from both its ends besides until the last of the flat-foot phase: launches are open loop
+    cop_reserve_share: float = 0.125
     least_push: float = 0.0  # share of the weight that both flat feet carry at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     straight_knee_rad: float = 0.15  # flexion at least while a foot carries: a leg
     # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
-    toe_s: tuple[float, float] = (0.06, 0.15)  # duration of the toe phase
+    toe_s: tuple[float, float] = (0.06, 0.13)  # duration of the toe phase, in which perturbed robots fall forward
     flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
     clearance_m: float = 0.035  # of the soles over the ground in mid-flight
     body_clearance_m: float = 0.05  # of knees and hands over the ground
@@ -74,15 +75,11 @@ class Limits:
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
     def of_flip(self) -> Limits:
-        """The same for a jump that turns over: time to wind up, a trunk that arrives turning, caught by momentum.
-
-        The launch is open loop and longer than an upright body's fall, so the CoP keeps off the sole's edges.
-        """
+        """The same for a jump that turns over: time to wind up, a trunk that arrives turning, caught by momentum."""
         return replace(
             self,
             flat_s=(0.25, 1.3),
             toe_s=(0.06, 0.45),  # a front flip leans over the toes before it brakes on them
-            cop_reserve_m=0.03,
             least_push=0.04,  # or high flips hop first
             body_clearance_m=0.06,
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body

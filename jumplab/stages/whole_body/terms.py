@@ -883,8 +883,8 @@ class WholeBodyTerms:
         return [row("opening speed", "ours, for flips", "rad/s", rates, -most, most, scale=10.0, skip=(1, 0))]
 
     def reserve(self) -> list[Term]:
-        """If asked, the CoP of flat feet keeps off both ends of the sole, but for the ends of the phase."""
-        reserve, share = self.limits.cop_reserve_m, RESERVE_SHARE
+        """The CoP of flat feet keeps off both ends of the sole, but for the ends of the phase."""
+        reserve, share = 2 * self.body.half_m * self.limits.cop_reserve_share, RESERVE_SHARE
         if not reserve:
             return []
 
@@ -898,4 +898,4 @@ class WholeBodyTerms:
                 rows += [ahead - kept * load, (length - kept) * load - ahead]
             return ca.vertcat(*rows)
 
-        return [row("CoP reserve", "ours, for flips", "m, of the weight", left, *POSITIVE, scale=PLACE_SCALE)]
+        return [row("CoP reserve", "ours", "m, of the weight", left, *POSITIVE, scale=PLACE_SCALE)]

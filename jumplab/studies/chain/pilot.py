@@ -138,7 +138,7 @@ class Foresight:
         self._missed: dict[int, np.ndarray] = {}  # jump: by how much way and turn (3,) fell short
         self._misjudged: list[np.ndarray] = []  # by how much poses (3,) foretold in the air were too far
         self._zero: np.ndarray | None = None  # where the chain began, by its own measurement
-        self._crouch = stance_angles(planner.robot)
+        self._crouch = stance_angles(robot)
 
     def learn_posture(self, q: np.ndarray) -> None:
         """Plans begin as far off the crouch as the robot, heavier perhaps, stands still in ``q``."""
