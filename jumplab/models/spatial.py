@@ -387,6 +387,17 @@ class SpatialState:
         linear, angular = self._momenta
         return angular - cross(self.com_from_base, linear)
 
+    @property
+    def inertia(self) -> ca.SX:
+        """Inertia (3, 3) about the CoM of the body as one [kg m^2]; of no even motion, whose sums are of half of it."""
+        total = -self.model.mass * _spread(self.com_from_base, self.com_from_base)
+        for k, b in enumerate(self.model.bodies):
+            turn, place = self._frame(k)
+            first = turn @ ca.DM(b.first)
+            total += turn @ ca.DM(b.second) @ turn.T + b.mass * _spread(place, place)
+            total += _spread(place, first) + _spread(first, place)
+        return total
+
     def spin(self, body: int) -> ca.SX:
         """Angular velocity (3,) of a body [rad/s]."""
         return self.rotation(body) @ self._spin(body)
@@ -466,6 +477,11 @@ def rates(of: Callable[[ca.SX], ca.SX], q: ca.SX, v: ca.SX, a: ca.SX | None = No
     made = ca.Function("rates", [x, w, b], [first] if a is None else [first, second])
     found = made(q, v, v if a is None else a)
     return (found, None) if a is None else found
+
+
+def _spread(x: ca.SX, y: ca.SX) -> ca.SX:
+    """(3, 3): x . y times the unit matrix, less the dyad y x'."""
+    return ca.dot(x, y) * ca.SX.eye(3) - y @ x.T
 
 
 def _unit(axis: int, size: ca.SX) -> ca.SX:

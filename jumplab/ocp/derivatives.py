@@ -19,6 +19,7 @@ MATRICES = ("jacobian", "hessian", "gauss_newton")  # of the symmetric ones the 
 FUNCTIONS = ("costs", "gradient", "rows", *MATRICES)  # that an element may be asked for
 SAID = 300  # characters of another error that a sentence quotes
 LARGE = 1500  # operations; in the derivatives of more the search takes seconds, and saves a few per cent of a solve
+BENT = 20_000  # operations of a cost, beyond which its second derivatives, which take minutes to make, are left out
 RARE = ("gauss_newton",)  # evaluated a few times a plan: the search for common subexpressions would not pay
 
 
@@ -79,12 +80,14 @@ class Formulas:
         """Hessian of the Lagrangian, lam_f * cost + lam . g.
 
         A cost w |y|^2 contributes 2 w J^T J, and the curvature of y as if y were a constraint with multiplier 2 w y: so
-        everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.)
+        everything is bent only once, with constant multipliers. (Where w depends on x, there are mixed terms.) Costs of
+        more than :data:`BENT` operations count as straight.
         """
         x, (extra, parts) = self.local, self._squares(self.lam_f)
         for k, (share, y, jacobian, _) in enumerate(parts):
             mixed = ca.jacobian(share, x).T @ (2 * self.lam_f * self.w[k] * (y.T @ jacobian))
             extra += mixed + mixed.T
+        parts = [part for part in parts if ca.n_nodes(part[1]) < BENT]
         y = ca.vertcat(ca.SX(0, 1), *(y for _, y, _, _ in parts))
         mu = ca.vertcat(ca.SX(0, 1), *(w * y for _, y, _, w in parts))
         held = ca.SX.sym("mu", y.numel())

@@ -10,22 +10,32 @@ import casadi as ca
 
 from jumplab.errors import InputError, quoted
 from jumplab.models.planar import PlanarState
+from jumplab.models.spatial import SpatialModel, SpatialState
 from jumplab.ocp.problem import Point
-from jumplab.robot.sagittal import SagittalModel
 from jumplab.robot_import.config import ROLES
 from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.terms import WholeBodyTerms
 
 
 @dataclass(frozen=True)
-class SpatialView:
+class _View:
+    """A point of a phase of the program."""
+
+    _terms: WholeBodyTerms
+    _point: Point
+
+    def moved(self, model: SpatialModel) -> SpatialState:
+        """Another robot, whose tree has the same joints, in the same motion."""
+        q, v = self._terms.chart(self._point.q), self._terms.chart(self._point.v, 1)
+        return SpatialState(model, q, v, v, self._point.p.gravity)
+
+
+@dataclass(frozen=True)
+class SpatialView(_View):
     """A point of the whole-body program, ``p.joints.left_knee`` and so on; vectors (3,) in the axes of the start.
 
     Places count from the middle between the soles in their first place: x forward, y to the left, z up.
     """
-
-    _terms: WholeBodyTerms
-    _point: Point
 
     def _named(self, column: ca.SX) -> SimpleNamespace:
         return SimpleNamespace(**dict(zip(self._terms.body.joint_names, ca.vertsplit(column), strict=True)))
@@ -91,15 +101,12 @@ class Joints(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PlaneView:
+class PlaneView(_View):
     """A point of the whole-body program in the plane, ``p.joints.knee`` and so on.
 
     The model is planar: left and right move alike, so an angle or rate is that of either side, and a torque is that of
     both sides together. Angles are positive about +y; places count from the toes' first place, x forward, z up.
     """
-
-    _terms: WholeBodyTerms
-    _point: Point
 
     @property
     def _state(self) -> PlanarState:
@@ -168,12 +175,6 @@ class PlaneView:
             x, z = ca.cos(phi) * place[0], -ca.sin(phi) * place[0]
             total += 2 * ca.vertcat(f[0], f[2], z * f[0] - x * f[2])
         return total
-
-    def moved(self, model: SagittalModel) -> PlanarState:
-        """Another robot in the same motion, its quantities from its own toe: that of stage 3's model, by its links."""
-        return PlanarState(
-            model, *(self._terms.links(x, k) for k, x in enumerate((self._point.q, self._point.v, self._point.a)))
-        )
 
     def point(self, name: str) -> ca.SX:
         """Place (2,) [m] of "toe", "heel", "knee", "hip", "shoulder", "hand" or "mid-arm"."""
