@@ -51,13 +51,15 @@ def test_joint_table(motion, bhr, odd_folder):
     assert np.diff(table["time_s"])[:-1] == pytest.approx(0.001, abs=1e-9)
     assert table["time_s"][0] == 0 and table["time_s"][-1] == pytest.approx(tape.t[-1], abs=1e-6)  # touchdown is in
     rows = np.concatenate([np.arange(tape.takeoff_index - 1), np.arange(tape.takeoff_index, len(tape.t))])
-    assert len(rows) == len(table)  # take-off once
+    # take-off once; a tape leaves out a sample that would lie just before its end, and the table has it
+    at = np.flatnonzero(np.isin(np.round(table["time_s"], 6), np.round(tape.t[rows], 6)))
+    assert len(at) == len(rows) >= len(table) - 1
     model = bhr.model
     for name in bhr.joint_names:
         i, j = model.idx_qs[model.getJointId(name)], model.idx_vs[model.getJointId(name)]
-        assert table[f"{name}_position_rad"] == pytest.approx(tape.q[rows, i], abs=1e-7)
-        assert table[f"{name}_velocity_rad_s"] == pytest.approx(tape.v[rows, j], abs=1e-6)
-        assert table[f"{name}_torque_N_m"] == pytest.approx(tape.tau[rows, j - 6], abs=1e-5)
+        assert table[f"{name}_position_rad"][at] == pytest.approx(tape.q[rows, i], abs=1e-7)
+        assert table[f"{name}_velocity_rad_s"][at] == pytest.approx(tape.v[rows, j], abs=1e-6)
+        assert table[f"{name}_torque_N_m"][at] == pytest.approx(tape.tau[rows, j - 6], abs=1e-5)
     code = table["phase_0_launch_1_flight_2_landing"]
     assert table["time_s"][code == 1][0] == pytest.approx(np.ceil(tape.takeoff_time * 1000) / 1000, abs=1e-9)
 

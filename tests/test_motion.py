@@ -48,11 +48,12 @@ def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
     x = Motion.of(tape).every(1000.0)
     keep = np.concatenate([np.diff(tape.t) > 0, [True]])
     keep &= np.abs(tape.t * 1000 - np.round(tape.t * 1000)) < 1e-6  # the end is no whole millisecond
-    assert keep.sum() == len(x.t) and len(x.t) < len(tape.t)
+    at = np.round(tape.t[keep] * 1000).astype(int)  # a tape leaves out a sample that would lie just before its end
+    assert len(x.t) - 1 <= len(at) <= len(x.t) < len(tape.t)
     assert np.diff(x.t) == pytest.approx(0.001, abs=1e-12)
     for name in ("q", "v", "tau"):
-        assert np.abs(getattr(x, name) - getattr(tape, name)[keep]).max() < 1e-6, name
-    assert list(x.phase) == list(tape.phase[keep])
+        assert np.abs(getattr(x, name)[at] - getattr(tape, name)[keep]).max() < 1e-6, name
+    assert list(x.phase[at]) == list(tape.phase[keep])
     assert Motion.of(tape).source == "plan" and Motion.of(tape).duration == tape.t[-1]
 
 

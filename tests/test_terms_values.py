@@ -279,7 +279,11 @@ class Seen:
         x["torque-speed"] = (self.tau + slope * self.rates[free]) / effort
         places = [self.joint(self.robot.joints["knee"][k]).translation for k in self.both]
         places += [self.hand(k) for k in self.both]
-        x["body clearance"] = [y[2] - self.ground(y, LIM.edge_clearance_m) for y in places]
+        face = self.body.shank_m + LIM.shank_clearance_m
+        over = float(self.par["platform"]) + face  # it is above the ground here
+        steps = [self.ground(y, face) / self.par["platform"] for y in self.shanks()]
+        heights = [y[2] - over * step for y, step in zip(self.shanks(), steps, strict=True)]
+        x["body clearance"] = [*(y[2] - self.ground(y, LIM.edge_clearance_m) for y in places), *heights]
         if not self.plane:
             x["sides apart"] = self.apart()
         for side in self.sides:
@@ -313,6 +317,18 @@ class Seen:
             behind = sum(-at[0] * f[2] for at, f in pushes) / self.body.mg
             rows += [behind - reserve * load, (length - reserve) * load - behind]
         return {"CoP reserve": rows}
+
+    def shanks(self) -> list[np.ndarray]:
+        """Five places along the middle of each shank's box, from its far end up."""
+        out = []
+        for side in self.both:
+            name = self.robot.joints["knee"][side]
+            (box,) = [s for s in self.body.shapes if s.body == 1 + self.names.index(name)]
+            way = box.axes[:, np.argmax(box.half)] * box.half.max()
+            frame = self.joint(name)
+            own = self.body.model.bodies[box.body].own
+            out += [frame.act(own @ (box.centre + share * way)) for share in (-0.8, -0.4, 0.0, 0.4, 0.8)]
+        return out
 
     def standing(self, side: int) -> dict:
         """Rows of a foot that carries: its place, heading, roll and pitch, on all three levels."""
@@ -629,7 +645,7 @@ def test_what_a_term_of_the_whole_body_sees(programs, body, name):
         (p.L, x.momentum[1]), (p.inertia, x.rho), (p.inertia_rate, x.rho_rate), (p.wrench, wrench),
         (p.point("hand"), x.hand(0)[[0, 2]] - first), (p.point("toe"), x.tip(0)[[0, 2]] - first),
         (p.point_velocity("hand"), hand[[0, 2]]), (p.joint_rates.knee, x.sagittal(x.rates)[1]),
-        (p.torques.ankle, torques[2]), (p.moved(body.robot.sagittal).inertia, x.rho), (p.time, 0.35 * 0.6),
+        (p.torques.ankle, torques[2]), (p.moved(body.model).inertia, x.data.Ig.inertia), (p.time, 0.35 * 0.6),
     ):  # fmt: skip
         np.testing.assert_allclose(numbers(seen), np.ravel(value), rtol=1e-8, atol=1e-7)
 

@@ -51,7 +51,7 @@ def test_it_solves(run):
     last = body.attempts[-1]
     assert s.status in GOOD_STATUSES and s.residual < 1e-4
     assert (last.status, last.iterations) == (s.status, s.iterations)
-    assert s.iterations <= (50 if last.hessian == "held Gauss-Newton" else 100)
+    assert s.iterations <= (60 if last.hessian == "held Gauss-Newton" else 100)
     assert body.used <= 1.0
 
 
@@ -208,7 +208,7 @@ def test_touchdown(run):
     planned = np.abs(run.plan.whole_body.phases["flight"].v[-1, 6:]).max()
     assert planned <= LIMITS.touchdown_joint_rate + 1e-3
     # between the nodes L is kept on the tape, to some per mille in the plan; the legs that arrive make up for it
-    assert np.abs(run.tape.v[-1, 6:]).max() <= LIMITS.touchdown_joint_rate + 5e-3
+    assert np.abs(run.tape.v[-1, 6:]).max() <= LIMITS.touchdown_joint_rate * 1.005
     assert abs(run.tape.v[-1, 4]) <= LIMITS.touchdown_trunk_rate + 1e-3
     pitch = 2 * np.arctan2(run.tape.q[-1, 4], run.tape.q[-1, 6])
     assert LIMITS.touchdown_pitch[0] - 1e-3 <= pitch <= LIMITS.touchdown_pitch[1] + 1e-3
@@ -390,7 +390,10 @@ def test_a_robot_too_weak_is_told_that_its_torques_are(refusal):
 
 
 def test_limits_are_read(bhr):
-    """Each row of the body's clearance by its own; knees keep the half thickness of the shank besides."""
+    """Each row of a limb's clearance by its own; knees keep the half depth of the shank besides.
+
+    Rows of the shanks, which come last, know a platform alone.
+    """
     body = Body(bhr)
     found = []
     for least in (LIMITS.body_clearance_m, 0.2):
@@ -398,5 +401,6 @@ def test_limits_are_read(bhr):
         problem = Schedule(body, jump_contacts(limits, Mesh()), limits, Weights(), free=even(body)).problem()
         (term,) = (t for owner, t in problem.terms() if (owner, t.name) == ("flat", "body clearance"))
         assert np.all(np.isinf(term.upper))
-        found.append(np.array(term.lower))
+        found.append(np.array(term.lower)[:2])
+        assert np.all(np.array(term.lower)[2:] == 0)
     assert found[1].min() == 0.2 and found[1] - found[0] == pytest.approx(0.2 - LIMITS.body_clearance_m)

@@ -28,11 +28,12 @@ class Limits:
     straight_knee_rad: float = 0.15  # flexion at least while a foot carries: a leg
     # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
-    toe_s: tuple[float, float] = (0.06, 0.13)  # duration of the toe phase, in which perturbed robots fall forward
+    toe_s: tuple[float, float] = (0.06, 0.12)  # duration of the toe phase, in which perturbed robots fall forward
     flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
-    clearance_m: float = 0.035  # of the soles over the ground in mid-flight
+    clearance_m: float = 0.037  # of the soles over the ground in mid-flight
     body_clearance_m: float = 0.05  # of knees and hands over the ground
     edge_clearance_m: float = 0.07  # by which a platform's edge counts as nearer to them
+    shank_clearance_m: float = 0.015  # of the faces of the shanks from a platform's edge
     edge_smoothing_m: float = 0.015  # a platform's edge is a step smoothed over about twice this
     edge_before_heel_m: float = 0.05  # a platform begins this far before the landing soles
     edge_step_m: float = 0.08  # and for clearance its upper surface counts as reaching this much further

@@ -38,6 +38,7 @@ TORSION_SLACK_M = 1e-4  # where a foot hardly carries both sides of the row vani
 
 
 POSITIVE = 0.0, np.inf
+SHANK_SHARES = -0.8, -0.4, 0.0, 0.4, 0.8  # of half the length of a shank's box, where a platform's edge may meet it
 
 
 def cost(name: str, equation: str, unit: str, of: Callable, weight: float, at: str = "node") -> Term:
@@ -171,6 +172,13 @@ class Body:
         """Half the thickness of the shank [m]: with a level shank its face is that much lower than the knee."""
         halves = [np.sort(x.half)[0] for x in self.shapes if x.body in {1 + k for k, _, _ in self.knees}]
         return float(max(halves, default=0.0))
+
+    @cached_property
+    def shank_points(self) -> list[tuple[int, np.ndarray]]:
+        """Places along the middle of the boxes of the shanks: (body, place in it)."""
+        shanks = [x for k, _, _ in self.knees for x in self.shapes if x.body == 1 + k]
+        along = [(x, x.axes[:, np.argmax(x.half)] * x.half.max()) for x in shanks]
+        return [(x.body, x.centre + share * way) for x, way in along for share in SHANK_SHARES]
 
     @cached_property
     def limb_points(self) -> list[tuple[int, np.ndarray]]:
@@ -437,20 +445,25 @@ class WholeBodyTerms:
         return row("torque-speed", "ours: motor line", "of the effort", line, -high, high, skip=(int(joined), 0))
 
     def body_clearance(self) -> Term:
-        """Knees and hands stay away from the ground."""
-
+        """Knees and hands stay away from the ground, and shanks from a platform that they are to be brought onto."""
         half = set(self.model.left_half) if self.free.even else set(range(len(self.model.bodies)))
-        kept = [k for k, (body, _) in enumerate(self.body.limb_points) if body in half]
+        limbs, lim = self.body.limb_points, self.limits
+        least = np.full(len(limbs), lim.body_clearance_m)
+        least[:2] += self.body.shank_m
+        kept = [k for k, (body, _) in enumerate(limbs) if body in half]
+        shanks = [x for x in self.body.shank_points if x[0] in half]
+        face = self.body.shank_m + lim.shank_clearance_m
 
         def heights(p):
-            places = [self.state(p).point(*self.body.limb_points[k]) for k in kept]
-            return ca.vertcat(*(x[2] - self.ground(p, x, self.limits.edge_clearance_m) for x in places))
+            s, up, lowest = self.state(p), p.p.platform > 0, ca.fmin(p.p.platform, 0)
+            limb = [s.point(*limbs[k]) for k in kept]
+            heights = [x[2] - self.ground(p, x, lim.edge_clearance_m) for x in limb]
+            for x in (s.point(*shank) for shank in shanks):
+                heights.append(x[2] - lowest - up * (p.p.platform + face) * self.beyond_edge(p, x, face))
+            return ca.vertcat(*heights)
 
         how = {"scale": PLACE_SCALE, "skip": (1, 0), "group": "clearance"}
-        least = np.full(len(self.body.limb_points), self.limits.body_clearance_m)
-        least[:2] += self.body.shank_m
-        least = least[kept]
-        return row("body clearance", "ours", "m", heights, least, np.inf, **how)
+        return row("body clearance", "ours", "m", heights, np.append(least[kept], np.zeros(len(shanks))), np.inf, **how)
 
     def sides_apart(self) -> list[Term]:
         """Left and right knees, ankles, toes and heels keep a share of their distance in the stance, seen from the
@@ -508,8 +521,12 @@ class WholeBodyTerms:
 
     def ground(self, p: Point, x: ca.SX, nearer_m: float = 0.0) -> ca.SX:
         """Height of the surface below a point, its upper part ``nearer_m`` than it is."""
-        beyond = ca.dot(p.p.along, x[:2]) - p.p.edge + nearer_m * ca.sign(p.p.platform)
-        return p.p.platform * (1 + ca.tanh(beyond / self.limits.edge_smoothing_m)) / 2
+        return p.p.platform * self.beyond_edge(p, x, nearer_m * ca.sign(p.p.platform))
+
+    def beyond_edge(self, p: Point, x: ca.SX, nearer_m: float | ca.SX) -> ca.SX:
+        """1 for a point beyond the edge where the ground steps up or down, 0 before it, smooth between."""
+        beyond = ca.dot(p.p.along, x[:2]) - p.p.edge + nearer_m
+        return (1 + ca.tanh(beyond / self.limits.edge_smoothing_m)) / 2
 
     # feet on the ground -----------------------------------------------------------------------------------------
     def foot_rows(self, side: int, joined: bool, landed: bool) -> list[Term]:
