@@ -44,8 +44,8 @@ def plan(
         planned by the whole-body program, audited foot by foot, and not yet played on a simulated robot.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone, from a crouch) or, for targets in the plane, "three-step" (SRMP,
-        joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step" for flips, and
-        where stages 1 or 2 are changed, see :meth:`jumplab.Planner.plan`.
+        joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step" where stages 1 or
+        2 are changed, see :meth:`jumplab.Planner.plan`.
     robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come
         to rest as near to the middle of their soles as can be, and a flip's tuck has time to open later, see
         :mod:`jumplab.studies.robust`.

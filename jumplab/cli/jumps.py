@@ -90,7 +90,7 @@ def run(args: Namespace) -> None:
     opt("--rotation-deg DEG", "0 or a multiple of 360; -360 is a backflip", "0", number),
     opt("--side-m M", "travel of the feet to the left [m] (default 0)", "0", number),
     opt("--yaw-deg DEG", "turn about the vertical, counter-clockwise, -360 to 360 (default 0)", "0", number),
-    opt("--method", "whole body alone, usual but for flips, or the paper's three steps", "usual", ("usual", *METHODS)),
+    opt("--method", "the whole body alone, which is usual, or the paper's three steps", "usual", ("usual", *METHODS)),
     opt("--atlas DIR", "folder of an atlas to begin with ('jumplab atlas'); the method is then direct", None, folder),
     opt("--robust", "allow for robots that differ as those of 'trials' do, and as --disturb says"),
     DISTURB,
