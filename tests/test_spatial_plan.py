@@ -438,6 +438,8 @@ def test_the_servo_asks_for_the_planned_torques_if_it_knows_what_each_foot_carri
     servo, player = Servo(bhr, substeps=10**6), Playback(tape, bhr)
     effort, worst = Actuators(bhr).effort, {True: 0.0, False: 0.0}
     for row in range(50, tape.takeoff_index - 5, 50):
+        if abs(tape.t[row] - tape.extra["toe_phase_start"]) < 2 * STEP_S:
+            continue  # wrenches change within the step
         step = round(float(tape.t[row]) / STEP_S)
         command = player.command(step, tape.q[row], tape.v[row], np.zeros(len(effort)))
         assert command.wrench is not None and command.tau is None
