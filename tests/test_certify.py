@@ -222,7 +222,7 @@ def test_the_page_shows_every_quantity_in_its_place(folder, physics):
 
 @pytest.mark.slow
 def test_a_plain_jump_is_certified(tmp_path):
-    """All engines, for real; of longer jumps, perturbed robots in PD mode fare differently in the two engines."""
+    """All engines, for real; of one of 1 m, perturbed robots in PD mode fare differently in the two engines."""
     plan, folder = jump(0.6, 0.3, method="direct"), tmp_path / "plan"
     store.write_plan(folder, plan.tape, plan.robot, plan.summary)
     found = certify(folder, 1, page=lambda c: certificate_page(c).html)

@@ -89,7 +89,7 @@ def test_feet_tell_where_the_com_is(bhr, tape, place_m):
     real = loaded.robot(bhr)
     last = round((float(tape.extra["toe_phase_start"]) - ROLLING_S) / STEP_S)
     model, truth = (Gauge(robot).com(run.q[last])[0] for robot in (bhr, real))
-    assert abs(truth - model) > 0.003
+    assert abs(truth - model) > 0.004
     assert run.settings["feedback"]["com_ahead_m"] == pytest.approx(truth - model, abs=0.004)
 
 
@@ -133,6 +133,7 @@ def test_on_ground_that_gives_way_the_launch_tips_less(bhr, tape):
     led = dict(perturbation=soft, stand_s=BRIEF_S)
     runs = [simulate_jump(tape, bhr, feedback=on, **led) for on in (False, True)]
     tipped = [abs(pitch_at_takeoff(run, tape)) for run in runs]
+    # open loop it rises 0.37 of the 0.50 m: plans that keep the CoP off the heel's edge lose less there to begin with
     assert tipped[1] < tipped[0] / 2 and runs[1].metrics.com_rise_m > runs[0].metrics.com_rise_m + 0.02
 
 

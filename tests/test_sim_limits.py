@@ -1,7 +1,7 @@
 """No joint of a nominal jump leaves its limits, from stand to stand, whatever planned, played and simulated it.
 
-One sample at touchdown is left out for ankles: the ground turns a sole that is a few milliradians off the level flat
-within a millisecond, and no motor has a part in it.
+Of the three-step plan one sample at touchdown is left out for ankles: played open loop its soles come down 5 mrad off the
+level, the ground turns them flat within a millisecond at 21 rad/s, and no motor has a part in it.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def within_limits(robot, run, slaps=0):
 @pytest.mark.parametrize("method", METHODS)
 def test_the_default_jump_stays_within_all_limits(bhr, method, mode, engine):
     run = simulate_jump(jump(1.0, 0.5, method=method).tape, bhr, mode=mode, engine=engine)
-    assert within_limits(bhr, run, slaps=1), run.metrics
+    assert within_limits(bhr, run, slaps=int(method == "three-step")), run.metrics
 
 
 @pytest.mark.slow

@@ -161,7 +161,7 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
     assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
-    assert abs(known.com_rise_m - asked.com_rise_m) < 0.02 * asked.com_rise_m  # what a grip on the toes is worth
+    assert abs(known.com_rise_m - asked.com_rise_m) < 0.006  # 2 % of the rise; 5.3 mm measured in position mode
 
 
 @pytest.mark.parametrize("mode", ["position", "pd"])

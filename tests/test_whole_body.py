@@ -51,7 +51,7 @@ def test_it_solves(run):
     last = body.attempts[-1]
     assert s.status in GOOD_STATUSES and s.residual < 1e-4
     assert (last.status, last.iterations) == (s.status, s.iterations)
-    assert s.iterations <= (60 if last.hessian == "held Gauss-Newton" else 100)
+    assert s.iterations <= (50 if last.hessian == "held Gauss-Newton" else 100)
     assert body.used <= 1.0
 
 
@@ -208,7 +208,7 @@ def test_touchdown(run):
     planned = np.abs(run.plan.whole_body.phases["flight"].v[-1, 6:]).max()
     assert planned <= LIMITS.touchdown_joint_rate + 1e-3
     # between the nodes L is kept on the tape, to some per mille in the plan; the legs that arrive make up for it
-    assert np.abs(run.tape.v[-1, 6:]).max() <= LIMITS.touchdown_joint_rate * 1.005
+    assert np.abs(run.tape.v[-1, 6:]).max() <= LIMITS.touchdown_joint_rate + 5e-3
     assert abs(run.tape.v[-1, 4]) <= LIMITS.touchdown_trunk_rate + 1e-3
     pitch = 2 * np.arctan2(run.tape.q[-1, 4], run.tape.q[-1, 6])
     assert LIMITS.touchdown_pitch[0] - 1e-3 <= pitch <= LIMITS.touchdown_pitch[1] + 1e-3
@@ -390,7 +390,7 @@ def test_a_robot_too_weak_is_told_that_its_torques_are(refusal):
 
 
 def test_limits_are_read(bhr):
-    """Each row of a limb's clearance by its own; knees keep the half depth of the shank besides.
+    """Each row of a limb's clearance by its own; knees keep the half thickness of the shank besides.
 
     Rows of the shanks, which come last, know a platform alone.
     """

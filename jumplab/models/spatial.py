@@ -389,7 +389,7 @@ class SpatialState:
 
     @property
     def inertia(self) -> ca.SX:
-        """Inertia (3, 3) about the CoM of the body as one [kg m^2]; of no even motion, whose sums are of half of it."""
+        """Inertia (3, 3) of all bodies as one, about the CoM, in world axes [kg m^2]."""
         total = -self.model.mass * _spread(self.com_from_base, self.com_from_base)
         for k, b in enumerate(self.model.bodies):
             turn, place = self._frame(k)

@@ -70,7 +70,8 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
         return {**changes, "limits": limits | own}
     stage = "whole body" if task.in_plane and robot.planar else "spatial"
     terms = {name: _listed(extra) for name, extra in (changes.get("terms") or {}).items()}
-    terms[stage] = [*terms.get(stage, ()), capture_term(robot, ranges, along=("x",) if task.in_plane else ("x", "y"))]
+    axes = (0,) if stage == "whole body" else (0, 1)
+    terms[stage] = [*terms.get(stage, ()), capture_term(robot, ranges, axes=axes)]
     off = [*changes.get("off", ()), f"{stage}/{INSTEAD_OF}"]
     return {**changes, "terms": terms, "off": off, "limits": limits | own}
 
@@ -79,17 +80,16 @@ def _listed(terms: Term | Iterable[Term]) -> list[Term]:
     return [terms] if isinstance(terms, Term) else list(terms)
 
 
-def capture_term(robot: Robot, ranges: Ranges, weight: float = WEIGHT, along: tuple[str, ...] = ("x",)) -> Term:
+def capture_term(robot: Robot, ranges: Ranges, weight: float = WEIGHT, axes: tuple[int, ...] = (0,)) -> Term:
     """The mean square of the distance from the middle of the soles to where sampled robots come to rest [m^2].
 
     A cost at "problem" of stage 3, ours: E[xi^2] = mean^2 + variance of the capture point xi, over
-    2 :data:`SAMPLES` robots, the same ones for every plan; ``along`` the axes x, y of the start.
+    2 :data:`SAMPLES` robots, the same ones for every plan; ``axes`` are 0 for x, 1 for y of the start.
     """
     models, body = sampled(robot, ranges), Body(robot)
-    axes = ["xy".index(axis) for axis in along]
 
     def points(ends: Mapping[str, SimpleNamespace]) -> ca.SX:
-        return ca.vertcat(*(capture_point(model, body, ends)[axes] for model in models)) / np.sqrt(len(models))
+        return ca.vertcat(*(capture_point(model, body, ends)[list(axes)] for model in models)) / np.sqrt(len(models))
 
     return Term("capture of sampled robots", "ours: scenarios", "m", "problem", points, weight=weight)
 

@@ -30,7 +30,7 @@ class Limits:
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
     toe_s: tuple[float, float] = (0.06, 0.12)  # duration of the toe phase, in which perturbed robots fall forward
     flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
-    clearance_m: float = 0.037  # of the soles over the ground in mid-flight
+    clearance_m: float = 0.037  # of the soles over the ground in mid-flight: 2 cm, beside platforms too, between nodes
     body_clearance_m: float = 0.05  # of knees and hands over the ground
     edge_clearance_m: float = 0.07  # by which a platform's edge counts as nearer to them
     shank_clearance_m: float = 0.015  # of the faces of the shanks from a platform's edge
