@@ -1,7 +1,7 @@
 """No joint of a nominal jump leaves its limits, from stand to stand, whatever planned, played and simulated it.
 
-Of the three-step plan one sample at touchdown is left out for ankles: played open loop its soles come down 5 mrad off the
-level, the ground turns them flat within a millisecond at 21 rad/s, and no motor has a part in it.
+Of the three-step plan one sample at touchdown is left out for ankles: played open loop its soles come down 5 mrad off
+the level, the ground turns them flat within a millisecond at 21 rad/s, and no motor has a part in it.
 """
 
 import numpy as np

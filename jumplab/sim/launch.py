@@ -59,8 +59,8 @@ class LaunchGains:
     foot_weight: float = 1e4
     posture_weight: float = 0.02
     most: float = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
-    # standard deviations. Of the load on the trunk before anything is felt, in shares of the robot's mass: its mass, and
-    # that times how far it is ahead of and above the base [m]
+    # standard deviations. Of the load on the trunk before anything is felt, in shares of the robot's mass: its mass,
+    # and that times how far it is ahead of and above the base [m]
     prior: tuple[float, float, float] = (0.1, 0.02, 0.03)
     # of one reading, in which all that moves unlike the model errs too, in shares of the push: push up, and moment [m]
     reading: tuple[float, float] = (0.07, 0.03)
