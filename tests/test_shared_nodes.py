@@ -8,7 +8,7 @@ import pytest
 from test_transcription import data_vector, derivatives_agree, sparse
 
 from jumplab.ocp.assembly import Assembled, pack_multipliers, unpack_multipliers
-from jumplab.ocp.derivatives import chain
+from jumplab.ocp.derivatives import BENT, chain
 from jumplab.ocp.nlp import Nlp, PhaseGuess
 from jumplab.ocp.problem import Bound, Phase, Problem, Term, layouts
 
@@ -271,6 +271,24 @@ def test_the_gauss_newton_hessian_is_exact_for_squares_of_straight_lines():
     free = np.setdiff1d(np.arange(a.size), durations)
     found = a.gauss_newton(x, p).full()
     np.testing.assert_allclose(found[np.ix_(free, free)], exact[np.ix_(free, free)], atol=1e-12)
+
+
+@pytest.mark.parametrize(("count", "straight"), [(3, False), (BENT, True)])
+def test_a_cost_of_very_many_operations_counts_as_straight(count, straight):
+    """Its second derivatives are left out of the exact Hessian, those of a small one are not."""
+
+    def waves(e):
+        q = e["one"].end.q[0]
+        return sum(ca.sin(k * q) for k in range(1, 1 + count)) / count
+
+    large = Term("waves", "-", "m", "problem", waves, weight=2.0)
+    problem = tangled()
+    a = Assembled(replace(problem, phases=tuple(replace(p, terms=()) for p in problem.phases), joints=(large,)))
+    rng = np.random.default_rng(5)
+    x, p = 0.5 + 0.1 * rng.normal(size=a.size), data_vector(a, rng)
+    exact = a.hess_lag(x, p, 1.0, np.zeros(a.n_rows)).full()
+    assert np.abs(exact).max() > 0
+    assert np.allclose(exact, a.gauss_newton(x, p).full(), atol=1e-12) == straight
 
 
 def test_multipliers_there_and_back():
