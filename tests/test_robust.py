@@ -12,6 +12,7 @@ import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.problem import Point
+from jumplab.robot_import.urdf import have_published
 from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
 from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
@@ -95,6 +96,7 @@ def test_a_robust_plan_to_the_side_does_so_along_both_axes(bhr, sideways):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
 def test_a_robot_of_many_joints_has_robust_plans():
     task, g1 = jl.JumpTask(0.2, 0.15), jl.Robot.load("g1_arms")
     plans = jl.plan(task, g1), jl.plan(task, g1, robust=Ranges())
