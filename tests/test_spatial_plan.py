@@ -38,12 +38,16 @@ from jumplab.stages.whole_body.shapes import ROUNDED_M, faces, gaps
 from jumplab.stages.whole_body.tape import (
     ACCELERATION_GAP,
     AIR,
+    CLEAR_M,
     FLAT,
     FRICTION,
     LOADED_N,
+    MIDDLE,
     PRESSURE_GAP,
     RATE_GAP,
+    SUNK_M,
     TOE,
+    Surface,
     edges,
     used_between,
 )
@@ -260,7 +264,7 @@ def doubted(monkeypatch, bhr):
 
     def said(*shares: float) -> None:
         told = chain(shares, repeat(shares[-1]))
-        monkeypatch.setattr(planning, "used_between", lambda tape, robot: next(told))
+        monkeypatch.setattr(planning, "used_between", lambda tape, robot, surface: next(told))
 
     return last, known, said
 
@@ -321,6 +325,37 @@ def test_limits_between_the_nodes_are_seen(bhr):
         pushed[row, 0, 4] = -down * ahead - (bhr.foot.toe + share * PRESSURE_GAP) * below  # the CoP beyond the toes
         used = used_between(replace(tape, f=pushed), bhr)
         assert used == pytest.approx(max(share, used_between(tape, bhr)), abs=1e-6)
+
+
+def test_soles_that_are_low_between_the_nodes_are_seen(bhr):
+    """2 cm in the middle of a flight as the audit asks, 1 mm in the ground elsewhere; also on a platform."""
+    assert (CLEAR_M, SUNK_M, MIDDLE) == (
+        1e-3 * LIMITS["foot clearance"].limit,
+        1e-3 * LIMITS["penetration"].limit,
+        METHOD.mid_flight,
+    )
+    plan = jl.plan(jl.JumpTask(0.6, 0.4, 0.15), bhr)
+    tape, body = plan.tape, plan.whole_body
+    surface = Surface(0.15, bhr.foot.toe - float(bhr.foot.center[0]) + body.edge_m)
+    assert body.used == used_between(tape, bhr, surface) <= 1
+    flying = np.flatnonzero(tape.phase == "flight")
+    for part, low, depth in ((0.5, CLEAR_M, 0.001), (0.99, 0.0, 0.002)):
+        k = flying[int(part * len(flying))]
+        moved = tape.q.copy()
+        moved[k, 2] -= _lowest(bhr, tape.q[k], surface) - low + depth
+        assert np.isclose(_lowest(bhr, moved[k], surface), low - depth)
+        alone = replace(tape, q=moved)
+        assert used_between(alone, bhr, surface) > max(1, used_between(alone, bhr, Surface(-1.0, -9.0)))
+    assert used_between(tape, bhr, replace(surface, edge_m=surface.edge_m - 0.3)) > 1
+
+
+def _lowest(robot: jl.Robot, q: np.ndarray, surface: Surface) -> float:
+    """Least height of the soles' corners over the ground [m]."""
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, q)
+    frames = [data.oMf[robot.model.getFrameId(name)] for name in robot.foot.frames]
+    points = np.array([f.act(corner) for f in frames for corner in robot.foot.corners])
+    return float((points[:, 2] - surface.below(points)).min())
 
 
 def test_own_weights_and_terms_reach_it(bhr):

@@ -25,7 +25,7 @@ from jumplab.stages.whole_body.contacts import SIDES, ContactPhase, Contacts
 from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
-from jumplab.stages.whole_body.tape import make_tape, used_between
+from jumplab.stages.whole_body.tape import Surface, make_tape, used_between
 from jumplab.stages.whole_body.terms import Body
 from jumplab.task import JumpTask
 
@@ -55,7 +55,7 @@ class Start:
     Attributes
     ----------
     name : of the motion: "schedule" (inverse kinematics along it), "stance" (carried along), "neighbour" (a plan for a
-        target close by).
+        target close by), "ramp" (the jump straight ahead, which goes aside and turns on the way).
     held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
     patience_s : processor time after which it is given up [s].
     options : of ipopt besides the usual ones.
@@ -73,6 +73,10 @@ COLD = (
     Start("schedule", False, 8.0, {}),
     Start("stance", False, 3.0, {}),
 )
+# solved in half the unknowns, the jump straight ahead halves the iterations of one to the side or with a turn
+STRAIGHT = Start("straight ahead", True, 3.0, {"max_iter": 80})
+RAMP = "ramp"
+ASIDE = (Start(RAMP, True, 9.0, {"max_iter": 150}), *COLD)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, True, 4.0, NEAR),
     Start(NEIGHBOUR, False, 6.0, WARM | {"acceptable_iter": 1}),
@@ -90,7 +94,7 @@ GIVEN = (
 QUICK = Start("schedule", True, 5.0, {"max_iter": 80})
 APART = Start("links apart", True, 5.0, WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80})
 SETTLED = Start("settled", False, 8.0, WARM | PATIENT)
-FINER_MESH = Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1})
+REFINED = 2 * (Start("finer mesh", False, 10.0, WARM | {"acceptable_iter": 1}),)
 HELD_TURN_RAD = np.radians(100)  # with more than that to turn only the exact Hessian settles, so it is tried first
 
 
@@ -136,7 +140,10 @@ class WholeBodyPlan(Shown):
     @cached_property
     def used(self) -> float:
         """Largest share of the limits that the tape uses, also between the nodes."""
-        return used_between(self.tape, self.schedule.body.robot)
+        robot, along = self.schedule.body.robot, self.task.along_rad
+        height = self.schedule.contacts.surface[0] if self.schedule.contacts.ends == "rest" else self.task.platform_m
+        first = robot.foot.toe - float(robot.foot.center[0])
+        return used_between(self.tape, robot, Surface(height, first + self.edge_m, along))
 
     def after(self, attempts: Iterable[Attempt]) -> WholeBodyPlan:
         """The same plan, with what was tried before it."""
@@ -151,7 +158,7 @@ class WholeBodyPlan(Shown):
 
     def began(self, start: str) -> bool:
         """Whether the solve that led here began with a start of that name."""
-        known = {x.name for x in (*COLD, *IN_PLANE, *GIVEN, *FROM_NEIGHBOUR)}
+        known = {x.name for x in (*ASIDE, *IN_PLANE, *GIVEN, *FROM_NEIGHBOUR)}
         return [x.start for x in self.attempts if x.start in known][-1:] == [start]
 
     @property
@@ -322,7 +329,7 @@ class WholeBodyPlanner:
 
     def _starts(self, task: JumpTask, near, begin) -> Iterable[Start]:
         """The list of starts for a target, in their order."""
-        cold = IN_PLANE if self.free.plane else COLD
+        cold = IN_PLANE if self.free.plane else ASIDE if self._ramps(task) else COLD
         if not EXPLAINED.get():
             cold = cold[:-1]
         cold = cold if self._begun is None else self._begun
@@ -330,6 +337,17 @@ class WholeBodyPlanner:
         if abs(task.yaw_rad) > HELD_TURN_RAD or task.rotation_rad:
             return sorted(found, key=lambda start: (start.name != NEIGHBOUR, start.name in ("stance",), start.held))
         return found
+
+    def _ramps(self, task: JumpTask) -> bool:
+        """Whether a jump may begin with the one straight ahead."""
+        small = abs(task.yaw_rad) <= HELD_TURN_RAD and not task.rotation_rad
+        aside = self.contacts.ends == "touchdown" and not task.in_plane
+        return aside and small and self._straight.free.kind != self.free.kind
+
+    @cached_property
+    def _straight(self) -> WholeBodyPlanner:
+        """The planner of even motions, without own terms: they may see what does not move there."""
+        return self._even_with(StageChanges()) if self.changes else self._even
 
     def beside(
         self, task: JumpTask, near: Mapping[str, PhaseGuess], *, stance: np.ndarray | None = None
@@ -354,7 +372,11 @@ class WholeBodyPlanner:
 
     @cached_property
     def _even(self) -> WholeBodyPlanner:
-        how = {"options": self._options, "keep": self._keep, "changes": self.changes, "body": self.body}
+        return self._even_with(self.changes)
+
+    def _even_with(self, changes: StageChanges) -> WholeBodyPlanner:
+        """The planner of even motions; this one where there is none."""
+        how = {"options": self._options, "keep": self._keep, "changes": changes, "body": self.body}
         how["starts"] = self._begun
         turns = self.limits.capture_moment is not None  # a flip: in the plane, if the feet stay in it
         how |= {"contacts": self.contacts, "free": in_plane(self.body) if turns else even(self.body)}
@@ -367,10 +389,24 @@ class WholeBodyPlanner:
         begin, apart = given, ()
         if start.name == NEIGHBOUR:
             apart = self._scaled(given) if given.schedule.free.kind == self.free.kind else ()
+        elif start.name == RAMP:
+            begin = self._ramped(asked)
         elif start.name != GIVEN[0].name:
             begin = self._motion(start, asked.task)
         found = self._solved(start, asked, begin, apart)
         return self._kept_apart(found, start.held, asked)
+
+    def _ramped(self, asked: Asked) -> dict[str, PhaseGuess]:
+        """Start values of a jump to the side or with a turn: the one straight ahead, led there along a ramp."""
+        even = self._straight
+        straight = replace(asked.task, side_m=0.0, yaw_rad=0.0)
+        try:
+            ahead = replace(asked, task=straight, parameters=even.parameters(straight), weights={})
+        except InfeasibleError as e:  # whose platform is too near
+            raise SolverError(str(e), stage=self.nlp.problem.name, status="Infeasible") from e
+        ahead = replace(ahead, references=even._references(None))
+        found = even._solved(STRAIGHT, ahead, even._motion(STRAIGHT, straight), ())
+        return starts.ramped(self._schedule(()), found.phases, asked.task)
 
     def _kept_apart(self, found: WholeBodyPlan, held: bool, asked: Asked) -> WholeBodyPlan:
         """The plan, solved on with rows for whatever links meet in it."""
@@ -437,19 +473,19 @@ class WholeBodyPlanner:
         return WholeBodyPlan(asked.task, solution, schedule, edge - origin, self.limits)
 
     def _settled(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
-        """The plan, solved on where it passes limits between the nodes, first to the end, then on a finer mesh."""
-        first = found
-        for start, planner in ((SETTLED, lambda: self), (FINER_MESH, lambda: self._finer)):
-            if found.used <= 1:
-                return found
-            p = planner()
+        """The plan, solved on where it passes limits between the nodes: first to the end, then on finer meshes."""
+        best, p = found, self
+        for start in (SETTLED, *REFINED):
+            if best.used <= 1:
+                break
+            p = p if start is SETTLED else p._finer
             finer = replace(asked, references=p._references(asked.srmp))
             try:
-                more = p._solved(start, finer, found, p._scaled(found))
-                found = p._kept_apart(more, False, finer)
+                found = p._kept_apart(p._solved(start, finer, found, p._scaled(found)), False, finer)
             except SolverError:
                 continue
-        return found if found.used <= 1 else first
+            best = min(best, found, key=lambda plan: plan.used)
+        return best
 
     def _scaled(self, found: WholeBodyPlan) -> tuple[Apart, ...]:
         """Rows for links that met, at the nodes of this planner's mesh."""

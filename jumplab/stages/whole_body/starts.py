@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -24,6 +24,8 @@ ARMS = 0.5, -1.0, -0.2, 0.2
 FOLD_RAD, FOLDED = 1.3, (0.2, 0.8)  # of hips and knees in a flight that turns over, between those shares of it
 CROUCH_S = 0.35  # before and after a flight
 SWING = 0.1  # of the leg, by which a foot that steps is lifted
+RAMP_S = 0.15  # before take-off, in which a base begins to go aside and to turn
+SIDE, YAW = 1, 3  # columns of the chart
 EARLY = 0.15  # of the way of a flight, which the base has made before it, and makes after it
 REACHED = 0.3  # [m, rad] a start whose feet are farther off their places is none
 IK_STEPS, DAMPING, IK_STEP_RAD = 10, 1e-4, 0.3
@@ -304,10 +306,37 @@ def beside(schedule: Schedule, phases: Mapping[str, PhaseSolution]) -> dict[str,
         columns = [w.coordinates.index(name) for name in b.coordinates]
         z = np.zeros((len(near.q), len(b.states)))
         z[:, b.n_forces :] = near.z[:, [w.states.index(name) for name in b.states[b.n_forces :]]]
-        z[:, : b.n_forces] = b.mg / len(b.modes) / max(1, b.n_forces // max(1, len(b.sides)))
+        if b.n_forces == w.n_forces:
+            z[:, : b.n_forces] = near.z[:, : b.n_forces]
+        else:
+            z[:, : b.n_forces] = b.mg * len(b.sides) / len(b.modes) / b.n_forces
         constants = {name: near.constants[name] for name in _constant_names(b)}
         motion = (x[:, columns] for x in (near.q, near.v, near.a))
         out[phase.name] = PhaseGuess(near.duration, *motion, z, constants)
+    return out
+
+
+def ramped(schedule: Schedule, phases: Mapping[str, PhaseSolution], task: JumpTask) -> dict[str, PhaseGuess]:
+    """Phase name -> start values: a jump straight ahead, whose base goes aside and turns until the target is reached.
+
+    It begins :data:`RAMP_S` before take-off.
+    """
+    out, near = {}, beside(schedule, phases)
+    ends = np.cumsum([x.duration for x in near.values()])
+    begin = max(0.0, ends[-2] - RAMP_S)
+    for (name, x), end in zip(near.items(), ends, strict=True):
+        u = np.clip((np.linspace(end - x.duration, end, len(x.q)) - begin) / (ends[-1] - begin), 0.0, 1.0)
+        value = u**3 * (10 - 15 * u + 6 * u * u)
+        slope = 30 * u**2 * (1 - u) ** 2 / (ends[-1] - begin)
+        bend = 60 * u * (1 - u) * (1 - 2 * u) / (ends[-1] - begin) ** 2
+        motion = [y.copy() for y in (x.q, x.v, x.a)]
+        for y, shape in zip(motion, (value, slope, bend), strict=True):
+            y[:, SIDE] += task.side_m * shape
+            y[:, YAW] += task.yaw_rad * shape
+        constants = dict(x.constants)
+        if "vel_y" in constants:
+            constants["vel_y"] = task.side_m / x.duration
+        out[name] = replace(x, **dict(zip("qva", motion, strict=True)), constants=constants)
     return out
 
 

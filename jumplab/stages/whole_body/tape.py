@@ -21,7 +21,7 @@ from jumplab.stages.whole_body.contacts import SIDES
 from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.legs import LEG_STEPS, Legs, Motion
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.terms import EDGES, Body, WholeBodyTerms
+from jumplab.stages.whole_body.terms import EDGES, SOLE_SHARES, Body, WholeBodyTerms
 
 SHORTEST_STEP = 0.05  # share of a sample; a shorter last step is joined to the one before
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
@@ -33,6 +33,8 @@ WRENCH_ARM_M = 0.05  # a moment of 0.05 N m costs what a force of 1 N does, wher
 FRICTION, LOADED_N = 0.5, 10.0  # of each foot; [N] below, the ratio is taken to this force instead
 RATE_GAP, ACCELERATION_GAP = 0.01, 4.0  # [rad/s, rad/s^2] over one step, against the mean of its ends
 RANGE_GAP, PRESSURE_GAP = 1e-3, 2e-3  # [rad] beyond a stop, [m] of the CoP beyond the sole
+CLEAR_M, MIDDLE = 0.02, (0.3, 0.7)  # [m] of the soles over the ground, between those shares of a flight
+SUNK_M = 1e-3  # [m] of a sole in the ground or in a platform
 PRESSED_N = 50.0  # [N] on a foot from which on its CoP is looked at
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 AIR, TOE, FLAT = 0, 1, 2  # codes of a foot in the tape's ``contacts``
@@ -47,6 +49,27 @@ class Piece:
     motion: Motion
     wrench: np.ndarray  # (n, 2, 6) of the feet about the world's origin, as planned
     contacts: np.ndarray  # (n, 2) codes
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Ground that steps up or down.
+
+    Attributes
+    ----------
+    height_m : of the part beyond the edge.
+    edge_m : where the edge is, ahead of the world's origin.
+    along_rad : the way in which it is ahead.
+    """
+
+    height_m: float = 0.0
+    edge_m: float = 0.0
+    along_rad: float = 0.0
+
+    def below(self, points: np.ndarray) -> np.ndarray:
+        """Height of the ground below points (..., 3) [m]."""
+        ahead = points[..., :2] @ [np.cos(self.along_rad), np.sin(self.along_rad)]
+        return np.where(ahead > self.edge_m, self.height_m, 0.0)
 
 
 def make_tape(schedule: Schedule, phases: Mapping[str, PhaseSolution], gravity: float) -> Tape:
@@ -100,10 +123,11 @@ def _times(start: float, end: float, first: bool) -> np.ndarray:
     return np.append(np.arange(start, end - SHORTEST_STEP / RATE_HZ, 1 / RATE_HZ), end)
 
 
-def used_between(tape: Tape, robot: Robot) -> float:
+def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> float:
     """Largest share that the tape uses of the limits of motors, stops, ground, and of gaps between angles and rates.
 
-    The limits are those of the audit; up to 1 the tape holds them, also between the nodes.
+    The limits are those of the audit; up to 1 the tape holds them, also between the nodes. Soles that in the middle of
+    a flight are as low as they may be use all of their height, on the surface twice of it.
     """
     motors = [robot.actuators[name] for name in robot.joint_names]
     keys = "effort", "speed", "corner_speed", "no_load_speed"
@@ -122,7 +146,34 @@ def used_between(tape: Tape, robot: Robot) -> float:
     beyond = np.maximum(low - tape.q[:, 7:], tape.q[:, 7:] - high)
     shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot) / PRESSURE_GAP]
     shares += [np.abs(gap) / most for gap, most in gaps]
+    shares.append(_low(tape, robot, surface))
     return float(max(x.max() for x in shares))
+
+
+def _low(tape: Tape, robot: Robot, surface: Surface) -> np.ndarray:
+    """Share of what soles may be too low in flight, in its middle under :data:`CLEAR_M`, for each foot (n, 2)."""
+    model, data, foot = robot.model, robot.model.createData(), robot.foot
+    frames = [model.getFrameId(name) for name in foot.frames]
+    heels, way = foot.corners[:2], foot.corners[2:] - foot.corners[:2]
+    sole = np.concatenate([heels + u * way for u in SOLE_SHARES])
+    out = np.full((len(tape.t), len(frames)), -np.inf)
+    for rows in _flights(tape.extra["contacts"]):
+        part = (tape.t[rows] - tape.t[rows[0]]) / max(np.ptp(tape.t[rows]), 1e-9)
+        for k, u in zip(rows, part, strict=True):
+            pin.framesForwardKinematics(model, data, tape.q[k])
+            for i, frame in enumerate(frames):
+                points = data.oMf[frame].translation + sole @ data.oMf[frame].rotation.T
+                height = (points[:, 2] - surface.below(points)).min()
+                out[k, i] = -height / SUNK_M
+                if MIDDLE[0] <= u <= MIDDLE[1]:
+                    out[k, i] = 2 - height / CLEAR_M
+    return out
+
+
+def _flights(contacts: np.ndarray) -> list[np.ndarray]:
+    """Rows of each stretch without a foot on the ground, by the contacts (n, 2)."""
+    flying = np.flatnonzero(~contacts.any(axis=1))
+    return np.split(flying, np.flatnonzero(np.diff(flying) > 1) + 1) if len(flying) else []
 
 
 def _pressed_outside(tape: Tape, robot: Robot) -> np.ndarray:
