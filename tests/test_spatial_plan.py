@@ -424,7 +424,7 @@ def refusing(monkeypatch):
     return last, tried
 
 
-STARTS = [("schedule", True), ("schedule", False), ("stance", False)]
+STARTS = [("ramp", True), ("schedule", True), ("schedule", False), ("stance", False)]
 
 
 def test_a_refusal_names_a_smaller_target_that_is_planned(refusing):
@@ -449,14 +449,14 @@ def test_where_nobody_reads_explanations_it_gives_up_sooner(refusing):
     finally:
         EXPLAINED.reset(token)
     neighbour = [("neighbour", True), ("neighbour", False)]
-    assert [x[1:3] for x in tried] == [*STARTS[:2], *neighbour, *STARTS[:2]]
+    assert [x[1:3] for x in tried] == [*STARTS[:3], *neighbour, *STARTS[:3]]
 
 
 def test_a_start_that_leads_nowhere_is_followed_by_the_next(monkeypatch):
     """Each attempt is a row of the plan's statistics, those that failed too."""
     first, *others = planning.COLD
     hasty = replace(first, options={"max_iter": 3})
-    monkeypatch.setattr(planning, "COLD", (hasty, *others))
+    monkeypatch.setattr(planning, "ASIDE", (hasty, *others))
     plan = planner().plan(SIDE, "direct")
     attempts = plan.whole_body.attempts
     made = [(x.start, x.hessian) for x in attempts[:2]]

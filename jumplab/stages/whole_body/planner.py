@@ -55,7 +55,8 @@ class Start:
     Attributes
     ----------
     name : of the motion: "schedule" (inverse kinematics along it), "stance" (carried along), "neighbour" (a plan for a
-        target close by), "ramp" (the jump straight ahead, which goes aside and turns on the way).
+        target close by), "ramp" (the jump straight ahead, which goes aside and turns on the way), "given motion" (also
+        with its feet in place).
     held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
     patience_s : processor time after which it is given up [s].
     options : of ipopt besides the usual ones.
@@ -67,7 +68,7 @@ class Start:
     options: Mapping[str, Any]
 
 
-NEIGHBOUR = "neighbour"
+NEIGHBOUR, MENDED = "neighbour", "given motion, feet in place"
 COLD = (
     Start("schedule", True, 9.0, {"max_iter": 150}),
     Start("schedule", False, 8.0, {}),
@@ -90,6 +91,8 @@ IN_PLANE = (
 GIVEN = (
     Start("given motion", True, 3.0, {"max_iter": 60}),
     Start("given motion", False, 5.0, {}),
+    Start(MENDED, True, 3.0, {"max_iter": 60}),
+    Start(MENDED, False, 5.0, {}),
 )
 QUICK = Start("schedule", True, 5.0, {"max_iter": 80})
 APART = Start("links apart", True, 5.0, WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80})
@@ -333,7 +336,10 @@ class WholeBodyPlanner:
         if not EXPLAINED.get():
             cold = cold[:-1]
         cold = cold if self._begun is None else self._begun
-        found = [*(FROM_NEIGHBOUR if near is not None else ()), *(GIVEN if begin is not None else ()), *cold]
+        given = GIVEN if begin is not None else ()
+        if task.rotation_rad:  # a body that turns over has no places for its feet
+            given = [start for start in given if start.name != MENDED]
+        found = [*(FROM_NEIGHBOUR if near is not None else ()), *given, *cold]
         if abs(task.yaw_rad) > HELD_TURN_RAD or task.rotation_rad:
             return sorted(found, key=lambda start: (start.name != NEIGHBOUR, start.name in ("stance",), start.held))
         return found
@@ -391,6 +397,8 @@ class WholeBodyPlanner:
             apart = self._scaled(given) if given.schedule.free.kind == self.free.kind else ()
         elif start.name == RAMP:
             begin = self._ramped(asked)
+        elif start.name == MENDED:
+            begin = starts.mended(self._schedule(()), asked.task, given)
         elif start.name != GIVEN[0].name:
             begin = self._motion(start, asked.task)
         found = self._solved(start, asked, begin, apart)

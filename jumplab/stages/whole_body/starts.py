@@ -29,6 +29,7 @@ SIDE, YAW = 1, 3  # columns of the chart
 EARLY = 0.15  # of the way of a flight, which the base has made before it, and makes after it
 REACHED = 0.3  # [m, rad] a start whose feet are farther off their places is none
 IK_STEPS, DAMPING, IK_STEP_RAD = 10, 1e-4, 0.3
+OFF_M = 0.02  # [m, rad] a given motion whose feet are farther off their places is not begun with
 NEAR_M = 1e-3  # [m, rad] near enough for a start
 RATE_BOX, ACCELERATION_BOX = 15.0, 150.0  # of differences, where the start is rough
 
@@ -163,6 +164,21 @@ def _reached(schedule: Schedule, task: JumpTask, times: np.ndarray, holds: list[
         charts.append(np.array(rows))
     charts[0][0] = body.stance
     return Motion(times, charts, missed)
+
+
+def mended(schedule: Schedule, task: JumpTask, motion: Motion) -> Motion:
+    """A motion whose legs are moved so that feet are in their places; where they do not reach, one along the schedule."""
+    contacts, reach = schedule.contacts, Reach(schedule.body, schedule.limits.range_margin_rad)
+    starts, leg = np.concatenate([[0.0], np.cumsum(motion.durations)]), leg_length(schedule.body.robot)
+    holds, usual, charts = _footholds(schedule, task), along(schedule, task).charts, []
+    for k, (p, rows) in enumerate(zip(contacts.phases, motion.charts, strict=True)):
+        times, legs = np.linspace(starts[k], starts[k + 1], len(rows)), []
+        for t, chart, other in zip(times, rows, usual[k], strict=True):
+            goals = {side: _foot(schedule, holds, task, k, side, t, starts, leg) for side in (0, 1)}
+            moved, left = reach(chart, goals, list(goals))
+            legs.append(moved if left < OFF_M else other)
+        charts.append(np.array(legs))
+    return replace(motion, charts=charts)
 
 
 def _over(holds: list[np.ndarray], ahead: float) -> np.ndarray:
