@@ -32,7 +32,7 @@ def planner() -> Planner:
 
 def optimum(task: JumpTask, plan) -> float:
     """Cost of the least dear motion close to a plan: solved on until nothing changes any more."""
-    body = planner().stage("direct")
+    body = planner().program()
     last = {"acceptable_iter": 50, "acceptable_obj_change_tol": 1e-9}
     patient = WholeBodyPlanner(body.robot, body=body.body, free=body.free, options=last)
     return patient.plan(task, near=plan.whole_body).solution.statistics.objective
@@ -48,7 +48,7 @@ def test_every_node_has_a_plan():
 def test_a_target_between_nodes_is_a_few_steps_away(place):
     task = JumpTask(*place)
     plan = planner().plan(task, "direct")
-    cold = planner().stage("direct").plan(task)
+    cold = planner().program().plan(task)
     s, most = plan.whole_body.solution.statistics, IPOPT["acceptable_constr_viol_tol"]
     assert [x.start for x in plan.attempts] == ["neighbour"] and s.residual <= most
     assert 2 * s.iterations <= sum(x.iterations for x in cold.attempts)
@@ -166,20 +166,20 @@ def test_files_of_something_else_are_refused(tmp_path):
 
 
 def test_key_follows_weights_and_own_terms():
-    plain = key_of(planner().stage("direct"))
-    assert plain == atlas().key == key_of(Planner(Robot.load()).stage("direct"))
+    plain = key_of(planner().program())
+    assert plain == atlas().key == key_of(Planner(Robot.load()).program())
     for how in (
         {"weights": {"whole body/torque": 2.0}},
         {"off": ["whole body/clearance of left sole"]},
         {"mesh": {"flight": 24}},
     ):
-        assert key_of(Planner(Robot.load(), **how).stage("direct")) != plain
+        assert key_of(Planner(Robot.load(), **how).program()) != plain
 
 
 def test_a_cheaper_neighbour_replaces_a_dear_node():
     dear = replace(atlas().nodes[0.7, 0.45], cost=2 * atlas().nodes[0.7, 0.45].cost)
     other = Atlas("bhr", DISTANCES, HEIGHTS, {**atlas().nodes, (0.7, 0.45): dear}, atlas().key)
-    assert other._swept(planner().stage("direct")) == 1
+    assert other._swept(planner().program()) == 1
     assert isinstance(other.nodes[0.7, 0.45], Node)
     assert other.nodes[0.7, 0.45].cost == pytest.approx(atlas().nodes[0.7, 0.45].cost, rel=0.01)
 

@@ -49,7 +49,7 @@ def test_start_turns_as_asked_and_goes_where_it_should(turns):
 
     Legs are those of the stance, turned over with the trunk: they end as far off as it leans.
     """
-    flips = planner().stage("direct flip")
+    flips = planner().program(JumpTask(0.2, 0.5, rotation_rad=TURN))
     task = JumpTask(0.2, 0.5, rotation_rad=turns * TURN)
     schedule = Schedule(flips.body, flips.contacts, flips.limits, flips.weights, free=flips.free)
     motion = starts.along(schedule, task)
@@ -81,9 +81,8 @@ def test_a_jump_keeps_its_own_limits():
     assert all(finer[name] >= 2 * n for name, n in Mesh().intervals().items())
     lighter = {k for k, w in vars(Weights().of_flip()).items() if w < vars(Weights())[k]}
     assert lighter == {"track_inertia", "track_inertia_rate", "track_flight_inertia_rate"}
-    for kind in ("direct", "whole body", "spatial"):
-        usual = planner().stage(kind)
-        flips = planner().stage(f"{kind} flip")
+    for kind in ("direct", "whole body"):
+        usual, flips = (planner().stage(kind, flip=flip) for flip in (False, True))
         assert (usual.limits, usual.weights, usual.mesh) == (Limits(), Weights(), Mesh())
         assert (flips.limits, flips.weights) == (Limits().of_flip(), Weights().of_flip())
         assert flips.mesh == Mesh().of_flip()

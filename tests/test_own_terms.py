@@ -4,12 +4,13 @@ import os
 import re
 import subprocess
 import sys
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_core import planner
 from test_solver import flat_guess, move
@@ -19,6 +20,7 @@ import jumplab as jl
 from jumplab.errors import InputError
 from jumplab.ocp import Nlp, Problem, Term, changed
 from jumplab.ocp import cache as kept
+from jumplab.ocp.problem import Point
 from jumplab.robot.stance import stance_configuration
 from jumplab.stages.changes import settled, sorted_out
 from jumplab.stages.srmp import SrmpSettings
@@ -28,13 +30,14 @@ from jumplab.stages.whole_body.coordinates import even
 from jumplab.stages.whole_body.planner import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.terms import Body
+from jumplab.stages.whole_body.view import BodyView
 from jumplab.studies.chain import Course, crouched, run_chain, run_chains
 from jumplab.studies.chain.pilot import Foresight, Rehearsal
 
 SMALL = Mesh(6, 4, 6)
 STAGES = (
     "srmp/flat, srmp/toe, srmp/launch, srmp/flight, joint qp/launch, joint qp/flight, whole body/flat, whole body/toe, "
-    "whole body/launch, whole body/flight, spatial/flat, spatial/toe, spatial/launch, spatial/flight"
+    "whole body/launch, whole body/flight"
 )
 
 
@@ -250,13 +253,13 @@ def test_what_a_method_would_ignore_is_refused(bhr):
 
 
 def test_the_usual_method(bhr):
-    """Direct, flips too; three steps where something is changed that only they have."""
+    """Direct; three steps where something is changed that only they have."""
     lopsided = bhr.with_mass("left_thigh", factor=1.2)
     assert not lopsided.planar
-    assert planner().chosen() == jl.Planner(lopsided).chosen() == jl.Planner(lopsided).chosen(flip=True) == "direct"
-    assert planner().chosen(flip=True) == "direct" and planner().chosen("three-step", flip=True) == "three-step"
+    assert planner().chosen() == jl.Planner(lopsided).chosen() == "direct"
+    assert planner().chosen("three-step") == "three-step"
     for weights in ({"srmp/turn": 1.0}, {"track inertia": 1.0}):
-        assert planner().chosen(weights=weights) == planner().chosen(weights=weights, flip=True) == "three-step"
+        assert planner().chosen(weights=weights) == "three-step"
     for how in ({"off": ["joint qp/friction"]}, {"settings": {"friction": 0.3}}, {"off": ["launch/track inertia"]}):
         assert jl.Planner(bhr, **how).chosen() == "three-step", how
     assert jl.Planner(bhr, terms={"whole body/flight": [calm()]}).chosen() == "direct"
@@ -267,7 +270,7 @@ def test_nothing_solves_before_all_is_checked(bhr, monkeypatch):
     one = jl.Planner(bhr, mesh=SMALL, terms={"whole body/flight": [cost(lambda p: p.joints.elbow)]})
     refused(
         "term 'x' of 'whole body/flight': its expression cannot be evaluated (AttributeError: there is no joint "
-        "'elbow'; there are hip, knee, ankle, shoulder)",
+        f"'elbow'; there are {', '.join(bhr.joint_names)}, hip, knee, ankle, shoulder)",
         one.plan, jl.JumpTask(0.4, 0.3),
     )  # fmt: skip
     with pytest.raises(InputError, match="weight or switch 'jrk': the problem 'whole body' has no such term"):
@@ -289,25 +292,27 @@ def test_flips_and_direct_have_it_all(bhr):
         bhr, mesh=SMALL, limits={"torque_share": 0.7}, terms={"whole body/flight": [calm()]},
         weights={"jerk": 1e-6}, off=["body clearance"],
     )  # fmt: skip
-    for name in ("whole body", "direct", "whole body flip", "direct flip"):
-        stage = one.stage(name)
+    flip = jl.JumpTask(0.0, 0.4, rotation_rad=2 * np.pi)
+    steps = one.stage("whole body"), one.stage("whole body", flip=True)
+    aside = jl.JumpTask(0.0, 0.3, side_m=0.2)
+    for stage in (*steps, one.program(), one.program(flip), one.program(aside)):
         assert stage.mesh == SMALL and stage.limits.torque_share == 0.7
         for nlp in (stage.nlp, stage._finer.nlp):
             terms = {(owner, t.name): t for owner, t in nlp.problem.terms()}
             assert terms["flight", "calm arms"].weight == 0.1 and terms["toe", "jerk"].weight == 1e-6
             assert not any(term == "body clearance" for _, term in terms)
             assert ("flight", "calm arms") in [(owner, t.name) for owner, t in nlp.assembled.cost_terms]
-    friction = jl.Planner(bhr, settings={"friction": 0.3}, weights={"srmp/turn": 1.0}).stage("srmp flip")
+    friction = jl.Planner(bhr, settings={"friction": 0.3}, weights={"srmp/turn": 1.0}).stage("srmp", flip=True)
     assert friction.settings.friction == 0.3 and friction.settings.momentum == (-32.0, 32.0)
 
 
 # what a term sees -----------------------------------------------------------------------------------------------
 def test_what_is_seen_is_named(bhr):
-    with pytest.raises(InputError, match="a point of this phase has no 'joint'; it has L, com, com_velocity, inertia"):
+    with pytest.raises(InputError, match="a point of this phase has no 'joint'; it has L, attitude, com, com_velocity"):
         changed(plane_problem(), {"flight": [cost(lambda p: p.joint.knee)]})
     with pytest.raises(InputError, match="a point of this phase has no 'posture'; it has L, com, com_velocity"):
         changed(srmp_problem(bhr), {"flight": [cost(lambda p: p.posture)]})
-    with pytest.raises(InputError, match="the robot has no point 'nose'; it has toe, knee, hip, shoulder, heel, hand"):
+    with pytest.raises(InputError, match="the robot has no point 'nose'; it has left_ankle_pitch, left_ankle_roll"):
         changed(plane_problem(), {"flight": [cost(lambda p: p.point("nose"))]})
 
 
@@ -390,7 +395,7 @@ def test_a_solved_plan_lists_its_terms():
     last = plan.whole_body.schedule.contacts.phases[-1].intervals
     assert place["share"] is None and place["node"] == last and abs(place["slack"]) < 1e-4
     cost = own["share"] * plan.whole_body.solution.statistics.objective
-    assert cost == pytest.approx(0.1 * swing(plan.whole_body), rel=1e-9)
+    assert cost == pytest.approx(0.1 * 2 * swing(plan.whole_body), rel=1e-9)  # of both arms
     for stage in ("SRMP", "whole body"):
         assert sum(r["share"] or 0 for r in plan.terms() if r["stage"] == stage) == pytest.approx(1)
     assert plan.weights["whole body"]["flight/calm arms"] == 0.1
@@ -472,7 +477,8 @@ def test_a_growing_weight_calms_the_arms_of_flips(method, distance_m, height_m, 
     """
     task = jl.JumpTask(distance_m, height_m, rotation_rad=2 * np.pi * turns)
     usual = plain(FINE).plan(task, method)
-    stage = armed(0.1, mesh=FINE).stage("direct flip" if method == "direct" else "whole body flip")
+    one = armed(0.1, mesh=FINE)
+    stage = one.program(task) if method == "direct" else one.stage("whole body", flip=True)
     bodies = [usual.whole_body]
     for w in GROWING[1:]:
         more = {"near": bodies[-1], "weights": {"flight/calm arms": w}}
@@ -528,3 +534,48 @@ def test_a_jump_under_another_gravity_is_planned_audited_and_lands():
         run = jl.simulate(plan)
         assert plan.robot.gravity == 3.7 and jl.audit(plan).passed and run.landed
         assert abs(run.metrics.foot_distance_m - 0.6) < 0.02 and abs(run.metrics.com_rise_m - 0.5) < 0.01
+
+
+@pytest.mark.parametrize("aside", [{}, {"side_m": 0.2, "yaw_rad": 0.5}], ids=["ahead", "aside"])
+def test_what_a_term_sees_is_what_pinocchio_says(bhr, aside):
+    """At nodes of a plan, in the program of even motions and in that of all: with its solution as numbers."""
+    body = planner().plan(jl.JumpTask(0.3, 0.3, **aside)).whole_body
+    tree, data = bhr.model, bhr.model.createData()
+    names = ("com", "com_velocity", "L", "inertia", "posture", "wrench")
+    for k, (phase, node) in enumerate((("flat", 5), ("toe", 4), ("flight", 6))):
+        x, b = body.solution.phases[phase], body.schedule.of(k)
+        spaces = SimpleNamespace(**{n: ca.SX(v) for n, v in x.constants.items()}), SimpleNamespace(gravity=9.8)
+        state = (ca.SX(y[node]) for y in (x.q, x.v, x.a))
+        point = Point(*state, None, ca.SX(x.z[node]), x.duration, x.t[node] / x.duration, *spaces, None,
+                      view=partial(BodyView, b))  # fmt: skip
+        seen = {name: ca.evalf(ca.vec(getattr(point, name))).full().ravel() for name in names}
+        motion = [b.chart(ca.SX(y[node]), level) for level, y in enumerate((x.q, x.v, x.a))]
+        chart = [ca.evalf(y).full().ravel()[None] for y in motion]
+        q, v, a = (y[0] for y in b.model.to_pinocchio(*chart))
+        pin.ccrba(tree, data, q, v)
+        pin.centerOfMass(tree, data, q, v)
+        np.testing.assert_allclose(seen["com"], data.com[0], atol=1e-9)
+        np.testing.assert_allclose(seen["com_velocity"], data.vcom[0], atol=1e-9)
+        np.testing.assert_allclose(seen["L"], data.hg.angular, atol=1e-8)
+        np.testing.assert_allclose(seen["inertia"].reshape(3, 3), data.Ig.inertia, atol=1e-9)
+        assert seen["posture"] == pytest.approx(chart[0][0, 5], abs=1e-12)
+        need = pin.rnea(tree, data, q, v, a)[:6]  # of the base, in its axes, at its origin
+        turn = data.oMi[1].rotation
+        force = turn @ need[:3]
+        moment = turn @ need[3:] + np.cross(data.oMi[1].translation, force)
+        np.testing.assert_allclose(seen["wrench"], [*force, *moment], atol=0.5)  # N, N m; rows are met to that
+        pin.forwardKinematics(tree, data, q, v)
+        pin.updateFramePlacements(tree, data)
+        for i, side in enumerate(("left", "right")):
+            frame = bhr.model.getFrameId(bhr.foot.frames[i])
+            heel = (bhr.foot.corners[0] + bhr.foot.corners[1]) / 2
+            place = ca.evalf(point.point(f"{side}_heel")).full().ravel()
+            np.testing.assert_allclose(place, data.oMf[frame].act(heel), atol=1e-9)
+            speed = pin.getFrameVelocity(tree, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            arm = data.oMf[frame].rotation @ heel
+            fast = ca.evalf(point.point_velocity(f"{side}_heel")).full().ravel()
+            np.testing.assert_allclose(fast, speed.linear + np.cross(speed.angular, arm), atol=1e-9)
+        knees = [q[7 + bhr.joint_names.index(f"{side}_knee")] for side in ("left", "right")]
+        signs = bhr.sagittal.signs[1]
+        np.testing.assert_allclose(ca.evalf(point.joints.knee).full().ravel(), np.multiply(signs, knees), atol=1e-12)
+        assert float(ca.evalf(point.joints.right_knee)) == pytest.approx(knees[1])

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import FrozenInstanceError
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,12 +147,16 @@ class Broken:
     """A stage that fails, or one that must not be reached."""
 
     toe_s = 0.1
+    nlp = SimpleNamespace(problem=None)
 
     def __init__(self, error):
         self.error = error
 
     def check_ground(self, task):
         """Nothing to refuse."""
+
+    def program(self, task, weights):
+        return self
 
     def plan(self, *arguments, **options):
         raise self.error
@@ -160,7 +165,8 @@ class Broken:
 def test_a_failed_stage_feeds_nothing(monkeypatch):
     failure, reached = SolverError("SRMP: no", stage="SRMP", status="Infeasible"), AssertionError("a later stage ran")
     one = Planner(Robot.load())
-    one._stages = {"srmp": Broken(failure), "whole body": Broken(reached), "direct": Broken(failure)}
+    stages = {"srmp": Broken(failure), "whole body": Broken(reached), "direct": Broken(failure)}
+    one._stages = {(name, False): stage for name, stage in stages.items()}
     monkeypatch.setattr(pipeline, "map_to_joints", lambda *a, **k: (_ for _ in ()).throw(reached))
     for method in METHODS:
         with pytest.raises(SolverError) as e:
@@ -171,7 +177,8 @@ def test_a_failed_stage_feeds_nothing(monkeypatch):
 def test_a_failed_map_feeds_nothing(monkeypatch):
     failure, reached = SolverError("stage 2: no", stage="stage 2"), AssertionError("stage 3 ran")
     one = Planner(Robot.load())
-    one._stages = {"srmp": planner().stage("srmp"), "whole body": Broken(reached)}
+    one._stages = {("srmp", False): planner().stage("srmp"), ("whole body", False): Broken(reached)}
+    one._stages["direct", False] = Broken(reached)
 
     def fail(*arguments, **options):
         raise failure

@@ -18,7 +18,7 @@ from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits
 from jumplab.stages.whole_body.terms import Body
-from jumplab.stages.whole_body.view import PlaneView, SpatialView
+from jumplab.stages.whole_body.view import BodyView
 from jumplab.studies import robust
 from jumplab.studies.margins import ranges_at
 
@@ -39,11 +39,10 @@ def sideways(bhr):
 def ends_of(plan, model):
     """Capture point (2,) of another robot in a finished plan, as the term has it, in numbers."""
     schedule, found = plan.whole_body.schedule, {}
-    seen = SpatialView if schedule.free.kind == "whole" else PlaneView
     for k, (name, x) in enumerate(plan.whole_body.solution.phases.items()):
         nodes = {key: ca.SX(ca.DM(getattr(x, key)[-1])) for key in "qvaz"}
         more = {"c": SimpleNamespace(**x.constants), "p": SimpleNamespace(gravity=9.8)}
-        view = partial(seen, schedule.of(k))
+        view = partial(BodyView, schedule.of(k))
         end = Point(**nodes, **more, j=None, duration=ca.SX(x.duration), s=ca.SX(1), ref=None, view=view)
         found[name] = SimpleNamespace(end=end)
     return np.array(ca.evalf(robust.capture_point(model, Body(plan.robot), found))).ravel()

@@ -397,8 +397,8 @@ def test_the_phases_of_a_planar_plan_meet_the_rows_of_the_whole_program(target):
     body = jump(*target).whole_body
     stages = planner()
     assert body.schedule.free.plane and not body.schedule.whole.free.even
-    data = stages.stage("spatial").parameters(body.task)
-    own = stages.stage("direct").parameters(body.task) | dict(momentum=0.0, launch_s=np.zeros(2))
+    data = stages.stage("direct").parameters(body.task)
+    own = stages.program().parameters(body.task) | dict(momentum=0.0, launch_s=np.zeros(2))
     of = body.schedule
     # deep squats, of which the program of all coordinates has none, are for both legs alike
     deep = Schedule(of.body, of.contacts, replace(of.limits, knee_rad=np.pi), of.weights)

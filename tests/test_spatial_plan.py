@@ -52,7 +52,7 @@ from jumplab.stages.whole_body.tape import (
     used_between,
 )
 from jumplab.stages.whole_body.terms import Body, WholeBodyTerms
-from jumplab.stages.whole_body.view import SpatialView
+from jumplab.stages.whole_body.view import BodyView
 from jumplab.task import JumpTask
 
 SIDE = JumpTask(0.0, 0.4, side_m=0.3)
@@ -243,7 +243,7 @@ def test_neighbour_is_planned_from_the_plan():
     after = planner().replan(before, replace(SIDE, side_m=0.31))
     first, again = (sum(row.iterations for row in p.statistics) for p in (before, after))
     assert again < first / 2
-    assert [row.stage for row in after.statistics] == ["spatial, neighbour, held Gauss-Newton"]
+    assert [row.stage for row in after.statistics] == ["direct, neighbour, held Gauss-Newton"]
     assert after.whole_body.schedule.apart == before.whole_body.schedule.apart
     assert audit(after.tape, after.robot, after.task).passed
 
@@ -278,7 +278,8 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     settled, finer, kept = (plan.solution for plan in plans)
     names = [[x.start for x in plan.attempts] for plan in plans]
     both = ["neighbour", "settled", "finer mesh"]
-    assert names == [["neighbour", "settled"], both, both + both]
+    every = [*both, "finer mesh"]
+    assert names == [["neighbour", "settled"], both, every + every]
     mesh = [last.mesh.flat, last.mesh.toe, last.mesh.flight]
     assert [len(x.j) for x in settled.phases.values()] == mesh
     assert settled.statistics.objective < first.statistics.objective
@@ -363,8 +364,8 @@ def test_own_weights_and_terms_reach_it(bhr):
         return ca.vertcat(p.joint_rates.left_shoulder_pitch, p.joint_rates.right_shoulder_pitch)
 
     arms = jl.Term("still arms", "ours", "rad/s", "node", still, weight=1.0)
-    mine = Planner(bhr, terms={"spatial/launch": [arms], "spatial/flight": [arms]})
-    plan = mine.plan(SIDE, "direct", weights={"spatial/flight/torque": 0.01})
+    mine = Planner(bhr, terms={"whole body/launch": [arms], "whole body/flight": [arms]})
+    plan = mine.plan(SIDE, "direct", weights={"whole body/flight/torque": 0.01})
     assert plan.weights["whole body"]["flight/torque"] == 0.01
     assert plan.weights["whole body"]["flight/still arms"] == 1.0
     rows = [6 + bhr.joint_names.index(f"{side}_shoulder_pitch") for side in ("left", "right")]
@@ -378,20 +379,20 @@ def test_points_know_the_robot_by_name(bhr):
     known = {key: ca.SX.sym(key, len(x)) for key, x in names.items()}
     constants = SimpleNamespace(**{f"{k}_{x}": ca.SX.sym(k + x) for k in ("com", "vel", "L") for x in "xyz"})
     time, more = ca.SX.sym("t"), SimpleNamespace(gravity=9.8)
-    p = Point(**known, j=None, duration=time, s=1.0, c=constants, p=more, ref=None, view=partial(SpatialView, b))
+    p = Point(**known, j=None, duration=time, s=1.0, c=constants, p=more, ref=None, view=partial(BodyView, b))
     knee = BASE + bhr.joint_names.index("left_knee")
     assert ca.is_equal(p.joints.left_knee, known["q"][knee])
     assert ca.is_equal(p.joint_rates.left_knee, known["v"][knee])
-    assert p.com.shape == p.com_velocity.shape == p.L.shape == p.attitude.shape == p.origin("left_knee").shape == (3, 1)
-    assert len(vars(p.torques)) == b.model.joints and all(x.is_zero() for x in p.feet_forces)
+    assert p.com.shape == p.com_velocity.shape == p.L.shape == p.attitude.shape == p.point("left_knee").shape == (3, 1)
+    assert p.torques.knee.shape == (2, 1) and all(x.is_zero() for x in p.feet_forces) and p.wrench.is_zero()
     with pytest.raises(InputError) as e:
-        p.origin("elbow")
-    assert str(e.value).startswith("the robot has no joint 'elbow'; it has left_hip_yaw, left_hip_roll")
+        p.point("elbow")
+    assert str(e.value).startswith("the robot has no point 'elbow'; it has left_ankle_pitch, left_ankle_roll")
 
 
 def test_names_that_do_not_exist_are_refused():
     with pytest.raises(InputError, match="the problem 'whole body' has no such term"):
-        planner().plan(SIDE, "direct", weights={"spatial/flight/torq": 0.01})
+        planner().plan(SIDE, "direct", weights={"whole body/flight/torq": 0.01})
 
 
 def test_platforms_that_would_lie_under_a_sole_are_refused():
@@ -399,7 +400,7 @@ def test_platforms_that_would_lie_under_a_sole_are_refused():
         planner().plan(replace(SIDE, platform_m=0.2), "direct")
     said = "platform = 0.2 m at a distance of 0.3 m: the two surfaces would meet under a sole of bhr; that takes "
     assert str(e.value) == said + "a distance of at least 0.35 m"
-    planner().stage("spatial").parameters(replace(SIDE, side_m=0.35, platform_m=0.2))
+    planner().stage("direct").parameters(replace(SIDE, side_m=0.35, platform_m=0.2))
 
 
 def test_it_begins_in_the_posture_in_which_the_robot_waits(bhr):
@@ -412,7 +413,7 @@ def test_it_begins_in_the_posture_in_which_the_robot_waits(bhr):
 @pytest.fixture
 def refusing(monkeypatch):
     """(stage, what it was asked for): nothing farther than half a metre to the side is solved."""
-    last, known, tried = planner().stage("spatial"), jump(SIDE).whole_body, []
+    last, known, tried = planner().stage("direct"), jump(SIDE).whole_body, []
 
     def solved(start, asked, begin, apart, *, explain=False):
         tried.append((asked.task.side_m, start.name, start.held, explain))
@@ -464,7 +465,7 @@ def test_a_start_that_leads_nowhere_is_followed_by_the_next(monkeypatch):
     assert (attempts[0].status, attempts[0].iterations) == ("Maximum_Iterations_Exceeded", 3)
     assert attempts[1].iterations > 3 and attempts[1].cpu_s > attempts[0].cpu_s > 0
     rows = [(row.stage, row.iterations, row.solve_s) for row in plan.statistics]
-    assert rows == [(f"spatial, {x.start}, {x.hessian}", x.iterations, x.cpu_s) for x in attempts]
+    assert rows == [(f"direct, {x.start}, {x.hessian}", x.iterations, x.cpu_s) for x in attempts]
     assert audit(plan.tape, plan.robot, SIDE).passed
 
 
@@ -616,7 +617,7 @@ def test_a_face_keeps_links_apart(bhr):
 
 
 def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
-    plan, last = jump(SIDE), planner().stage("spatial")
+    plan, last = jump(SIDE), planner().stage("direct")
     phases = list(plan.whole_body.solution.phases.values())
     intervals, names = [len(p.j) for p in phases], list(plan.whole_body.solution.phases)
     assert too_close(last.body, phases) == []
@@ -627,7 +628,7 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     for x in apart:
         asked[names[x.phase], x.pair.key] = x.first, intervals[x.phase] - x.last
     assert rows == asked
-    assert apart and plan.statistics[-1].stage == "spatial, links apart, held Gauss-Newton"
+    assert apart and plan.statistics[-1].stage == "direct, links apart, held Gauss-Newton"
     q, rolls = phases[2].q.copy(), ("left_hip_roll", "right_hip_roll")
     q[5:8, [BASE + bhr.joint_names.index(name) for name in rolls]] += [-0.3, 0.3]  # legs that cross
     found = too_close(last.body, [*phases[:2], replace(phases[2], q=q)])
@@ -642,7 +643,7 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
 
 def test_rows_for_links_that_met_stay_where_they_are_on_another_mesh():
     """A neighbour that was solved on a finer mesh, and one on the usual mesh: the same shares of each phase."""
-    first, last = jump(SIDE).whole_body, planner().stage("spatial")
+    first, last = jump(SIDE).whole_body, planner().stage("direct")
     fine = last._finer.plan(SIDE, near=first)
     found = []
     for plan in (first, fine, last.plan(SIDE, near=fine)):

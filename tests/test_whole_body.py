@@ -267,7 +267,7 @@ def test_names_are_unique_within_a_phase():
 def test_unknown_names_are_refused(bhr):
     said = "weight or switch 'gravity': the problem 'whole body' has no such term; it has "
     with pytest.raises(InputError) as e:
-        planner().stage("direct").plan(JumpTask(0.5, 0.3), weights={"gravity": 1.0})
+        planner().program().plan(JumpTask(0.5, 0.3), weights={"gravity": 1.0})
     assert str(e.value).startswith(said)
     body = Body(bhr)
     with pytest.raises(InputError) as e:
@@ -378,7 +378,7 @@ def test_a_robot_too_weak_is_told_so(refusal):
     sentence = str(refusal)
     assert "\n" not in sentence and " at t = " in sentence and " by " in sentence
     # what only says that the motion is one motion is no limit that anybody could relax
-    links = [t.name for _, t in planner().stage("direct").nlp.problem.terms() if t.identity]
+    links = [t.name for _, t in planner().program().nlp.problem.terms() if t.identity]
     assert "joint dynamics" in links and "base turns" in links
     assert not any(name in sentence for name in links)
 

@@ -14,7 +14,6 @@ PHASES = {  # stage -> names of its phases; but for stage 2 "launch" means both 
     "srmp": (*LAUNCH, "launch", "flight"),
     "joint qp": ("launch", "flight"),
     "whole body": (*LAUNCH, "launch", "flight"),
-    "spatial": (*LAUNCH, "launch", "flight"),
 }
 LAST = "whole body"  # the stage of names without one; the direct planner takes its terms too
 Settings = TypeVar("Settings")

@@ -31,7 +31,6 @@ from jumplab.stages.srmp.planner import reach_of
 from jumplab.stages.srmp.reachable import check_reachable
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Weights, WholeBodyPlan, WholeBodyPlanner
-from jumplab.stages.whole_body.coordinates import even, whole
 from jumplab.stages.whole_body.planner import GIVEN
 from jumplab.stages.whole_body.starts import Motion
 from jumplab.stages.whole_body.terms import Body
@@ -42,6 +41,7 @@ FIRST_STAGES = "srmp", "joint qp"  # those that the direct method leaves out ...
 FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
 STEPS_S = (0.015, 0.0125, 0.02)  # stage 2's steps on flat feet, on the toes, in flight [s]: fine enough for a start
 LEAST_RISE_M = 0.02  # that a target can say
+ANY = JumpTask(0.5, 0.3)  # a jump straight ahead: its terms are those of all of them
 _COUNT = count()
 OTHERWISE = "stage 3 began from postures of a flip instead"  # in words, where stage 2 cannot follow
 
@@ -55,14 +55,12 @@ class Planner:
     Parameters
     ----------
     robot : who jumps.
-    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stage "srmp" and "whole body",
-        out of the plane "spatial", have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight;
-        "srmp" or "whole body" alone takes those at "problem". An expression sees a point with joints, joint_rates,
-        torques, com, com_velocity, L, inertia, wrench, posture, point("hand"), time, see
-        :class:`jumplab.stages.whole_body.view.PlaneView`, and in stage 1 com, com_velocity, L, inertia, wrench, lean,
-        posture, time, see :class:`jumplab.stages.srmp.view.RodView`; out of the plane
-        :class:`jumplab.stages.whole_body.view.SpatialView`. The direct planner takes those of "whole body", out of the
-        plane of "spatial".
+    terms : own costs and constraints: "stage/phase" -> list of :class:`jumplab.Term`. Stages "srmp" and "whole body"
+        have phases flat, toe, launch (both) and flight, "joint qp" has launch and flight; "srmp" or "whole body" alone
+        takes those at "problem". An expression sees a point with joints, joint_rates, torques, com, com_velocity, L,
+        inertia, wrench, posture, point("left_hand"), time, see :class:`jumplab.stages.whole_body.view.BodyView`, and
+        in stage 1 com, com_velocity, L, inertia, wrench, lean, posture, time, see
+        :class:`jumplab.stages.srmp.view.RodView`. The direct planner takes those of "whole body".
     weights : "stage/term" or "stage/phase/term" -> weight instead of the term's own; without a stage, stage 3's. For
         "joint qp" it is a factor on the block's own weights.
     off : names of the same sort: terms and bounds to leave out.
@@ -111,66 +109,55 @@ class Planner:
         given = self._given[2]
         return given if isinstance(given, Mesh) else settled(Mesh, given, flip)
 
-    def stage(self, name: str) -> Any:
-        """A stage's planner: "reach", "spatial", "srmp", "whole body", "direct".
+    def stage(self, name: str, *, flip: bool = False) -> Any:
+        """A stage's planner, of jumps or of flips: "reach", "srmp", "direct", "whole body" (which follows stage 1)."""
+        if (name, flip) not in self._stages:
+            self._stages[name, flip] = self._built(name, flip)
+        return self._stages[name, flip]
 
-        The last four as "... flip" too.
-        """
-        if name not in self._stages:
-            kind, flip = name.removesuffix(" flip"), name.endswith(" flip")
-            build = {"reach": lambda flip: reach_of(self.robot, keep=self.keep), "srmp": self._srmp}
-            build["spatial"] = self._away
-            self._stages[name] = build[kind](flip) if kind in build else self._body(flip, kind == "whole body")
-        return self._stages[name]
+    def program(self, task: JumpTask = ANY, weights: Mapping[str, float] = MappingProxyType({})) -> WholeBodyPlanner:
+        """The planner of the whole-body program that plans a target directly; ``weights`` as in :meth:`plan`."""
+        return self.stage("direct", flip=bool(task.rotation_rad)).program(task, weights)
 
-    def _srmp(self, flip: bool) -> SrmpPlanner:
-        settings = settled(SrmpSettings, self._given[1], flip)
-        return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
+    def _built(self, name: str, flip: bool) -> Any:
+        if name == "reach":
+            return reach_of(self.robot, keep=self.keep)
+        if name == "srmp":
+            settings = settled(SrmpSettings, self._given[1], flip)
+            return SrmpPlanner(self.robot, settings, keep=self.keep, changes=self.changes["srmp"])
+        weights = Weights().of_flip() if flip else Weights()
+        how = {"keep": self.keep, "body": self._model, "changes": self.changes[LAST], "tracking": name == LAST}
+        return WholeBodyPlanner(self.robot, self._mesh(flip), settled(Limits, self._given[0], flip), weights, **how)
 
     @cached_property
     def _model(self) -> Body:
         """The robot as all whole-body programs see it."""
         return Body(self.robot)
 
-    def _away(self, flip: bool) -> WholeBodyPlanner:
-        """The program of all coordinates; of a robot that no plane describes also that of even motions."""
-        return self._program(flip, changes=self.changes["spatial"], free=whole(self._model))
-
-    def _body(self, flip: bool, tracking: bool) -> WholeBodyPlanner:
-        """The program of jumps in the plane."""
-        return self._program(flip, tracking=tracking, changes=self.changes["whole body"], free=even(self._model))
-
-    def _program(self, flip: bool, **how: Any) -> WholeBodyPlanner:
-        weights = Weights().of_flip() if flip else Weights()
-        how |= {"keep": self.keep, "body": self._model}
-        return WholeBodyPlanner(self.robot, self._mesh(flip), settled(Limits, self._given[0], flip), weights, **how)
-
     def prepared(
-        self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False
+        self, method: str = USUAL, weights: Mapping[str, float] | None = None, task: JumpTask = ANY
     ) -> dict[str, StageChanges]:
-        """Build the stages of a method, so that nothing is refused after the first has solved.
+        """Build the stages that a method needs for a target, so that nothing is refused after the first has solved.
 
         Returns the ``weights`` of one plan by stage. Raises :class:`InputError` for own terms, weights or settings that
         the method has no place for, and for names that do not exist.
         """
-        asked, turn = sorted_out(weights=weights), " flip" * flip
-        if self.chosen(method, weights, flip=flip) == "direct":
-            ignored = [f"{s!r}" for s in ("srmp", "joint qp") if self.changes[s] or asked[s]]
+        asked, flip = sorted_out(weights=weights), bool(task.rotation_rad)
+        if self.chosen(method, weights) == "direct":
+            ignored = [f"{s!r}" for s in FIRST_STAGES if self.changes[s] or asked[s]]
             if ignored := ignored + ["the settings of 'srmp'"] * (self._given[1] is not None):
                 raise InputError(
                     f"the method 'direct' has no place for {' and '.join(ignored)}: it takes limits, mesh and the "
                     f"terms of 'whole body'; choose 'three-step', or leave that out"
                 )
-            stages = {"reach": None, "direct" + turn: asked["whole body"]}
-        else:
-            stages = {f"{name}{turn}": asked[name] for name in ("srmp", "whole body")}
-            self._joint_options(asked["joint qp"].weights)
-        for name, changes in stages.items():
-            if (stage := self.stage(name)) and changes:
-                changes.applied(stage.nlp.problem)
+            asked[LAST].applied(self.program(task, asked[LAST].weights).nlp.problem)
+            return asked
+        for name in ("srmp", LAST):
+            asked[name].applied(self.stage(name, flip=flip).nlp.problem)
+        self._joint_options(asked["joint qp"].weights)
         return asked
 
-    def chosen(self, method: str = USUAL, weights: Mapping[str, float] | None = None, *, flip: bool = False) -> str:
+    def chosen(self, method: str = USUAL, weights: Mapping[str, float] | None = None) -> str:
         """The method that is meant: "usual" is "direct", but "three-step" where something is changed that only it has.
 
         Raises :class:`InputError` for a method that does not exist, and for one that this planner cannot follow.
@@ -214,18 +201,17 @@ class Planner:
         body, stance = FullBody(self.robot), stance_configuration(self.robot)
         return changed(Options(), body, stance, own.terms, {**own.weights, **weights}, own.off)
 
-    def terms(self, *, flip: bool = False, method: str = USUAL) -> list[dict[str, Any]]:
-        """All terms and bounds of the stages as they are now, own ones included; ``jl.plots.table`` shows them.
+    def terms(self, task: JumpTask = ANY, *, method: str = USUAL) -> list[dict[str, Any]]:
+        """All terms and bounds of the stages for a target, own ones included; ``jl.plots.table`` shows them.
 
         Returns
         -------
         rows with stage, phase, name, kind, at, unit, equation and value (weight, or bounds).
         """
-        if not self.robot.planar:
-            return self.stage("spatial").nlp.problem.table()
-        if self.chosen(method, flip=flip) == "direct":
-            return self.stage("direct" + " flip" * flip).nlp.problem.table()
-        first, last = (self.stage(name + " flip" * flip).nlp.problem.table() for name in ("srmp", "whole body"))
+        flip = bool(task.rotation_rad)
+        if self.chosen(method) == "direct":
+            return self.program(task).nlp.problem.table()
+        first, last = (self.stage(name, flip=flip).nlp.problem.table() for name in ("srmp", LAST))
         return [*first, *terms_table(self._joint_options()), *last]
 
     def plan(
@@ -248,7 +234,7 @@ class Planner:
         weights : of cost terms in this plan, instead of their own; names as in :class:`Planner`. With 0 an own term is
             left out: the plan is that of a planner without it, to the last bit.
         start : absolute link angles (5,) of the posture in which the robot waits at rest, soles flat; the stance if
-            None. Not for flips.
+            None. Not for flips, nor for robots that no plane describes.
 
         Raises
         ------
@@ -256,47 +242,58 @@ class Planner:
             If a stage refuses or fails; no later stage is run.
         """
         require_type(task, JumpTask, "the target")
-        method = self.chosen(method, weights, flip=bool(task.rotation_rad) and task.in_plane)
-        if not (task.in_plane and self.robot.planar):
-            if method != "direct":
-                raise InputError(
-                    f"method {quoted(method)}: stages 1 and 2 are planar, and this target goes to the "
-                    f"side or turns; choose 'direct'"
-                )
-            return self._spatial(task, weights, start)
-        self.stage("direct" + " flip" * bool(task.rotation_rad)).check_ground(task)
-        if start is not None and task.rotation_rad:
-            raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
-        asked = self.prepared(method, weights, flip=task.rotation_rad != 0)
+        method = self.chosen(method, weights)
+        self._check(task, method, start)
+        asked = self.prepared(method, weights, task)
         if (less := self._less(asked)) is not self:
             return less.plan(task, method, start=start)
-        last, weights = self.stage("whole body"), asked["whole body"].weights
         if method == "direct":
-            if self.atlas is not None and not asked["whole body"]:
-                if (body := self.atlas.solve(self.stage("direct"), task, self._posture(start))) is not None:
-                    return self._finished(method, body)
-            return self._finished(method, self._direct(task, weights=weights, stance=self._posture(start)))
+            return self._finished(method, self._direct(task, asked[LAST].weights, start))
         if task.rotation_rad:
             return self._flip(task, asked)
         srmp, joints = self._first_two(task, start, asked)
+        last = self.stage(LAST)
         begin = motion_of_joints(joints, last, srmp.toe_s)
-        body = last.plan(task, srmp, begin=begin, weights=weights, stance=self._posture(start))
+        body = last.plan(task, srmp, begin=begin, weights=asked[LAST].weights, stance=self._posture(start))
         return self._finished(method, body, srmp, joints, (_joint_row(joints),))
 
-    def _direct(self, task: JumpTask, **how: Any) -> WholeBodyPlan:
+    def _check(self, task: JumpTask, method: str, start: np.ndarray | None) -> None:
+        """Refuse a target or a start that a method or the robot has no place for, before anything is solved."""
+        if method != "direct" and not task.in_plane:
+            raise InputError(
+                f"method {quoted(method)}: stages 1 and 2 are planar, and this target goes to the "
+                f"side or turns; choose 'direct'"
+            )
+        if start is not None and not self.robot.planar:
+            raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
+        if start is not None and task.rotation_rad:
+            raise InputError("a flip begins in the stance; leave its start away, or ask for no rotation")
+        self.stage("direct", flip=bool(task.rotation_rad)).check_ground(task)
+
+    def _direct(
+        self,
+        task: JumpTask,
+        weights: Mapping[str, float] | None = None,
+        start: np.ndarray | None = None,
+        near: WholeBodyPlan | None = None,
+    ) -> WholeBodyPlan:
         """The whole body alone.
 
         Raises :class:`InfeasibleError` where it finds nothing and a straight push cannot reach the target either, with
-        what the push is enough for.
+        the bound of that push.
         """
-        planner, short = self.stage("direct" + " flip" * bool(task.rotation_rad)), None
-        try:
-            check_reachable(task, self.stage("reach"), self.robot)
-        except InfeasibleError as e:
-            short = e
+        planner, stance, short = self.stage("direct", flip=bool(task.rotation_rad)), self._posture(start), None
+        if self.atlas is not None and not weights and near is None and task.in_plane and not task.rotation_rad:
+            if (body := self.atlas.solve(self.program(task), task, stance)) is not None:
+                return body
+        if self.robot.planar and task.in_plane:
+            try:
+                check_reachable(task, self.stage("reach"), self.robot)
+            except InfeasibleError as e:
+                short = e
         explained = EXPLAINED.set(EXPLAINED.get() and short is None)
         try:
-            return planner.plan(task, **how)
+            return planner.plan(task, weights=weights, stance=stance, near=near)
         except SolverError as e:
             if short is None:
                 raise
@@ -317,29 +314,9 @@ class Planner:
         """The plan with its tape and the table of stages; ``rows`` are stage 2's."""
         if srmp is not None:
             rows = (_row("1 SRMP", srmp.solution.statistics), *rows)
-        stage, kind = ("direct", "direct") if srmp is None else ("3 whole body", "whole body")
-        build_s = self.stage(kind + " flip" * bool(body.task.rotation_rad)).nlp.build_s
-        rows = (*rows, *body_rows(stage, body, build_s))
-        tape = make_tape(body, srmp)
-        return JumpPlan(
-            body.task, self.robot.under_gravity(body.task.gravity), method, tape, srmp, joints, body, rows, skipped
-        )
-
-    def _spatial(self, task: JumpTask, weights: Mapping[str, float] | None, start: Any) -> JumpPlan:
-        """A jump out of the plane, or of a robot that no plane describes: the spatial program."""
-        if start is not None and not self.robot.planar:
-            raise InputError(f"robot {self.robot.name} begins in its stance: five links do not describe it; drop start")
-        last, asked = self.stage(_away(task)), sorted_out(weights=weights)
-        last.parameters(task)  # refuses what cannot be before anything is solved
-        if others := [stage for stage, x in asked.items() if stage != "spatial" and x]:
-            raise InputError(
-                f"weights of {others[0]!r}: jumps to the side, with a turn or of robot {self.robot.name} have the one "
-                f"stage 'spatial'; write 'spatial/{next(iter(asked[others[0]].weights))}'"
-            )
-        if asked["spatial"]:
-            asked["spatial"].applied(last.nlp.problem)
-        stance = None if start is None else self._standing(start)
-        return self._placed(last.plan(task, weights=asked["spatial"].weights, stance=stance))
+        rows = (*rows, *body_rows("direct" if srmp is None else "3 whole body", body))
+        robot = self.robot.under_gravity(body.task.gravity)
+        return JumpPlan(body.task, robot, method, make_tape(body, srmp), srmp, joints, body, rows, skipped)
 
     def follow(
         self, contacts: Contacts, *, gravity: float = GRAVITY, weights: Mapping[str, float] | None = None
@@ -350,7 +327,7 @@ class Planner:
         ----------
         contacts : the schedule; it ends at rest.
         gravity : [m/s^2].
-        weights : of cost terms of stage "spatial" in this plan, instead of their own.
+        weights : of cost terms of stage "whole body" in this plan, instead of their own.
 
         Raises
         ------
@@ -360,8 +337,8 @@ class Planner:
         require_type(contacts, Contacts, "the contact schedule")
         if contacts.ends != "rest":
             raise InputError("a schedule that ends at touchdown is a standing jump; ask for it by its target")
-        asked = sorted_out(weights=weights)["spatial"]
-        how = {"contacts": contacts, "keep": self.keep, "changes": self.changes["spatial"], "body": self._model}
+        asked = sorted_out(weights=weights)[LAST]
+        how = {"contacts": contacts, "keep": self.keep, "changes": self.changes[LAST], "body": self._model}
         last = WholeBodyPlanner(self.robot, limits=self.limits, **how)
         level = JumpTask(0.0, 0.1, gravity=gravity)  # a schedule has its own places; of a target only gravity is taken
         body, ends = last.plan(level, weights=asked.weights), contacts.places[-2:]
@@ -376,22 +353,14 @@ class Planner:
             side_m=float(travel[1]),
             yaw_rad=turn,
         )
-        plan = self._placed(replace(body, task=task), last)
-        return replace(plan, contacts=contacts)
-
-    def _placed(self, body: WholeBodyPlan, last: WholeBodyPlanner | None = None) -> JumpPlan:
-        """The plan of a spatial solution, one row of statistics for each attempt."""
-        last = last or self.stage(_away(body.task))
-        robot = self.robot.under_gravity(body.task.gravity)
-        rows = body_rows("spatial", body, last.nlp.build_s)
-        return JumpPlan(body.task, robot, "direct", body.tape, None, None, body, rows)
+        return replace(self._finished("direct", replace(body, task=task)), contacts=contacts)
 
     def _flip(self, task: JumpTask, asked: Mapping[str, StageChanges]) -> JumpPlan:
         """Three steps of a flip. Stage 2 may lose it: rates of 20 rad/s in every link are no feedback's business, and
         its reference says nothing of the tuck. Stage 3 then starts from postures of a flip, and the plan says so.
         """
-        last, weights = self.stage("whole body flip"), asked["whole body"].weights
-        srmp = self.stage("srmp flip").plan(task, weights=asked["srmp"].weights)
+        last, weights = self.stage(LAST, flip=True), asked[LAST].weights
+        srmp = self.stage("srmp", flip=True).plan(task, weights=asked["srmp"].weights)
         joints, begin, skipped, rows = None, None, None, ()
         try:
             joints = self._joints(srmp, asked)
@@ -447,25 +416,15 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(f"the previous plan is for the robot {previous.robot.name}, not for {self.robot.name}")
-        if not (task.in_plane and self.robot.planar):
-            near = previous.whole_body if isinstance(previous.whole_body, WholeBodyPlan) else None
-            if near is None or previous.method != "direct":
-                return self.plan(task, previous.method, start=start)
-            try:
-                stance = None if start is None else self._standing(start)
-                body = self.stage(_away(task)).plan(task, near=near, stance=stance)
-            except SolverError:
-                return self.plan(task, previous.method, start=start)
-            return self._placed(body)
         if task.rotation_rad or previous.contacts is not None or previous.whole_body is None:
             return self.plan(task, previous.method, start=start)
-        self.stage("direct").check_ground(task)
-        self.prepared(previous.method)
-        how = {"near": previous.whole_body, "stance": self._posture(start)}
+        self._check(task, previous.method, start)
+        self.prepared(previous.method, task=task)
+        near = previous.whole_body
         if previous.method == "direct":
-            return self._finished("direct", self._direct(task, **how))
+            return self._finished("direct", self._direct(task, start=start, near=near))
         srmp = self._pendulum(task, start, near=previous.srmp)
-        body = self.stage("whole body").plan(task, srmp, **how)
+        body = self.stage(LAST).plan(task, srmp, near=near, stance=self._posture(start))
         return self._finished(previous.method, body, srmp)
 
 
@@ -480,11 +439,6 @@ def here(planner: Planner) -> Planner:
     return _HERE[planner.token]
 
 
-def _away(task: JumpTask) -> str:
-    """The stage for a jump out of the plane."""
-    return "spatial" + " flip" * bool(task.rotation_rad)
-
-
 def _row(stage: str, s: Statistics) -> StageRow:
     return StageRow(stage, s.iterations, s.build_s, s.solve_s)
 
@@ -494,8 +448,9 @@ def _joint_row(joints: JointPlan) -> StageRow:
     return StageRow("2 joint map" + ", gentle" * bool(joints.gentle), s.iterations, s.total_s - s.solve_s, s.solve_s)
 
 
-def body_rows(stage: str, body: WholeBodyPlan, build_s: float) -> tuple[StageRow, ...]:
-    """What the whole-body program cost, one row for each attempt."""
+def body_rows(stage: str, body: WholeBodyPlan) -> tuple[StageRow, ...]:
+    """The cost of the whole-body program, one row for each attempt."""
+    build_s = body.solution.statistics.build_s
     return tuple(
         StageRow(f"{stage}, {x.start}, {x.hessian}", x.iterations, 0.0 if k else build_s, x.cpu_s)
         for k, x in enumerate(body.attempts)
@@ -512,10 +467,12 @@ def motion_of_joints(joints: JointPlan, planner: WholeBodyPlanner, toe_s: float)
 
 
 def make_tape(body: WholeBodyPlan, srmp: SrmpPlan | None = None) -> Tape:
-    """The 1 kHz tape of a whole-body plan in the plane, with planar and stage-1 trajectories under their own names."""
-    robot, gravity = body.schedule.body.robot, body.task.gravity
-    tape = body.tape
-    return replace(tape, extra={**tape.extra, **planar_columns(tape, robot.under_gravity(gravity)), **_of_stage1(srmp)})
+    """The 1 kHz tape of a whole-body plan; of a jump in the plane with planar and stage-1 trajectories by name."""
+    robot, tape, jump = body.schedule.body.robot, body.tape, body.schedule.contacts.ends == "touchdown"
+    if not (robot.planar and body.task.in_plane and jump):
+        return tape
+    planar = planar_columns(tape, robot.under_gravity(body.task.gravity))
+    return replace(tape, extra={**tape.extra, **planar, **_of_stage1(srmp)})
 
 
 def _of_stage1(srmp: SrmpPlan | None) -> dict[str, np.ndarray]:

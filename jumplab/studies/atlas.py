@@ -110,7 +110,7 @@ class Atlas:
         for distance, height in product(distances, heights):
             JumpTask(distance, height)  # refuses what no task may ask
         planner = Planner(robot, **{"keep": True} | how)
-        body, tell = planner.stage("direct"), tell or (lambda line: None)
+        body, tell = planner.program(), tell or (lambda line: None)
         atlas, done = cls(robot.name, distances, heights, {}, key_of(body)), set()
         if folder is not None and (Path(folder) / FILE).exists():
             atlas, done = _read(Path(folder) / FILE, robot, atlas)
@@ -209,7 +209,8 @@ class Atlas:
     def solve(self, body: WholeBodyPlanner, task: JumpTask, start: np.ndarray | None = None) -> WholeBodyPlan | None:
         """The direct plan for a target from the nodes around it; None if they lead nowhere.
 
-        ``body`` is the planner's direct stage; raises :class:`InputError` if the atlas was made of something else.
+        ``body`` is the planner's program of jumps straight ahead; raises :class:`InputError` if the atlas was made of
+        something else.
         """
         if key_of(body) != self.key:
             raise InputError(
@@ -287,7 +288,7 @@ def _node(body: WholeBodyPlanner, plan: WholeBodyPlan) -> Node:
 
 def _plan_row(planner: Planner, height: float, distances: Sequence[float]) -> tuple[float, list[Node]]:
     """Nodes of one height, from near to far, each from its neighbour's solution."""
-    body, plan, row, failed = here(planner).stage("direct"), None, [], 0
+    body, plan, row, failed = here(planner).program(), None, [], 0
     for distance in distances:
         task = JumpTask(distance, height)
         try:

@@ -22,7 +22,7 @@ from jumplab.models.spatial import SpatialModel, cross
 from jumplab.ocp import Term
 from jumplab.robot import Robot
 from jumplab.sim import Perturbation, Ranges
-from jumplab.stages.changes import settled, sorted_out
+from jumplab.stages.changes import LAST, settled, sorted_out
 from jumplab.stages.whole_body import Limits
 from jumplab.stages.whole_body.terms import Body
 from jumplab.task import JumpTask
@@ -68,11 +68,10 @@ def robust_changes(task: JumpTask, robot: Robot, ranges: Ranges, changes: Mappin
     own = {name: getattr(given, name) for name in named}
     if task.rotation_rad:
         return {**changes, "limits": limits | own}
-    stage = "whole body" if task.in_plane and robot.planar else "spatial"
     terms = {name: _listed(extra) for name, extra in (changes.get("terms") or {}).items()}
-    axes = (0,) if stage == "whole body" else (0, 1)
-    terms[stage] = [*terms.get(stage, ()), capture_term(robot, ranges, axes=axes)]
-    off = [*changes.get("off", ()), f"{stage}/{INSTEAD_OF}"]
+    axes = (0,) if task.in_plane and robot.planar else (0, 1)
+    terms[LAST] = [*terms.get(LAST, ()), capture_term(robot, ranges, axes=axes)]
+    off = [*changes.get("off", ()), f"{LAST}/{INSTEAD_OF}"]
     return {**changes, "terms": terms, "off": off, "limits": limits | own}
 
 

@@ -20,9 +20,9 @@ import pinocchio as pin
 
 from jumplab.errors import InputError, quoted
 from jumplab.models.full import FullBody, FullTerms, skew
+from jumplab.models.names import ByJoint
 from jumplab.ocp import Term
 from jumplab.ocp.changes import ends
-from jumplab.robot import SAGITTAL_JOINTS
 
 SIDES = ("left", "right")
 
@@ -93,25 +93,6 @@ class Place:
     acceleration: Affine
 
 
-class ByJoint:
-    """One quantity of the joints by name: ``.knee`` is left and right (2,), about +y; ``.left_knee`` one's own."""
-
-    def __init__(self, body: FullBody, values: Any):
-        self._body, self._values = body, values
-
-    def __getattr__(self, name: str) -> Any:
-        robot = self._body.robot
-        own = {joint: ([k], [1.0]) for k, joint in enumerate(robot.joint_names)}
-        for role in SAGITTAL_JOINTS:
-            pair = [(joint, sign) for joint, row, sign in robot.role_signs() if SAGITTAL_JOINTS[row] == role]
-            if pair:  # else the arms are held
-                own[role] = [robot.joint_names.index(joint) for joint, _ in pair], [sign for _, sign in pair]
-        if name not in own:
-            raise AttributeError(f"there is no joint {quoted(name)}; there are {', '.join(own)}")
-        rows, signs = own[name]
-        return self._values[rows] * np.array(signs)
-
-
 class StepPoint:
     """What an own term of stage 2 sees: the robot in the middle of a step, whose accelerations are unknown.
 
@@ -142,24 +123,24 @@ class StepPoint:
     @property
     def joints(self) -> ByJoint:
         """Joint angles [rad]: numbers."""
-        return ByJoint(self._body, self._terms.q[7:])
+        return ByJoint(self._body.robot, self._terms.q[7:])
 
     @property
     def joint_rates(self) -> ByJoint:
         """Joint rates [rad/s]: numbers."""
-        return ByJoint(self._body, self._terms.v[6:])
+        return ByJoint(self._body.robot, self._terms.v[6:])
 
     @property
     def joint_accelerations(self) -> ByJoint:
         """Joint accelerations [rad/s^2]: affine."""
-        return ByJoint(self._body, self.accelerations[6:])
+        return ByJoint(self._body.robot, self.accelerations[6:])
 
     @property
     def torques(self) -> ByJoint:
         """Joint torques, M theta'' + H - J^T F, of each side by itself [N m]: affine."""
         x = self._terms
         forces = -x.J[:, 6:].T if self._first else 0.0
-        return ByJoint(self._body, self._of(x.M[6:], x.H[6:], forces))
+        return ByJoint(self._body.robot, self._of(x.M[6:], x.H[6:], forces))
 
     @property
     def accelerations(self) -> Affine:

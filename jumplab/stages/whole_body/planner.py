@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -296,7 +297,7 @@ class WholeBodyPlanner:
             If there is no plan; names the terms in conflict, and the nearest of a few smaller targets that has one.
             Where nobody reads explanations (:data:`jumplab.ocp.nlp.EXPLAINED`), it gives up sooner.
         """
-        if (less := self._even_one(task, weights or {}, stance)) is not None:
+        if (less := self.program(task, weights or {})) is not self:
             how: dict[str, Any] = {"begin": begin, "weights": weights, "near": near, "stance": stance}
             if less.free.plane:
                 return less.plan(task, srmp, **how)
@@ -367,13 +368,15 @@ class WholeBodyPlanner:
         found = self._kept_apart(found, True, asked)
         return self._settled(found, asked).after(asked.attempts)
 
-    def _even_one(self, task: JumpTask, weights: Mapping[str, float], stance) -> WholeBodyPlanner | None:
-        """The planner of even motions, where nothing asks for another."""
-        if self.free.even or not (task.in_plane and self.contacts.even) or self.changes.terms:
-            return None
+    def program(self, task: JumpTask, weights: Mapping[str, float] = MappingProxyType({})) -> WholeBodyPlanner:
+        """The planner of a target: of even motions, which take half the unknowns, where nothing asks for another."""
+        if self.free.even or not (task.in_plane and self.contacts.even):
+            return self
         named = (*weights, *self.changes.weights, *self.changes.off)
-        if any(name.rpartition("/")[2] == "mirror" for name in named) or self._even.free.kind == "whole":
-            return None
+        # an own term may ask for an uneven motion, but in the plane there is none
+        uneven = any(name.rpartition("/")[2] == "mirror" for name in named) or self.changes.terms
+        if (uneven and not self.robot.planar) or self._even.free.kind == "whole":
+            return self
         return self._even
 
     @cached_property

@@ -17,7 +17,7 @@ from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import BASE, Coordinates, whole
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.terms import Body, WholeBodyTerms
-from jumplab.stages.whole_body.view import PlaneView, SpatialView
+from jumplab.stages.whole_body.view import BodyView
 
 SCALES = {"q": 1.0, "v": 10.0, "a": 100.0}  # peaks of solutions, for conditioning
 ANGLE_BOX_RAD = 15.0  # beyond two full turns
@@ -170,7 +170,7 @@ class Schedule:
             self._constants(k),
             references,
             SCALES | {"z": self._sizes(b)},
-            partial(PlaneView if self.free.plane and self.body.robot.planar else SpatialView, b),
+            partial(BodyView, b),
             b.integrated,
             "" if not k else "qv" if landed else "qvaz",
             b.kind,

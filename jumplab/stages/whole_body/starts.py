@@ -167,11 +167,11 @@ def _reached(schedule: Schedule, task: JumpTask, times: np.ndarray, holds: list[
 
 
 def mended(schedule: Schedule, task: JumpTask, motion: Motion) -> Motion:
-    """A motion whose legs are moved so that feet are in their places; where they do not reach, one along the schedule."""
-    contacts, reach = schedule.contacts, Reach(schedule.body, schedule.limits.range_margin_rad)
+    """A motion with its feet put in their places by the legs; where they do not reach, one along the schedule."""
+    reach = Reach(schedule.body, schedule.limits.range_margin_rad)
     starts, leg = np.concatenate([[0.0], np.cumsum(motion.durations)]), leg_length(schedule.body.robot)
     holds, usual, charts = _footholds(schedule, task), along(schedule, task).charts, []
-    for k, (p, rows) in enumerate(zip(contacts.phases, motion.charts, strict=True)):
+    for k, rows in enumerate(motion.charts):
         times, legs = np.linspace(starts[k], starts[k + 1], len(rows)), []
         for t, chart, other in zip(times, rows, usual[k], strict=True):
             goals = {side: _foot(schedule, holds, task, k, side, t, starts, leg) for side in (0, 1)}

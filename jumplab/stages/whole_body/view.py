@@ -1,59 +1,51 @@
-"""What an own term of the whole-body program sees at a point: the robot's quantities by name, in SI units."""
+"""The sight of an own term of the whole-body program: the robot's quantities at a point by name, in SI units."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from jumplab.errors import InputError, quoted
-from jumplab.models.planar import PlanarState
-from jumplab.models.spatial import SpatialModel, SpatialState
+from jumplab.models.names import ByJoint
+from jumplab.models.spatial import SpatialModel, SpatialState, cross
 from jumplab.ocp.problem import Point
-from jumplab.robot_import.config import ROLES
-from jumplab.stages.whole_body.coordinates import BASE
+from jumplab.stages.whole_body.contacts import SIDES
+from jumplab.stages.whole_body.coordinates import BASE, PITCH
 from jumplab.stages.whole_body.terms import WholeBodyTerms
 
 
 @dataclass(frozen=True)
-class _View:
-    """A point of a phase of the program."""
+class BodyView:
+    """A point of the whole-body program, ``p.joints.left_knee`` and so on.
+
+    Vectors (3,) are in the axes of the start: x forward, y to the left, z up. Places count from the middle between the
+    soles in their first place; angles are positive about +y. In a jump straight ahead of a robot whose halves are alike
+    left and right move alike, and what points to the side is zero.
+    """
 
     _terms: WholeBodyTerms
     _point: Point
 
-    def moved(self, model: SpatialModel) -> SpatialState:
-        """Another robot, whose tree has the same joints, in the same motion."""
-        q, v = self._terms.chart(self._point.q), self._terms.chart(self._point.v, 1)
-        return SpatialState(model, q, v, v, self._point.p.gravity)
-
-
-@dataclass(frozen=True)
-class SpatialView(_View):
-    """A point of the whole-body program, ``p.joints.left_knee`` and so on; vectors (3,) in the axes of the start.
-
-    Places count from the middle between the soles in their first place: x forward, y to the left, z up.
-    """
-
-    def _named(self, column: ca.SX) -> SimpleNamespace:
-        return SimpleNamespace(**dict(zip(self._terms.body.joint_names, ca.vertsplit(column), strict=True)))
+    @property
+    def _state(self) -> SpatialState:
+        return self._terms.state(self._point)
 
     @property
-    def joints(self) -> SimpleNamespace:
-        """Joint angles by the names of the joints [rad]."""
-        return self._named(self._terms.chart(self._point.q)[BASE:])
+    def joints(self) -> ByJoint:
+        """Joint angles [rad]: ``.left_knee`` (1,), ``.knee`` of left and right (2,)."""
+        return ByJoint(self._terms.robot, self._terms.chart(self._point.q)[BASE:])
 
     @property
-    def joint_rates(self) -> SimpleNamespace:
+    def joint_rates(self) -> ByJoint:
         """Joint rates [rad/s]."""
-        return self._named(self._terms.chart(self._point.v, 1)[BASE:])
+        return ByJoint(self._terms.robot, self._terms.chart(self._point.v, 1)[BASE:])
 
     @property
-    def torques(self) -> SimpleNamespace:
+    def torques(self) -> ByJoint:
         """Joint torques [N m]."""
-        return self._named(self._terms.all_torques(self._point))
+        return ByJoint(self._terms.robot, self._terms.all_torques(self._point))
 
     @property
     def attitude(self) -> ca.SX:
@@ -61,132 +53,79 @@ class SpatialView(_View):
         return self._terms.chart(self._point.q)[3:BASE]
 
     @property
+    def posture(self) -> ca.SX:
+        """Pitch of the base, forward positive, turns included [rad]."""
+        return self._terms.chart(self._point.q)[PITCH]
+
+    @property
     def com(self) -> ca.SX:
-        """Centre of mass [m]."""
-        return self._terms.state(self._point).com
+        """Centre of mass (3,) [m]."""
+        return self._state.com
 
     @property
     def com_velocity(self) -> ca.SX:
-        """Its velocity [m/s]."""
-        return self._terms.state(self._point).com_velocity
+        """Its velocity (3,) [m/s]."""
+        return self._state.com_velocity
 
     @property
     def L(self) -> ca.SX:
-        """Angular momentum about the CoM [kg m^2/s]."""
-        return self._terms.state(self._point).angular_momentum
+        """Angular momentum about the CoM (3,) [kg m^2/s]."""
+        return self._state.angular_momentum
+
+    @property
+    def inertia(self) -> ca.SX:
+        """Inertia of all bodies as one, about the CoM (3, 3) [kg m^2]; the paper's rho is ``p.inertia[1, 1]``."""
+        return self._state.inertia
 
     @property
     def feet_forces(self) -> list[ca.SX]:
         """Force of the ground on the left and on the right foot in the axes of its foothold [N]; zero in the air."""
         return [self._terms.foot_force(self._point, side) for side in (0, 1)]
 
-    def origin(self, joint: str) -> ca.SX:
-        """Place of a joint [m]."""
-        names = self._terms.body.joint_names
-        if joint not in names:
-            raise InputError(f"the robot has no joint {quoted(joint)}; it has {', '.join(names)}")
-        return self._terms.state(self._point).point(1 + names.index(joint), [0.0, 0.0, 0.0])
-
-
-class Joints(NamedTuple):
-    """One quantity of every joint, by its role."""
-
-    hip: ca.SX
-    knee: ca.SX
-    ankle: ca.SX
-    shoulder: ca.SX
-
-    def __getattr__(self, name: str) -> ca.SX:
-        raise AttributeError(f"there is no joint {name!r}; there are {', '.join(self._fields)}")
-
-
-@dataclass(frozen=True)
-class PlaneView(_View):
-    """A point of the whole-body program in the plane, ``p.joints.knee`` and so on.
-
-    The model is planar: left and right move alike, so an angle or rate is that of either side, and a torque is that of
-    both sides together. Angles are positive about +y; places count from the toes' first place, x forward, z up.
-    """
-
-    @property
-    def _state(self) -> PlanarState:
-        return self._terms.plane_state(self._point)
-
-    @property
-    def joints(self) -> Joints:
-        """Joint angles hip, knee, ankle, shoulder [rad]."""
-        return Joints(*ca.vertsplit(self._state.joints))
-
-    @property
-    def joint_rates(self) -> Joints:
-        """Joint rates hip, knee, ankle, shoulder [rad/s]."""
-        return Joints(*ca.vertsplit(self._state.joint_rates))
-
-    @property
-    def torques(self) -> Joints:
-        """Joint torques hip, knee, ankle, shoulder, both sides together [N m]."""
-        torques, roles = self._terms.all_torques(self._point), zip(ROLES, self._terms.robot.sagittal.signs, strict=True)
-        names, joints = self._terms.body.joint_names, self._terms.robot.joints
-        rows = [sum(float(s) * torques[names.index(n)] for n, s in zip(joints[r], x, strict=False)) for r, x in roles]
-        return Joints(*(ca.SX(x) for x in rows))
-
-    @property
-    def posture(self) -> ca.SX:
-        """Pitch of the trunk, forward positive, turns included [rad]."""
-        return self._state.angles[3]
-
-    @property
-    def com(self) -> ca.SX:
-        """Centre of mass, x and z (2,) [m]."""
-        return self._terms.toe(self._point) + self._state.com
-
-    @property
-    def com_velocity(self) -> ca.SX:
-        """Its velocity (2,) [m/s]."""
-        if not self._terms.flying:
-            return self._state.com_velocity
-        c = self._point.c
-        return ca.vertcat(c.vel_x, c.vel_z - self._point.p.gravity * self._point.time)
-
-    @property
-    def L(self) -> ca.SX:
-        """Angular momentum about the CoM, about +y [kg m^2/s]."""
-        return self._state.angular_momentum
-
-    @property
-    def inertia(self) -> ca.SX:
-        """Pitch inertia about the CoM, rho [kg m^2]."""
-        return self._state.inertia
-
-    @property
-    def inertia_rate(self) -> ca.SX:
-        """Its rate [kg m^2/s]."""
-        return self._state.inertia_rate
-
     @property
     def wrench(self) -> ca.SX:
-        """The ground's force and its moment about the toe: F_x, F_z [N], M_y [N m] (3,); zero in flight."""
-        if self._terms.flying:
-            return ca.SX.zeros(3)
-        p, side = self._point, 0
-        phi = self._terms.pitch(side, p.q)
-        total = ca.SX.zeros(3)
-        for place, f in zip(self._terms.points[side], self._terms.point_forces(p, side), strict=True):
-            x, z = ca.cos(phi) * place[0], -ca.sin(phi) * place[0]
-            total += 2 * ca.vertcat(f[0], f[2], z * f[0] - x * f[2])
+        """The ground's force on the robot, and its moment about the origin (6,) [N, N m]; zero in flight."""
+        terms, total = self._terms, ca.SX.zeros(6)
+        for side in terms.sides:
+            place, yaw = terms.foothold(self._point, side)
+            c, s = ca.cos(yaw), ca.sin(yaw)
+            for local, f in zip(terms.points[side], terms.point_forces(self._point, side), strict=True):
+                force = ca.vertcat(c * f[0] - s * f[1], s * f[0] + c * f[1], f[2])
+                arm = place + ca.vertcat(c * local[0] - s * local[1], s * local[0] + c * local[1], 0)
+                total += ca.vertcat(force, cross(arm, force))
+        if terms.free.even:  # the right foot is the left one's mirror image
+            total *= ca.DM([2, 0, 2, 0, 2, 0])
         return total
 
     def point(self, name: str) -> ca.SX:
-        """Place (2,) [m] of "toe", "heel", "knee", "hip", "shoulder", "hand" or "mid-arm"."""
-        return self._terms.toe(self._point) + self._state.point(self._known(name))
+        """Place (3,) [m] of "left_toe", "left_heel", "left_sole", "left_hand", the right ones, or a joint's origin.
+
+        Raises :class:`InputError` with the names that exist.
+        """
+        return self._state.point(*self._anchor(name))
 
     def point_velocity(self, name: str) -> ca.SX:
-        """Velocity (2,) [m/s] of the same points."""
-        state = self._state
-        return self.com_velocity - state.com_velocity + state.point(self._known(name), 1)
+        """Velocity (3,) [m/s] of the same points."""
+        body, local = self._anchor(name)
+        return self._state.rotation(body) @ self._state.own_rates(body, local)[0]
 
-    def _known(self, name: str) -> str:
-        points = self._terms.robot.sagittal.points
-        if name not in points:
-            raise InputError(f"the robot has no point {quoted(name)}; it has {', '.join(points)}")
-        return name
+    def _anchor(self, name: str) -> tuple[int, np.ndarray]:
+        """Body that carries a point, and where it is in that body's frame (3,)."""
+        body = self._terms.body
+        known = {joint: (1 + k, np.zeros(3)) for k, joint in enumerate(body.joint_names)}
+        for i, (side, foot) in enumerate(zip(SIDES, body.feet, strict=True)):
+            heel = body.corners[i, 2:].mean(axis=0)
+            known |= {f"{side}_toe": (foot, body.tips[i]), f"{side}_heel": (foot, heel)}
+            known[f"{side}_sole"] = foot, body.middles[i]
+            for shoulder in body.robot.joints.get("shoulder_pitch", ())[i : i + 1]:
+                arm = 1 + body.joint_names.index(shoulder)
+                hands = [x for x in body.limb_points[2:] if arm in body.chain(x[0])]
+                known |= {f"{side}_hand": x for x in hands[:1]}
+        if name not in known:
+            raise InputError(f"the robot has no point {quoted(name)}; it has {', '.join(sorted(known))}")
+        return known[name]
+
+    def moved(self, model: SpatialModel) -> SpatialState:
+        """Another robot, whose tree has the same joints, in the same motion."""
+        q, v = self._terms.chart(self._point.q), self._terms.chart(self._point.v, 1)
+        return SpatialState(model, q, v, v, self._point.p.gravity)
