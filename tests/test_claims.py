@@ -253,7 +253,7 @@ def test_the_same_words_everywhere():
         assert said in text, stem
     every = next(row for row in hard_cases.compared(hard_cases.read()) if row["cases"] == "all")
     counted = (
-        f"With that program three steps ended in a clean plan in {every['three-step, clean']} of {every['number']} "
-        f"harder cases, the direct program in {every['direct, clean']}."
+        f"Three steps ended in a clean plan in {every['three-step, clean']} of {every['number']} "
+        f"harder cases, the direct program in {every['direct, clean']}"
     )
     assert counted in readme and "made with the five-link program" in readme

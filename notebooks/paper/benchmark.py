@@ -1,4 +1,4 @@
-"""What a benchmark's numbers should reach, in words and limits; plans from ever denser atlases; ever larger sweeps.
+"""Cost of an iteration on ever finer meshes; plans from ever denser atlases; ever larger sweeps.
 
 ``python -m paper.benchmark`` in the folder of the notebooks measures the sweeps anew, in half an hour of two idle
 cores, and writes :data:`SWEEPS`; notebook 10 draws that file. The one that is there was made with the five-link program
@@ -25,33 +25,37 @@ from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.show.style import COLUMN_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import WholeBodyPlanner
+from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
 from jumplab.stages.whole_body.coordinates import even
 from jumplab.stages.whole_body.terms import Body
 from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
 
-# name in the report of jumplab.studies.bench -> (words, limit, aim); ratios of CPU times
-GOALS = {
-    "atlas_over_direct": ("plan from an atlas / direct NLP's solve", 0.10, None),
-    "replan_over_direct": ("re-plan of a neighbouring target / direct NLP's solve", 0.12, None),
-    "warm_over_direct": ("three steps, warm / direct NLP's solve", 0.35, 0.25),
-    "three_over_direct_gn": ("three steps, warm / direct NLP, held Gauss-Newton Hessian first", 1.0, None),
-    "cold_over_direct": ("new process to finished plan / direct NLP's build and solve", 1.5, None),
-    "process_s": ("new process, functions on file, to the audit's end [s]", 1.2, None),
-    "peak_memory_gib": ("peak memory of a new process [GiB]", 0.6, None),
-    "node_growth_error": ("cost of an iteration: largest distance from a straight line over the nodes", 0.2, None),
-}
+NODES = (20, 40, 80)  # intervals of the three phases together
+NODE_REPEATS = 3  # the growth is a fit over many meshes
 
 
-def goals(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One row per goal for a table: the number in words, its value, limit and aim, and whether it is reached."""
-    rows = []
-    for name, (words, limit, aim) in GOALS.items():
-        value = found[name]
-        verdict = "not measured here" if value is None else "reached" if value <= limit else "not reached"
-        rows.append({"number": words, "value": value, "limit": limit, "aim": aim, "verdict": verdict})
+def growth(robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES) -> list[dict[str, Any]]:
+    """Cost of an iteration of the direct program on ever finer meshes: intervals, iterations, iteration_s."""
+    body, rows = Body(robot), []
+    for n in nodes:
+        flat, toe = round(n / 3), round(4 * n / 15)
+        mesh = Mesh(flat, toe, n - flat - toe)
+        planner = WholeBodyPlanner(robot, mesh, body=body, free=even(body))
+        plans = [planner.plan(task) for _ in range(NODE_REPEATS + 1)][1:]  # the first call of anything is not timed
+        solves = [plan.attempts[0] for plan in plans]
+        each = float(np.median([x.cpu_s / x.iterations for x in solves]))
+        rows.append({"intervals": n, "iterations": solves[0].iterations, "iteration_s": each})
     return rows
+
+
+def shares(plans: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Solver times [ms] of the last plan of a sort by its stages or starts, then the time of its tape and checks."""
+    plan, out = plans[-1], {}
+    for stage, took in plan["stages"]:
+        first = stage.removeprefix("direct, ").partition(",")[0].removeprefix("3 ")
+        out[first] = out.get(first, 0.0) + 1e3 * took
+    return out | {"tape": 1e3 * (plan["plan_s"] - plan["solver_s"])}
 
 
 AREA_M = (0.4, 0.2)  # distance and height around the target that every atlas spans

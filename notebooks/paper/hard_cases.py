@@ -1,8 +1,7 @@
 """Three steps against one program where it is hard: far, high, flips, tight limits, other robots, bad guesses.
 
 ``python -m paper.hard_cases`` in the folder of the notebooks solves what :data:`LOG` lacks, one line per solve, and can
-be stopped and started again. Notebook 10 draws the file; the one that is there was made with the five-link program of
-the version before.
+be stopped and started again. Notebook 10 draws the file.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ COLD = (
     Start("stance", False, 3.0, {}),
 )
 # solved in half the unknowns, the jump straight ahead halves the iterations of one to the side or with a turn
-STRAIGHT = Start("straight ahead", True, 3.0, {"max_iter": 80})
+STRAIGHT = Start("straight ahead", True, 3.0, {"max_iter": 80, "acceptable_iter": 1})
 RAMP = "ramp"
 ASIDE = (Start(RAMP, True, 9.0, {"max_iter": 150}), *COLD)
 FROM_NEIGHBOUR = (
