@@ -40,8 +40,9 @@ class Legs:
         slope = ca.jtimes(rows, q, v)
         drift = ca.jtimes(slope, ca.vertcat(q, v), ca.vertcat(v, a))
         self._levels = ca.Function("levels", [q, v, a, holds], [slope, drift])
-        self._slope = ca.Function("slope", [q, holds], [rows, ca.jacobian(rows, q)])
         self.columns = np.array([1, 3, 4] * body.short + [k for side in b.modes for k in body.legs[side]])
+        slopes = ca.densify(ca.jacobian(rows, q)[:, self.columns.tolist()])
+        self._slope = ca.Function("slope", [q, holds], [rows, slopes])
 
     def held(self, motion: Motion, holds: Mapping[int, np.ndarray], pitch: Mapping[int, Motion]) -> Motion:
         """The motion with the legs moved so that the feet stay in their places.
@@ -73,6 +74,5 @@ class Legs:
 
     def _solved(self, slope: np.ndarray, off: np.ndarray) -> np.ndarray:
         """Least changes (n, .) of the columns that make up for what rows are off by (n, .)."""
-        rows = slope[:, :, self.columns]
-        across = rows.transpose(0, 2, 1)
-        return (across @ np.linalg.solve(rows @ across, off[..., None]))[..., 0]
+        across = slope.transpose(0, 2, 1)
+        return (across @ np.linalg.solve(slope @ across, off[..., None]))[..., 0]

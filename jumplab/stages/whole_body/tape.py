@@ -39,6 +39,7 @@ PRESSED_N = 50.0  # [N] on a foot from which on its CoP is looked at
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 AIR, TOE, FLAT = 0, 1, 2  # codes of a foot in the tape's ``contacts``
 CODES = {"toe": TOE, "flat": FLAT}
+Feet = tuple[np.ndarray, np.ndarray]  # origins (n, 2, 3), attitudes (n, 2, 3, 3)
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def make_tape(schedule: Schedule, phases: Mapping[str, PhaseSolution], gravity: 
         "contacts": contacts,
         "toe_phase_start": t[toes[0]] - t[0] if len(toes) else t[0],
     }
-    extra |= _travel(robot, q)
+    extra |= _travel(robot, _placed(robot, q))
     names = np.array(robot.foot.frames), np.array(robot.joint_names)
     return Tape(t - t[0], q, v, a, tau, phase, names[0], f, names[1], extra)
 
@@ -129,7 +130,7 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
     The limits are those of the audit; up to 1 the tape holds them, also between the nodes. Soles that in the middle of
     a flight are as low as they may be use all of their height, on the surface twice of it.
     """
-    motors = [robot.actuators[name] for name in robot.joint_names]
+    motors, feet = [robot.actuators[name] for name in robot.joint_names], _placed(robot, tape.q)
     keys = "effort", "speed", "corner_speed", "no_load_speed"
     effort, speed, corner, free = (np.array([m[key] for m in motors]) for key in keys)
     rate = tape.v[:, 6:]
@@ -144,29 +145,24 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
     shares = [np.abs(tape.tau) / effort + (1 - left), np.abs(rate) / speed, along / (FRICTION * load)]
     low, high = (np.array([m[key] for m in motors]) for key in ("lower", "upper"))
     beyond = np.maximum(low - tape.q[:, 7:], tape.q[:, 7:] - high)
-    shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot) / PRESSURE_GAP]
+    shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot, feet) / PRESSURE_GAP]
     shares += [np.abs(gap) / most for gap, most in gaps]
-    shares.append(_low(tape, robot, surface))
+    shares.append(_low(tape, robot, surface, feet))
     return float(max(x.max() for x in shares))
 
 
-def _low(tape: Tape, robot: Robot, surface: Surface) -> np.ndarray:
+def _low(tape: Tape, robot: Robot, surface: Surface, feet: Feet) -> np.ndarray:
     """Share of what soles may be too low in flight, in its middle under :data:`CLEAR_M`, for each foot (n, 2)."""
-    model, data, foot = robot.model, robot.model.createData(), robot.foot
-    frames = [model.getFrameId(name) for name in foot.frames]
-    heels, way = foot.corners[:2], foot.corners[2:] - foot.corners[:2]
+    origin, turn = feet
+    heels, way = robot.foot.corners[:2], robot.foot.corners[2:] - robot.foot.corners[:2]
     sole = np.concatenate([heels + u * way for u in SOLE_SHARES])
-    out = np.full((len(tape.t), len(frames)), -np.inf)
+    points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
+    height = (points[..., 2] - surface.below(points)).min(axis=2)
+    out = np.full(height.shape, -np.inf)
     for rows in _flights(tape.extra["contacts"]):
         part = (tape.t[rows] - tape.t[rows[0]]) / max(np.ptp(tape.t[rows]), 1e-9)
-        for k, u in zip(rows, part, strict=True):
-            pin.framesForwardKinematics(model, data, tape.q[k])
-            for i, frame in enumerate(frames):
-                points = data.oMf[frame].translation + sole @ data.oMf[frame].rotation.T
-                height = (points[:, 2] - surface.below(points)).min()
-                out[k, i] = -height / SUNK_M
-                if MIDDLE[0] <= u <= MIDDLE[1]:
-                    out[k, i] = 2 - height / CLEAR_M
+        middle = ((part >= MIDDLE[0]) & (part <= MIDDLE[1]))[:, None]
+        out[rows] = np.where(middle, 2 - height[rows] / CLEAR_M, -height[rows] / SUNK_M)
     return out
 
 
@@ -176,41 +172,40 @@ def _flights(contacts: np.ndarray) -> list[np.ndarray]:
     return np.split(flying, np.flatnonzero(np.diff(flying) > 1) + 1) if len(flying) else []
 
 
-def _pressed_outside(tape: Tape, robot: Robot) -> np.ndarray:
+def _pressed_outside(tape: Tape, robot: Robot, feet: Feet) -> np.ndarray:
     """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge (n, 2) [m]."""
-    model, data, foot = robot.model, robot.model.createData(), robot.foot
-    frames, out = [model.getFrameId(name) for name in foot.frames], np.full((len(tape.t), 2), -np.inf)
-    contacts = tape.extra["contacts"]
-    for k in np.flatnonzero((tape.f[..., 2] > PRESSED_N).any(axis=1)):
-        pin.framesForwardKinematics(model, data, tape.q[k])
-        for i, frame in enumerate(frames):
-            force, moment = tape.f[k, i, :3], tape.f[k, i, 3:]
-            if force[2] <= PRESSED_N:
-                continue
-            turn, origin = data.oMf[frame].rotation, data.oMf[frame].translation
-            down = origin[2] - (origin + turn @ foot.tip)[2]
-            arm = np.array([-down * force[0] - moment[1], -down * force[1] + moment[0]]) / force[2]
-            ahead = turn[:2, 0] / np.linalg.norm(turn[:2, 0])
-            seen = arm - (turn @ foot.tip)[:2]
-            x, y = ahead @ seen, ahead[0] * seen[1] - ahead[1] * seen[0]
-            length = foot.toe - foot.heel if contacts[k, i] == FLAT else 0.0
-            out[k, i] = max(x, -x - length, abs(y) - foot.half_width)
-    return out
+    foot, (_origin, turn) = robot.foot, feet
+    force, moment = tape.f[..., :3], tape.f[..., 3:]
+    load = np.where(force[..., 2] > PRESSED_N, force[..., 2], np.nan)
+    tip = turn @ foot.tip
+    x = (tip[..., 2] * force[..., 0] - moment[..., 1]) / load - tip[..., 0]
+    y = (tip[..., 2] * force[..., 1] + moment[..., 0]) / load - tip[..., 1]
+    ahead = turn[..., :2, 0] / np.linalg.norm(turn[..., :2, 0], axis=-1, keepdims=True)
+    along, across = ahead[..., 0] * x + ahead[..., 1] * y, ahead[..., 0] * y - ahead[..., 1] * x
+    length = np.where(tape.extra["contacts"] == FLAT, foot.toe - foot.heel, 0.0)
+    out = np.max([along, -along - length, np.abs(across) - foot.half_width], axis=0)
+    return np.where(np.isnan(load), -np.inf, out)
 
 
-def _travel(robot, q: np.ndarray) -> dict[str, np.ndarray]:
-    """How far the middle between the soles moves (3,) [m], and by how much the feet turn about the vertical [rad]."""
+def _placed(robot: Robot, q: np.ndarray) -> Feet:
+    """Origins (n, 2, 3) [m] and attitudes (n, 2, 3, 3) of the feet's frames."""
     model, data = robot.model, robot.model.createData()
-    ids = [model.getFrameId(name) for name in robot.foot.frames]
-    left, ends = np.zeros((len(q), 3)), []
+    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    origin, turn = np.empty((len(q), len(frames), 3)), np.empty((len(q), len(frames), 3, 3))
     for k, x in enumerate(q):
         pin.framesForwardKinematics(model, data, x)
-        for i in ids:
-            left[k] += data.oMf[i].rotation[:, 1]  # it stays level in a flip, too
-        if k in (0, len(q) - 1):
-            ends.append(sum(data.oMf[i].act(robot.foot.center) for i in ids) / len(ids))
+        for i, frame in enumerate(frames):
+            origin[k, i], turn[k, i] = data.oMf[frame].translation, data.oMf[frame].rotation
+    return origin, turn
+
+
+def _travel(robot: Robot, feet: Feet) -> dict[str, np.ndarray]:
+    """How far the middle between the soles moves (3,) [m], and by how much the feet turn about the vertical [rad]."""
+    origin, turn = feet
+    middle = (origin + turn @ robot.foot.center)[[0, -1]].mean(axis=1)
+    left = turn[..., 1].sum(axis=1)  # it stays level in a flip, too
     turned = np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
-    return {"soles_travel": ends[-1] - ends[0], "feet_turn": np.array(turned[-1] - turned[0])}
+    return {"soles_travel": middle[1] - middle[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
 # on the ground ------------------------------------------------------------------------------------------------------
