@@ -50,7 +50,8 @@ ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", 
 COLD = """
 import time
 began = time.perf_counter()
-import json, resource, sys
+import json, sys
+from pathlib import Path
 from jumplab.stages.planner import Planner
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
@@ -59,11 +60,12 @@ plan = Planner(robot, keep=sys.argv[4] == "keep").plan(task)
 plan_s, wall_s = time.process_time(), time.perf_counter() - began
 solver_s, build_s = sum(x.cpu_s for x in plan.attempts), plan.statistics[0].build_s
 iterations = sum(x.iterations for x in plan.attempts)
-peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+status = Path("/proc/self/status")  # of this process alone; what rusage says begins with the parent's peak
+peak_gib = float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**20 if status.exists() else None
 from jumplab.auditing.audit import audit
 clean = audit(plan.tape, robot, task).passed
 print(json.dumps(dict(solver_s=solver_s, plan_s=plan_s, wall_s=wall_s, build_s=build_s, iterations=iterations,
-                      clean=clean, peak_gib=peak_kib / 2**20)))
+                      clean=clean, peak_gib=peak_gib)))
 """
 
 

@@ -1,8 +1,8 @@
 """The same jump by crocoddyl, which knows multiple shooting and DDP and no hard limits: time and quality of its answer.
 
-Crocoddyl wants an older Pinocchio than this package, so it runs in an environment of its own:
-``pip install crocoddyl==3.2.1``, then ``python peer_crocoddyl.py PLAN_DIR OUT.json`` with the folder of a plan. The
-durations of launch and flight are the plan's, with flat feet; what the plan has as limits are barriers here.
+Crocoddyl wants another Pinocchio than this package, so it runs in an environment of its own:
+``pip install crocoddyl==3.2.0 "cmeel-urdfdom<5" "cmeel-tinyxml2<11"``, then
+``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans. The durations of launch and flight are the plan's, with flat feet; what the plan has as limits are barriers here.
 """
 
 from __future__ import annotations
@@ -141,17 +141,23 @@ def solved(jump: Jump) -> dict[str, Any]:
     return row | jump.measured(q, v, np.array(solver.us), n, np.full(len(solver.us), jump.step_s))
 
 
-def main(folder: Path, out: Path) -> None:
-    """Solve with each step, and put the plan of the folder beside."""
+def compared(folder: Path) -> list[dict[str, Any]]:
+    """Rows of the plan of a folder, and of crocoddyl's answers with each step."""
     jump, tape = Jump(folder, STEPS_S[0]), np.load(folder / "plan.npz")
     solves, n = [row["solve_s"] for row in jump.told["stages"]], int(np.argmax(tape["phase"] == "flight"))
     ours = {"method": "direct", "nodes": None, "cpu_s": sum(solves), "near_cpu_s": sum(solves)}
     ours |= {"iterations": sum(row["iterations"] for row in jump.told["stages"]), "converged": True}
     ours |= jump.measured(tape["q"], tape["v"], tape["tau"][:-1], n, np.diff(tape["t"]))
-    rows = [ours, *(solved(Jump(folder, step_s)) for step_s in STEPS_S)]
-    out.write_text(json.dumps({"target": jump.told["target"], "rows": rows}, indent=1) + "\n")
+    head = {"robot": jump.told["robot"]["name"], "target": jump.told["target"]}
+    return [head | row for row in (ours, *(solved(Jump(folder, step_s)) for step_s in STEPS_S))]
+
+
+def main(out: Path, folders: list[Path]) -> None:
+    """Solve the jump of each folder with each step, and put its plan beside."""
+    rows = [row for folder in folders for row in compared(folder)]
+    out.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     print(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), [Path(name) for name in sys.argv[2:]])
