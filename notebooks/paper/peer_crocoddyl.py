@@ -2,8 +2,8 @@
 
 Crocoddyl wants another Pinocchio than this package, so it runs in an environment of its own:
 ``pip install crocoddyl==3.2.0 "cmeel-urdfdom<5" "cmeel-tinyxml2<11"``, then
-``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans. The durations of launch and flight are the plan's, with flat feet; what the plan has as limits
-are barriers here.
+``python peer_crocoddyl.py OUT.json DIR...`` with folders of plans. The durations of launch and flight are the plan's,
+with flat feet; what the plan has as limits are barriers here.
 """
 
 from __future__ import annotations
