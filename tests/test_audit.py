@@ -52,6 +52,11 @@ def sideways_grip(f, takeoff):
     f[STANDING, :, 1] += np.array([0.6, -0.6]) * f[STANDING, :, 2]
 
 
+def on_flat_feet(f, takeoff):
+    """A moment that moves the CoP by millimetres, inside the sole."""
+    f[: takeoff - 150, :, 4] += 0.5
+
+
 def twist(f, takeoff):
     f[STANDING, :, 5] += np.array([0.03, -0.03]) * f[STANDING, :, 2]
 
@@ -95,7 +100,7 @@ BROKEN = {
     "base moment residual": lambda t: edit(t, f=put(STANDING, [LEFT, 4], 5.0)),
     "joint torque consistency": lambda t: edit(t, tau=put(STANDING, KNEE, 5.0)),
     "linear impulse": lambda t: edit(t, f=everywhere([slice(None), 0], 0.75, "launch")),
-    "angular impulse": lambda t: edit(t, f=everywhere([slice(None), 4], 0.5, "launch")),
+    "angular impulse": lambda t: edit(t, f=on_flat_feet),
     "ballistic CoM": lambda t: shifted(t, 0, 0.003, t.takeoff_time + 0.1, t.t[-1] - 0.1),
     "gravity in flight": lambda t: edit(t, q=falling_faster),
     "angular momentum in flight": lambda t: edit(t, v=everywhere(6 + joint("left_shoulder_pitch"), 0.2, "flight")),

@@ -239,12 +239,13 @@ class Truth:
                 continue
             # moment about the point: moment + (place - point) x force, horizontal parts zero on the ground
             across = np.array([[0.0, force[2]], [-force[2], 0.0]])
-            about = moment + np.cross(place.translation, force)
-            cop = np.array([*np.linalg.solve(across, about[:2]), 0.0])
+            ground = self.surface(self.toe[i, k].mean(axis=0)[0])
+            about = moment + np.cross(place.translation - [0.0, 0.0, ground], force)
+            cop = np.array([*np.linalg.solve(across, about[:2]), ground])
             torsion = (moment + np.cross(place.translation - cop, force))[2]
             toe, heel = self.toe[i, k].mean(axis=0)[:2], self.heel[i, k].mean(axis=0)[:2]
             along = place.rotation[:2, 0] / np.hypot(*place.rotation[:2, 0])
-            x, y = along @ (cop[:2] - toe), along[0] * (cop - [*toe, 0])[1] - along[1] * (cop - [*toe, 0])[0]
+            x, y = along @ (cop[:2] - toe), along[0] * (cop[1] - toe[1]) - along[1] * (cop[0] - toe[0])
             beyond[i, k] = 1e3 * max(x, -x - along @ (toe - heel), abs(y) - ROBOT.foot.half_width)
             tipped[i, k] = 1e3 * abs(x) * (self.heel[i, k, :, 2].min() > 0.005)
             twist[i, k] = 100 * abs(torsion) / (0.5 * 0.05 * force[2])

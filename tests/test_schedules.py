@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import jumplab as jl
@@ -85,6 +86,28 @@ def test_a_folder_keeps_the_schedule(tmp_path):
     again = jl.load(tmp_path / "hop").plan
     assert again.schedule == plan.schedule and again.attempts == plan.attempts
     assert jl.audit(again).passed
+
+
+@pytest.mark.slow
+def test_after_a_step_down_the_cop_is_judged_at_the_height_of_the_lower_ground(bhr):
+    plan = jl.plan(robot=bhr, contacts=jl.Contacts.step_off(bhr, 0.1))
+    report = jl.audit(plan)
+    assert report.passed and plan.task.platform_m == -0.1, report.table()
+    tape, toe, data = plan.tape, bhr.foot.toe, bhr.model.createData()
+    landed = np.flatnonzero((tape.extra["contacts"] == FLAT).all(axis=1) & (tape.f[..., 2] > 100.0).all(axis=1))
+    k = landed[landed > tape.takeoff_index][len(landed) // 50]
+    pin.framesForwardKinematics(bhr.model, data, tape.q[k])
+    place = data.oMf[bhr.model.getFrameId(bhr.foot.frames[0])]
+    ahead = place.rotation[:2, 0] / np.linalg.norm(place.rotation[:2, 0])
+    tip = place.act(bhr.foot.tip)
+    assert tip[2] == pytest.approx(-0.1, abs=1e-6) and toe > 0
+    for beyond_m in (0.001, 0.003):
+        f = tape.f.copy()  # a force through a point that far ahead of the toe edge, friction included
+        at = np.array([*(tip[:2] + beyond_m * ahead), tip[2]])
+        f[k, 0, :3] = 0.3 * f[k, 0, 2] * ahead[0], 0.3 * f[k, 0, 2] * ahead[1], f[k, 0, 2]
+        f[k, 0, 3:] = np.cross(at - place.translation, f[k, 0, :3])
+        cop = audit(replace(tape, f=f), plan.robot, plan.task, edge_m=plan.whole_body.edge_m)["CoP in the sole"]
+        assert cop.value == pytest.approx(1e3 * beyond_m, abs=1e-3) and cop.passed == (beyond_m < 0.002)
 
 
 def test_nobody_plays_it_yet(tmp_path, capsys):

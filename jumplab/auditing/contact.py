@@ -47,7 +47,8 @@ def _pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
     """CoP on the ground (N, K, 2) [m], nan without load, and torsion about it (N, K) [N m]."""
     force, moment = r.tape.f[..., :3], r.tape.f[..., 3:]
     up = np.where(force[..., 2] > METHOD.cop_force_n, force[..., 2], np.nan)
-    down = -r.foot[..., 2]  # from the frame's origin to the ground
+    ground = r.surface(r.along(r.toe_corners.mean(axis=2)))  # where a foot stands on a step its CoP is up there
+    down = ground - r.foot[..., 2]  # from the frame's origin to it
     dx = (down * force[..., 0] - moment[..., 1]) / up
     dy = (down * force[..., 1] + moment[..., 0]) / up
     torsion = moment[..., 2] - (dx * force[..., 1] - dy * force[..., 0])

@@ -41,6 +41,7 @@ IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturb
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
+PATIENCE_S = 20.0  # of all attempts for one target: beyond, no other start and no finer mesh is tried
 HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 USUAL_SIZE = 4500  # variables, up to which the patience of a start is what it says; larger programs have more
@@ -123,6 +124,11 @@ class Asked:
     references: Mapping[str, Mapping[str, np.ndarray]]
     attempts: list[Attempt]  # made so far
     srmp: SrmpPlan | None = None
+
+    @property
+    def spent_s(self) -> float:
+        """Processor time of all attempts [s]."""
+        return sum(attempt.cpu_s for attempt in self.attempts)
 
 
 @dataclass(frozen=True, repr=False)
@@ -312,6 +318,8 @@ class WholeBodyPlanner:
         asked = Asked(task, self.parameters(task, stance, srmp), weights, self._references(srmp), [], srmp)
         best, failure = None, None
         for start in self._starts(task, near, begin):
+            if asked.spent_s > self._patience_s(PATIENCE_S):
+                break
             try:
                 found = self._settled(self._tried(start, asked, near if start.name == NEIGHBOUR else begin), asked)
             except SolverError as e:
@@ -457,8 +465,7 @@ class WholeBodyPlanner:
         It begins with a plan, with a motion, or with values at the nodes.
         """
         schedule, nlp = self._schedule(apart), self._nlp(apart)
-        patience_s = start.patience_s * max(1.0, nlp.assembled.size / USUAL_SIZE)
-        options = {**IPOPT, **start.options, "max_cpu_time": patience_s, **self._options}
+        options = {**IPOPT, **start.options, "max_cpu_time": self._patience_s(start.patience_s), **self._options}
         nlp = nlp.with_options(options, HOLD if start.held else None)
         how: dict[str, Any] = {"explain": explain, "weights": asked.weights, "references": asked.references}
         if isinstance(begin, Mapping):
@@ -483,11 +490,15 @@ class WholeBodyPlanner:
         edge = self._edge(asked.task)[0] if self.contacts.ends == "touchdown" else self._step()[1]
         return WholeBodyPlan(asked.task, solution, schedule, edge - origin, self.limits)
 
+    def _patience_s(self, usual_s: float) -> float:
+        """Processor time [s] that a program of this size may take where one of usual size takes ``usual_s``."""
+        return usual_s * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+
     def _settled(self, found: WholeBodyPlan, asked: Asked) -> WholeBodyPlan:
         """The plan, solved on where it passes limits between the nodes: first to the end, then on finer meshes."""
         best, p = found, self
         for start in (SETTLED, *REFINED):
-            if best.used <= 1:
+            if best.used <= 1 or asked.spent_s > self._patience_s(PATIENCE_S):
                 break
             p = p if start is SETTLED else p._finer
             finer = replace(asked, references=p._references(asked.srmp))
