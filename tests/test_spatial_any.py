@@ -251,7 +251,7 @@ def test_what_cannot_hold_its_own_weight_is_refused_before_any_solve(robot):
 def test_planned_clean_and_landed(robot):
     task, target = jl.JumpTask(0.5, 0.3), (0.5, 0.3)
     plan = jl.plan(task, robot)
-    assert {row.stage.split(",")[0] for row in plan.statistics} == {"spatial"}
+    assert {row.stage.split(",")[0] for row in plan.statistics} == {"direct"}
     assert len(plan.statistics) == len(plan.whole_body.attempts)
     assert plan.planned_side_m == pytest.approx(0, abs=1e-3)
     assert jl.audit(plan).passed

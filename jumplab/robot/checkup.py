@@ -54,7 +54,7 @@ class Checkup:
             f"trunk {r.stance['trunk_pitch_rad']:.2f} rad",
             "five links describe it"
             if r.planar
-            else "no five links describe it: the spatial program plans all its jumps",
+            else "no five links describe it: jumps are planned directly, not in three steps",
         ]
         return out + [f"changed: {what}: {x:.3g} {unit}" for what, (x, unit) in self.jumper.lumped.changed.items()]
 

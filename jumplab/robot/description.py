@@ -386,7 +386,7 @@ class Robot(Shown):
 
     @cached_property
     def planar(self) -> bool:
-        """Whether five links in the plane stand for it exactly; if not, the spatial program plans its jumps."""
+        """Whether five links in the plane stand for it exactly; if not, it has no three steps."""
         return bool(in_plane(self))
 
     @cached_property

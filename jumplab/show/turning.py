@@ -23,7 +23,7 @@ LEAST_FORCE_SHARE = 0.05  # of the weight, on one foot, below which CoP and fric
 
 
 def leaves_plane(tape: Tape) -> bool:
-    """Whether a tape is one of the spatial program."""
+    """Whether a tape has no quantities of the five links in the plane."""
     return "planar_joints" not in tape.extra
 
 

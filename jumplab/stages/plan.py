@@ -44,8 +44,7 @@ class JumpPlan(Shown, Named):
     task, robot, method : what was asked, of whom (under the task's gravity), and how it was planned.
     tape : the 1 kHz tape of the full robot.
     srmp, joints : results of stages 1 and 2 (None for the direct planner; a re-plan has no stage 2).
-    whole_body : result of stage 3 or of the direct planner, out of the plane of the spatial program; None if the plan
-        was read from a result folder.
+    whole_body : result of stage 3 or of the direct planner; None if the plan was read from a result folder.
     statistics : one row per stage; stage 2's is called "2 joint map, gentle" where it had to follow less closely.
     skipped : why stage 2 is missing, in a flip that it cannot follow; None if nothing is.
     stored : the summary that the plan was read with; None if it has just been made.
