@@ -316,8 +316,23 @@ class WholeBodyPlanner:
                 EXPLAINED.reset(explained)
         weights = self.changes.spread(self.nlp.problem, weights or {})
         asked = Asked(task, self.parameters(task, stance, srmp), weights, self._references(srmp), [], srmp)
+        best, failure = self._searched(asked, near, begin)
+        if best is None:
+            raise self._explained(failure, asked)
+        if best.used > BROKEN:
+            raise SolverError(
+                f"{self.nlp.problem.name}: motions that keep every limit at the nodes break them between the nodes, at "
+                f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
+                stage=self.nlp.problem.name,
+            )
+        return best.after(asked.attempts)
+
+    def _searched(
+        self, asked: Asked, near: WholeBodyPlan | None, begin: starts.Motion | None
+    ) -> tuple[WholeBodyPlan | None, SolverError | None]:
+        """The best plan of all starts, up to the first that keeps every limit; and how the last that failed did."""
         best, failure = None, None
-        for start in self._starts(task, near, begin):
+        for start in self._starts(asked.task, near, begin):
             if asked.spent_s > self._patience_s(PATIENCE_S):
                 break
             try:
@@ -329,15 +344,7 @@ class WholeBodyPlanner:
                 best = found
             if best.used <= 1:
                 break
-        if best is None:
-            raise self._explained(failure, asked)
-        if best.used > BROKEN:
-            raise SolverError(
-                f"{self.nlp.problem.name}: motions that keep every limit at the nodes break them between the nodes, at "
-                f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
-                stage=self.nlp.problem.name,
-            )
-        return best.after(asked.attempts)
+        return best, failure
 
     def _starts(self, task: JumpTask, near, begin) -> Iterable[Start]:
         """The list of starts for a target, in their order."""
