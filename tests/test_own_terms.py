@@ -539,7 +539,8 @@ def test_a_jump_under_another_gravity_is_planned_audited_and_lands():
 @pytest.mark.parametrize("aside", [{}, {"side_m": 0.2, "yaw_rad": 0.5}], ids=["ahead", "aside"])
 def test_what_a_term_sees_is_what_pinocchio_says(bhr, aside):
     """At nodes of a plan, in the program of even motions and in that of all: with its solution as numbers."""
-    body = planner().plan(jl.JumpTask(0.3, 0.3, **aside)).whole_body
+    plan = planner().plan(jl.JumpTask(0.3, 0.3, **aside))
+    body = plan.whole_body
     tree, data = bhr.model, bhr.model.createData()
     names = ("com", "com_velocity", "L", "inertia", "posture", "wrench")
     for k, (phase, node) in enumerate((("flat", 5), ("toe", 4), ("flight", 6))):
@@ -579,3 +580,10 @@ def test_what_a_term_sees_is_what_pinocchio_says(bhr, aside):
         signs = bhr.sagittal.signs[1]
         np.testing.assert_allclose(ca.evalf(point.joints.knee).full().ravel(), np.multiply(signs, knees), atol=1e-12)
         assert float(ca.evalf(point.joints.right_knee)) == pytest.approx(knees[1])
+        if phase == "flight":
+            assert not np.any(seen["wrench"])
+            tape = plan.tape
+            column, rows = bhr.joint_names.index("left_shoulder_pitch"), tape.phase == "flight"
+            on_tape = np.interp(tape.takeoff_time + x.t[node], tape.t[rows], tape.tau[rows, column])
+            both = ca.evalf(point.torques.shoulder).full().ravel() * bhr.sagittal.signs[3]
+            np.testing.assert_allclose(both[0], on_tape, atol=0.2)  # N m; between the nodes joints are polynomials

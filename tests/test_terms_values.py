@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_core import LIMBS, full_state
+from fixtures_core import LIMBS
 from test_terms_table import program
 
 from jumplab.ocp import Problem, Term
@@ -598,58 +598,6 @@ def test_a_tuck_opens_slowly_if_asked(body, share, begun):
 
 
 # what an own term sees --------------------------------------------------------------------------------------------
-def standing_point(body, phase, seed=7) -> Point:
-    """A point at which the toes stand in their place, and the foot is as flat as its phase says."""
-    rng = np.random.default_rng(seed)
-    robot = body.robot
-    angles = 0.4 * rng.normal(size=5)
-    rates = 2.0 * rng.normal(size=5)
-    accels = 8.0 * rng.normal(size=5)
-    if phase.name == "flat":
-        angles[0] = rates[0] = accels[0] = 0.0
-    place = body.places[0][[0, 2]]
-    charts = body.model.charts(*(x[None] for x in full_state(robot, angles, rates, accels, place)))
-    foot = [] if phase.name == "flat" else [[angles[0]], [rates[0]], [accels[0]]]
-    free = [coordinates.even(body).taken(x)[0] for x in charts]
-    q, v, a = (np.append(x, y) for x, y in zip(free, foot or 3 * [[]], strict=True))
-    push = [name.startswith("force") for name in phase.states]
-    z = np.where(push, rng.uniform(0, 150, len(push)), 40 * rng.normal(size=len(push)))
-    return point(phase, rng, PLANE, q=q, v=v, a=a, z=z, c=dict.fromkeys(phase.constants, 0.1))
-
-
-@pytest.mark.parametrize("name", ["flat", "toe", "flight"])
-def test_what_a_term_of_the_whole_body_sees(programs, body, name):
-    phase = next(p for p in programs["whole body"].phases if p.name == name)
-    if name == "flight":  # the CoM as its parabola has it
-        _, p = random_point(programs["whole body"], name, 7, PLANE)
-        x = Seen(body, phase, p, {})
-        c = x.c | {"vel_x": x.com_velocity[0], "vel_z": x.com_velocity[2] + G * 0.35 * 0.6}
-        _, p = random_point(programs["whole body"], name, 7, PLANE, c=c)
-    else:
-        p = standing_point(body, phase)
-    x = Seen(body, phase, p, LAUNCH.get(name, {}))
-    first = body.places[0][[0, 2]]
-    shoulder = x.joint(body.robot.joints["shoulder_pitch"][0])
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    local = x.tree.getJointId(body.robot.joints["shoulder_pitch"][0])
-    twist = pin.getVelocity(x.tree, x.data, local, axes)
-    hand = twist.linear + np.cross(twist.angular, x.hand(0) - shoulder.translation)
-    torques = 2 * body.robot.sagittal.signs[:, 0] * x.tau
-    wrench = np.zeros(3)
-    if name != "flight":
-        force, moment = x.wrench[0]
-        wrench = 2 * np.array([force[0], force[2], moment[1]])
-    for seen, value in (
-        (p.joints, x.sagittal(x.chart)), (p.joint_rates, x.sagittal(x.rates)), (p.torques, torques),
-        (p.posture, x.chart[5]), (p.com, x.com[[0, 2]] - first), (p.com_velocity, x.com_velocity[[0, 2]]),
-        (p.L, x.momentum[1]), (p.inertia, x.rho), (p.inertia_rate, x.rho_rate), (p.wrench, wrench),
-        (p.point("hand"), x.hand(0)[[0, 2]] - first), (p.point("toe"), x.tip(0)[[0, 2]] - first),
-        (p.point_velocity("hand"), hand[[0, 2]]), (p.joint_rates.knee, x.sagittal(x.rates)[1]),
-        (p.torques.ankle, torques[2]), (p.moved(body.model).inertia, x.data.Ig.inertia), (p.time, 0.35 * 0.6),
-    ):  # fmt: skip
-        np.testing.assert_allclose(numbers(seen), np.ravel(value), rtol=1e-8, atol=1e-7)
-
-
 # stage 1 --------------------------------------------------------------------------------------------------------
 class Rod:
     """The pendulum written out: a rod (theta, phi) from the pivot, and a barbell (theta_pl, varphi) on it."""

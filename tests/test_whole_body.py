@@ -246,7 +246,7 @@ def test_momentum_follows_stage_one(run):
 # the problem ----------------------------------------------------------------------------------------------------
 def table(tracking):
     """Rows of the problem, of stage 3 or of the direct planner."""
-    return planner().stage("whole body" if tracking else "direct").nlp.problem.table()
+    return (planner().stage("whole body") if tracking else planner().program()).nlp.problem.table()
 
 
 def test_the_direct_problem_tracks_nothing_and_keeps_every_limit():
