@@ -41,7 +41,7 @@ IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturb
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
-PATIENCE_S = 60.0  # of all attempts for one target: beyond, no other start and no finer mesh is tried; a busy core takes twice
+PATIENCE_S = 60.0  # of all attempts for one target: beyond, no other start and no finer mesh is tried
 HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 USUAL_SIZE = 4500  # variables, up to which the patience of a start is what it says; larger programs have more
