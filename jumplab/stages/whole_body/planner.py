@@ -41,7 +41,9 @@ IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturb
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
-PATIENCE_S = 60.0  # of all attempts for one target: beyond, no other start and no finer mesh is tried
+# of all attempts for one target: beyond, no other start and no finer mesh is tried; on a busy core a hop, which has to be
+# solved on a finer mesh with its links apart, takes 20 to 40 s
+PATIENCE_S = 60.0
 HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
 USUAL_SIZE = 4500  # variables, up to which the patience of a start is what it says; larger programs have more
@@ -423,7 +425,10 @@ class WholeBodyPlanner:
         return self._kept_apart(found, start.held, asked)
 
     def _ramped(self, asked: Asked) -> dict[str, PhaseGuess]:
-        """Start values of a jump to the side or with a turn: the one straight ahead, led there along a ramp."""
+        """Start values of a jump to the side or with a turn: the one straight ahead, led there along a ramp.
+
+        That one begins in the stance, whatever posture is asked for.
+        """
         even = self._straight
         straight = replace(asked.task, side_m=0.0, yaw_rad=0.0)
         try:

@@ -145,7 +145,7 @@ def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> floa
     shares = [np.abs(tape.tau) / effort + (1 - left), np.abs(rate) / speed, along / (FRICTION * load)]
     low, high = (np.array([m[key] for m in motors]) for key in ("lower", "upper"))
     beyond = np.maximum(low - tape.q[:, 7:], tape.q[:, 7:] - high)
-    shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot, feet) / PRESSURE_GAP]
+    shares += [beyond / RANGE_GAP, _pressed_outside(tape, robot, feet[1]) / PRESSURE_GAP]
     shares += [np.abs(gap) / most for gap, most in gaps]
     shares.append(_low(tape, robot, surface, feet))
     return float(max(x.max() for x in shares))
@@ -172,9 +172,12 @@ def _flights(contacts: np.ndarray) -> list[np.ndarray]:
     return np.split(flying, np.flatnonzero(np.diff(flying) > 1) + 1) if len(flying) else []
 
 
-def _pressed_outside(tape: Tape, robot: Robot, feet: Feet) -> np.ndarray:
-    """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge (n, 2) [m]."""
-    foot, (_origin, turn) = robot.foot, feet
+def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
+    """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge (n, 2) [m].
+
+    ``turn`` (n, 2, 3, 3) are attitudes of the feet.
+    """
+    foot = robot.foot
     force, moment = tape.f[..., :3], tape.f[..., 3:]
     load = np.where(force[..., 2] > PRESSED_N, force[..., 2], np.nan)
     tip = turn @ foot.tip

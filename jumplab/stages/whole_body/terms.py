@@ -847,10 +847,6 @@ class WholeBodyTerms:
             p.memo["plane"] = PlanarState(self.robot.sagittal, *links, p.p.gravity)
         return p.memo["plane"]
 
-    def toe(self, p: Point) -> ca.SX:
-        """Place (2,) of the toes in the plane, x and z, from where they stood first [m]."""
-        return (self.state(p).point(self.body.feet[0], self.body.tips[0]) - ca.DM(self.body.places[0]))[[0, 2]]
-
     def tracking(self) -> list[Term]:
         """Stage 1's trajectories as references, at the same share of each phase (WL-J1, WL-J3, WF-J1, WF-J2).
 

@@ -1,4 +1,4 @@
-"""The sight of an own term of the whole-body program: the robot's quantities at a point by name, in SI units."""
+"""Quantities of the robot at a point of the whole-body program by name, for own terms; SI units."""
 
 from __future__ import annotations
 
