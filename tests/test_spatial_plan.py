@@ -288,6 +288,13 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
     assert plans[2].used == 1.2
 
 
+def test_where_the_patience_is_spent_nothing_more_is_tried(doubted, monkeypatch):
+    last, known, said = doubted
+    monkeypatch.setattr(planning, "PATIENCE_S", 0.0)
+    said(1.2)
+    assert [x.start for x in last.plan(AHEAD, near=known).attempts] == ["neighbour"]
+
+
 def test_a_motion_that_breaks_limits_between_the_nodes_is_none(doubted):
     last, known, said = doubted
     said(2.0, 1.9, 1.8)

@@ -41,8 +41,8 @@ IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturb
 NEAR = WARM | {"acceptable_iter": 1, "mu_strategy": "monotone", "mu_init": 1e-4}
 # where a motion passes limits between the nodes, it often is not settled: from there on with smaller steps of the cost
 PATIENT = {"acceptable_iter": 8, "acceptable_obj_change_tol": 5e-4}
-# of all attempts for one target: beyond, no other start and no finer mesh is tried; on a busy core a hop, which has to be
-# solved on a finer mesh with its links apart, takes 20 to 40 s
+# of all attempts for one target: beyond, no other start and no finer mesh is tried; on a busy core a hop, which has to
+# be solved on a finer mesh with its links apart, takes 20 to 40 s
 PATIENCE_S = 60.0
 HOLD = 0.1  # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
