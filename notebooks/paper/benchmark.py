@@ -32,7 +32,7 @@ from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
 
 NODES = (20, 40, 80)  # intervals of the three phases together
-NODE_REPEATS = 2  # the growth is a fit over many meshes
+NODE_REPEATS = 3  # the growth is a fit over many meshes
 
 
 def growth(robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES) -> list[dict[str, Any]]:
