@@ -7,11 +7,15 @@
 >>> run = jl.simulate(plan)
 >>> jl.save("out", plan, run); jl.view(plan, run)
 
-Each name below is loaded when it is first used. Errors are in ``jl.errors``, pictures and tables in ``jl.plots``.
+Each name below is loaded when it is first used. Errors are in ``jl.errors``, pictures and tables in
+``jl.plots``.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from jumplab.errors import Shown
+from jumplab.robot.foreign import register
 
 if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ loads what is asked for
     from jumplab import errors as errors
@@ -37,6 +41,13 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab.studies.trials import run_trials as run_trials
     from jumplab.task import JumpTask as JumpTask
 
+
+def _import_robot(name_or_path: Any, repair: tuple[str, ...]) -> Any:
+    """What :meth:`Robot.load` does with files of somebody else; the importer is above the core."""
+    return import_module("jumplab.robot_import.checkup").load(name_or_path, repair)
+
+
+register(_import_robot)
 _PLACES = {
     "JumpTask": "task",
     "Contacts": "stages.whole_body",
@@ -60,6 +71,7 @@ _PLACES = {
     "envelope": "studies.envelope",
 }
 _MODULES = {"errors": "errors", "plots": "show"}
+Shown.pictures = lambda: import_module("jumplab.show.cards")
 
 __all__ = [*_PLACES, *_MODULES]
 
@@ -74,7 +86,9 @@ def __getattr__(name: str) -> Any:
 
         value = versions()["jumplab"]
     else:
-        raise AttributeError(f"module 'jumplab' has no attribute {name!r}; it has {', '.join(__all__)}")
+        raise AttributeError(
+            f"module 'jumplab' has no attribute {name!r}; it has {', '.join(__all__)}"
+        )
     globals()[name] = value
     return value
 

@@ -6,7 +6,9 @@ import sys
 
 
 def main() -> int:
-    """Run the command that was typed; a signal while it is still being imported ends it without a word."""
+    """Run the command that was typed; a signal while it is still being imported ends it without a
+    word.
+    """
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, lambda *_, code=code: os._exit(code))

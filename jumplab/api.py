@@ -1,4 +1,6 @@
-"""The front door's functions: each takes what the one before returned. ``import jumplab as jl`` has them all."""
+"""The front door's functions: each takes what the one before returned. ``import jumplab as jl`` has
+them all.
+"""
 
 from __future__ import annotations
 
@@ -35,37 +37,43 @@ def plan(
     robust: Ranges | None = None,
     **changes: Any,
 ) -> JumpPlan:
-    """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz tape.
+    """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
+    tape.
 
     Parameters
     ----------
     task : what to reach, in a jump from a stand; or else
-    contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of your own. It is
-        planned by the whole-body program, audited foot by foot, and not yet played on a simulated robot.
+    contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
+        your own. It is planned by the whole-body program, audited foot by foot, and not yet played
+        on a simulated robot.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
-    method : "direct" (the whole body alone, from a crouch) or, for targets in the plane, "three-step" (SRMP,
-        joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step" where stages 1 or
-        2 are changed, see :meth:`jumplab.Planner.plan`.
-    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``: sampled ones come
-        to rest as near to the middle of their soles as can be, and a flip's tuck has time to open later, see
-        :mod:`jumplab.studies.robust`.
-    changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and ``mesh``, as of
-        :class:`jumplab.Planner`, which plans many targets with them.
+    method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
+        joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step"
+        where stages 1 or 2, or stage 3's tracking, are changed.
+    robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``,
+        see :mod:`jumplab.studies.robust`.
+    changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
+        ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
 
     Raises
     ------
     InputError, InfeasibleError, SolverError
-        If a stage refuses the target or finds no motion; the sentence says which, and ends with an easier target
-        that has a plan, if one was found.
+        If a stage refuses the target or finds no motion; the sentence says which, and ends with an
+        easier target that has a plan, if one was found.
     """
     from jumplab.studies.advice import plan_or_advise
 
     robot = robot if isinstance(robot, Robot) else Robot.load(robot)
     if (task is None) == (contacts is None):
-        raise InputError("give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)")
+        raise InputError(
+            "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
+        )
     if contacts is not None:
         if robust is not None or method != USUAL:
-            raise InputError("a contact schedule is planned by the whole-body program; leave method and robust out")
+            raise InputError(
+                "a contact schedule is planned by the whole-body program; leave method and robust "
+                "out"
+            )
         return Planner(robot, keep=True, **changes).follow(contacts)
     if robust is not None:
         from jumplab.studies.robust import robust_changes
@@ -75,7 +83,9 @@ def plan(
 
 
 def audit(plan: JumpPlan) -> AuditReport:
-    """Check a plan by a second code path that sees its tape, its robot and its target, and nothing of the planner."""
+    """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
+    of the planner.
+    """
     from jumplab.auditing import audit as check
 
     require_type(plan, JumpPlan, "the plan to audit")
@@ -87,9 +97,10 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
 
     Parameters
     ----------
-    options : as of :func:`jumplab.sim.simulate_jump`: ``mode``, ``perturbation``, ``scene`` (by default the ground that
-        the plan was made for), ``feedback``, ``reaim``, ``step``, ``landing``, ``stand_s``, ``engine`` ("bullet" or
-        "mujoco").
+    options : as of :func:`jumplab.sim.simulate_jump`: ``mode``, ``perturbation``, ``scene`` (by
+        default the ground that the plan was made for), ``feedback``, ``reaim``, ``step``,
+        ``landing``, ``stand_s``, ``engine`` ("bullet" or "mujoco"), ``contact`` ("hard" or
+        "usual").
 
     Returns
     -------
@@ -104,7 +115,9 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
 
 
 def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None) -> AuditReport:
-    """Write a plan, its audit and its simulation into a result folder, whole or not at all; returns the audit."""
+    """Write a plan, its audit and its simulation (if given) into a result folder, whole or not at
+    all; returns the audit.
+    """
     from jumplab.auditing import write_audit
 
     require_type(plan, JumpPlan, "the plan to save")
@@ -115,7 +128,9 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
 
 
 def load(folder: str | Path) -> Saved:
-    """Read a result folder: ``plan, run = jl.load("out")``; raises :class:`InputError` if there is no sound plan."""
+    """Read a result folder: ``plan, run = jl.load("out")``; raises :class:`InputError` if there is
+    no sound plan.
+    """
     from jumplab.sim import SimulationResult
 
     tape, robot, summary = folders.read_plan(folder)
@@ -124,7 +139,9 @@ def load(folder: str | Path) -> Saved:
 
 
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
-    """The jump in 3-D, plan and simulation: a notebook shows the page, ``view(...).save("jump.html")`` writes it."""
+    """The jump in 3-D, plan and simulation: a notebook shows the page,
+    ``view(...).save("jump.html")`` writes it.
+    """
     from jumplab.show.viewer import page
     from jumplab.sim import Scene
 

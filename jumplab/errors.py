@@ -1,15 +1,16 @@
-"""One root for every error that jumplab raises on purpose, and for all objects that say in a line what they are.
+"""One root for every error that jumplab raises on purpose, and for all objects that say in a line
+what they are.
 
-A message says what is wrong, where, the value, the limit and what to do. The command line prints the message alone and
-exits with ``exit_code``.
+A message says what is wrong, where, the value, the limit and what to do. The command line prints
+the message alone and exits with ``exit_code``.
 """
 
 import os
 import reprlib
+from collections.abc import Callable
 from dataclasses import fields
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60  # enough to recognise what one has typed
@@ -32,24 +33,26 @@ class RobotError(InputError):
 
 
 class InfeasibleError(JumplabError):
-    """The question is well posed, but this robot cannot do it (or no plan was found within the limits).
+    """The question is well posed, but this robot cannot do it (or no plan was found within the
+    limits).
 
-    ``number`` names what of the target is beyond its limit ("height_m"), ``bound`` how much of it a straight push of
-    the legs is enough for, or the least that is possible [m].
+    ``number`` names what of the target is beyond its limit ("distance_m"), ``bound`` the limit [m].
     """
 
     exit_code = 3
 
     def __init__(self, message: str, *, number: str = "", bound: float | None = None):
         super().__init__(message)
-        self.number, self.bound = number, bound
+        self.number = number
+        self.bound = bound
 
 
 class SolverError(JumplabError):
     """A solver stopped without an answer that passes its own re-evaluated residuals.
 
-    ``stage`` names the stage that failed, ``status`` is what the solver said after how many ``iterations``, and
-    ``violations`` are the worst violated terms, each as "name: amount unit at node k, t = ... s".
+    ``stage`` names the stage that failed, ``status`` is what the solver said after how many
+    ``iterations``, and ``violations`` are the worst violated terms, each as "name: amount unit at
+    node k, t = ... s".
     """
 
     exit_code = 3
@@ -64,7 +67,10 @@ class SolverError(JumplabError):
         iterations: int = 0,
     ):
         super().__init__(message)
-        self.stage, self.status, self.violations, self.iterations = stage, status, violations, iterations
+        self.stage = stage
+        self.status = status
+        self.violations = violations
+        self.iterations = iterations
 
 
 def quoted(value: Any) -> str:
@@ -87,14 +93,24 @@ def as_path(value: Any, what: str) -> Path:
 
 # objects ------------------------------------------------------------------------------------------
 class Shown:
-    """A dataclass with arrays in it, whose own text would flood a screen; declare it with ``repr=False``."""
+    """A dataclass with arrays in it, whose own text would flood a screen; declare it with
+    ``repr=False``.
+    """
 
     __slots__ = ()
+    # gives the module that draws results; the front door names it, since pictures stand above
+    pictures: ClassVar[Callable[[], Any]]
 
     def line(self) -> str:
-        """What there is to say of it, without line breaks; by default its plain values, and the names of the rest."""
+        """What there is to say of it, without line breaks; by default its plain values, and the
+        names of the rest.
+        """
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        plain = [f"{k}={x!r}" for k, x in values.items() if isinstance(x, str | int | float) and len(repr(x)) < 40]
+        plain = [
+            f"{k}={x!r}"
+            for k, x in values.items()
+            if isinstance(x, str | int | float) and len(repr(x)) < 40
+        ]
         rest = [k for k in values if not any(text.startswith(f"{k}=") for text in plain)]
         return ", ".join([*plain, *rest])
 
@@ -102,4 +118,4 @@ class Shown:
         return f"<{type(self).__name__}: {self.line()}>"
 
     def _repr_html_(self) -> str | None:
-        return import_module("jumplab.show.cards").card(self)  # by name: pictures stand above whatever shows itself
+        return Shown.pictures().card(self)

@@ -4,17 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from jumplab.errors import InputError, quoted
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
-FRICTION = 0.45  # [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not have
-MAX_DISTANCE_M = 3.0  # beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
+# [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not
+# have
+FRICTION = 0.45
+# beyond the standing long-jump record for humans with run-up excluded (3.73 m): surely a typo
+MAX_DISTANCE_M = 3.0
 MAX_HEIGHT_M = 1.5  # beyond any human's CoM rise: surely a typo
 MAX_PLATFORM_M = 1.0  # higher than any published standing humanoid jump
 
 
-def _number(name: str, value, low: float, high: float, unit: str) -> float:
+# of a target: in words, from, to
+RANGES = {
+    "distance_m": ("distance", -MAX_DISTANCE_M, MAX_DISTANCE_M),
+    "height_m": ("height", 0.02, MAX_HEIGHT_M),
+    "platform_m": ("platform", -MAX_PLATFORM_M, MAX_PLATFORM_M),
+    "rotation_rad": ("rotation", -4 * math.pi, 4 * math.pi),
+    "gravity": ("gravity", 0.5, 30.0),
+    "side_m": ("side", -MAX_DISTANCE_M, MAX_DISTANCE_M),
+    "yaw_rad": ("yaw", -2 * math.pi, 2 * math.pi),
+}
+UNITS = {"m": "m", "rad": "rad", "gravity": "m/s^2"}  # by the ends of names
+
+
+def _number(name: str, value: Any, low: float, high: float, unit: str) -> float:
     try:
         x = float("" if isinstance(value, bool) else value)  # True is no number of metres
     except (TypeError, ValueError, OverflowError):
@@ -33,13 +50,16 @@ class JumpTask:
     Attributes
     ----------
     distance_m : travel of the feet, toe to toe [m] (l in the paper; negative is backward).
-    height_m : rise of the CoM from the instant the feet leave the ground to the apex [m] (h in the paper).
+    height_m : rise of the CoM from the instant the feet leave the ground to the apex [m] (h in the
+        paper).
     platform_m : height of the landing surface above the launching surface [m].
-    rotation_rad : rotation about +y in flight, 0 or a multiple of 2 pi (theta_tar; -2 pi is a backflip).
+    rotation_rad : rotation about +y in flight, 0 or a multiple of 2 pi (theta_tar; -2 pi is a
+        backflip).
     gravity : [m/s^2].
     side_m : travel of the middle between the soles to the left [m]; negative is to the right.
-    yaw_rad : turn about the vertical, counter-clockwise seen from above [rad]; ``distance_m`` and ``side_m`` stay in
-        the axes of the start, and are then those of the middle between the soles.
+    yaw_rad : turn about the vertical, counter-clockwise seen from above [rad]; ``distance_m`` and
+        ``side_m`` stay in the axes of the start, and are then those of the middle between the
+        soles.
     """
 
     distance_m: float
@@ -51,22 +71,15 @@ class JumpTask:
     yaw_rad: float = 0.0
 
     def __post_init__(self):
-        clean = {
-            "distance_m": _number("distance", self.distance_m, -MAX_DISTANCE_M, MAX_DISTANCE_M, "m"),
-            "height_m": _number("height", self.height_m, 0.02, MAX_HEIGHT_M, "m"),
-            "platform_m": _number("platform", self.platform_m, -MAX_PLATFORM_M, MAX_PLATFORM_M, "m"),
-            "rotation_rad": _number("rotation", self.rotation_rad, -4 * math.pi, 4 * math.pi, "rad"),
-            "gravity": _number("gravity", self.gravity, 0.5, 30.0, "m/s^2"),
-            "side_m": _number("side", self.side_m, -MAX_DISTANCE_M, MAX_DISTANCE_M, "m"),
-            "yaw_rad": _number("yaw", self.yaw_rad, -2 * math.pi, 2 * math.pi, "rad"),
-        }
-        for name, x in clean.items():
-            object.__setattr__(self, name, x)
+        for name, (words, low, high) in RANGES.items():
+            unit = UNITS[name.rpartition("_")[2]]
+            value = _number(words, getattr(self, name), low, high, unit)
+            object.__setattr__(self, name, value)
         turns = self.rotation_rad / (2 * math.pi)
         if abs(turns - round(turns)) > 1e-6:
             raise InputError(
-                f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet only after a "
-                f"multiple of 360 deg; nearest is {360 * round(turns):g} deg"
+                f"rotation = {math.degrees(self.rotation_rad):g} deg: the robot lands on its feet "
+                f"only after a multiple of 360 deg; nearest is {360 * round(turns):g} deg"
             )
 
     @property
@@ -76,7 +89,9 @@ class JumpTask:
 
     @property
     def along_rad(self) -> float:
-        """Direction of the travel seen from above [rad], along which a platform begins; zero straight ahead or back."""
+        """Direction of the travel seen from above [rad], along which a platform begins; zero
+        straight ahead or back.
+        """
         return math.atan2(self.side_m, self.distance_m) if self.side_m else 0.0
 
     @property
@@ -85,15 +100,17 @@ class JumpTask:
         return math.sqrt(2 * self.gravity * self.height_m)
 
     def flight_time(self, com_rise_at_touchdown_m: float = 0.0) -> float:
-        """Time in the air [s] when the CoM touches down ``com_rise_at_touchdown_m`` above its take-off height.
+        """Time in the air [s] when the CoM touches down ``com_rise_at_touchdown_m`` above its
+        take-off height.
 
         Zero gives the paper's 2 v / g. Raises :class:`InputError` if the apex is lower than that.
         """
-        v, g = self.takeoff_speed, self.gravity
+        v = self.takeoff_speed
+        g = self.gravity
         rest = v * v - 2 * g * com_rise_at_touchdown_m
         if not rest >= 0:
             raise InputError(
-                f"a CoM rise of {self.height_m:g} m cannot reach a touchdown {com_rise_at_touchdown_m:.3f} m above "
-                f"take-off; it takes at least that height"
+                f"a CoM rise of {self.height_m:g} m cannot reach a touchdown "
+                f"{com_rise_at_touchdown_m:.3f} m above take-off; it takes at least that height"
             )
         return (v + math.sqrt(rest)) / g

@@ -1,12 +1,21 @@
 """Shared by all tests: no display, one thread per process, and the default robot once."""
 
 import os
+import shutil
+import tempfile
 
 os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ["JUMPLAB_CACHE"] = ""  # nothing that an earlier version built
+WORKER = "PYTEST_XDIST_WORKER" in os.environ
+if not WORKER:  # a new folder: nothing that an earlier run built, and each function is made once for all processes
+    os.environ["JUMPLAB_CACHE"] = tempfile.mkdtemp(prefix="jumplab-tests-")
 
-import pytest
+import pytest  # noqa: E402
+
+
+def pytest_unconfigure():
+    if not WORKER:
+        shutil.rmtree(os.environ["JUMPLAB_CACHE"], ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

@@ -76,7 +76,7 @@ def bump(t, first, last):
 
 
 def shifted(tape: Tape, axis: int, amount: float, first: float, last: float) -> Tape:
-    """The whole robot shifted along a world axis by a smooth bump, with consistent q, v, a and honest forces."""
+    """The whole robot shifted along a world axis by a smooth bump, with consistent q, v, a and their forces."""
     s, rate, acceleration = (amount * x for x in bump(tape.t, first, last))
     q, v, a = np.array(tape.q), np.array(tape.v), np.array(tape.a)
     q[:, axis] += s

@@ -3,9 +3,9 @@
 from functools import cache
 
 from jumplab.robot import Robot
-from jumplab.sim import SLIGHT, Perturbation
+from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
-from jumplab.studies.chain import ChainResult, Course, Rehearsal, crouched, run_chain
+from jumplab.studies.chain import ChainResult, Course, crouched, rehearse, run_chain
 
 
 @cache
@@ -20,13 +20,12 @@ def planner() -> Planner:
 
 
 @cache
-def rehearsal() -> Rehearsal:
-    return Rehearsal.of(Course.of([0.6, 0.6], 0.3), planner())
+def rehearsal() -> tuple[JumpPlan, ...]:
+    return rehearse(Course.of([0.6, 0.6], 0.3), planner())
 
 
 @cache
-def chain(solve_s: float = 0.2, seed: int | None = None) -> ChainResult:
+def chain(solve_s: float = 0.2) -> ChainResult:
     """Two jumps of 0.6 m, planning charged with a given time."""
-    drawn = None if seed is None else Perturbation.draw(Robot.load(), seed, SLIGHT)
     return run_chain(Course.of([0.6, 0.6], 0.3), Robot.load(), planner=planner(), rehearsal=rehearsal(),
-                     solve_s=solve_s, perturbation=drawn)  # fmt: skip
+                     solve_s=solve_s)  # fmt: skip

@@ -18,6 +18,12 @@ from jumplab.task import JumpTask
 LIMBS = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 
 
+def slopes(f, x: np.ndarray, step: float, ways: np.ndarray | None = None) -> np.ndarray:
+    """Jacobian (..., n) of ``f`` at ``x`` (n,) by central differences, or times ``ways`` (k, n)."""
+    ways = step * (np.eye(len(x)) if ways is None else ways)
+    return np.stack([(np.asarray(f(x + way)) - np.asarray(f(x - way))) / (2 * step) for way in ways], axis=-1)
+
+
 @cache
 def planner() -> Planner:
     """The stages, built once."""

@@ -1,13 +1,16 @@
 """Robots made from the default one by hand: other proportions, axes, ankles, arms and base links."""
 
 import pickle
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import fields
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from paper import bhr_table as table
 
+from jumplab.errors import RobotError
 from jumplab.robot import Robot
 from jumplab.robot.sagittal import SagittalModel
 from jumplab.robot.stance import com_from_toe, configuration
@@ -45,6 +48,13 @@ def config(name: str, size: float = 1.0, **values) -> str:
     told = {"trunk": "trunk", "forward": "+x", "up": "+z", "shoulders": SWINGING, "heel": -0.1 * size,
             "toe": 0.14 * size, "half": 0.05 * size, "z": -0.075 * size}  # fmt: skip
     return CONFIG.format(name=name, **(told | values))
+
+
+def refused(make: Callable[[], object]) -> str:
+    """The sentence that refuses to make something."""
+    with pytest.raises(RobotError) as e:
+        make()
+    return str(e.value)
 
 
 def root() -> ET.Element:
@@ -141,6 +151,14 @@ def held_arms() -> tuple[str, str]:
     return GOOD, config("held_arms", shoulders="[]")
 
 
+def _fixed(robot: ET.Element, parent: str, child: str, kind: str = "fixed", **origin: str) -> ET.Element:
+    """A further joint, called by its child."""
+    j = ET.SubElement(robot, "joint", name=f"to_{child}", type=kind)
+    ET.SubElement(j, "parent", link=parent), ET.SubElement(j, "child", link=child)
+    ET.SubElement(j, "origin", **origin)
+    return j
+
+
 def arm_base() -> tuple[str, str]:
     """The root is the left arm: the shoulder is met from its far end."""
     robot = root()
@@ -151,10 +169,7 @@ def arm_base() -> tuple[str, str]:
     shoulder.find("child").set("link", "socket")
     shoulder.find("origin").set("xyz", "0 0 0")
     shoulder.find("axis").set("xyz", "0 -1 0")
-    j = ET.SubElement(robot, "joint", name="socket_fixed", type="fixed")
-    ET.SubElement(j, "parent", link="socket")
-    ET.SubElement(j, "child", link="trunk")
-    ET.SubElement(j, "origin", xyz=" ".join(f"{-float(x)}" for x in place.split()))
+    _fixed(robot, "socket", "trunk", xyz=" ".join(f"{-float(x)}" for x in place.split()))
     return text(robot), config("arm_base")
 
 
@@ -166,10 +181,8 @@ def waist() -> tuple[str, str]:
     ET.SubElement(inertial, "origin", xyz="0.02 0 0.1")
     ET.SubElement(inertial, "mass", value="2")
     ET.SubElement(inertial, "inertia", ixx="0.01", ixy="0", ixz="0.002", iyy="0.012", iyz="0", izz="0.008")
-    j = ET.SubElement(robot, "joint", name="waist", type="revolute")
-    ET.SubElement(j, "parent", link="chest")
-    ET.SubElement(j, "child", link="trunk")
-    ET.SubElement(j, "origin", xyz="0 0 0")
+    j = _fixed(robot, "chest", "trunk", "revolute", xyz="0 0 0")
+    j.set("name", "waist")
     ET.SubElement(j, "axis", xyz="0 1 0")
     ET.SubElement(j, "limit", lower="-0.5", upper="0.5", effort="100", velocity="5")
     return text(robot), config("waist") + "[locked]\nwaist = -0.1\n"
@@ -179,20 +192,15 @@ def sideways() -> tuple[str, str]:
     """The whole robot hangs on a root that is turned by 90 degrees: its trunk looks along +y of the root."""
     robot = root()
     ET.SubElement(robot, "link", name="turned")
-    j = ET.SubElement(robot, "joint", name="turn", type="fixed")
-    ET.SubElement(j, "parent", link="turned")
-    ET.SubElement(j, "child", link="trunk")
-    ET.SubElement(j, "origin", xyz="0.3 0.2 0.1", rpy="0 0 1.5707963267948966")
+    _fixed(robot, "turned", "trunk", xyz="0.3 0.2 0.1", rpy="0 0 1.5707963267948966")
     return text(robot), config("sideways", trunk="turned", forward="+y")
 
 
 def canted(angle_rad: float) -> tuple[str, str]:
     """Both hips canted, as mirror images."""
-    import math
-
     robot = root()
     for side, sign in (("left", 1), ("right", -1)):
-        axis = f"0 {math.cos(angle_rad):.12f} {sign * math.sin(angle_rad):.12f}"
+        axis = f"0 {np.cos(angle_rad):.12f} {sign * np.sin(angle_rad):.12f}"
         joint(robot, f"{side}_hip_pitch").find("axis").set("xyz", axis)
     return text(robot), config("canted")
 
@@ -212,11 +220,8 @@ def write(folder, variant, *args) -> str:
 def alike(robot: Robot, other: Robot) -> bool:
     """Same texts, same physics."""
     same = robot.hash == other.hash and robot.model == other.model and robot.actuators == other.actuators
-    return same and all(map(np.array_equal, values(robot.sagittal), values(other.sagittal)))
-
-
-def values(sagittal) -> list:
-    return [getattr(sagittal, f.name) for f in fields(sagittal) if f.name != "points"]
+    names = [f.name for f in fields(SagittalModel) if f.name != "points"]
+    return same and all(np.array_equal(getattr(robot.sagittal, n), getattr(other.sagittal, n)) for n in names)
 
 
 def through_processes(robot: Robot) -> Robot:
@@ -229,34 +234,21 @@ SAMPLES = 24  # fixed random postures over the whole joint range
 RATE_RAD_S = 3.0  # of every link, for the momentum
 
 
-@dataclass(frozen=True)
-class ReductionError:
-    """Largest difference between the sagittal and the full model; the shares are of the largest value seen."""
-
-    mass_kg: float
-    com_m: float
-    inertia_kgm2: float
-    momentum_kgm2_s: float
-    inertia_share: float
-    momentum_share: float
-
-
-def reduction_error(robot: Robot) -> ReductionError:
-    """Compare mass, CoM, pitch inertia and angular momentum of both models on random symmetric motions."""
+def reduction_error(robot: Robot) -> np.ndarray:
+    """Largest differences (4,) of five links and full robot on random symmetric motions: mass [kg], CoM [m], pitch
+    inertia [kg m^2], angular momentum [kg m^2/s].
+    """
     s, model, rng = robot.sagittal, robot.model, np.random.default_rng(8)
-    data = model.createData()
-    com, full, flat = [], [], []
+    data, rows = model.createData(), []
     for _ in range(SAMPLES):
         joints = s.lower + rng.uniform(0.05, 0.95, 4) * (s.upper - s.lower)
         angles = s.link_angles(joints, rng.uniform(-0.3, 0.8))
         rates = rng.uniform(-RATE_RAD_S, RATE_RAD_S, 5)
         pin.ccrba(model, data, configuration(robot, angles), _velocity(robot, angles, rates))
-        com.append(data.com[0][[0, 2]] - com_from_toe(robot, angles))
-        full.append((data.Ig.inertia[1, 1], data.hg.angular[1]))
-        flat.append(_planar(s, angles, rates))
-    off, top = np.abs(np.subtract(full, flat)).max(axis=0), np.abs(full).max(axis=0)
-    mass = abs(robot.total_mass - s.total_mass)
-    return ReductionError(mass, float(np.abs(com).max()), *off.tolist(), *(off / top).tolist())
+        inertia, momentum = _planar(s, angles, rates)
+        com = np.abs(data.com[0][[0, 2]] - com_from_toe(robot, angles)).max()
+        rows.append((com, data.Ig.inertia[1, 1] - inertia, data.hg.angular[1] - momentum))
+    return np.array([abs(robot.total_mass - s.total_mass), *np.abs(rows).max(axis=0)])
 
 
 def _planar(s: SagittalModel, angles: np.ndarray, rates: np.ndarray) -> tuple[float, float]:

@@ -39,14 +39,7 @@ SAME = {
     ("Sub", 44, "return max(foot.heel - x, x - foot.toe, abs(y - foot.center[1]) - foot.half_width)"): "center[1] is 0",
     ("Sub", 8, "speed = speed - np.cross(spin, arm)"): "a steady speed of the whole robot takes no force",
     ("Gt", 25, "for k in np.flatnonzero((result.foot_wrench[:-1, :, 2] > LOADED_N).any(axis=1)):"): "asked again below",
-    (
-        "0",
-        48,
-        'blocks.append(pin.GeometryObject("platform", 0, 0, pin.SE3(np.eye(3), centre), coal.Box(size, size, size)))',
-    ): "distances do not ask for the frame",
-    ("1", 53, 'LIMITS["start at rest"].worst(np.abs(tape.v[:1]), t[:1], names),'): "one row has one time",
     ("Mult", 22, "corners += [place.act(half * signs) for signs in product((-1, 1), repeat=3)]"): "signs are 1 or -1",
-    ("1.0", 63, "share = np.clip((times - self.t[row]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)"): "0 / 1 is 0 / 2",
 }
 SWAPS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.And: ast.Or,
          ast.Mod: ast.Div, ast.MatMult: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Or: ast.And,

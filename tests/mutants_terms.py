@@ -19,7 +19,7 @@ from jumplab.ocp import Problem
 from jumplab.robot import Robot
 from jumplab.stages import srmp
 from jumplab.stages.joint_qp.settings import FlightWeights, LaunchWeights, Options
-from jumplab.stages.whole_body.terms import Body
+from jumplab.stages.whole_body.body import Body
 
 TESTS = ("tests/test_terms_table.py", "tests/test_terms_values.py")
 FACTOR, LEAST = 10.0, 0.95

@@ -34,7 +34,6 @@ from fixtures_audit import (
 from fixtures_core import jump
 
 from jumplab.auditing import AuditReport, audit
-from jumplab.errors import InputError
 from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
 
@@ -151,15 +150,14 @@ def audited(broken) -> AuditReport:
 
 
 def test_good_plan_is_clean(good):
+    """Every check has a corruption below; it says value, limit and unit, and the worst instant where there is one."""
+    before = {k: v.copy() for k, v in good.arrays().items()}
     passport = audit(good, ROBOT, TASK)
     assert passport.passed, passport.table()
-    assert len({c.name for c in passport.checks}) == len(passport.checks)
-
-
-def test_every_check_says_what_was_found_where_and_when(good):
-    """Value, limit and unit always; the worst instant wherever there is one."""
-    checks = audit(good, ROBOT, TASK).checks
-    assert all(math.isfinite(c.value) and math.isfinite(c.limit) and c.unit and len(c.note) > 15 for c in checks)
+    assert sorted(BROKEN) == sorted(c.name for c in passport.checks)
+    assert all(
+        math.isfinite(c.value) and math.isfinite(c.limit) and c.unit and len(c.note) > 15 for c in passport.checks
+    )
     timeless = {
         "finite numbers",
         "order of phases",
@@ -168,12 +166,11 @@ def test_every_check_says_what_was_found_where_and_when(good):
         "sole as in the URDF",
         "links have mass",
     }
-    assert {c.name for c in checks if c.time is None} == timeless
-    assert all(0 <= c.time <= good.t[-1] for c in checks if c.time is not None)
-
-
-def test_every_check_has_its_corruption(good):
-    assert set(BROKEN) == {c.name for c in audit(good, ROBOT, TASK).checks}
+    assert {c.name for c in passport.checks if c.time is None} == timeless
+    assert all(0 <= c.time <= good.t[-1] for c in passport.checks if c.time is not None)
+    assert audit(good, ROBOT, TASK).to_json() == passport.to_json()
+    for name, array in good.arrays().items():
+        np.testing.assert_array_equal(array, before[name])
 
 
 @pytest.mark.parametrize("name", BROKEN)
@@ -205,25 +202,14 @@ def test_landing_on_a_platform_that_is_not_there(good):
     assert {"sole on the surface", "penetration", "body clearance"} <= {c.name for c in passport.failed}
 
 
-@pytest.mark.parametrize("platform", [0.3, -0.2])
-def test_platform_plan_is_clean(platform):
-    task = JumpTask(0.6, 0.5, platform_m=platform)
-    passport = audit(jump(0.6, 0.5, platform).tape, ROBOT, task)
-    assert passport.passed, passport.table()
-
-
-@pytest.mark.parametrize("target", [(1.0, 0.5, 0.0, "direct"), (0.3, 0.2, 0.0, "direct"), (0.0, 0.1)])
+@pytest.mark.parametrize(
+    "target",
+    [(0.6, 0.5, 0.3), (0.6, 0.5, -0.2), (1.0, 0.5, 0.0, "direct"), (0.3, 0.2, 0.0, "direct"), (0.0, 0.1)],
+)
 def test_other_good_plans_are_clean(target):
-    """The direct planner too; and small hops, whose feet pass closest to the ground."""
-    passport = audit(jump(*target).tape, ROBOT, JumpTask(*target[:2]))
+    """Onto and off a platform; the direct planner; and small hops, whose feet pass closest to the ground."""
+    passport = audit(jump(*target).tape, ROBOT, JumpTask(*target[:3]))
     assert passport.passed, passport.table()
-
-
-def test_audit_is_repeatable_and_leaves_the_tape_alone(good):
-    before = {k: v.copy() for k, v in good.arrays().items()}
-    assert audit(good, ROBOT, TASK).to_json() == audit(good, ROBOT, TASK).to_json()
-    for name, array in good.arrays().items():
-        np.testing.assert_array_equal(array, before[name])
 
 
 def test_without_a_task_the_target_is_left_out(good):
@@ -233,20 +219,10 @@ def test_without_a_task_the_target_is_left_out(good):
     assert "sole on the surface" in names and passport.manifest["target"] is None
 
 
-def test_another_robots_tape_is_refused(good):
-    other = robot_with(urdf=("left_knee", "left_other"), config=("left_knee", "left_other"))
-    with pytest.raises(InputError, match="joints are not those of the robot 'bhr'"):
-        audit(good, other, TASK)
-    with pytest.raises(InputError, match=r"q has shape \(\d+, 20\), the robot 'bhr' needs"):
-        audit(dataclasses.replace(good, q=good.q[:, :-1]), ROBOT, TASK)
-    with pytest.raises(InputError, match="'tail' is not a link"):
-        audit(dataclasses.replace(good, contact_frames=np.array(["left_foot", "tail"])), ROBOT, TASK)
-
-
 def test_audit_shares_no_code_with_the_planner():
     code = """
 import sys, jumplab.auditing
-ours = {"errors", "task", "robot_import", "robot", "io", "auditing"}
+ours = {"errors", "task", "robot", "io", "auditing"}
 names = [m.split(".") for m in sys.modules]
 print([n for n in names if n[0] == "casadi" or n[0] == "jumplab" and len(n) > 1 and n[1] not in ours])
 """

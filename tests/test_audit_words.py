@@ -16,7 +16,7 @@ from jumplab.auditing import AuditReport, Check, audit, write_audit
 from jumplab.auditing.dynamics import available_torque
 from jumplab.auditing.motion import form, mirror
 from jumplab.auditing.replay import open_tape, replay
-from jumplab.auditing.report import LIMITS, METHOD, Limit
+from jumplab.auditing.report import LIMITS, Limit
 from jumplab.errors import InputError, RobotError
 from jumplab.io.folder import versions
 from jumplab.robot.stance import stance_configuration
@@ -43,16 +43,20 @@ def test_a_limit_is_kept_by_its_own_value():
 
 def test_the_worst_is_the_first_of_equals_and_never_minus_zero():
     limit = Limit("a", "x", 2.0, "m", "at {here}, over {cop_force_n:g} N")
-    found = limit.worst([[1.0, 3.0], [3.0, 0.0]], [0.5, 0.6], ["p", "q"], here="home")
+    found = limit.check([[1.0, 3.0], [3.0, 0.0]], [0.5, 0.6], ["p", "q"], {"here": "home"})
     assert found == Check("a", "x", 3.0, 2.0, "m", 0.5, "at home, over 50 N; worst: q", False)
-    assert math.copysign(1.0, limit.worst([-0.0], [0.0], here="").value) == 1.0
-    assert limit.worst(np.empty((0, 2)), [], ["p", "q"], here="y") == Check(
+    gap = limit.check([[1.0, np.nan], [5.0, 2.0]], [0.1, 0.2], ["p", "q"], {"here": ""})
+    assert math.isnan(gap.value) and not gap.passed and gap.time == 0.1 and gap.note.endswith("worst: q")
+    least = Limit("a", "low", 0.0, "m", "what", at_least=True).check([3.0, -1.0], [0.1, 0.2])
+    assert (least.value, least.time, least.passed) == (-1.0, 0.2, False)
+    assert math.copysign(1.0, limit.check([-0.0], [0.0], None, {"here": ""}).value) == 1.0
+    assert limit.check(np.empty((0, 2)), [], ["p", "q"], {"here": "y"}) == Check(
         "a", "x", 2.0, 2.0, "m", None, "at y, over 50 N (nothing to check)", False
     )
 
 
 def test_what_is_found_stays():
-    for thing in (METHOD, LIMITS["mass"], Check("g", "n", 1, 2, "m", None, ""), AuditReport(())):
+    for thing in (LIMITS["mass"], Check("g", "n", 1, 2, "m", None, ""), AuditReport(())):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(thing, dataclasses.fields(thing)[0].name, None)
     r = replay(random_tape(0), ROBOT, None)
@@ -85,6 +89,12 @@ def test_table_and_json_word_for_word():
         "group": "one", "name": "longer", "value": 3.0, "limit": 2.0, "unit": "mm", "time": None, "note": "second",
         "at_least": False, "passed": False}  # fmt: skip
     assert said == {"schema": "jumplab-passport-1", "passed": False, "failed": ["longer", "b"], "manifest": {}}
+    odd = AuditReport((Check("a", "x", math.nan, 9.0, "m", 0.1, "what"),), {"size": np.float64(np.inf)})
+    strict = json.loads(odd.to_json(), parse_constant=pytest.fail)
+    assert strict["checks"][0]["value"] is None and strict["manifest"]["size"] is None and not strict["passed"]
+    assert not AuditReport(()).passed
+    with pytest.raises(KeyError):
+        found["absent"]
 
 
 def test_the_notes_carry_what_was_found():
@@ -131,7 +141,7 @@ def test_the_manifest_names_robot_target_and_versions():
 
 def faults(**changes) -> list[float]:
     """Broken entries, and faults in the order of phases."""
-    return [c.value for c in form(dataclasses.replace(random_tape(0), **changes))]
+    return [count for _, count in form(dataclasses.replace(random_tape(0), **changes))]
 
 
 def test_every_fault_of_form_is_counted():
@@ -259,17 +269,16 @@ def test_links_without_mass_are_counted_and_named():
 
 def test_mirrored_joints_by_name():
     model, _ = open_tape(random_tape(0), ROBOT, None)
-    expected = []
-    for i, name in enumerate(JOINTS):
+    other, sign = mirror(model)
+    swap = {"left": "right", "right": "left"}
+    for name, k, s in zip(JOINTS, other, sign, strict=True):
         side, rest = name.split("_", 1)
-        other = JOINTS.index({"left": "right", "right": "left"}[side] + "_" + rest)
-        expected.append((i, other, -1.0 if rest.endswith(("yaw", "roll")) else 1.0))
-    assert mirror(model) == expected
+        assert JOINTS[k] == f"{swap[side]}_{rest}" and s == (-1.0 if rest.endswith(("yaw", "roll")) else 1.0)
     ahead = ROBOT.urdf
     for side in ("-0.1", "0.1"):
         assert f'<origin xyz="0 {side} -0.43"' in ahead
         ahead = ahead.replace(f'<origin xyz="0 {side} -0.43"', f'<origin xyz="0.02 {side} -0.43"')
-    assert mirror(pin.buildModelFromXML(ahead, pin.JointModelFreeFlyer())) == expected
+    np.testing.assert_array_equal(mirror(pin.buildModelFromXML(ahead, pin.JointModelFreeFlyer())), (other, sign))
     one = ahead.replace('<origin xyz="0.02 0.1 -0.43"', '<origin xyz="-0.02 0.1 -0.43"')
     assert mirror(pin.buildModelFromXML(one, pin.JointModelFreeFlyer())) is None
     lopsided = robot_with(urdf=('<origin xyz="0 0.23 0"', '<origin xyz="0 0.25 0"'))
@@ -280,7 +289,7 @@ def test_the_step_between_two_surfaces_may_be_given():
     """Sample by sample: the height under a sole jumps at edge_m ahead of the toes' first place."""
     known = truth(1)
     r = replay(known.tape, ROBOT, known.task, edge_m=-0.15)
-    edge = known.toe[0, ..., 0].mean() - 0.15
+    edge = known.sole[0, ..., 0].mean() + ROBOT.foot.toe - ROBOT.foot.center[0] - 0.15
     assert r.edge == pytest.approx(edge) and r.heading == known.ahead
     ahead = known.ahead
     assert list(r.surface(edge + ahead * np.array([-1e-3, 1e-3]))) == [0.0, known.task.platform_m]
@@ -393,6 +402,7 @@ def test_a_folders_target_edge_and_place(tmp_path):
     into.mkdir()
     write(tmp_path, target | {"unknown": 3}, platform_edge_m=0.123)
     found = write_audit(tmp_path, into=into)
+    assert len(found.manifest["plan_sha256"]) == 64 and found.manifest["robot_hash"] == ROBOT.hash
     assert found.checks == audit(tape, ROBOT, task, edge_m=0.123).checks != audit(tape, ROBOT, task).checks
     assert [p.name for p in into.iterdir()] == ["passport.json"] and not (tmp_path / "passport.json").exists()
     assert json.loads((into / "passport.json").read_text())["manifest"]["planner"]["platform_edge_m"] == 0.123

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from fixtures_core import jump
+from paper import basin
+from paper.basin import BasinGrid, landing_basin
 
 from jumplab.errors import InputError
 from jumplab.io import folder as store
-from jumplab.studies import basin
-from jumplab.studies.basin import BasinGrid, landing_basin
 from jumplab.studies.trials import Trial, TrialSettings
 
 SMALL = BasinGrid((1.0,), (0.0, 30.0), (0.0,), (0.6,))
@@ -24,7 +24,7 @@ def folder(plan, bhr, tmp_path):
     return tmp_path / "plan"
 
 
-def fake(tape, robot, scene, settings, key, state):
+def fake(plan, settings, key, state):
     """Stands in for a simulation: too much pitch falls."""
     landed = abs(state.pitch_deg) < 7
     return Trial(key, {}, vars(state), landed, "stood" if landed else "trunk touched the ground 0.5 s", None)
@@ -44,7 +44,10 @@ def test_the_grid_has_all_combinations_once():
     }  # any first part of it has something of everything
 
 
-def test_counts_and_resumes(folder, fakes):
+def test_counts_and_resumes(folder, fakes, bhr):
+    for n, words in ((0, "too small; it must be at least 1"), (226, "too large; the basin has 225 states")):
+        with pytest.raises(InputError, match=f"^n = {n} is {words}$"):
+            landing_basin(folder, n)
     first = landing_basin(folder, 50, jobs=1)
     assert first.resumed == 0 and first.count == 50
     whole = landing_basin(folder, jobs=1)
@@ -56,16 +59,8 @@ def test_counts_and_resumes(folder, fakes):
     assert said["reasons"] == {"trunk touched the ground ... s": 90}
     assert landing_basin(folder, settings=TrialSettings(reaim=False), jobs=1).resumed == 0
     assert landing_basin(folder, 5, grid=BasinGrid(speed_factor=(1.0,)), jobs=1).resumed > 0  # the same states
-
-
-@pytest.mark.parametrize(
-    ("n", "sentence"),
-    [(0, "n = 0 is too small; it must be at least 1"), (226, "n = 226 is too large; the basin has 225 states")],
-)
-def test_bad_numbers(folder, n, sentence):
-    with pytest.raises(InputError) as e:
-        landing_basin(folder, n)
-    assert str(e.value) == sentence and not (folder / "basin.json").exists()
+    store.write_plan(folder, jump(0.6, 0.3, method="direct").tape, bhr, store.read_plan(folder)[2])
+    assert not {"basin.json", "trials.jsonl"} & {f.name for f in folder.iterdir()}  # a new plan, a new basin
 
 
 def test_a_state_is_simulated_as_it_says(folder):
@@ -78,9 +73,3 @@ def test_a_state_is_simulated_as_it_says(folder):
         turn = trial.metrics.touchdown_trunk_pitch_rad
         assert (abs(turn) > 0.4) == (trial.features["pitch_deg"] == 30)
     assert landing_basin(folder, settings=TrialSettings(reaim=False), grid=SMALL, jobs=1).trials == report.trials
-
-
-def test_trials_and_basin_share_the_log(folder, fakes, bhr):
-    landing_basin(folder, 3, jobs=1)
-    store.write_plan(folder, jump(0.6, 0.3, method="direct").tape, bhr, store.read_plan(folder)[2])
-    assert not {"basin.json", "trials.jsonl"} & {f.name for f in folder.iterdir()}  # a new plan, a new basin

@@ -1,16 +1,22 @@
 """The benchmark: every sort of planning, true to its own raw times. Nothing is judged by its time."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
-from paper.benchmark import growth
+from paper import planning_times as benchmark
+from paper.benchmark import FRESH, growth, new_processes
+from paper.planning_times import BASE, SORTS, rows
 
 from jumplab.cli.main import main
 from jumplab.errors import InputError
 from jumplab.robot import Robot
-from jumplab.studies import bench as benchmark
-from jumplab.studies.bench import BASE, FRESH, SORTS, rows
 from jumplab.task import JumpTask
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def row(solver_s: float, clean: bool = True, **target: float) -> dict:
@@ -35,26 +41,32 @@ def test_rows_are_medians_over_targets_of_medians_over_repeats():
 
 
 @pytest.mark.slow
-def test_every_sort_is_timed_and_audited():
-    """Three steps only of a robot that five links describe."""
+def test_every_sort_is_timed_and_audited(monkeypatch):
     task, said = JumpTask(0.4, 0.3), []
-    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], processes=False, say=said.append)
+    for sort in SORTS:
+        monkeypatch.setitem(SORTS, sort, SORTS[sort][:2])
+    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], say=said.append)
     again = json.loads(json.dumps(found))
     assert [x["sort"] for x in again["rows"]] == [*SORTS][:4] == [x.partition(":")[0] for x in said]
-    assert all(x["targets"] == x["planned"] == x["clean"] == 6 for x in again["rows"]), again["rows"]
+    assert all(x["targets"] == x["planned"] == x["clean"] == 2 for x in again["rows"]), again["rows"]
     assert again["rows"] == json.loads(json.dumps(rows(found["raw"])))
     near = {x["sort"]: x["iterations"] for x in again["rows"]}
     assert max(near["ahead, re-planned"], near["ahead, from an atlas"]) < near[BASE] / 2
     for plans in again["raw"].values():
         assert all(0 < x["solver_s"] and sum(s for _, s in x["stages"]) == pytest.approx(x["solver_s"]) for x in plans)
-    lopsided = Robot.load().with_mass("left_thigh", factor=1.2)
-    made = benchmark.Bench(lopsided, task)
-    assert not made.robot.planar and {len(x) for x in (made.ahead, made.aside, made.flips)} == {6}
+
+
+def test_sorts_have_six_targets_around_one():
+    """Three steps only of a robot that five links describe."""
+    around = {name: benchmark.targets(JumpTask(0.4, 0.3), name) for name in SORTS}
+    assert {len(set(tasks)) for tasks in around.values()} == {6}
+    assert all(task.in_plane == (name.partition(",")[0] != "aside") for name in SORTS for task in around[name])
+    assert all(bool(task.rotation_rad) == (name == "flips") for name in SORTS for task in around[name])
 
 
 @pytest.mark.slow
 def test_new_processes_are_timed():
-    plans = benchmark.bench("bhr", JumpTask(0.4, 0.3), 1, sorts=())["raw"]
+    plans = new_processes("bhr", JumpTask(0.4, 0.3), 1)
     (fresh,), (kept,) = plans.values()
     assert next(iter(plans)) == FRESH and fresh["clean"] and kept["clean"] and kept["build_s"] < fresh["build_s"]
     assert fresh["iterations"] == kept["iterations"] and 0 < fresh["peak_gib"] < 4
@@ -72,6 +84,13 @@ def test_the_command_prints_a_table_and_writes_the_numbers(monkeypatch, capsys, 
 def test_the_growth_has_a_row_for_each_mesh():
     found = growth(Robot.load(), JumpTask(0.4, 0.3), (16, 24))
     assert [x["intervals"] for x in found] == [16, 24] and all(x["iteration_s"] > 0 for x in found)
+
+
+def test_the_folder_beside_the_package_is_loaded_by_name():
+    code = "from jumplab.cli.notebooks import paper; print(paper('planning_times').__file__)"
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, cwd="/", capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()) == ROOT / "notebooks" / "paper" / "planning_times.py"
 
 
 def test_wrong_questions_of_the_benchmark():

@@ -6,14 +6,15 @@ import pytest
 from fixtures_chains import planner, rehearsal, waiting
 from fixtures_core import jump
 
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InfeasibleError, InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration, stance_angles
-from jumplab.sim.kinematics import Gauge
 from jumplab.stages.planner import Planner
 from jumplab.studies.chain import Course, crouched, run_chain
 from jumplab.studies.chain.course import CROUCH
-from jumplab.studies.chain.pilot import Ahead, Foresight, _over_feet, posture
+from jumplab.studies.chain.foresight import Ahead, Foresight, posture
+from jumplab.studies.chain.pilot import over_feet
 from jumplab.task import JumpTask
 
 # ------------------------------------------------------------------------------------------ courses
@@ -21,30 +22,30 @@ from jumplab.task import JumpTask
 
 def test_course_of_numbers():
     course = Course.of(["0.6", 0.5, 0.4], "0.3", [0, 0.2, 0.1])
-    assert course.count == 3 and course.heights_m == (0.3, 0.3, 0.3)
+    assert course.count == 3 and [task.height_m for task in course.tasks] == [0.3, 0.3, 0.3]
     assert course.goals_m == pytest.approx((0.6, 1.1, 1.5))
-    assert [course.task(k).platform_m for k in range(3)] == pytest.approx([0.0, 0.2, -0.1])
-    assert course.task(1, np.array([0.55, 0.0, 0.0])) == JumpTask(0.55, 0.3, 0.2)
-    assert Course.of([0.6, 0.5], [0.3, 0.4]).heights_m == (0.3, 0.4)
+    assert [task.platform_m for task in course.tasks] == pytest.approx([0.0, 0.2, -0.1])
+    assert Course.of([0.6, 0.5], [0.3, 0.4]).tasks == (JumpTask(0.6, 0.3), JumpTask(0.5, 0.4))
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (([], 0.3), "a chain has 1 ... 50 jumps, this one has 0; give one distance per jump"),
-        (([0.1] * 51, 0.3), "a chain has 1 ... 50 jumps, this one has 51; give one distance per jump"),
         (([0.6, 0.6], [0.3, 0.3, 0.3]), "3 heights for 2 distances: give one per jump"),
         (([0.6, 0.6], 0.3, [0.1]), "1 platforms for 2 distances: give one per jump"),
         (([0.6, "far"], 0.3), "the distances of a chain must be numbers in m; number 2 is 'far'"),
         (([0.6, True], 0.3), "the distances of a chain must be numbers in m; number 2 is True"),
-        (([0.6, None], 0.3), "the distances of a chain must be numbers in m; number 2 is None"),
         (("0.6", 0.3), "the distances of a chain must be a list of numbers, got '0.6'"),
-        ((None, 0.3), "the distances of a chain must be a list of numbers, got None"),
-        (([0.6], "high"), "the heights of a chain must be numbers in m; number 1 is 'high'"),
         (([0.6, float("nan")], 0.3), "jump 2 of 2: distance must be finite, got nan"),
-        (([0.6, 7], 0.3), "jump 2 of 2: distance = 7 m is outside -3 ... 3 m"),
         (([0.6], 0.0), "jump 1 of 1: height = 0 m is outside 0.02 ... 1.5 m"),
         (([0.6, 0.6], 0.3, [0.8, -0.8]), "jump 2 of 2: platform = -1.6 m is outside -1 ... 1 m"),
+        (([0.5, 0.5], 0.3, None, [0.1]), "1 sides for 2 distances: give one per jump"),
+        (([0.5, 0.5], 0.3, None, None, [1.0] * 3), "3 turns for 2 distances: give one per jump"),
+        (
+            ([0.5, 0.5], 0.3, [0.1, 0.1], None, [1.0, 0.0]),
+            "platforms lie on a straight way: leave them away, or ask for neither sides nor turns",
+        ),
     ],
 )
 def test_courses_that_cannot_be_meant(arguments, sentence):
@@ -59,11 +60,6 @@ def test_courses_that_cannot_be_meant(arguments, sentence):
         (
             ([0.6, 0.25], 0.3, [0.0, 0.2]), InputError,
             "jump 2 of 2: the surface 0.2 m high would begin under the sole that stands 0.25 m before it; place them "
-            "0.34 m apart or more, toe to toe",
-        ),
-        (
-            ([0.6, 0.2, 0.5], 0.3, [0.2, 0.1, 0.1]), InputError,
-            "jump 2 of 3: the surface down at 0.1 m would begin under the sole that stands 0.2 m before it; place them "
             "0.34 m apart or more, toe to toe",
         ),
         (
@@ -94,8 +90,6 @@ def test_jump_without_a_plan_is_named_before_anything_moves(monkeypatch):
     ("arguments", "sentence"),
     [
         ({"solve_s": -0.1}, "solve_s = -0.1 s is outside 0 ... 60 s"),
-        ({"solve_s": float("nan")}, "solve_s = nan s is outside 0 ... 60 s"),
-        ({"look_s": 5.0}, "look_s = 5.0 s is outside -1 ... 2 s"),
         ({"look_s": "soon"}, "look_s = 'soon' s is outside -1 ... 2 s"),
         ({"method": "magic"}, "method 'magic': choose one of three-step, direct"),
         ({"landing": "soft"}, "landing 'soft': choose one of planned, spring"),
@@ -149,16 +143,15 @@ def test_gauge_reads_what_a_configuration_was_made_of(bhr):
     assert gauge.toe(q)[[0, 2]] == pytest.approx([0.7, 0.2], abs=1e-12)
     v = np.zeros(bhr.model.nv)
     v[0] = 2.0  # in the base's axes, which are pitched
-    speed = gauge.com_velocity(q, v)
+    speed = gauge.motion(q, v).velocity
     assert np.linalg.norm(speed) == pytest.approx(2.0)
-    assert gauge.com_ahead(q, v, 0.5) == pytest.approx(gauge.com(q) + 0.5 * speed - [0, 0, 9.8 * 0.125])
 
 
 def test_a_plan_begins_in_the_posture_it_is_given(bhr):
     """Cold and warm, in every stage; the tape starts at rest there, and its distance is kept."""
     start = stance_angles(waiting()) + np.array([0.0, 0.02, -0.03, 0.01, 0.05])
     task = JumpTask(0.6, 0.3)
-    for plan in (planner().plan(task, start=start), planner().replan(rehearsal().plans[0], task, start=start),
+    for plan in (planner().plan(task, start=start), planner().replan(rehearsal()[0], task, start=start),
                  planner().plan(task, "direct", start=start)):  # fmt: skip
         assert posture(waiting(), plan.tape.q[0]) == pytest.approx(start, abs=1e-6), plan.method
         assert np.abs(plan.tape.v[0]).max() < 1e-6
@@ -170,32 +163,21 @@ def test_a_plan_begins_in_the_posture_it_is_given(bhr):
 # ------------------------------------------------------------------------------------------ heading
 def test_a_square_leads_back():
     course = Course.of([0.3] * 4, 0.35, None, None, [np.pi / 2] * 4)
-    assert not course.in_plane and course.task(1) == JumpTask(0.3, 0.35, yaw_rad=np.pi / 2)
+    assert not course.in_plane and course.tasks[1] == JumpTask(0.3, 0.35, yaw_rad=np.pi / 2)
     assert course.goals[:2] == pytest.approx(np.array([[0.3, 0.0, np.pi / 2], [0.3, 0.3, np.pi]]))
     assert course.goals[3] == pytest.approx([0.0, 0.0, 2 * np.pi], abs=1e-12)
     aside = Course.of([0.3, 0.0], 0.3, sides_m=[0.0, 0.2])
     assert aside.goals[1] == pytest.approx([0.3, 0.2, 0.0]) and Course.of([0.3], 0.3, sides_m=[0.0]).in_plane
 
 
-@pytest.mark.parametrize("given, sentence", [
-    (dict(sides_m=[0.1]), "1 sides for 2 distances: give one per jump"),
-    (dict(turns_rad=[1.0, 2.0, 3.0]), "3 turns for 2 distances: give one per jump"),
-    (dict(turns_rad=[1.0, 0.0], platforms_m=[0.1, 0.1]),
-     "platforms lie on a straight way: leave them away, or ask for neither sides nor turns"),
-])  # fmt: skip
-def test_courses_with_heading_that_cannot_be_meant(given, sentence):
-    with pytest.raises(InputError) as e:
-        Course.of([0.5, 0.5], 0.3, **given)
-    assert str(e.value) == sentence
-
-
 def test_what_is_missed_is_made_good_in_the_axes_of_each_jump(bhr):
     """A turn of 90 degrees that ends 80 degrees round and 4 cm short: the next begins there and asks for the rest."""
     echo = Echo()
-    see = Foresight(Course.of([0.3, 0.3], 0.3, turns_rad=[np.pi / 2] * 2), bhr, echo, None, solve_s=0.1)
+    see = Foresight(Course.of([0.3, 0.3], 0.3, turns_rad=[np.pi / 2] * 2), bhr, echo, (None,) * 3, solve_s=0.1)
     first = see.look(0, 0.5, np.zeros(3))
     stands = np.array([0.26, 0.0, np.radians(80)])
-    see.look(1, 1.5, stands, last=(first, np.zeros(3)))
+    first.began_at = np.zeros(3)
+    see.look(1, 1.5, stands, last=first)
     task, (c, s) = echo.asked[-1][0], (np.cos(stands[2]), np.sin(stands[2]))
     goal = np.array([0.3, 0.3]) - stands[:2]
     assert task.distance_m == pytest.approx(c * goal[0] + s * goal[1] + 0.04)
@@ -212,7 +194,7 @@ class Echo:
     def __init__(self):
         self.asked = []
 
-    def plan(self, task, method, start):
+    def replan(self, rehearsed, task, start):
         self.asked.append((task, start))
         return type("Plan", (), {"task": task})
 
@@ -220,16 +202,18 @@ class Echo:
 def test_what_is_measured_enters_the_next_plan(bhr):
     """Foot place, shortfall, and what forecasts were wrong by, each with the number that arithmetic gives."""
     echo = Echo()
-    see = Foresight(Course.of([0.6, 0.6, 0.6], 0.3), bhr, echo, None, solve_s=0.1234)
+    see = Foresight(Course.of([0.6, 0.6, 0.6], 0.3), bhr, echo, (None,) * 3, solve_s=0.1234)
     first = see.look(0, 0.5, np.array([0.12, 0.0, 0.0]))
     assert echo.asked[-1][0].distance_m == pytest.approx(0.6) and first.solve_s == pytest.approx(0.124)
     assert first.ready_s == pytest.approx(0.624) and not first.air
     # in the air, 0.57 m are foretold: 3 cm short, to be made good and to be expected again
-    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, (first, np.array([0.12, 0.0, 0.0])))
+    first.began_at = np.array([0.12, 0.0, 0.0])
+    second = see.look(1, 1.5, np.array([0.69, 0.0, 0.0]), True, first)
     assert echo.asked[-1][0].distance_m == pytest.approx(1.2 - 0.57 + 0.03)
     # it stands at 0.56 m: the forecast was 1 cm too far, and the jump 4 cm short
-    see.learn_place(first, np.array([0.12, 0.0, 0.0]), [second], np.array([0.68, 0.0, 0.0]))
-    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, (second, np.array([0.68, 0.0, 0.0])))
+    second.began_at = np.array([0.68, 0.0, 0.0])
+    see.learn_place(first, [second], second.began_at)
+    third = see.look(2, 3.0, np.array([1.33, 0.0, 0.0]), True, second)
     foretold, place = 1.33 - 0.12, 1.33 - 0.12 - 0.01
     assert (third.foretold_m, third.place_m) == pytest.approx((foretold, place))
     missed = [0.04, 0.66 - (place - 0.56)]
@@ -237,7 +221,7 @@ def test_what_is_measured_enters_the_next_plan(bhr):
 
 
 def test_posture_off_the_crouch_enters_within_reason(bhr):
-    see = Foresight(Course.of([0.6], 0.3), bhr, echo := Echo(), None)
+    see = Foresight(Course.of([0.6], 0.3), bhr, echo := Echo(), (None,))
     off = np.array([0.0, 0.02, -0.03, 0.5, 0.04])
     see.learn_posture(configuration(bhr, stance_angles(bhr) + off))
     see.look(0, 0.5, np.zeros(3))
@@ -263,7 +247,7 @@ def test_the_trunk_moves_as_planned_over_feet_that_stand_unevenly(bhr):
     q[7:][hips] += rng.uniform(-0.05, 0.05, len(hips))
     asked = between(q)
     assert abs(asked[0]) > 5e-3 and abs(asked[2]) > 0.01
-    spline = _over_feet(tape, bhr, q)
+    spline = over_feet(tape, bhr, q)
     for time in (0.0, 0.2, 0.9 * tape.takeoff_time):
         row = np.searchsorted(tape.t, time)
         moved = tape.q[row].copy()
@@ -272,21 +256,21 @@ def test_the_trunk_moves_as_planned_over_feet_that_stand_unevenly(bhr):
         level = [data.oMf[f].translation[2] for f in frames]
         assert between(moved) == pytest.approx(asked, abs=1e-4 if time == 0 else 2e-3)  # heels rise about turned toes
         assert [data.oMf[f].translation[2] for f in frames] == pytest.approx(level, abs=1e-4)
-    even = _over_feet(tape, bhr, tape.q[0])
+    even = over_feet(tape, bhr, tape.q[0])
     assert np.abs(even(np.linspace(0, tape.takeoff_time, 50))).max() < 1e-9
 
 
 def test_a_failure_of_the_planner_is_kept_as_words(bhr):
     class Refusing(Echo):
-        def plan(self, task, method, start):
+        def replan(self, rehearsed, task, start):
             raise SolverError("no plan today")
 
-    ahead = Foresight(Course.of([0.6], 0.3), bhr, Refusing(), None).look(0, 0.5, np.zeros(3))
+    ahead = Foresight(Course.of([0.6], 0.3), bhr, Refusing(), (None,)).look(0, 0.5, np.zeros(3))
     assert ahead.plan is None and ahead.failure == "no plan today" and not ahead.in_time
 
 
 def test_in_time_means_before_it_was_needed():
     def plan(needed):
-        return Ahead(1, 2.0, True, 0.6, 0.6, np.zeros(5), np.zeros(14), 0.0, 0.5, 0.5, object(), needed_s=needed)
+        return Ahead(1, 2.0, True, 0.6, 0.6, np.zeros(5), 0.0, 0.5, 0.5, object(), needed_s=needed)
 
     assert plan(2.5).in_time and not plan(2.499).in_time and not plan(None).in_time

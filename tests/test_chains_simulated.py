@@ -10,22 +10,24 @@ from matplotlib.text import Text
 from paper import experiments
 
 from jumplab.cli import main as cli
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import SolverError
 from jumplab.io import folder as store
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.show.style import MIN_FONT_PT, PAGE_IN
 from jumplab.sim import SLIGHT, Perturbation
-from jumplab.sim.kinematics import Gauge
-from jumplab.studies.chain import ChainReport, ChainTrial, Course, run_chain, write_chain
+from jumplab.studies.chain import Course, run_chain, series, write_chain
 
 # ------------------------------------------------------------------------------------------ in the simulation
 
 
 @pytest.mark.slow
-def test_a_chain_stands_and_hits():
+def test_a_chain_stands_and_hits_and_made_twice_is_the_same():
     result = chain()
     assert result.stood, result.reason
+    again = run_chain(result.course, Robot.load(), planner=planner(), rehearsal=rehearsal(), solve_s=0.2)
+    assert np.array_equal(again.q, result.q) and np.array_equal(again.tau, result.tau)
     assert np.abs(result.errors_m).max() < 0.01
     assert result.travels_m.sum() == pytest.approx(result.places_m[-1, 0])
     assert len(result.replans) == 2 == result.in_time and result.jumps[1].ahead is result.replans[-1]
@@ -41,9 +43,9 @@ def test_a_chain_stands_and_hits():
 
 
 @pytest.mark.slow
-def test_a_perturbed_robot_keeps_its_heading_over_five_jumps():
+def test_a_perturbed_robot_keeps_its_heading_over_four_jumps():
     """Jump by jump it lands a little turned; that must not grow from one to the next."""
-    course, robot = Course.of([0.6] * 5, 0.3), Robot.load()
+    course, robot = Course.of([0.6] * 4, 0.3), Robot.load()
     how = dict(planner=planner(), perturbation=Perturbation.draw(robot, 3, SLIGHT), solve_s=0.2)
     result = run_chain(course, robot, **how)
     assert result.stood, result.reason
@@ -54,7 +56,7 @@ def test_a_perturbed_robot_keeps_its_heading_over_five_jumps():
 
 @pytest.mark.slow
 def test_nothing_is_reset_between_jumps():
-    """The log goes on from jump to jump as the engine's own step has it, and every part passes the honesty checks."""
+    """The log goes on from jump to jump as the engine's own step has it, and every part passes the checks of a run."""
     result = chain()
     assert all(j.simulation.checks_passed for j in result.jumps)
     assert np.all(np.diff(result.t) > 0) and result.t[1] == pytest.approx(0.001)
@@ -79,15 +81,6 @@ def test_a_late_plan_is_waited_for_in_the_crouch():
     still = held.com_velocity[-200:]
     assert np.abs(still).max() < 0.05 and held.com[-1, 2] == pytest.approx(
         Gauge(waiting()).com(stance_configuration(waiting()))[2], abs=0.02)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_chain_made_twice_is_the_same(tmp_path):
-    a = chain(0.2, 3)
-    b = run_chain(a.course, Robot.load(), planner=planner(), rehearsal=rehearsal(), solve_s=0.2,
-                  perturbation=Perturbation.draw(Robot.load(), 3, SLIGHT))  # fmt: skip
-    assert np.array_equal(a.q, b.q) and np.array_equal(a.tau, b.tau)
-    assert a.stood and np.abs(a.errors_m).max() < 0.03
 
 
 @pytest.mark.slow
@@ -120,22 +113,20 @@ def test_folder_is_whole_and_replaced_as_a_whole(tmp_path, odd_folder):
 
 @pytest.mark.slow
 def test_report_of_many_counts_what_the_chains_say():
-    trial, late = ChainTrial.of(3, chain()), ChainTrial.of(4, chain(2.0))
-    report = ChainReport(chain().course, (trial, late, ChainTrial(5, False, "fell")))
-    assert (report.stood, report.replans, report.in_time) == (2, 3, 2)
-    assert len(report.errors_m) == 4 and list(report.waits_s <= 0) == [True, False]
-    assert report.interval == pytest.approx((0.2077, 0.9385), abs=1e-4)  # Wilson's, of 2 in 3
-    data = json.loads(store.to_json(report.to_json()))
-    assert data["begun_without_waiting"] == 1 and data["trials"][2]["reason"] == "fell"
+    good, late, fell = series.row(3, chain()), series.row(4, chain(2.0)), {"seed": 5, "stood": False, "reason": "fell"}
+    found = series.counts([good, late, fell | dict.fromkeys(series.PER_JUMP, ())])
+    assert (found["stood"], found["replans"], found["in_time"], found["jumps"]) == (2, 3, 2, 2)
+    assert found["largest_error_m"] == max(abs(e) for x in (good, late) for e in x["errors_m"])
+    assert found["interval"] == pytest.approx((0.2077, 0.9385), abs=1e-4)  # Wilson's, of 2 in 3
+    assert found["begun_without_waiting"] == 1 and json.loads(store.to_json(good)) == json.loads(json.dumps(good))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["chain_strobe", "chain_path", "chain_timeline", "chain_errors"])
-@pytest.mark.parametrize("solve_s", [0.2, 2.0])
-def test_figures_are_legible_in_print(name, solve_s):
-    result, more = chain(solve_s), ()
+def test_figures_are_legible_in_print(name):
+    result, more = chain(2.0), ()
     if name == "chain_errors":
-        more = ((ChainTrial.of(0, result),),)
+        more = ((series.row(0, result),),)
     fig = getattr(experiments, name)(result, *more)
     fig.canvas.draw()
     texts = [t for t in fig.findobj(Text) if t.get_text().strip() and t.get_visible()]
@@ -152,17 +143,10 @@ HELP = "'jumplab chain --help' shows what is possible"
     ("arguments", "code", "sentence"),
     [
         ("--out x", 2, f"the following arguments are required: --distance-m; {HELP}"),
-        ("--distance-m --out x", 2, f"argument --distance-m: expected one argument; {HELP}"),
         ("--distance-m 0.6,far --out x", 2, "--distance-m must be a number, got 'far'"),
-        ("--distance-m 0.6 --height-m tall --out x", 2, "--height-m must be a number, got 'tall'"),
         ("--distance-m 0.6,0.6 --platform-m 0.1 --out x", 2, "1 platforms for 2 distances: give one per jump"),
-        ("--distance-m 0.6 --seed -1 --out x", 2, "--seed must be a whole number from 0 to 2147483647, got '-1'"),
         ("--distance-m 0.6 --runs 1.5 --out x", 2, "--runs must be a whole number from 1 to 10000, got '1.5'"),
-        ("--distance-m 0.6 --solve-s -1 --out x", 2, "solve_s = -1.0 s is outside 0 ... 60 s"),
-        ("--distance-m 0.6,0.2 --platform-m 0,0.1 --out x", 2,
-         "jump 2 of 2: the surface 0.1 m high would begin under the sole that stands 0.2 m before it; place them "
-         "0.34 m apart or more, toe to toe"),
-        ("--distance-m 0.6,0.6 --height-m 0.3,1.4 --out x", 3, "jump 2 of 2: height = 1.4 m"),
+        ("--distance-m 0.6,0.6 --height-m 0.3,1.4 --out x", 3, "jump 2 of 2: whole body: no plan ("),
     ],
 )  # fmt: skip
 def test_refusals_of_the_command(capsys, tmp_path, monkeypatch, arguments, code, sentence):
@@ -179,6 +163,6 @@ def test_the_command_tells_jump_by_jump(capsys, tmp_path):
     code = cli.main(["chain", "--distance-m", "0.5", "--solve-s", "0.2", "--seed", "4", "--out", str(out)])
     told, err = capsys.readouterr()
     assert code == 0, err
-    assert re.search(r"^1 +0\.500 m +0\.500 m +0\.\d{3} m +-?0\.0\d\d m +0\.4\d\d s +0\.200 s", told, re.M), told
+    assert re.search(r"^ *1 +0\.500 +0\.500 +0\.\d{3} +-?0\.0\d\d +-?0\.0\d\d +0\.4\d\d +0\.200", told, re.M), told
     assert "chain: stands after every jump" in told and "checks of 1 plans passed" in told
     assert "A chain of jumps" in (out / "chain.html").read_text(encoding="utf-8")

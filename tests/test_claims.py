@@ -183,7 +183,7 @@ def test_what_is_drawn_in_counts_for_the_limbs_that_move(bhr):
     body, q = FullBody(bhr), np.tile(pin.neutral(bhr.model), (11, 1))
     for name in ("left_knee", "right_knee"):
         q[:, 7 + bhr.joint_names.index(name)] = np.linspace(0.0, 1.5, 11)
-    rho = np.array([body.motion(x, np.zeros(body.nv)).rho for x in q])
+    rho = np.array([body.terms(x, np.zeros(body.nv)).rho for x in q])
     run = SimpleNamespace(t=np.arange(11.0), q=q, rho=rho, metrics=SimpleNamespace(liftoff_s=2.0, touchdown_s=9.0))
     found = claims.drawn_in(run, bhr)
     assert found["lift-off"] == found["greatest"] == rho[2] and found["least"] == found["touchdown"] == rho[8]

@@ -16,15 +16,15 @@ from test_store import Result, make_summary, make_tape, names
 from jumplab.cli import main as cli
 from jumplab.errors import InfeasibleError, SolverError
 from jumplab.io import folder as store
-from jumplab.robot.description import SHIPPED
+from jumplab.robot.files import SHIPPED
 
 ROOT = Path(__file__).resolve().parent.parent
 STAGES = [{"stage": "SRMP launch", "iterations": 31, "build_s": 0.25, "solve_s": 0.125}]
 FINDING = {"name": "mass", "value": 42.0, "limit": 42.5, "unit": "kg", "passed": True, "catches": "another robot"}
 METRICS = {"foot_distance_m": 1.002, "com_rise_m": 0.497, "standing_s": 3.4, "landed": True, "reason": "stood",
-           "honesty": [FINDING]}  # fmt: skip
+           "checks": [FINDING]}  # fmt: skip
 FALL = {"foot_distance_m": None, "com_rise_m": None, "standing_s": 0.0, "landed": False, "reason": "fell",
-        "honesty": [FINDING, FINDING | {"value": 43.0, "passed": False}]}  # fmt: skip
+        "checks": [FINDING, FINDING | {"value": 43.0, "passed": False}]}  # fmt: skip
 HELP = "'jumplab --help' shows what is possible"
 HELP_PLAN = "'jumplab plan --help' shows what is possible"
 
@@ -49,30 +49,20 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-NAMES = (
-    "run, plan, audit, simulate, trials, margins, certify, chain, clips, view, export, robot, envelope, atlas, sweep, "
-    "bench "
-)
-NAMES += "or completion"
+NAMES = ", ".join(work.__name__ for work in cli.COMMANDS).replace(", completion", " or completion")
 REFUSALS = [
     ("", f"choose a command: {NAMES}; " + HELP),
     ("plan", "the following arguments are required: --out; " + HELP_PLAN),
     ("plan --out x --fast", "unrecognized arguments: --fast; " + HELP),
     ("plan --out x --dist 1", "unrecognized arguments: --dist 1; " + HELP),
-    (
-        "plan --out x --distance-m",
-        "argument --distance-m: expected one argument; 'jumplab plan --help' shows what is possible",
-    ),
+    ("plan --out x --distance-m", "argument --distance-m: expected one argument; " + HELP_PLAN),
     ("plan --out x --distance-m=--", "--distance-m=--: '--' is not a value; " + HELP),
     ("plan --out x --distance-m far", "--distance-m must be a number, got 'far'"),
     ("plan --out x --distance-m nan", "distance must be finite, got nan"),
     ("plan --out x --distance-m -inf", "distance must be finite, got -inf"),
-    ("plan --out x --distance-m 1e9", "distance = 1e+09 m is outside -3 ... 3 m"),
     ("plan --out x --distance-m -1e1", "distance = -10 m is outside -3 ... 3 m"),
-    ("plan --out x --height-m 0", "height = 0 m is outside 0.02 ... 1.5 m"),
     ("plan --out x --height-m -0.5", "height = -0.5 m is outside 0.02 ... 1.5 m"),
     ("plan --out x --platform-m 5", "platform = 5 m is outside -1 ... 1 m"),
-    ("plan --out x --rotation-deg x", "--rotation-deg must be a number, got 'x'"),
     ("plan --out x --rotation-deg 1e400", "rotation must be finite, got inf"),
     (
         "plan --out x --rotation-deg 350",
@@ -86,28 +76,17 @@ REFUSALS = [
         "plan --out x --robot asimo",
         f"robot 'asimo': neither a shipped robot ({', '.join(SHIPPED)}) nor a readable TOML file",
     ),
+    ("plan --out=", "--out must name a folder, got ''"),
     ("plan --out /dev/null/x", "the folder '/dev/null/x' cannot be written (Not a directory); choose another one"),
     ("simulate", "the following arguments are required: DIR; 'jumplab simulate --help' shows what is possible"),
     ("simulate nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
     ("simulate .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
-    ("trials", "the following arguments are required: DIR; 'jumplab trials --help' shows what is possible"),
-    ("trials nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
     ("trials .", "'.' holds no finished plan (summary.json is missing); make one with 'jumplab plan'"),
     ("trials . --n 0", "--n must be a whole number from 1 to 100000, got '0'"),
-    ("trials . --n -3", "--n must be a whole number from 1 to 100000, got '-3'"),
     ("trials . --n 2.5", "--n must be a whole number from 1 to 100000, got '2.5'"),
-    ("trials . --n many", "--n must be a number, got 'many'"),
-    ("trials . --n 1000000", "--n must be a whole number from 1 to 100000, got '1000000'"),
     ("trials . --seed -1", "--seed must be a whole number from 0 to 2147483647, got '-1'"),
     ("trials . --jobs 0", "--jobs must be a whole number from 1 to 4096, got '0'"),
-    (
-        "trials . --mode fast",
-        "argument --mode: invalid choice: 'fast' (choose from 'position', 'pd'); "
-        "'jumplab trials --help' shows what is possible",
-    ),
     ("trials . --reaim yes", "unrecognized arguments: yes; " + HELP),
-    ("audit nowhere", "there is no folder 'nowhere'; make a plan with 'jumplab plan --out' first"),
-    ("run --distance-m nan", "distance must be finite, got nan"),
     ("run --parameter fast", "--parameter must be NAME=VALUE, got 'fast'"),
     ("run -p height_m=1", "--parameter height_m is given twice, or has an option of its own"),
     ("run -p out=1", "the parameter 'out' is set by the runner; use its own argument out"),
@@ -127,17 +106,12 @@ def test_unknown_notebook_parameter(capsys, here):
     assert names(here) == []
 
 
-def test_empty_folder_name(capsys, here):
-    assert one_sentence(*run(capsys, "plan", "--out", "")) == "--out must name a folder, got ''"
-
-
-@pytest.mark.parametrize(("count", "seed"), [(100, 12), pytest.param(1000, 11, marks=pytest.mark.slow)])
-def test_seeded_random_bad_inputs(capsys, here, count, seed):
+def test_seeded_random_bad_inputs(capsys, here):
     """Never a traceback, never accepted, never a file, never slow. API and notebooks: test_fuzz.py."""
-    rng = random.Random(seed)
+    rng = random.Random(12)
     bad = [*"nan -nan inf -inf 1e999 one 1,0 0x10 -- - 1m ½ 10 -7.5 1e17".split(), "", " "]
     options = ["--distance-m", "--height-m", "--platform-m"]
-    for _ in range(count):
+    for _ in range(100):
         junk = "".join(rng.choices(string.printable, k=rng.randint(1, 12)))
         argv = {
             0: ["plan", "--out", "x", rng.choice(options), rng.choice(bad)],
@@ -241,12 +215,12 @@ def test_debug_shows_the_traceback(capsys, here, planner):
         (
             METRICS,
             "simulated: distance 1.002 m, rise 0.497 m\nlanding: stands, 3.40 s on its feet after touchdown (stood)\n"
-            "honesty: all 1 checks of the run passed\n",
+            "checks: all 1 of the run passed\n",
         ),
         (
             FALL,
             "simulated: distance none, rise none\nlanding: FAILED, 0.00 s on its feet after touchdown (fell)\n"
-            "NOT HONEST: mass 43 kg, at most 42.5: another robot\n",
+            "CHECK FAILED: mass 43 kg, at most 42.5: another robot\n",
         ),
     ],
 )
@@ -280,12 +254,9 @@ def test_help_is_quick_and_complete():
     assert done.stdout.splitlines()[-1] == "[]" and done.stderr == ""
 
 
-def test_module_and_version():
+def test_version_and_a_reader_that_goes_away():
     done = subprocess.run([sys.executable, "-m", "jumplab", "--version"], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0 and done.stdout.startswith("jumplab ")
-
-
-def test_reader_that_goes_away_is_no_traceback():
     command = f"'{sys.executable}' -m jumplab --version | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=ROOT)
     assert done.stderr == ""
@@ -317,13 +288,9 @@ def test_real_plan_is_self_contained(planned):
 @pytest.mark.parametrize(
     ("arguments", "code", "sentence"),
     [
-        ("--height-m 1.4", 3, "height = 1.4 m: take-off at 5.24 m/s, on average"),
-        (
-            "--distance-m 2.9 --height-m 0.1",
-            3,
-            "distance = 2.9 m: in the time that a height of 0.1 m leaves in the air",
-        ),
-        ("--rotation-deg -360 --height-m 0.05", 3, "rotation = -360 deg: 0."),
+        ("--height-m 1.4", 3, "whole body: no plan ("),
+        ("--distance-m 2.9 --height-m 0.1", 3, "whole body: no plan ("),
+        ("--rotation-deg -360 --height-m 0.05", 3, "whole body: no plan ("),
         ("--distance-m -1.0 --method three-step", 3, "stage 2: at t = 0."),
         ("--distance-m 9", 2, "distance = 9 m is outside -3 ... 3 m"),
     ],

@@ -39,8 +39,8 @@ def world(monkeypatch):
     """One plan for all targets, and what each engine measures; calls are listed."""
     world, plan = SimpleNamespace(say=lambda engine: {}, calls=[], refuse=set()), jump(0.6, 0.3, method="direct")
 
-    def planned(self, task, method):
-        world.calls.append((task.distance_m, method))
+    def planned(self, task):
+        world.calls.append(task.distance_m)
         if task.distance_m in world.refuse:
             raise InfeasibleError("the knee is too slow")
         return plan
@@ -61,7 +61,6 @@ def test_thirty_targets_of_every_kind_grow_with_the_leg(bhr):
         "forward", "back", "height", "platform", "side", "turn"}  # fmt: skip
     assert len(set(found.values())) == 30
     leg = clips.leg_m(bhr)
-    assert clips.leg_m(bhr.with_legs(1.1)) == pytest.approx(1.1 * leg)  # thigh and shank
     assert found["forward-1"] == JumpTask(round(0.2 * leg, 2), round(0.2 * leg, 2))
     assert found["back-4"].distance_m == -round(0.4 * leg, 2) and found["side-2"].side_m == -round(0.15 * leg, 2)
     assert found["platform-5"].platform_m < 0 < found["platform-1"].platform_m
@@ -90,26 +89,13 @@ def test_what_passes_is_exported_and_the_rest_is_left_out_with_its_reason(world,
     assert store.read_json(tmp_path / "lib" / "forward-1" / "simulation.json")["engine"] == DEFAULT_ENGINE
 
 
-def test_where_the_usual_plan_is_not_clean_three_steps_plan(world, monkeypatch, bhr, tmp_path):
-    reports = iter([False, True])
-    monkeypatch.setattr(clips, "audit", lambda tape, robot, task: SimpleNamespace(passed=next(reports)))
-    assert len(clips.make_clips(bhr, tmp_path, jobs=1, only=["forward-1"]).rows) == 1
-    assert [method for _, method in world.calls] == ["usual", "three-step"]
-
-
-def test_three_steps_plan_nothing_to_the_side(world, monkeypatch, bhr):
-    monkeypatch.setattr(clips, "audit", lambda tape, robot, task: SimpleNamespace(passed=False))
-    clips._planned(Planner(bhr), JumpTask(0.0, 0.3, side_m=0.2))
-    assert [method for _, method in world.calls] == ["usual"]
-
-
 def test_clips_that_failed_are_tried_again(world, tmp_path):
     robot = Robot.load()
     world.refuse = {task.distance_m for task in clips.targets(robot).values()}
-    assert len(clips.make_clips(robot, tmp_path, jobs=1).left_out) == 2
+    assert len(clips.make_clips(robot, tmp_path, jobs=1)["left_out"]) == 2
     world.refuse = set()
-    assert len(clips.make_clips(robot, tmp_path, jobs=1).rows) == 2
-    assert len(world.calls) == 6  # where the usual method failed, three steps were tried as well
+    assert len(clips.make_clips(robot, tmp_path, jobs=1)["clips"]) == 2
+    assert len(world.calls) == 4
 
 
 def test_engines_that_do_not_agree_leave_a_clip_out(world, tmp_path, capsys):
@@ -130,9 +116,9 @@ def test_a_stopped_library_goes_on(world, tmp_path):
         clips.make_clips(robot, tmp_path, jobs=1, say=stop)
     assert len(world.calls) == 1 and not (tmp_path / "index.json").exists()
     found = clips.make_clips(robot, tmp_path, jobs=1, say=said.append)
-    assert len(found.rows) == 2 and len(world.calls) == 2 and said == ["forward-1: passed", "forward-2: passed"]
+    assert len(found["clips"]) == 2 and len(world.calls) == 2 and said == ["forward-1: passed", "forward-2: passed"]
     other = clips.make_clips(robot, tmp_path, "unitree-csv", jobs=1)  # another format of the same simulations
-    assert len(world.calls) == 2 and other.rows[0]["file"] == "forward-1/simulated_unitree.csv"
+    assert len(world.calls) == 2 and other["clips"][0]["file"] == "forward-1/simulated_unitree.csv"
     assert (tmp_path / "forward-1" / "simulated_mjlab.npz").is_file()
     clips.make_clips(robot.with_limits(effort=1.01), tmp_path, jobs=1, only=["forward-2"])
     assert len(world.calls) == 3 and (tmp_path / "forward-1").is_dir()  # another robot's are made anew

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from jumplab.errors import InputError
-from jumplab.ocp.problem import layouts
+from jumplab.ocp.layout import layouts
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
 from jumplab.stages.whole_body import ContactPhase, Contacts, Limits, Mesh, Place, Weights
-from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES
-from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.contacts import INTERVALS, STEP_SHARE, TIMES, jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.terms import Body
 
 LEAP = "LR L lR R r - L LR"
 
@@ -44,14 +43,7 @@ def letters(contacts: Contacts) -> str:
 def test_letters_are_feet_and_how_they_stand():
     modes = [one(word).modes for word in ("LR", "lR", "Lr", "l", "R", "-")]
     flat, toe = "flat", "toe"
-    assert modes == [
-        {0: flat, 1: flat},
-        {0: toe, 1: flat},
-        {0: flat, 1: toe},
-        {0: toe},
-        {1: flat},
-        {},
-    ]
+    assert modes == [{0: flat, 1: flat}, {0: toe, 1: flat}, {0: flat, 1: toe}, {0: toe}, {1: flat}, {}]
     assert [one(word).flying for word in ("LR", "-")] == [False, True]
 
 
@@ -79,12 +71,7 @@ def stairs(words: str, *heights: float) -> Contacts:
 
 @pytest.mark.parametrize(
     ("heights", "surface"),
-    [
-        ((), (0.0, 0)),
-        ((0.0, 0.0), (0.0, 0)),
-        ((-0.3, -0.3), (-0.3, 0)),
-        ((0.0, 0.0, 0.2, 0.2), (0.2, 2)),
-    ],
+    [((), (0.0, 0)), ((0.0, 0.0), (0.0, 0)), ((-0.3, -0.3), (-0.3, 0)), ((0.0, 0.0, 0.2, 0.2), (0.2, 2))],
 )
 def test_the_ground_has_one_step(heights, surface):
     words = "LR" + " - LR" * (len(heights) // 2)
@@ -107,12 +94,7 @@ def usual(robot) -> dict[str, tuple[Contacts, str, list[float], float]]:
         "leap": (Contacts.leap(robot), LEAP, [1, 2.4, 2.4], 0.0),
         "bound": (Contacts.bound(robot), "LR lr - LR lr - LR", [1, 1, 2, 2], 0.0),
         "step off": (Contacts.step_off(robot, 0.3), "LR L l - LR", [off, off], -0.3),
-        "drop jump": (
-            Contacts.drop_jump(robot, 0.3),
-            "LR L l - LR lr - LR",
-            [off, off, off + 1, off + 1],
-            -0.3,
-        ),
+        "drop jump": (Contacts.drop_jump(robot, 0.3), "LR L l - LR lr - LR", [off, off, off + 1, off + 1], -0.3),
         "hurdle": (Contacts.hurdle(robot), LEAP, [1, 2.8, 2.8], 0.0),
     }
 
@@ -147,8 +129,6 @@ def test_phases_take_times_that_suit_the_legs(bhr):
         assert p.time_s[0] <= p.guess_s <= p.time_s[1] and p.intervals == INTERVALS[kind]
         slow = ContactPhase.usual(feet, bhr.under_gravity(bhr.gravity / 4))
         assert slow.guess_s == pytest.approx(2 * p.guess_s)
-    told = ContactPhase.usual("LR", bhr, (2.0, 3.0))
-    assert (told.time_s, told.guess_s) == ((2.0, 3.0), 2.0)
 
 
 def test_a_standing_jump_ends_in_flight():
@@ -156,11 +136,7 @@ def test_a_standing_jump_ends_in_flight():
     contacts = jump_contacts(limits, Mesh(12, 6, 10))
     assert letters(contacts) == "LR lr -" and contacts.ends == "touchdown"
     found = [(p.name, p.time_s, p.intervals) for p in contacts.phases]
-    assert found == [
-        ("flat", limits.flat_s, 12),
-        ("toe", limits.toe_s, 6),
-        ("flight", limits.flight_s, 10),
-    ]
+    assert found == [("flat", limits.flat_s, 12), ("toe", limits.toe_s, 6), ("flight", limits.flight_s, 10)]
 
 
 # as a problem -------------------------------------------------------------------------------------
@@ -234,18 +210,9 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
             "phase '1 LR': time_s must be (low, high) and guess_s a number, both in seconds",
         ),
         (lambda: Contacts.hop(Robot.load(), foot="both"), "foot = 'both': choose left or right"),
-        (
-            lambda: Contacts(long(0.5, 0.3)),
-            "phase '1 LR': its time of 0.5 to 0.3 s must be positive, and in order",
-        ),
-        (
-            lambda: Contacts(long(0.0, 0.3)),
-            "phase '1 LR': its time of 0 to 0.3 s must be positive, and in order",
-        ),
-        (
-            lambda: Contacts(long(0.1, np.inf)),
-            "phase '1 LR': its time of 0.1 to inf s must be positive, and in order",
-        ),
+        (lambda: Contacts(long(0.5, 0.3)), "phase '1 LR': its time of 0.5 to 0.3 s must be positive, and in order"),
+        (lambda: Contacts(long(0.0, 0.3)), "phase '1 LR': its time of 0 to 0.3 s must be positive, and in order"),
+        (lambda: Contacts(long(0.1, np.inf)), "phase '1 LR': its time of 0.1 to inf s must be positive, and in order"),
         (
             lambda: Contacts(phases("LR", intervals=1)),
             "phase '1 LR': intervals = 1 must be a whole number of 2 or more",
@@ -261,43 +228,19 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
         (lambda: schedule("lr - LR", 2), f"phase '1 lr': {WAIT}"),
         (lambda: schedule("Lr - LR", 2), f"phase '1 Lr': {WAIT}"),
         (lambda: schedule("- LR", 2), f"phase '1 -': {WAIT}"),
-        (
-            lambda: Contacts(phases("LR L", name="go")),
-            "two phases are called 'go'; names must be unique in a schedule",
-        ),
+        (lambda: Contacts(phases("LR L", name="go")), "two phases are called 'go'; names must be unique in a schedule"),
         (lambda: schedule("LR -", ends="flight"), "ends = 'flight': choose 'rest' or 'touchdown'"),
-        (
-            lambda: schedule("LR -"),
-            "phase '2 -': a schedule that ends with 'rest' has to end on the ground",
-        ),
+        (lambda: schedule("LR -"), "phase '2 -': a schedule that ends with 'rest' has to end on the ground"),
         (
             lambda: schedule("LR - LR", 2, ends="touchdown"),
             "phase '3 LR': a schedule that ends with 'touchdown' has to end in flight",
         ),
-        (
-            lambda: schedule("L LR", 1),
-            f"phase '1 L': {ALONE} right one waits nobody says; begin with 'LR'",
-        ),
-        (
-            lambda: schedule("R - R", 1),
-            f"phase '1 R': {ALONE} left one waits nobody says; begin with 'LR'",
-        ),
-        (
-            lambda: schedule("LR lr - LR", 1),
-            f"places: 1 given, but {CAME}; {AFTER}",
-        ),
-        (
-            lambda: schedule("LR lr LR", 2),
-            f"places: 2 given, but feet come down 0 times (none); {AFTER}",
-        ),
-        (
-            lambda: stairs("LR - LR", 0.2, 0.3),
-            f"places at the heights 0.2, 0.3 m: {STEP}",
-        ),
-        (
-            lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0),
-            f"places at the heights 0.2, 0.2, 0, 0 m: {STEP}",
-        ),
+        (lambda: schedule("L LR", 1), f"phase '1 L': {ALONE} right one waits nobody says; begin with 'LR'"),
+        (lambda: schedule("R - R", 1), f"phase '1 R': {ALONE} left one waits nobody says; begin with 'LR'"),
+        (lambda: schedule("LR lr - LR", 1), f"places: 1 given, but {CAME}; {AFTER}"),
+        (lambda: schedule("LR lr LR", 2), f"places: 2 given, but feet come down 0 times (none); {AFTER}"),
+        (lambda: stairs("LR - LR", 0.2, 0.3), f"places at the heights 0.2, 0.3 m: {STEP}"),
+        (lambda: stairs("LR - LR - LR", 0.2, 0.2, 0.0, 0.0), f"places at the heights 0.2, 0.2, 0, 0 m: {STEP}"),
     ],
 )
 def test_refused(make, sentence):

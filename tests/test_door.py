@@ -13,7 +13,7 @@ import pytest
 import jumplab as jl
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("robot", "io", "models", "stages", "sim", "studies", "show")  # those that load their names lazily
+ROOMS = ("robot", "io", "models", "stages", "control", "sim", "studies", "show")  # those that load their names lazily
 HEAVY = ("numpy", "casadi", "pinocchio", "pybullet", "matplotlib", "scipy", "cvxpy")
 
 
@@ -29,7 +29,7 @@ def test_importing_the_package_imports_nothing_else():
 
 
 def test_planning_needs_neither_engine_nor_pictures():
-    code = "import jumplab as jl; jl.Planner, jl.JumpTask, jl.Robot, jl.Term"
+    code = "import jumplab as jl; jl.Planner, jl.JumpTask, jl.Robot, jl.Term, jl.Scene.flat(), jl.Perturbation"
     assert not loaded_by(code) & {"pybullet", "matplotlib"}
 
 
@@ -40,10 +40,6 @@ def test_a_room_is_light_and_has_what_it_lists(room):
     assert module.__all__ and all(hasattr(module, name) for name in module.__all__)
 
 
-def test_scenes_and_perturbations_need_no_engine():
-    assert "pybullet" not in loaded_by("import jumplab as jl; jl.Scene.flat(); jl.Perturbation")
-
-
 @pytest.mark.parametrize("name", jl.__all__)
 def test_every_name_is_there_and_documented(name):
     value = getattr(jl, name)
@@ -51,11 +47,8 @@ def test_every_name_is_there_and_documented(name):
     assert name in dir(jl)
 
 
-def test_the_names_are_few():
+def test_the_names_are_few_and_an_unknown_one_is_refused_with_those_that_exist():
     assert len(jl.__all__) <= 22  # a contact schedule is written with three of them
-
-
-def test_an_unknown_name_is_refused_with_those_that_exist():
     with pytest.raises(AttributeError, match=r"module 'jumplab' has no attribute 'paln'; it has JumpTask, Contacts, "):
         _ = jl.paln
 

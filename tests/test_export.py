@@ -18,15 +18,10 @@ from jumplab.errors import InputError, RobotError
 from jumplab.io import export
 from jumplab.io import folder as store
 from jumplab.io.motion import Motion
-from jumplab.io.whole import ORDERS, Whole
+from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
-from jumplab.robot.description import SHIPPED
+from jumplab.robot.files import SHIPPED
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
-
-
-@pytest.fixture(scope="module")
-def motion():
-    return Motion.of(jump(1.0, 0.5).tape)
 
 
 @pytest.fixture(scope="module")
@@ -39,49 +34,6 @@ def flip():
         q[k, :7] = pin.SE3ToXYZQUAT(tilt * pin.XYZQUATToSE3(row[:7]))
     assert model.nq == q.shape[1]
     return Motion(tape.t, q, tape.v, tape.tau, tape.phase, "plan")  # base twists are in the base frame: unchanged
-
-
-# joint table ----------------------------------------------------------------------------------------------------
-def test_joint_table(motion, bhr, odd_folder):
-    tape = jump(1.0, 0.5).tape
-    path = export.write("csv", motion, bhr, odd_folder / "joints.csv")
-    head = path.read_text().splitlines()[0].split(",")
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    assert list(table.dtype.names) == head and len(head) == 4 + 3 * len(bhr.joint_names)
-    assert np.diff(table["time_s"])[:-1] == pytest.approx(0.001, abs=1e-9)
-    assert table["time_s"][0] == 0 and table["time_s"][-1] == pytest.approx(tape.t[-1], abs=1e-6)  # touchdown is in
-    rows = np.concatenate([np.arange(tape.takeoff_index - 1), np.arange(tape.takeoff_index, len(tape.t))])
-    # take-off once; a tape leaves out a sample that would lie just before its end, and the table has it
-    at = np.flatnonzero(np.isin(np.round(table["time_s"], 6), np.round(tape.t[rows], 6)))
-    assert len(at) == len(rows) >= len(table) - 1
-    model = bhr.model
-    for name in bhr.joint_names:
-        i, j = model.idx_qs[model.getJointId(name)], model.idx_vs[model.getJointId(name)]
-        assert table[f"{name}_position_rad"][at] == pytest.approx(tape.q[rows, i], abs=1e-7)
-        assert table[f"{name}_velocity_rad_s"][at] == pytest.approx(tape.v[rows, j], abs=1e-6)
-        assert table[f"{name}_torque_N_m"][at] == pytest.approx(tape.tau[rows, j - 6], abs=1e-5)
-    code = table["phase_0_launch_1_flight_2_landing"]
-    assert table["time_s"][code == 1][0] == pytest.approx(np.ceil(tape.takeoff_time * 1000) / 1000, abs=1e-9)
-
-
-# plain arrays ---------------------------------------------------------------------------------------------------
-def test_plain_arrays(flip, bhr, tmp_path):
-    with np.load(export.write("npz", flip, bhr, tmp_path / "motion.npz"), allow_pickle=False) as file:
-        x = {k: file[k] for k in file.files}
-    model, data = bhr.model, bhr.model.createData()
-    assert set(x["joint_names"]) == set(bhr.joint_names) and np.diff(x["time_s"])[:-1] == pytest.approx(0.001)
-    at = [bhr.joint_names.index(name) for name in x["joint_names"]]
-    for k in range(0, len(x["time_s"]), 97):
-        row = np.searchsorted(flip.t, x["time_s"][k] + 1e-9) - 1
-        pin.forwardKinematics(model, data, flip.q[row], flip.v[row])
-        twist = pin.getVelocity(model, data, 1, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-        assert x["base_position_m"][k] == pytest.approx(data.oMi[1].translation, abs=1e-6)
-        turn = pin.Quaternion(x["base_quaternion_xyzw"][k]).toRotationMatrix()
-        assert turn == pytest.approx(data.oMi[1].rotation, abs=1e-6)
-        assert x["base_velocity_world_m_s"][k] == pytest.approx(twist.linear, abs=1e-5)
-        assert x["base_angular_velocity_world_rad_s"][k] == pytest.approx(twist.angular, abs=1e-5)
-        assert x["joint_position_rad"][k] == pytest.approx(flip.q[row, 7:][at], abs=1e-6)
-        assert x["joint_torque_N_m"][k] == pytest.approx(flip.tau[row][at], abs=1e-4)
 
 
 # every frame of every format in MuJoCo --------------------------------------------------------------------------
@@ -249,7 +201,7 @@ def test_orders_of_a_g1():
             ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch",
              "wrist_yaw")]  # fmt: skip
     assert list(whole.joints) == [*legs, "waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint", *arms]
-    assert [name.removesuffix("_joint") for name in whole.ordered(ORDERS[1])[0]][:9] == [
+    assert [name.removesuffix("_joint") for name in ordered(whole.urdf, ORDERS[1])[0]][:9] == [
         "left_hip_pitch", "right_hip_pitch", "waist_yaw", "left_hip_roll", "right_hip_roll", "waist_roll",
         "left_hip_yaw", "right_hip_yaw", "waist_pitch"]  # fmt: skip
     assert whole.links[0] == "pelvis" and len(whole.links) == 30
@@ -263,9 +215,9 @@ def test_both_robots_are_one(variant, tmp_path):
     whole, motion = Whole(robot), tumbling(robot, 0.02)
     x, here, there = whole.frames(motion, 1000.0), robot.model, whole.model
     a, b = here.createData(), there.createData()
-    for k, row in enumerate(range(len(motion.t))):
-        pin.ccrba(here, a, motion.q[row], motion.v[row])
-        pin.ccrba(there, b, x.q[k], x.v[k])
+    for *jumping, q, v in zip(motion.q, motion.v, *whole.states(x), strict=True):
+        pin.ccrba(here, a, *jumping)
+        pin.ccrba(there, b, q, v)
         assert b.com[0] == pytest.approx(a.com[0], abs=1e-9)
         assert b.hg.vector == pytest.approx(a.hg.vector, abs=1e-8)
     assert set(robot.joint_names) <= set(whole.joints)
@@ -283,7 +235,7 @@ def test_held_joints_carry_what_hangs_on_them(tmp_path):
     assert held
     for i in held:
         joint = whole.model.getJointId(whole.joints[i])
-        inertia, rate = whole.model.inertias[joint], np.abs(x.torques[:, i])
+        inertia, rate = whole.model.inertias[joint], np.abs(x.tau[:, i])
         assert rate == pytest.approx(inertia.mass * robot.gravity * abs(inertia.lever[2]), rel=1e-6)
 
 

@@ -14,9 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError
-from jumplab.io import export, whole
+from jumplab.io import export
 from jumplab.io.motion import Motion, read_simulation, steady
-from jumplab.io.whole import ORDERS, Whole
+from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 
@@ -57,7 +57,7 @@ def frames(rate: float, motion: Motion | None = None):
 
 # tables and arrays ----------------------------------------------------------------------------------------------
 def test_every_number_of_the_joint_table():
-    motion, lines = short(), export.joint_table(WHOLE, frames(1000.0)).splitlines()
+    motion, lines = short(), export.joint_table(WHOLE, frames(1000.0), 1000.0).splitlines()
     kinds = {"position_rad": motion.q[:, 7:], "velocity_rad_s": motion.v[:, 6:], "torque_N_m": motion.tau}
     head = [f"{name}_{kind}" for kind in kinds for name in WHOLE.joints]
     assert lines[0].split(",") == [
@@ -77,7 +77,7 @@ def test_every_number_of_the_joint_table():
 def test_every_plain_array():
     motion = short()
     for rate, rows in ((1000.0, [*ROWS, LAST]), (500.0, [*ROWS[::2], LAST])):
-        x = export.plain_arrays(WHOLE, frames(rate))
+        x = export.plain_arrays(WHOLE, frames(rate), rate)
         turn = Rotation.from_quat(motion.q[rows, 3:7])
         expected = {
             "time_s": np.append(np.arange(len(rows) - 1) / rate, 0.0205), "phase": motion.phase[rows],
@@ -119,14 +119,16 @@ def test_names_and_kinds_of_what_trackers_read():
 
 def test_the_world_is_the_first_body():
     x = frames(500.0)
-    clip, bare = export.with_world(export.tracked(WHOLE, x, 500.0), x), export.tracked(WHOLE, x, 500.0)
+    clip, bare = export.with_world(WHOLE, x, 500.0), export.tracked(WHOLE, x, 500.0, at_com=True)
     assert list(clip) == KEYS and list(clip["body_names"]) == ["world", *WHOLE.links]
     assert not clip["body_pos_w"][:, 0].any() and not clip["body_lin_vel_w"][:, 0].any()
     assert (clip["body_quat_w"][:, 0] == [1, 0, 0, 0]).all() and not clip["body_ang_vel_w"][:, 0].any()
     for name in KEYS[4:8]:
         np.testing.assert_array_equal(clip[name][:, 1:], bare[name])
-    np.testing.assert_allclose(clip["joint_pos"], np.hstack([x.place, x.turn[:, [3, 0, 1, 2]], x.angles]), atol=1e-6)
-    np.testing.assert_allclose(clip["joint_vel"], np.hstack([x.velocity, x.spin, x.rates]), atol=1e-5)
+    np.testing.assert_allclose(clip["joint_pos"], np.hstack([x.q[:, :3], x.q[:, [6, 3, 4, 5]], x.q[:, 7:]]), atol=1e-6)
+    np.testing.assert_allclose(
+        clip["joint_vel"], np.hstack([Rotation.from_quat(x.q[:, 3:7]).apply(x.v[:, :3]), x.v[:, 3:]]), atol=1e-5
+    )
     assert clip["joint_pos"].dtype == clip["body_pos_w"].dtype == np.float32
 
 
@@ -135,11 +137,11 @@ def test_what_retargeters_keep():
     names = ["fps", "root_pos", "root_rot", "dof_pos", "local_body_pos", "link_body_list"]
     assert list(clip) == [*names, "dof_torque", "contact", "phase", "joint_names"] and clip["fps"] == 30.0
     assert clip["link_body_list"] == list(WHOLE.links) and clip["joint_names"] == list(WHOLE.joints)
-    for name, values in dict(root_pos=x.place, root_rot=x.turn, dof_pos=x.angles, dof_torque=x.torques).items():
+    for name, values in dict(root_pos=x.q[:, :3], root_rot=x.q[:, 3:7], dof_pos=x.q[:, 7:], dof_torque=x.tau).items():
         np.testing.assert_array_equal(clip[name], values)
     data = MODEL.createData()
     still = pin.neutral(MODEL)
-    for k, angles in enumerate(x.angles):
+    for k, angles in enumerate(x.q[:, 7:]):
         still[7:][AT] = angles
         pin.framesForwardKinematics(MODEL, data, still)
         for i, link in enumerate(WHOLE.links):
@@ -158,8 +160,7 @@ TREE = """<robot name="x">
 
 
 def test_links_in_both_orders():
-    tree = SimpleNamespace(_below=whole._children(TREE))
-    deep, broad = (Whole.ordered(tree, order) for order in ORDERS)
+    deep, broad = (ordered(TREE, order) for order in ORDERS)
     assert deep == (("jb", "jb1", "je", "ja1"), ("root", "b", "b1", "end", "a1"))  # a is fixed to the root
     assert broad == (("jb", "jb1", "ja1", "je"), ("root", "b", "b1", "a1", "end"))
     one, other = (export.tracked(WHOLE, frames(50.0), 50.0, order=order) for order in ORDERS)
@@ -187,13 +188,13 @@ def test_files_and_their_names(tmp_path):
             f"--out must name a file that ends in {ending}, got {str(tmp_path / 'x.txt')!r}"
         )
     path = export.write("csv", short(), ROBOT, str(tmp_path / "LOUD.CSV"))
-    assert path == tmp_path / "LOUD.CSV" and path.read_text() == export.joint_table(WHOLE, frames(1000.0))
+    assert path == tmp_path / "LOUD.CSV" and path.read_text() == export.joint_table(WHOLE, frames(1000.0), 1000.0)
     for name, arrays, fps in (
-        ("npz", export.plain_arrays(WHOLE, frames(1000.0)), None),
+        ("npz", export.plain_arrays(WHOLE, frames(1000.0), 1000.0), None),
         ("mjlab-npz", export.tracked(WHOLE, frames(50.0), 50.0), None),
         ("mjlab-npz", export.tracked(WHOLE, frames(250.0), 250.0), 250),
         ("beyondmimic-npz", export.tracked(WHOLE, frames(50.0), 50.0, order=ORDERS[1], at_com=True), None),
-        ("holosoma-npz", export.with_world(export.tracked(WHOLE, frames(50), 50, at_com=True), frames(50)), None),
+        ("holosoma-npz", export.with_world(WHOLE, frames(50), 50), None),
     ):
         path = export.write(name, short(), ROBOT, tmp_path / "x.npz", fps=fps)
         raw = sum(x.nbytes for x in arrays.values())
@@ -203,7 +204,7 @@ def test_files_and_their_names(tmp_path):
                 np.testing.assert_array_equal(file[key], x)
         assert path.stat().st_size < raw + 300 * len(arrays)  # compressed
     path, x = export.write("unitree-csv", short(), ROBOT, tmp_path / "x.csv"), frames(30.0)
-    states = np.hstack([x.place, x.turn, x.angles])
+    states = np.hstack([x.q[:, :3], x.q[:, 3:7], x.q[:, 7:]])
     expected = "".join(",".join(f"{v:.9g}" for v in state) + "\n" for state in states)
     assert path.read_text() == expected  # no line of names
     raw = export.write("gmr-pkl", short(), ROBOT, tmp_path / "x.pkl").read_bytes()
@@ -225,7 +226,7 @@ def test_the_folder_of_a_replay(tmp_path):
     readme, script = (folder / "README.md").read_text(), (folder / "replay.py").read_text()
     assert re.search(r"```python\n(.*?)\n```", readme, re.S)[1] == script.strip()
     assert "@@" not in readme and "simulation" in readme and ROBOT.name in readme
-    arrays = export.plain_arrays(WHOLE, frames(100.0))
+    arrays = export.plain_arrays(WHOLE, frames(100.0), 100.0)
     with np.load(folder / "trajectory.npz") as file:
         assert file.files == ["hz", *arrays] and file["hz"] == 100.0
         for key, x in arrays.items():
@@ -285,7 +286,7 @@ def test_grids():
     assert len(motion.every(2000.0, end=True).t) == 42  # once
     rounded = replace(motion, t=np.append(motion.t[:-1], 0.5205 - 1e-10))
     assert rounded.every(2000.0).t[-1] == rounded.t[-1]
-    for rate in (0.0, -1.0, 10_000.1):
+    for rate in (0.0, -1.0, 10_000.1, np.nan, np.inf):
         assert refused(lambda rate=rate: motion.every(rate)) == (
             f"rate = {rate:g} per second must lie above 0 and not above 10000"
         )
@@ -342,5 +343,7 @@ def test_where_a_motion_comes_from(tmp_path):
     )
     np.savez(path, **(good | {"t": good["t"].astype(object)}))
     assert "not a readable simulation (ValueError)" in refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT))
+    path.write_bytes(path.read_bytes()[:200])
+    assert "not a readable simulation" in refused(lambda: Motion.of_simulation_file(tmp_path, ROBOT))
     with pytest.raises(AttributeError):
         back.source = "plan"

@@ -19,7 +19,7 @@ from jumplab.cli import main as cli
 from jumplab.cli.interrupts import Stopped
 from jumplab.io import files
 
-SHOTS = int(os.environ.get("JUMPLAB_SHOTS", "8"))
+SHOTS = int(os.environ.get("JUMPLAB_SHOTS", "5"))
 LONGEST_S = 2.0
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 LOGS = {"cases.jsonl", "trials.jsonl"}  # finished pieces of work are kept
@@ -80,7 +80,7 @@ LOST = """
 import sys, time
 from jumplab.cli import main as cli
 from jumplab.cli import jumps
-def swallow(*given):
+def swallow(*given, **how):
     print("working", flush=True)
     end = time.monotonic() + 20
     while time.monotonic() < end:
@@ -89,9 +89,9 @@ def swallow(*given):
         except BaseException as e:  # as CasADi does with what is raised in its callbacks
             del e
             {then}
-jumps.advice._name, jumps.store._name = "lost", "lost"
+jumps.api._name, jumps.store._name = "lost", "lost"
 import types
-sys.modules["lost"] = types.SimpleNamespace(plan_or_advise=swallow, ensure_writable=lambda x: x)
+sys.modules["lost"] = types.SimpleNamespace(plan=swallow, ensure_writable=lambda x: x)
 sys.exit(cli.main())
 """
 

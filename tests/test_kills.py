@@ -22,7 +22,7 @@ from jumplab import auditing as passport
 from jumplab.io import folder as store
 
 ROOT = Path(__file__).resolve().parent.parent
-KILLS = int(os.environ.get("JUMPLAB_KILLS", "4"))
+KILLS = int(os.environ.get("JUMPLAB_KILLS", "3"))
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
 PLAN = {"passport.json", "plan.npz", "robot.toml", "robot.urdf", "summary.json"}
 SIMULATION = {"simulation.npz", "simulation.json"}
@@ -106,39 +106,29 @@ def quiet(said, code, kind):
     assert code in {0, *answered}
 
 
+# what is shot -> its arguments, and how long it writes [s]: the audit takes about a second
+SHOT = {"plan": (["--height-m", str(NEW), "--out"], 2.0), "simulate": (["--mode", "pd"], 0.5)}
+
+
 @pytest.mark.slow
-def test_plans_shot_at_random_moments(folder):
-    rng, seen = random.Random(5), []
+@pytest.mark.parametrize("name", SHOT)
+def test_shot_at_random_moments(folder, name):
+    """A plan leaves the old result or the new one without a simulation; a simulation leaves the plan as it was."""
+    rng, seen, (options, aimed_s) = random.Random(5), [], SHOT[name]
+    arguments = [name, *options, str(folder)]
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
     for k in range(KILLS):
-        arguments = ["plan", "--height-m", str(NEW), "--out", str(folder)]
         kind = SIGNALS[k % 3]
-        said, code = shoot(arguments, folder, rng, kind, aimed_s=(2.0, None)[k % 2])  # the audit takes about a second
+        said, code = shoot(arguments, folder, rng, kind, (aimed_s, None)[k % 2])
         quiet(said, code, kind)
         rise, simulated = check(folder)
         assert (rise, simulated) in ((OLD, True), (NEW, False))
+        if name == "simulate":
+            mode = store.read_json(folder / "simulation.json")["settings"]["mode"]
+            assert rise == OLD and mode in ("position", "pd")
+            assert all((folder / n).read_bytes() == before[n] for n in PLAN)
         seen.append(rise)
-        if rise == NEW:  # the next one finds the old result again
-            restore(folder, before)
-    print(f"{KILLS} plans shot: {seen.count(OLD)} left the old result, {seen.count(NEW)} the new one")
-    said = command(["plan", "--height-m", str(NEW), "--out", str(folder)], folder).communicate(timeout=120)[1]
-    assert said == "" and names(folder) == PLAN and check(folder) == (NEW, False)
-
-
-@pytest.mark.slow
-def test_simulations_shot_at_random_moments(folder):
-    rng, seen = random.Random(6), []
-    before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    for k in range(KILLS):
-        kind = SIGNALS[k % 3]
-        arguments = ["simulate", str(folder), "--mode", "pd"]
-        said, code = shoot(
-            arguments, folder, rng, kind, aimed_s=(0.5, None)[k % 2]
-        )  # two tenths of a second of writing
-        quiet(said, code, kind)
-        assert check(folder) == (OLD, True)
-        mode = store.read_json(folder / "simulation.json")["settings"]["mode"]
-        assert mode in ("position", "pd") and all((folder / n).read_bytes() == before[n] for n in PLAN)
-        seen.append(mode)
-        restore(folder, before)
-    print(f"{KILLS} simulations shot: {seen.count('position')} left the old result, {seen.count('pd')} the new one")
+        restore(folder, before)  # the next one finds the old result again
+    print(f"{KILLS} shot: {seen.count(OLD)} left the old plan, {seen.count(NEW)} the new one")
+    said = command(arguments, folder).communicate(timeout=120)[1]
+    assert said == "" and check(folder) == ((NEW, False) if name == "plan" else (OLD, True))

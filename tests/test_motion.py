@@ -1,12 +1,11 @@
-"""Motions between their samples, and simulations read back from files."""
+"""Motions between their samples."""
 
 import numpy as np
 import pinocchio as pin
-import pytest
 from fixtures_core import jump
+from pytest import approx
 from scipy.spatial.transform import Rotation
 
-from jumplab.errors import InputError
 from jumplab.io.motion import Motion
 
 
@@ -34,15 +33,6 @@ def test_constant_rates_are_met_exactly_between_samples():
     assert (np.sum(x.q[1:, 3:7] * x.q[:-1, 3:7], axis=1) > 0).all()
 
 
-def test_an_instant_that_stands_twice_gives_its_later_sample():
-    motion = spinning([0.0, 0.1, 0.1, 0.2, 0.2])
-    tau = np.array([[0.0], [1.0], [5.0], [6.0], [9.0]])
-    motion = Motion(motion.t, motion.q, motion.v, tau, np.array(["launch"] * 2 + ["flight"] * 2 + ["landing"]), "plan")
-    x = motion.at([0.05, 0.1, 0.15, 0.2])
-    assert x.tau[:, 0] == pytest.approx([0.5, 5.0, 5.5, 9.0])
-    assert list(x.phase) == ["launch", "flight", "flight", "landing"]
-
-
 def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
     tape = jump(1.0, 0.5).tape
     x = Motion.of(tape).every(1000.0)
@@ -50,7 +40,7 @@ def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
     keep &= np.abs(tape.t * 1000 - np.round(tape.t * 1000)) < 1e-6  # the end is no whole millisecond
     at = np.round(tape.t[keep] * 1000).astype(int)  # a tape leaves out a sample that would lie just before its end
     assert len(x.t) - 1 <= len(at) <= len(x.t) < len(tape.t)
-    assert np.diff(x.t) == pytest.approx(0.001, abs=1e-12)
+    assert np.diff(x.t) == approx(0.001, abs=1e-12)
     for name in ("q", "v", "tau"):
         assert np.abs(getattr(x, name)[at] - getattr(tape, name)[keep]).max() < 1e-6, name
     assert list(x.phase[at]) == list(tape.phase[keep])
@@ -73,44 +63,3 @@ def test_velocities_are_those_of_the_resampled_motion(bhr):
         worst.append(np.abs(np.array(rate) - (x.v[:-1] + x.v[1:]) / 2).max())
     # accelerations are linear between the plan's nodes, and a kink between two samples costs some of the second order
     assert worst[0] < 0.025 and worst[1] < worst[0] / 2.5
-
-
-@pytest.mark.parametrize("rate", [0.0, -50.0, np.nan, np.inf, 1e9])
-def test_impossible_rates(rate):
-    with pytest.raises(InputError, match=r"per second must lie above 0 and not above 10000$"):
-        spinning([0, 1]).every(rate)
-
-
-def test_times_outside():
-    with pytest.raises(InputError, match=r"^times -0.1 ... 0.5 s leave the motion, 0 ... 1 s$"):
-        spinning([0, 1]).at([-0.1, 0.5])
-
-
-def write(folder, **changes):
-    arrays = {"schema": np.array("jumplab-simulation-1"), "t": np.arange(3.0), "q": np.zeros((3, 21)),
-              "v": np.zeros((3, 20)), "tau": np.zeros((3, 14)), "phase": np.array(["launch"] * 3),
-              "foot_wrench": np.zeros((3, 2, 6))}  # fmt: skip
-    np.savez(folder / "simulation.npz", **(arrays | changes))
-
-
-def test_simulation_file(bhr, tmp_path):
-    with pytest.raises(InputError, match=r"holds no simulation; run 'jumplab simulate .*' first$"):
-        Motion.of_simulation_file(tmp_path, bhr)
-    names = np.array(bhr.joint_names)
-    write(tmp_path, joint_names=names)
-    assert Motion.of_simulation_file(tmp_path, bhr).source == "simulation"
-    other = r"not a simulation of this folder's robot; simulate the plan again$"
-    for change in ({"schema": np.array("x")}, {"q": np.zeros((3, 20))}, {"tau": np.zeros((2, 14))}):
-        write(tmp_path, joint_names=names, **change)
-        with pytest.raises(InputError, match=other):
-            Motion.of_simulation_file(tmp_path, bhr)
-    write(tmp_path, joint_names=names[::-1])
-    with pytest.raises(InputError, match=other):
-        Motion.of_simulation_file(tmp_path, bhr)
-    write(tmp_path)
-    with pytest.raises(InputError, match=r"not a readable simulation \(KeyError\)"):
-        Motion.of_simulation_file(tmp_path, bhr)
-    path = tmp_path / "simulation.npz"
-    path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match=r"not a readable simulation"):
-        Motion.of_simulation_file(tmp_path, bhr)

@@ -9,29 +9,31 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from fixtures_robots import config, root, text
+from fixtures_robots import config, refused, root, text
+from paper.planar import evaluator
 
 from jumplab.auditing.audit import audit
 from jumplab.auditing.report import METHOD
 from jumplab.errors import RobotError
 from jumplab.io import export
 from jumplab.io.motion import Motion
-from jumplab.models.planar import evaluator
 from jumplab.robot import Robot
-from jumplab.robot.description import SHIPPED, SLIDING_RATE
+from jumplab.robot.files import read_toml
+from jumplab.robot.motors import SLIDING_RATE
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.stance import stance_configuration
-from jumplab.robot_import.config import read_toml
 from jumplab.robot_import.jumper import make_jumper
 from jumplab.sim import INSTALLED, STEP_S, simulate_jump
 from jumplab.sim.checks import check
 from jumplab.sim.engine import engine_class
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits, Mesh, Weights
-from jumplab.stages.whole_body.coordinates import even, whole
-from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.contacts import jump_contacts
+from jumplab.stages.whole_body.coordinates import BASE, even, whole
+from jumplab.stages.whole_body.instant import Instant
+from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.terms import BASE, Body, WholeBodyTerms
 from jumplab.task import JumpTask
 
 NUMBERS = {"hip_pitch": (0.03, 1.5, 0.15), "knee": (0.04, 2.0, 0.2), "ankle_pitch": (0.02, 1.0, 0.1),
@@ -62,10 +64,6 @@ def plan(heavy):
     return Planner(heavy).plan(JumpTask(0.4, 0.2))
 
 
-def numbers(robot: Robot, key: str) -> np.ndarray:
-    return np.array([robot.actuators[name][key] for name in robot.joint_names])
-
-
 # told ---------------------------------------------------------------------------------------------------------------
 def imported(told: str) -> Robot:
     jumper = make_jumper(text(root()), read_toml(config("x") + told, "config"), "my.urdf")
@@ -88,8 +86,8 @@ def test_kept_by_what_makes_other_robots():
     robot = imported(KNEE + "velocity = 20.0\nno_load = 25.0\narmature = 0.05\nfriction = 2.0\n")
     others = robot.with_limits(effort=0.9, speed=0.8), robot.with_mass("trunk", factor=1.1), robot.with_legs(1.02)
     for other in (*others, robot.with_stance(knee_rad=0.6), pickle.loads(pickle.dumps(robot))):
-        assert np.array_equal(other.armature, robot.armature) and other.lossy
-        assert np.array_equal(other.model.armature[6:], robot.armature)
+        assert np.array_equal(other.limits.armature, robot.limits.armature) and other.limits.lossy
+        assert np.array_equal(other.model.armature[6:], robot.limits.armature)
     assert others[0].actuators["left_knee"]["no_load_speed"] == pytest.approx(20.0)  # with the speed limit
 
 
@@ -98,16 +96,9 @@ def test_a_corner_beyond_the_speed_limit_needs_a_no_load_speed():
     assert robot.actuators["left_knee"]["corner_speed"] == pytest.approx(12.0)
 
 
-@pytest.mark.parametrize("name", [name for name in SHIPPED if not name.startswith("g1")])
-def test_robots_without_such_numbers_are_as_ever(name):
-    try:
-        robot = Robot.load(name)
-    except RobotError as e:
-        assert "jumplab[robots]" in str(e) or "jumplab[descriptions]" in str(e)
-        return pytest.skip("the published robots are not installed")
-    assert not robot.armature.any() and not robot.lossy and not robot.model.armature.any()
-    assert np.array_equal(numbers(robot, "no_load_speed"), numbers(robot, "speed"))
-    assert not any(robot.motors.values()) and not robot.sagittal.heavy_motors
+def test_a_robot_without_such_numbers_is_as_ever(bhr):
+    assert not bhr.limits.armature.any() and not bhr.limits.lossy and not bhr.model.armature.any()
+    assert np.array_equal(bhr.limits.no_load_speed, bhr.limits.speed) and not any(bhr.motors.values())
 
 
 @pytest.mark.parametrize("told, sentence", [
@@ -123,9 +114,7 @@ def test_robots_without_such_numbers_are_as_ever(name):
      "corner = 25 rad/s must lie between 0 and the no-load speed, 25 rad/s"),
 ])  # fmt: skip
 def test_refused(told, sentence):
-    with pytest.raises(RobotError) as e:
-        imported(KNEE + told)
-    assert str(e.value) == f"my.urdf: joint 'left_knee': {sentence}; correct [limits.knee]"
+    assert refused(lambda: imported(KNEE + told)) == f"my.urdf: joint 'left_knee': {sentence}; correct [limits.knee]"
 
 
 @pytest.mark.parametrize("told, sentence", [
@@ -137,9 +126,7 @@ def test_refused(told, sentence):
      "corner_speed_ratios: left_knee = 1.2 must be of a joint, and between 0 and 1.2"),
 ])  # fmt: skip
 def test_refused_of_a_robot(bhr, told, sentence):
-    with pytest.raises(RobotError) as e:
-        with_motors(bhr, (), **told)
-    assert str(e.value) == f"robot bhr: {sentence}"
+    assert refused(lambda: with_motors(bhr, (), **told)) == f"robot bhr: {sentence}"
 
 
 def test_a_source_is_a_text():
@@ -163,18 +150,18 @@ def test_five_links_turn_the_motors_too(bhr, heavy):
 
 def test_the_tree_turns_the_motors_too(heavy):
     """Torques in flight are Pinocchio's without motors, plus what armature and damping take."""
-    b = WholeBodyTerms(Body(heavy), Limits(), Weights(), {})
+    b = Mode(Body(heavy), Limits(), Weights(), "-")
     n, rng = len(b.coordinates), np.random.default_rng(2)
     q, v, a = (ca.SX.sym(key, n) for key in "qva")
     point = SimpleNamespace(q=q, v=v, a=a, p=SimpleNamespace(gravity=9.8), memo={})
-    needed = ca.Function("needed", [q, v, a], [b.needed(point)[2]])
+    needed = ca.Function("needed", [q, v, a], [Instant(b, point).needed[2]])
     chart, rates, accels = 0.3 * rng.normal(size=(3, n))
     told = needed(chart, rates, accels).full().ravel()
     model = pin.buildModelFromXML(heavy.urdf, pin.JointModelFreeFlyer())  # knows nothing of motors
     model.gravity.linear = np.array([0.0, 0.0, -9.8])
     own = [x[0] for x in b.model.to_pinocchio(chart[None], rates[None], accels[None])]
     rigid = pin.rnea(model, model.createData(), *own)[6:]
-    armature, damping = (numbers(heavy, key) for key in ("armature", "damping"))
+    armature, damping = (getattr(heavy.limits, key) for key in ("armature", "damping"))
     motors = armature * accels[BASE:] + damping * rates[BASE:]
     np.testing.assert_allclose(told, rigid + motors, atol=1e-9)
 
@@ -190,7 +177,7 @@ def test_dry_friction_lowers_the_limits_of_torques(bhr, heavy, coordinates):
         problem = Schedule(body, contacts, limits, Weights(), free=free).problem()
         bounds.append([x for _, x in problem.bounds() if x.name == "forces and torques"])
         lines.append([t for _, t in problem.terms() if t.name == "torque-speed"])
-    friction, effort = (numbers(heavy, key)[free.joints] for key in ("friction", "effort"))
+    friction, effort = (getattr(heavy.limits, key)[free.joints] for key in ("friction", "effort"))
     assert len(friction) == (4 if free.plane else 14)
     for free, less in zip(*bounds, strict=True):
         for side in ("lower", "upper"):
@@ -202,17 +189,6 @@ def test_dry_friction_lowers_the_limits_of_torques(bhr, heavy, coordinates):
     for free, less in zip(*lines, strict=True):
         np.testing.assert_allclose(free.upper - less.upper, friction / effort)
         np.testing.assert_allclose(less.lower, -less.upper)
-
-
-@pytest.mark.slow
-def test_a_tape_in_space_holds_motor_torques_within_the_motors(heavy):
-    side = Planner(heavy).plan(JumpTask(0.1, 0.25, side_m=0.1))
-    tape, rate = side.tape, side.tape.v[:, 6:]
-    assert audit(tape, side.robot, side.task).passed
-    armature, friction, damping = (numbers(heavy, key) for key in KEYS)
-    motors = armature * tape.a[:, 6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
-    np.testing.assert_allclose(tape.tau, rigid_torques(heavy, tape) + motors, atol=1e-6)
-    assert np.abs(motors).max() > 3.0 and np.all(np.abs(tape.tau) < numbers(heavy, "effort"))
 
 
 def rigid_torques(robot: Robot, tape) -> np.ndarray:
@@ -231,13 +207,16 @@ def rigid_torques(robot: Robot, tape) -> np.ndarray:
     return np.array(out)
 
 
-def test_a_planned_tape_holds_motor_torques(heavy, plan):
-    tape = plan.tape
+@pytest.mark.parametrize("target", [
+    JumpTask(0.4, 0.2), pytest.param(JumpTask(0.1, 0.25, side_m=0.1), marks=pytest.mark.slow),
+], ids=["ahead", "in space"])  # fmt: skip
+def test_a_planned_tape_holds_motor_torques_within_the_motors(heavy, plan, target):
+    plan = plan if target == plan.task else Planner(heavy).plan(target)
+    tape, limits = plan.tape, heavy.limits
     assert audit(tape, plan.robot, plan.task).passed
-    rate, (armature, friction, damping) = tape.v[:, 6:], (numbers(heavy, key) for key in KEYS)
-    motors = armature * tape.a[:, 6:] + damping * rate + friction * np.tanh(rate / SLIDING_RATE)
-    assert np.abs(motors).max() > 3.0
+    motors = limits.armature * tape.a[:, 6:] + limits.lost(tape.v[:, 6:])
     np.testing.assert_allclose(tape.tau, rigid_torques(heavy, tape) + motors, atol=1e-6)
+    assert np.abs(motors).max() > 3.0 and np.all(np.abs(tape.tau) < limits.effort)
 
 
 @pytest.mark.parametrize("key", KEYS)
@@ -245,9 +224,9 @@ def test_the_audit_misses_what_a_tape_leaves_out(heavy, plan, key):
     """A tape whose torques lack armature, friction or damping is no jump of this robot."""
     tape, rate = plan.tape, plan.tape.v[:, 6:]
     own = {"armature": tape.a[:, 6:], "damping": rate, "friction": np.tanh(rate / SLIDING_RATE)}[key]
-    lacking = replace(tape, tau=tape.tau - numbers(heavy, key) * own)
+    lacking = replace(tape, tau=tape.tau - getattr(heavy.limits, key) * own)
     found = {c.name: c for c in audit(lacking, plan.robot, plan.task).checks}["joint torque consistency"]
-    worst = 100 * np.abs(numbers(heavy, key) * own / numbers(heavy, "effort")).max()
+    worst = 100 * np.abs(getattr(heavy.limits, key) * own / heavy.limits.effort).max()
     assert not found.passed and found.value == pytest.approx(worst, rel=1e-3)
 
 
@@ -264,13 +243,8 @@ def test_torque_at_speed_ends_at_the_no_load_speed(bhr):
     robot = with_motors(bhr, (), no_load_ratios={"left_knee": 1.5, "right_knee": 1.5})
     knee = robot.actuators["left_knee"]
     assert (knee["speed"], knee["corner_speed"], knee["no_load_speed"]) == (20.0, 10.0, 30.0)
-    from jumplab.sim.playback import Actuators
-
-    at, k = np.zeros(len(robot.joint_names)), robot.joint_names.index("left_knee")
-    for rate, share in ((10.0, 1.0), (20.0, 0.5), (30.0, 0.0), (-10.0, 1.0)):
-        at[k] = rate
-        low, high = (x[k] for x in Actuators(robot).range(at))
-        assert high == pytest.approx(share * knee["effort"]) and low == -knee["effort"]
+    low, high = robot.limits[[robot.joint_names.index("left_knee")] * 4].range(np.array([10.0, 20.0, 30.0, -10.0]))
+    np.testing.assert_allclose([low, high], knee["effort"] * np.array([[-1, -1, -1, -1], [1, 0.5, 0, 1]]))
     assert robot.sagittal.no_load_speed[1] == 30.0 and METHOD.torque_floor == 0.01
 
 
@@ -289,7 +263,7 @@ def test_a_pendulum_with_a_motor(bhr, engine, keys):
     tau = np.zeros(model.nv - 6)
     tau[k] = torque
     with engine_class(engine)(robot, q) as world:
-        assert world.inertia_error() < 1e-6 and world.damping == 0
+        assert world.read_back()["inertia_error"] < 1e-6 and world.kept().damping == 0
         for _ in range(steps):
             world.set_torque(tau)
             world.step()
@@ -320,8 +294,7 @@ def test_a_robot_in_the_air_moves_as_with_armature(bhr, engine):
     assert np.abs(pin.difference(model, q, there))[3:].max() < close[0] and np.abs(speed - v)[3:].max() < close[1]
 
 
-@pytest.mark.parametrize("engine", INSTALLED)
-@pytest.mark.parametrize("mode", ["position", "pd"])
+@pytest.mark.parametrize("engine, mode", [*zip(INSTALLED, ("position", "pd"), strict=False)])
 def test_a_jump_with_motors_lands(plan, engine, mode):
     run = simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
     assert run.landed, run.reason
@@ -345,4 +318,4 @@ def test_exported(heavy, plan, tmp_path):
     model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
     rows = [model.joint(name).dofadr[0] for name in heavy.joint_names]
     for key, own in zip(KEYS, (model.dof_armature, model.dof_frictionloss, model.dof_damping), strict=True):
-        assert np.allclose(own[rows], numbers(heavy, key)) and own[:6].max() == 0
+        assert np.allclose(own[rows], getattr(heavy.limits, key)) and own[:6].max() == 0

@@ -10,14 +10,14 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from paper import experiments as pictures
 from paper import worlds
+from paper.basin import BasinGrid, BasinReport
 from paper.measurement import measure
 
 from jumplab.show.style import GROUND, LANDING, MIN_FONT_PT, PAGE_IN, VERMILION, tint
 from jumplab.sim import ENGINES, Engine, Scene, SensorNoise, simulate_jump
-from jumplab.studies.basin import BasinGrid, BasinReport
 from jumplab.studies.trials import Trial, TrialKey, TrialSettings, wilson
 
-DITCH = Scene.ditch(0.3, 0.75)
+DITCH = Scene.level("ditch", {0.3: -1.0, 0.75: 0.0})
 SHORT_S = 0.3  # of standing: enough for a picture
 
 
@@ -62,7 +62,7 @@ def test_a_ditch_is_a_gap_between_two_grounds(result, bhr):
 
 
 def test_a_platform_has_its_height_and_edge(result, bhr):
-    fig = pictures.scene_strobe(result, bhr, Scene.platform(0.5, 0.4))
+    fig = pictures.scene_strobe(result, bhr, Scene.level("platform", {0.5: 0.4}))
     tops = {round(top, 6): start for start, _, top in grounds(fig)}
     assert tops[0.4] == pytest.approx(0.5) and 0.0 in tops
 

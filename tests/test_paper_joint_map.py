@@ -8,6 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from paper import drawings
 from paper.claims import Start
+from paper.tracking import compared
 
 from jumplab import show as plotting
 from jumplab.show.style import MIN_FONT_PT
@@ -22,13 +23,13 @@ PANELS = {"iterations": "iterations [1]", "cost": "cost [best]"}
 
 @pytest.fixture(scope="module")
 def mapped(bhr):
-    return map_to_joints(pendulum(1.0, 0.5), bhr, method="direct")
+    return map_to_joints(pendulum(1.0, 0.5), bhr)
 
 
 FIGURES = {
     "snapshots": lambda plan, robot: drawings.mapped_snapshots(plan, robot),
     "snapshots, platform": lambda plan, robot: drawings.mapped_snapshots(plan, robot, 0.2),
-    "tracking": lambda plan, robot: drawings.mapped_tracking(plan),
+    "tracking": lambda plan, robot: drawings.mapped_tracking(plan, pendulum(1.0, 0.5), robot),
     "starts": lambda plan, robot: drawings.guess_comparison(ROWS, PANELS),
 }
 
@@ -63,11 +64,12 @@ def test_snapshots_end_at_touchdown_at_their_true_heights(mapped, bhr):
     )
 
 
-def test_tracking_shows_reference_dashed_and_the_difference_below(mapped):
-    axes = np.reshape(drawings.mapped_tracking(mapped).axes, (2, 4))
+def test_tracking_shows_reference_dashed_and_the_difference_below(mapped, bhr):
+    axes = np.reshape(drawings.mapped_tracking(mapped, pendulum(1.0, 0.5), bhr).axes, (2, 4))
     assert all(any(line.is_dashed() for line in ax.lines) for ax in axes[0])
     difference = np.concatenate([line.get_ydata() for line in axes[1, 1].lines if len(line.get_ydata()) > 2])
-    np.testing.assert_allclose(difference, mapped.actual["L"] - mapped.reference["L"])
+    actual, asked = compared(mapped, pendulum(1.0, 0.5), bhr)
+    np.testing.assert_allclose(difference, actual["L"] - asked["L"])
 
 
 def test_starts_without_a_solution_leave_a_gap():

@@ -5,6 +5,12 @@ import pytest
 from jumplab.cli import notebooks
 from jumplab.errors import InputError
 
+DECLARED = """distance_m: float = 1.0  # travel of the feet [m]
+height_m: float = 0.5
+robot: str = "bhr"
+out: str = "x"
+n: int = 1  # 1 ... 9, how many"""
+
 
 @pytest.mark.parametrize(
     ("injected", "sentence"),
@@ -14,29 +20,31 @@ from jumplab.errors import InputError
         ("distance_m = float('inf')", "parameter distance_m must be finite, got inf"),
         ("height_m = -1", "height = -1 m is outside 0.02 ... 1.5 m"),
         ("n = 1.5", "parameter n must be of type int, got 1.5"),
-        ("n = True", "parameter n must be of type int, got True"),
+        ("n = 10", "parameter n must be 1 ... 9, got 10"),
         ("out = ''", "parameter out must be a name or a path, got ''"),
-        ("robot = None", "parameter robot must be of type str, got None"),
     ],
 )
 def test_check_parameters_refuses(injected, sentence):
-    cell = f"# Parameters\n{injected}\n"
-    namespace = {"In": ["", "distance_m = 1.0\nn = 1", cell], "distance_m": 1.0, "n": 1}
-    exec(cell, namespace)
     with pytest.raises(InputError) as e:
-        notebooks.check_parameters(namespace, n=int)
+        notebooks.check_parameters(opened(injected))
     assert str(e.value).startswith(sentence)
+
+
+def opened(injected, declared=DECLARED):
+    """What a notebook's cells know after its parameters and papermill's own cell."""
+    namespace = {"In": ["", declared, f"# Parameters\n{injected}\n"]}
+    exec("\n".join(namespace["In"]), namespace)
+    return namespace
 
 
 def test_an_engine_is_looked_for_before_anything_runs(tmp_path):
     from jumplab.sim import INSTALLED
 
-    namespace = {"engine": "ode", "In": ["# Parameters\nengine = 'ode'"]}
     words = f"^engine 'ode': must be one of {', '.join(INSTALLED)}$"
     with pytest.raises(InputError, match=words):
-        notebooks.check_parameters(namespace, engine=str)
+        notebooks.check_parameters(opened("engine = 'ode'", f"{DECLARED}\nengine: str = 'bullet'"))
     with pytest.raises(InputError, match=r"^unknown notebook parameter 'engine'"):  # a notebook that simulates nothing
-        notebooks.check_parameters(namespace)
+        notebooks.check_parameters(opened("engine = 'ode'"))
     with pytest.raises(InputError, match=words):
         notebooks.run_notebooks({"engine": "ode"}, notebooks=notebooks.find_notebooks(["00"]), out=tmp_path / "out")
     assert not list(tmp_path.iterdir())
@@ -44,4 +52,8 @@ def test_an_engine_is_looked_for_before_anything_runs(tmp_path):
 
 def test_check_parameters_accepts_what_is_meant():
     notebooks.check_parameters({"distance_m": 1, "height_m": 0.3, "robot": "bhr", "later": 3, "In": ["later = 3"]})
-    notebooks.check_parameters({"fast": True, "In": ["# Parameters\nfast = True"]}, fast=bool)
+    namespace = {"In": ["", DECLARED.replace("n: int = 1", "n: int = 0")]}  # edited by hand, without papermill
+    exec(namespace["In"][1], namespace)
+    with pytest.raises(InputError, match=r"^parameter n must be 1 \.\.\. 9, got 0$"):
+        notebooks.check_parameters(namespace)
+    notebooks.check_parameters(opened("fast = True\nrobot = 'a = b'\nn = 3", f"{DECLARED}\nfast: bool = False"))

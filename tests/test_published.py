@@ -12,10 +12,10 @@ from fixtures_robots import reduction_error
 
 from jumplab.auditing.audit import audit
 from jumplab.cli.main import main
-from jumplab.errors import InfeasibleError, RobotError
+from jumplab.errors import RobotError, SolverError
 from jumplab.robot import Robot
-from jumplab.robot.checkup import check
-from jumplab.robot.description import SHIPPED
+from jumplab.robot.files import SHIPPED, read_toml
+from jumplab.robot_import.checkup import check
 from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
@@ -40,17 +40,24 @@ def test_without_the_package_the_way_to_it_is_told():
         Robot.load("g1")
 
 
+KG = {"g1": 33.341, "talos": 93.336, "romeo": 40.529, "alexander": 49.081}
+
+
+def is_as_configured(name: str, robot: Robot, repair: tuple[str, ...]) -> None:
+    """Five links are the full robot, and what is found in the URDF is what the configuration says."""
+    config = read_toml(SHIPPED[name].read_text(), name)
+    found = draft(locate(config["urdf"], SHIPPED[name].parent), repair).roles
+    assert found.joints == robot.joints
+    assert (found.trunk, found.forward, found.up) == tuple(config["source"][k] for k in ("trunk", "forward", "up"))
+    assert not robot.planar or reduction_error(robot).max() < 1e-9
+
+
 @here
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_sagittal_model_is_the_full_robot(name):
-    e = reduction_error(Robot.load(name))
-    assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
-
-
-@here
-@pytest.mark.parametrize("name, kg", [("g1", 33.341), ("talos", 93.336), ("romeo", 40.529), ("alexander", 49.081)])
-def test_nothing_of_the_mass_is_lost(name, kg):
-    assert Robot.load(name).total_mass == pytest.approx(kg, abs=1e-3)
+def test_a_published_robot_is_what_its_configuration_says(name):
+    robot = Robot.load(name)
+    assert robot.planar and robot.total_mass == pytest.approx(KG[name], abs=1e-3)
+    is_as_configured(name, robot, ("inertia",))
 
 
 @here
@@ -70,18 +77,6 @@ def test_motors_of_the_g1_are_the_makers():
 
 
 @here
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_what_is_found_is_what_the_configuration_says(name):
-    robot = Robot.load(name)
-    from jumplab.robot_import.config import read_toml
-
-    config = read_toml(SHIPPED[name].read_text(), name)
-    found = draft(locate(config["urdf"], SHIPPED[name].parent), ("inertia",)).roles
-    assert found.joints == robot.joints
-    assert (found.trunk, found.forward, found.up) == tuple(config["source"][k] for k in ("trunk", "forward", "up"))
-
-
-@here
 @pytest.mark.slow
 @pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05)), ("alexander", (0.2, 0.05))])
 def test_planned_clean_and_landed(name, target):
@@ -89,20 +84,19 @@ def test_planned_clean_and_landed(name, target):
     plan = Planner(robot).plan(JumpTask(*target))
     report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
-    result = simulate_jump(plan.tape, plan.robot, scene=Scene.of_plan(plan.summary, plan.robot)).to_json()
-    assert result["landed"], result["reason"]
-    assert result["foot_distance_m"] == pytest.approx(target[0], abs=0.01)
-    assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
+    # drives that do not know the base let a G1 that stands on its toes fall back by 1.2 cm of travel
+    for mode, place_m in (("whole-body", 0.01), ("position", 0.02)):
+        scene = Scene.of_plan(plan.summary, plan.robot)
+        result = simulate_jump(plan.tape, plan.robot, scene=scene, mode=mode).to_json()
+        assert result["landed"], result["reason"]
+        assert result["foot_distance_m"] == pytest.approx(target[0], abs=place_m)
+        assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
 
 
 @here
-@pytest.mark.parametrize("name, words", [
-    ("romeo", r"a straight push does not lift romeo off the ground, .* \(limited by the speed of hip 2\.09 rad/s\)"),
-    ("talos", r"\(limited by the speed of knee 7 rad/s\), by a straight push enough for 0\.\d\d m"),
-    ("g1", r"by a straight push enough for 0\.\d\d m"),
-])  # fmt: skip
-def test_too_much_is_refused_with_the_joint_and_the_largest_jump(name, words):
-    with pytest.raises(InfeasibleError, match=words):
+@pytest.mark.parametrize("name", ["romeo", "talos", "g1"])
+def test_too_much_is_refused_in_words(name):
+    with pytest.raises(SolverError, match="take-off speed"):
         Planner(Robot.load(name)).plan(JumpTask(0.3, 1.2))
 
 
@@ -153,15 +147,7 @@ def downloaded(request) -> tuple[str, Robot]:
 
 @pytest.mark.slow
 def test_a_downloaded_robot_is_what_its_configuration_says(downloaded):
-    name, robot = downloaded
-    from jumplab.robot_import.config import read_toml
-
-    config = read_toml(SHIPPED[name].read_text(), name)
-    found = draft(locate(config["urdf"], SHIPPED[name].parent), ()).roles
-    assert found.joints == robot.joints and found.trunk == config["source"]["trunk"]
-    if robot.planar:
-        e = reduction_error(robot)
-        assert max(e.mass_kg, e.com_m, e.inertia_kgm2, e.momentum_kgm2_s) < 1e-9
+    is_as_configured(*downloaded, ())
 
 
 @pytest.mark.slow

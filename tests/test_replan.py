@@ -11,8 +11,9 @@ from test_transcription import toy
 
 from jumplab.auditing.audit import audit
 from jumplab.errors import InputError
-from jumplab.ocp.assembly import Assembled, pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
+from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import GOOD_STATUSES, WARM, Nlp, PhaseGuess
+from jumplab.ocp.posing import pack, pack_multipliers, row_bounds, unpack, unpack_multipliers
 from jumplab.ocp.problem import Term
 from jumplab.stages import planner as pipeline
 from jumplab.task import JumpTask
@@ -33,22 +34,17 @@ def test_packing_and_unpacking_are_inverse(assembled):
             np.testing.assert_allclose(packed[index], x[index], rtol=1e-14)
 
 
-def test_every_row_is_in_one_group(assembled):
-    found = np.concatenate([index.ravel() for _, _, index in assembled.groups])
+def test_every_row_has_one_place(assembled):
+    found = np.concatenate([rows.index.ravel() for rows in assembled.rows])
     np.testing.assert_array_equal(np.sort(found), np.arange(assembled.n_rows))
-    for owner, term, index in assembled.groups:
-        for (_, c), i in np.ndenumerate(index):
-            row = assembled.rows[i]
-            assert (row.owner, row.term.name, row.component) == (owner, term.name, c)
-        for places in index:
-            assert len({assembled.rows[i].node for i in places}) == 1
+    assert all(len(rows.nodes) == len(rows.index) for rows in assembled.rows)
 
 
 def test_rows_that_are_off_have_no_bounds(assembled):
     low, high = row_bounds(assembled, {}, ("one/mid row", "meet"))
-    for i, row in enumerate(assembled.rows):
-        expected = (-np.inf, np.inf) if row.term.name in ("mid row", "meet") else (0.0, 0.0)
-        assert (low[i], high[i]) == expected
+    for rows in assembled.rows:
+        least, most = (-np.inf, np.inf) if rows.term.name in ("mid row", "meet") else (0.0, 0.0)
+        assert np.all(low[rows.index] == least) and np.all(high[rows.index] == most)
 
 
 def test_multipliers_survive_on_their_own_mesh(assembled):
@@ -75,7 +71,7 @@ def test_multipliers_of_two_meshes_say_the_same():
         found[n] = nlp.solve({"goal": 1.0}, guess), nlp
     share, values = found[60][0].multipliers.rows["go", "wall"]
     coarse = pack_multipliers(found[60][1].assembled, found[30][0].multipliers)[1]
-    index = next(index for _, term, index in found[60][1].assembled.groups if term.name == "wall")
+    index = next(rows.index for rows in found[60][1].assembled.rows if rows.term.name == "wall")
     total = {n: f[0].multipliers.rows["go", "wall"][1].sum() / n for n, f in found.items()}
     assert total[60] == pytest.approx(total[120], rel=0.01) and total[60] > 1.0
     assert (total[30] - total[60]) / (total[60] - total[120]) == pytest.approx(4.0, rel=0.05)
@@ -102,7 +98,7 @@ def test_a_neighbouring_target(bhr, method):
     assert audit(again.tape, bhr, again.task).passed
     cost = [p.whole_body.solution.statistics.objective for p in (again, fresh)]
     assert cost[0] <= 1.01 * cost[1]
-    assert again.whole_body.began("neighbour") and len(again.whole_body.attempts) == 1
+    assert again.whole_body.start == "neighbour" and len(again.whole_body.attempts) == 1
     assert again.whole_body.solution.statistics.status in GOOD_STATUSES
     spent = [sum(r.iterations for r in p.statistics if "joint" not in r.stage) for p in (again, fresh)]
     assert spent[0] < spent[1] / 2

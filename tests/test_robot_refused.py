@@ -1,10 +1,11 @@
 """Descriptions that are no robot, each with the sentence that says so."""
 
 import pytest
+from fixtures_robots import refused
 
 from jumplab.errors import RobotError
 from jumplab.robot import Robot
-from jumplab.robot.description import SHIPPED
+from jumplab.robot.files import SHIPPED
 from jumplab.robot.stance import stance_angles
 
 
@@ -33,9 +34,7 @@ def changed(robot, old, new=""):
     ("corner_speed_ratio = 0.5", "actuators.corner_speed_ratio"),
 ])  # fmt: skip
 def test_missing_entries(bhr, line, entry):
-    with pytest.raises(RobotError) as e:
-        changed(bhr, line)
-    assert str(e.value) == f"robot configuration: the entry {entry!r} is missing"
+    assert refused(lambda: changed(bhr, line)) == f"robot configuration: the entry {entry!r} is missing"
 
 
 WRONG = [
@@ -55,9 +54,7 @@ WRONG = [
 
 @pytest.mark.parametrize("old, new, sentence", WRONG)
 def test_wrong_entries(bhr, old, new, sentence):
-    with pytest.raises(RobotError) as e:
-        changed(bhr, old, new)
-    assert str(e.value) == sentence
+    assert refused(lambda: changed(bhr, old, new)) == sentence
 
 
 def test_files_that_cannot_be_read(bhr, tmp_path):
@@ -66,9 +63,8 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
     with pytest.raises(RobotError, match=r"robot\.toml: not a TOML file: "):
         Robot.load(str(config))
     config.write_text(bhr.config_text)
-    with pytest.raises(RobotError) as e:
-        Robot.load(str(config))
-    assert str(e.value) == f"{tmp_path / 'bhr.urdf'}: there is no such file; give the path of a URDF"
+    missing = tmp_path / "bhr.urdf"
+    assert refused(lambda: Robot.load(config)) == f"{missing}: there is no such file; give the path of a URDF"
     (tmp_path / "bhr.urdf").write_text("<robot")
     with pytest.raises(RobotError, match=r"^robot bhr: the URDF is no well-formed XML: "):
         Robot.load(str(config))
@@ -77,9 +73,7 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
 
 
 def test_a_posture_that_cannot_stand(bhr):
-    with pytest.raises(RobotError) as e:
-        stance_angles(changed(bhr, "[-0.10, 0.14]", "[2.0, 2.2]"))
-    assert str(e.value) == (
+    assert refused(lambda: stance_angles(changed(bhr, "[-0.10, 0.14]", "[2.0, 2.2]"))) == (
         "robot bhr: with the knee at 0.5 rad and the trunk at 0.05 rad no lean of the shank brings the CoM above the "
         "middle of the sole; change [stance] in its configuration"
     )

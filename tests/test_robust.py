@@ -17,8 +17,8 @@ from jumplab.sim import Perturbation, Ranges, Scene, simulate_jump
 from jumplab.stages.changes import settled
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits
-from jumplab.stages.whole_body.terms import Body
-from jumplab.stages.whole_body.view import BodyView
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.instant import Instant
 from jumplab.studies import robust
 from jumplab.studies.margins import ranges_at
 
@@ -42,7 +42,7 @@ def ends_of(plan, model):
     for k, (name, x) in enumerate(plan.whole_body.solution.phases.items()):
         nodes = {key: ca.SX(ca.DM(getattr(x, key)[-1])) for key in "qvaz"}
         more = {"c": SimpleNamespace(**x.constants), "p": SimpleNamespace(gravity=9.8)}
-        view = partial(BodyView, schedule.of(k))
+        view = partial(Instant, schedule.modes[k])
         end = Point(**nodes, **more, j=None, duration=ca.SX(x.duration), s=ca.SX(1), ref=None, view=view)
         found[name] = SimpleNamespace(end=end)
     return np.array(ca.evalf(robust.capture_point(model, Body(plan.robot), found))).ravel()
@@ -76,22 +76,17 @@ def test_samples_and_their_opposites_are_the_planned_robot_on_average(bhr):
     assert alone.mass == pytest.approx(bhr.total_mass)
 
 
-def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, plans):
-    spread = [[ends_of(plan, model)[0] for model in robust.sampled(bhr, Ranges())] for plan in plans]
-    plain, found = (np.sqrt(np.mean(np.square(x))) for x in spread)
-    assert found < 0.8 * plain
-    assert jl.audit(plans[1]).passed
+def test_a_robust_plan_brings_sampled_robots_to_rest_nearer_to_the_middle(bhr, plans, sideways):
+    """Ahead along x, to the side along both axes."""
+    for pair, axes in ((plans, [0]), (sideways, [0, 1])):
+        spread = [[ends_of(plan, model)[axes] for model in robust.sampled(bhr, Ranges())] for plan in pair]
+        plain, found = (np.sqrt(np.mean(np.square(x))) for x in spread)
+        assert found < 0.8 * plain
+        assert jl.audit(pair[1]).passed
     effort = [
         np.abs(plan.tape.tau).max(axis=0) / [bhr.actuators[n]["effort"] for n in bhr.joint_names] for plan in plans
     ]
     assert effort[1].max() <= 1.15 * effort[0].max()
-
-
-def test_a_robust_plan_to_the_side_does_so_along_both_axes(bhr, sideways):
-    spread = [[ends_of(plan, model) for model in robust.sampled(bhr, Ranges())] for plan in sideways]
-    plain, found = (np.sqrt(np.mean(np.square(x))) for x in spread)
-    assert found < 0.8 * plain
-    assert jl.audit(sideways[1]).passed
 
 
 @pytest.mark.slow
@@ -125,7 +120,8 @@ def test_a_flip_allows_for_other_robots_by_a_slow_opening(bhr):
     )
     own = robust.robust_changes(flip, bhr, Ranges(), {"limits": {"opening_speed_share": 0.5}})
     assert own["limits"]["opening_speed_share"] == 0.5
-    assert "opening_speed_share" not in robust.robust_changes(TASK, bhr, Ranges(), {})["limits"]
+    jump = robust.robust_changes(TASK, bhr, Ranges(), {})
+    assert jump["limits"]["opening_speed_share"] == Limits().opening_speed_share
 
 
 @pytest.mark.parametrize(
@@ -165,7 +161,7 @@ def test_what_is_no_change_is_refused(bhr, changes, words):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, share, index", [("payload_kg", 0.5, 4), ("mass", 1.0, 1), ("com_m", 0.75, 2)])
+@pytest.mark.parametrize("name, share, index", [("payload_kg", 0.5, 4), ("com_m", 0.75, 2)])
 def test_robots_that_fall_with_the_plain_plan_stand_with_the_robust_one(bhr, plans, name, share, index):
     from jumplab.studies.trials import TrialKey
 

@@ -183,7 +183,7 @@ def test_colours_reach_trunk_and_limbs_but_not_the_feet(studio, bhr):
 def test_marks_and_platform_are_drawn_in_their_places(bhr):
     q = stance_configuration(bhr)
     camera = render.Camera(x=0.8, width=1.0, top=0.8, bottom=-0.2, pixels_per_m=200)
-    picture = render.Renderer(bhr, scene=Scene.platform(0.75, 0.3), marks=(1.1,)).picture(q, camera)
+    picture = render.Renderer(bhr, scene=Scene.level("platform", {0.75: 0.3}), marks=(1.1,)).picture(q, camera)
     solid = body(picture)
     left, right = solid[:, 40], solid[:, 160]  # x = 0.5 and x = 1.1
     top = [0.8 - np.flatnonzero(column)[0] / 200 for column in (left, right)]

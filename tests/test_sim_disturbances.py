@@ -11,43 +11,29 @@ import pytest
 from fixtures_core import jump
 from test_sim_world import Hold, momentum
 
+from jumplab import sim
 from jumplab.cli.common import disturbances
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError
 from jumplab.robot.stance import stance_configuration
-from jumplab.sim import (
-    INSTALLED,
-    STEP_S,
-    Perturbation,
-    Ranges,
-    Scene,
-    SensorNoise,
-    Shove,
-    Sign,
-    engine_class,
-    ranges_of,
-    signs,
-    simulate_jump,
-)
-from jumplab.sim.kinematics import Gauge
+from jumplab.sim import INSTALLED, STEP_S, Perturbation, Ranges, Scene, SensorNoise, Shove, Sign, ranges_of, signs
+from jumplab.sim.checks import check
+from jumplab.sim.motors import Motors
 from jumplab.sim.perturbation import Push
-from jumplab.sim.playback import Motors
 from jumplab.sim.scene import REACH_M, Block
 
 OLD = ("seed", "mass", "inertia", "com", "friction", "delay_s", "known_delay_s", "motor_gain", "noise")
 FORCE_N = np.array([30.0, -20.0, 10.0])
 
 
+@pytest.fixture(params=INSTALLED)
+def engine(request):
+    return sim.engine_class(request.param)
+
+
 @cache
 def tape():
     return jump(0.6, 0.3, method="direct").tape
-
-
-@pytest.fixture(params=INSTALLED)
-def engine(request):
-    return engine_class(request.param)
-
-
-# ------------------------------------------------------------------------------------------ draws
 
 
 def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):
@@ -114,9 +100,6 @@ def test_disturbances_as_they_are_typed():
         assert str(e.value).startswith(words)
 
 
-# ------------------------------------------------------------------------------------------ robots
-
-
 def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
     place = np.array([0.05, -0.1, -0.2])
     real = Perturbation(payload_kg=4.0, payload_m=tuple(place.tolist())).robot(bhr)
@@ -126,7 +109,7 @@ def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
     cube = pin.Inertia(4.0, place, 4 * 0.1**2 / 6 * np.eye(3))
     assert other.toDynamicParameters() == pytest.approx((one + cube).toDynamicParameters())
     with engine(real, stance_configuration(bhr)) as world:
-        assert world.mass_kg == pytest.approx(bhr.total_mass + 4) and world.inertia_error() < 1e-9
+        assert world.kept().mass_kg == pytest.approx(bhr.total_mass + 4) and world.read_back()["inertia_error"] < 1e-9
 
 
 def test_weak_motors_and_an_empty_battery_shrink_the_limit_curve(bhr):
@@ -152,17 +135,9 @@ def test_a_wrong_posture_leaves_the_soles_where_they_stand(bhr):
     wrong = Perturbation.draw(bhr, 2, ranges_of({"posture_deg": (3.0,)})).start(bhr, q)
     off = np.degrees(wrong[7:] - q[7:])
     assert 1.0 < np.abs(off).max() < 6.0
-    for frame in Gauge(bhr).frames:
-        data = bhr.model.createData()
-        places = []
-        for x in (q, wrong):
-            pin.framesForwardKinematics(bhr.model, data, x)
-            places.append(data.oMf[frame].copy())
-        assert pin.log6(places[0].actInv(places[1])).vector == pytest.approx(np.zeros(6), abs=1e-9)
+    for was, there in zip(Gauge(bhr).places(q), Gauge(bhr).places(wrong), strict=True):
+        assert pin.log6(was.actInv(there)).vector == pytest.approx(np.zeros(6), abs=1e-9)
     assert Perturbation().start(bhr, q) is q
-
-
-# ------------------------------------------------------------------------------------------ forces and ground
 
 
 def test_a_push_gives_its_impulse_and_its_moment(engine, bhr):
@@ -208,12 +183,12 @@ def test_a_shove_is_timed_by_the_plan_and_known_to_the_checks(bhr):
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_a_disturbed_run_is_honest_and_a_hidden_shove_is_not(bhr, name):
+def test_a_disturbed_run_passes_and_a_hidden_shove_does_not(bhr, name):
     """Everything at once; the momentum in the log is that of gravity, ground and shove, for which the log says so."""
     told = dict(payload_kg=(3, 3), torque_loss=(0.1, 0.1), sag_per_kw=(0.02, 0.02), ground_m=0.02, ground_tilt_deg=2,
                 soft_m=(0.003, 0.003), shove_flight_n_s=(8, 8), posture_deg=1)  # fmt: skip
     drawn = Perturbation.draw(bhr, 5, Ranges.none(**told), SensorNoise.typical())
-    run = simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
+    run = sim.simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
     assert run.checks_passed, [str(f) for f in run.checks if not f.passed]
     assert run.settings["perception"]["state"] == "estimated" and run.link_names[-1] == "payload"
     (push,) = run.settings["pushes"]
@@ -222,8 +197,6 @@ def test_a_disturbed_run_is_honest_and_a_hidden_shove_is_not(bhr, name):
     ground = run.foot_wrench[at, :, :2].sum(axis=(0, 1)) * STEP_S
     assert gained - ground == pytest.approx(0.05 * np.array(push["force_n"][:2]), abs=0.2)
     assert np.hypot(*push["force_n"][:2]) * 0.05 == pytest.approx(8.0)
-    from jumplab.sim.checks import check
-
     hidden = replace(run, settings=run.settings | {"pushes": []})
     assert "unexplained force on the body" in {f.name for f in check(hidden, run.robot) if not f.passed}
 
@@ -245,19 +218,18 @@ def test_the_landing_is_moved_and_the_start_is_not(bhr):
     )
 
 
-# ------------------------------------------------------------------------------------------ scenes
+def slope(pitch_rad, roll_rad=0.0):
+    return Scene("slope", (Block(-REACH_M, REACH_M, pitch_rad=pitch_rad, roll_rad=roll_rad),))
 
 
 def test_scenes_are_what_they_say(engine, bhr):
-    assert [Scene.stairs(0.3, 0.1, 0.25, 3).top_at(x) for x in (0, 0.4, 0.6, 0.9)] == pytest.approx([0, 0.1, 0.2, 0.3])
-    assert [Scene.ledge(0.3, 0.2).top_at(x) for x in (0, 1)] == [0, -0.2]
-    assert Scene.slope(0.1).top_at(1.0) == pytest.approx(-np.tan(0.1))
-    gravel = Scene.gravel(0.4, 1.0, 0.02, seed=3)
-    tops = [gravel.top_at(x, y) for x in (0.45, 0.65, 0.85) for y in (-0.1, 0.1)]
-    assert len(set(tops)) == 6 and 0 < min(tops) and max(tops) <= 0.02 and gravel.top_at(0.2) == 0
-    assert gravel == Scene.gravel(0.4, 1.0, 0.02, seed=3) != Scene.gravel(0.4, 1.0, 0.02, seed=4)
-    assert [b.soft_m for b in Scene.mat(0.4, 0.02).blocks] == [0, 0.02]
-    for scene in (gravel, Scene.slope(0.05, 0.03)):
+    stairs = Scene.level("stairs", {0.3: 0.1, 0.55: 0.2, 0.8: 0.3})
+    assert [stairs.top_at(x) for x in (0, 0.4, 0.6, 0.9)] == [0, 0.1, 0.2, 0.3]
+    assert slope(0.1).top_at(1.0) == pytest.approx(-np.tan(0.1))
+    stone = Block(0.4, 0.5, 0.02, y_from=0.05, y_to=0.15)
+    gravel = Scene("gravel", (*Scene.flat().blocks, stone))
+    assert [gravel.top_at(0.45, y) for y in (0.0, 0.1)] == [0, 0.02] and gravel.top_at(0.2) == 0
+    for scene in (gravel, slope(0.05, 0.03)):
         start = scene.seated(bhr, stance_configuration(bhr))
         with engine(bhr, start, scene=scene) as world:
             hold = Hold(bhr, start)
@@ -273,10 +245,9 @@ def test_boxes_lie_where_the_heights_are():
     scene = Scene("one", (block,), along_rad=0.7)
     ((half, centre, turn),) = scene.boxes()
     axes = pin.Quaternion(turn[3], *turn[:3]).toRotationMatrix()
-    for x in (-1, 1):
-        for y in (-1, 1):
-            corner = centre + axes @ (half * [x, y, 1])
-            assert corner[2] == pytest.approx(block.height_at(*scene._along(corner)), abs=1e-12)
+    for sign in ((1, 1, 1), (1, -1, 1), (-1, -1, 1)):
+        corner = centre + axes @ (half * sign)
+        assert corner[2] == pytest.approx(block.height_at(*scene.along(corner)), abs=1e-12)
     cut = scene.within(0.7, 3.0, 0.3).blocks[0]
     assert (cut.x_from, cut.x_to, cut.y_from, cut.y_to, cut.pivot_m) == (0.7, 1.5, -0.3, 0.3, 0.8)
 
@@ -284,46 +255,23 @@ def test_boxes_lie_where_the_heights_are():
 @pytest.mark.parametrize(
     ("scene", "sentence"),
     [
-        (Scene.slope(0.3), "its CoM is"),
-        (Scene.ditch(0.05, 1.0), "a corner of its soles is +1000 mm above the ground, at most 5; let the ground be "
-                                 "even around x = 0, at z = 0"),
-        (Scene.stairs(0.05, 0.1, 0.3, 1), "a corner of its soles is -100 mm above the ground, at most 5; let"),
+        (slope(0.3), "its CoM is"),
+        (Scene.level("stairs", {0.05: 0.1}),
+         "a corner of its soles is -100 mm above the ground, at most 5; let the ground be even around x = 0, at z = 0"),
         (Scene("none", ()), f"a corner of its soles is +{1e3 * REACH_M:.0f} mm above the ground, at most 5; let"),
     ],
 )  # fmt: skip
 def test_a_scene_that_the_robot_cannot_stand_on_is_refused(bhr, scene, sentence):
     with pytest.raises(InputError) as e:
-        simulate_jump(tape(), bhr, scene=scene)
+        sim.simulate_jump(tape(), bhr, scene=scene)
     assert str(e.value).startswith(f"scene {scene.name}: the robot cannot stand on it at the start, {sentence}")
-
-
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: Scene.ledge(0.3, 0.0), "ledge at 0.3 m, 0 m high: both numbers must be positive"),
-        (lambda: Scene.mat(0.0, 0.01), "mat at 0 m, 0.01 m soft: both numbers must be positive"),
-        (lambda: Scene.stairs(0.3, 0.0, 0.2, 2),
-         "stairs at 0.3 m, 2 steps of 0 m rise and 0.2 m going: place, going and count must be positive, and the rise "
-         "not zero"),
-        (lambda: Scene.gravel(-0.3, 1.0, 0.02),
-         "gravel from -0.3 to 1 m, stones of 0.1 m, 0.02 m high: it must begin ahead of the robot, and all lengths be "
-         "positive"),
-    ],
-)  # fmt: skip
-def test_impossible_scenes_are_refused(make, sentence):
-    with pytest.raises(InputError) as e:
-        make()
-    assert str(e.value) == sentence
-
-
-# ------------------------------------------------------------------------------------------ causes
 
 
 @pytest.fixture(scope="module")
 def fall(bhr):
     """A real one: a shove of 60 N s to the side while it lands."""
     drawn = Perturbation(shoves=(Shove("landing", 0.0, 60.0, np.pi / 2),), friction=1.0)
-    return simulate_jump(tape(), bhr, perturbation=drawn)
+    return sim.simulate_jump(tape(), bhr, perturbation=drawn)
 
 
 def test_a_shoved_robot_tips(fall):
@@ -364,7 +312,7 @@ def test_each_cause_is_read_from_its_own_numbers(bhr, fall):
         assert found.cause == sign.cause and found.time_s == pytest.approx(sign.time_s)
     both = signs(replace(quiet, tau=spent, com_velocity=tips, foot_wrench=slides))
     assert [sign.cause for sign in both] == ["slip", "torque", "tip"]
-    tilted = quiet.settings | {"ground": asdict(Scene.slope(0.1))}  # towards which the force leans
+    tilted = quiet.settings | {"ground": asdict(slope(0.1))}  # towards which the force leans
     assert signs(replace(quiet, foot_wrench=slides, settings=tilted))[0].cause == "other"
     short = slides.copy()
     short[215:] = wrench[215:]

@@ -4,9 +4,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from jumplab.control.estimator import Estimator
+from jumplab.control.kinematics import State
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Perturbation, SensorNoise, simulate_jump
-from jumplab.sim.estimator import LEVER_M, Estimator, Perception, Sensors, estimation_error
+from jumplab.sim.sensors import LEVER_M, Perception, Sensors, estimation_error
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
@@ -108,10 +110,9 @@ def test_exact_readings(bhr):
 def test_perception_is_the_truth_until_a_sensor_errs(bhr):
     q, v = stance_configuration(bhr), np.zeros(20)
     exact, noisy = (Perception(bhr, q, v, noise, 0) for noise in (SensorNoise(), SensorNoise.typical()))
-    told = exact(q, v, STILL)
-    assert told[0] is q and told[1] is v and exact.to_json() == {"state": "true"}
-    told = noisy(q, v, STILL)
-    assert told[0][:7] != pytest.approx(q[:7], abs=1e-6)
+    state = State(q, v, STILL)
+    assert exact(state) is state and exact.to_json() == {"state": "true"}
+    assert noisy(state).q[:7] != pytest.approx(q[:7], abs=1e-6)
     assert noisy.to_json()["state"] == "estimated" and noisy.to_json()["worst_tilt_error_rad"] > 0
 
 

@@ -5,13 +5,16 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 
 import fixtures_core
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from jumplab.control.controller import level
+from jumplab.control.kinematics import Gauge, pitch_of
+from jumplab.control.playback import Playback
+from jumplab.control.reference import Forecast
 from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -19,18 +22,14 @@ from jumplab.sim import (
     INSTALLED,
     STEP_S,
     Disturbance,
-    LandingReference,
     Perturbation,
     Ranges,
     Scene,
     SensorNoise,
     SimulationResult,
-    simulate_landing,
 )
 from jumplab.sim import simulate_jump as simulate
-from jumplab.sim.playback import Actuators, Playback
-from jumplab.sim.reference import Forecast
-from jumplab.sim.result import Recorder, _events
+from jumplab.sim.result import events, record
 from jumplab.sim.scene import Contacts
 from jumplab.stages.planner import Planner
 from jumplab.stages.srmp.landing import LandingPlanner, touchdown_of_state
@@ -45,10 +44,16 @@ def tape(bhr):
     return Planner(bhr).plan(JumpTask(DISTANCE, HEIGHT), "direct").tape
 
 
-@pytest.fixture(scope="module", params=[(mode, engine) for engine in INSTALLED for mode in ("position", "pd")])
+@pytest.fixture(scope="module", params=[("position", INSTALLED[0]), ("pd", INSTALLED[-1])])
 def jump(request, bhr, tape):
     mode, engine = request.param
     return simulate(tape, bhr, mode=mode, engine=engine)
+
+
+@pytest.fixture(scope="module")
+def look(bhr, tape):
+    """A short look at a jump."""
+    return simulate(tape, bhr, stand_s=SHORT_S)
 
 
 def test_reaches_the_target_and_stands(jump):
@@ -59,20 +64,21 @@ def test_reaches_the_target_and_stands(jump):
     assert m.com_rise_m == pytest.approx(HEIGHT, abs=0.01)
     assert m.standing_s >= 3
     assert m.self_collision_s == 0 and m.stray_contacts == () and m.qp_failures == 0
-    assert m.qp_solves == pytest.approx(500 * m.standing_s, rel=0.01)
+    assert m.qp_solves == pytest.approx(250 + 100 * (m.standing_s - 0.5), abs=2)  # rarely, once it is calm
 
 
 def test_torques_stay_within_the_motors(bhr, jump):
     """At every step, from the log alone: peak torque, and the torque-speed line at the speed of that step."""
-    motors = Actuators(bhr)
+    motors = bhr.limits
     low, high = motors.range(jump.v[:, 6:])
     assert (jump.tau <= high + 1e-6).all() and (jump.tau >= low - 1e-6).all()
     m = jump.metrics
     assert m.max_torque_ratio == pytest.approx(np.max(np.abs(jump.tau) / motors.effort))
-    assert m.max_torque_ratio <= 1 and m.max_torque_ratio_before_touchdown < 0.9
+    assert m.max_torque_ratio_before_touchdown < 0.9
     assert m.max_speed_ratio_before_touchdown < 0.9
     assert set(m.max_torque_ratio_by_joint) == set(bhr.joint_names)
     assert max(m.max_speed_ratio_by_joint.values()) == m.max_speed_ratio
+    assert max(m.overspeed_s.values()) == 0 and m.max_torque_ratio < 0.9
 
 
 def test_measurements_agree_with_mechanics(jump):
@@ -109,61 +115,34 @@ def test_the_record_is_complete(bhr, tape, jump):
     assert jump.settings["robot_hash"] == bhr.hash
 
 
-def test_saved_whole(jump, odd_folder):
-    jump.save(odd_folder, {"planned_distance_m": DISTANCE})
-    assert sorted(os.listdir(odd_folder)) == ["simulation.json", "simulation.npz"]
-    said = json.loads((odd_folder / "simulation.json").read_text())
-    assert said["planned_distance_m"] == DISTANCE
-    assert said["foot_distance_m"] == jump.metrics.foot_distance_m
-    assert said["settings"]["mode"] in ("position", "pd")
-    assert said["max_torque_ratio_by_joint"]["left_knee"] <= 1
-    with np.load(odd_folder / "simulation.npz", allow_pickle=False) as file:
-        assert np.array_equal(file["q"], jump.q) and str(file["schema"]) == said["schema"]
-
-
-def test_saving_nowhere_is_refused(jump, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"file/folder' cannot be written .*choose another one"):
-        jump.save(tmp_path / "file" / "folder")
-
-
-def test_what_was_saved_is_loaded(bhr, jump, odd_folder):
+def test_what_was_saved_is_loaded(bhr, look, odd_folder):
     assert SimulationResult.load(odd_folder, bhr) is None
-    jump.save(odd_folder)
-    again = SimulationResult.load(odd_folder, bhr)
-    before, after = jump.arrays(), again.arrays()
+    look.save(odd_folder, {"planned_distance_m": DISTANCE})
+    assert sorted(os.listdir(odd_folder)) == ["simulation.json", "simulation.npz"]
+    again, path = SimulationResult.load(odd_folder, bhr), odd_folder / "simulation.json"
+    before, after = look.arrays(), again.arrays()
     assert before.keys() == after.keys() and all(np.array_equal(before[name], after[name]) for name in before)
-    assert (again.metrics, again.checks, again.checks_passed) == (jump.metrics, jump.checks, True)
-    assert again.settings == json.loads(json.dumps(jump.settings)) and again.link_names == jump.link_names
+    assert (again.metrics, again.checks, again.checks_passed) == (look.metrics, look.checks, True)
+    assert again.settings == json.loads(json.dumps(look.settings)) and again.link_names == look.link_names
     assert not again.q.flags.writeable
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("simulation.npz", b"PK"),
-        ("simulation.json", b"{"),
-        ("simulation.json", b"[]"),
-        ("simulation.json", b"{}"),
-        ("simulation.json", None),
-    ],
-)
-def test_damaged_simulations_are_refused(bhr, jump, tmp_path, name, content):
-    jump.save(tmp_path)
-    if content is None:
-        (tmp_path / name).unlink()
-    else:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match="not a") as e:
-        SimulationResult.load(tmp_path, bhr)
-    assert str(tmp_path) in str(e.value) and "\n" not in str(e.value)
-
-
-def test_the_simulation_of_another_robot_is_not_loaded(bhr, jump, tmp_path):
-    jump.save(tmp_path)
+    said = json.loads(path.read_text())
+    assert said["planned_distance_m"] == DISTANCE and said["foot_distance_m"] == look.metrics.foot_distance_m
+    assert said["schema"] == str(before["schema"]) and said["settings"]["mode"] == "position"
+    older = {k: v for k, v in said.items() if "checks" not in k} | {"honesty": said["checks"]}
+    path.write_text(json.dumps(older))
+    assert SimulationResult.load(odd_folder, bhr).checks == look.checks
     texts = (text.replace("left_knee", "left_knie") for text in (bhr.urdf, bhr.config_text))
     with pytest.raises(InputError, match="not a simulation of this folder's robot"):
-        SimulationResult.load(tmp_path, Robot.from_text(*texts))
+        SimulationResult.load(odd_folder, Robot.from_text(*texts))
+    path.unlink()
+    for name, content in (("json", None), ("json", b"{"), ("json", b"[]"), ("json", b"{}"), ("npz", b"PK")):
+        if content is not None:
+            (odd_folder / f"simulation.{name}").write_bytes(content)
+        with pytest.raises(InputError, match="not a") as e:
+            SimulationResult.load(odd_folder, bhr)
+        assert str(odd_folder) in str(e.value) and "\n" not in str(e.value)
+    with pytest.raises(InputError, match=r"simulation.json/folder' cannot be written .*choose another one"):
+        look.save(path / "folder")
 
 
 def test_scenes_and_perturbations_need_no_engine():
@@ -184,60 +163,28 @@ def test_same_seed_same_jump(bhr, tape):
     json.dumps(runs[0].to_json())
 
 
-def test_a_perturbed_robot_lands_with_reaim(bhr, tape):
-    assert simulate(tape, bhr, perturbation=Perturbation.draw(bhr, 3), reaim=True).landed
-
-
-def test_reaim_leaves_a_good_flight_alone_and_saves_a_bad_one(bhr, tape):
-    plain, aimed = (simulate(tape, bhr, reaim=on, stand_s=SHORT_S).metrics for on in (False, True))
-    assert aimed.foot_distance_touchdown_m == pytest.approx(plain.foot_distance_touchdown_m, abs=0.01)
+def test_reaim_leaves_a_good_flight_alone_and_saves_a_bad_one(bhr, tape, look):
+    aimed = simulate(tape, bhr, reaim=True, stand_s=SHORT_S).metrics
+    assert aimed.foot_distance_touchdown_m == pytest.approx(look.metrics.foot_distance_touchdown_m, abs=0.01)
     tipped = Disturbance(pitch_rad=-np.radians(10))
-    assert "touched the ground" in simulate_landing(tape, bhr, tipped).reason
-    saved = simulate_landing(tape, bhr, tipped, reaim=True)
+    assert "touched the ground" in simulate(tape, bhr, disturbance=tipped).reason
+    saved = simulate(tape, bhr, disturbance=tipped, reaim=True)
     assert saved.landed and saved.settings["disturbance"]["pitch_rad"] < 0
 
 
 def test_disturbance_is_what_it_says(bhr, tape):
-    model, data = bhr.model, bhr.model.createData()
-
-    def look(disturbance):
-        step, q, v = disturbance.apex(tape, bhr)
-        pin.ccrba(model, data, q, v)
-        return (
-            step,
-            data.com[0].copy(),
-            data.hg.linear / 42,
-            data.hg.angular[1],
-            pin.rpy.matrixToRpy(data.oMi[1].rotation),
-        )
-
-    step, com, velocity, momentum, rpy = look(Disturbance())
-    assert abs(velocity[2]) < 0.02
-    again, moved, faster, same, turned = look(Disturbance(1.2, 0.1, 0.05))
-    assert again == step
-    assert moved - com == pytest.approx([0, 0, 0.05])
-    assert faster == pytest.approx([1.2 * velocity[0], 0, velocity[2]])
-    assert same == pytest.approx(momentum)
-    assert turned[1] - rpy[1] == pytest.approx(0.1)
-
-
-def test_follows_a_landing_planned_at_touchdown(bhr, tape):
-    """The reference may be made from the measured state at touchdown."""
-    asked = []
-
-    def plan(q, v):
-        asked.append((q.shape, v.shape))
-        return LandingReference(np.array([0.0, 1.0]), np.array([[0, 0.7], [0, 0.7]]), np.zeros((2, 2)), np.zeros(2))
-
-    run = simulate(tape, bhr, reference=plan)
-    assert asked == [((21,), (20,))]
-    assert run.landed and run.settings["landing"]["followed"] == "given"
-    assert run.com[-1, 2] == pytest.approx(0.7, abs=0.005)
+    (step, q, v), (again, p, u) = (x.apex(tape, bhr) for x in (Disturbance(), Disturbance(1.2, 0.1, 0.05)))
+    plain, other = Gauge(bhr).motion(q, v), Gauge(bhr).motion(p, u)
+    assert again == step and abs(plain.velocity[2]) < 0.02
+    assert other.com - plain.com == pytest.approx([0, 0, 0.05])
+    assert other.velocity == pytest.approx(plain.velocity * [1.2, 1.2, 1.0])
+    assert other.momentum[1] == pytest.approx(plain.momentum[1])
+    assert pitch_of(p) - pitch_of(q) == pytest.approx(0.1)
 
 
 def test_the_landing_is_planned_in_flight(bhr, tape):
     """By default stage 1's landing is followed, there in time, and needs less torque and force than spring-dampers."""
-    planned, spring = (simulate(tape, bhr, landing=name) for name in ("planned", "spring"))
+    planned, spring = (simulate(tape, bhr, landing=name, stand_s=1.0) for name in ("planned", "spring"))
     said = planned.settings["landing"]
     assert said["asked"] == said["followed"] == "planned" and said["reason"] is None
     assert said["planned_at_s"] < planned.metrics.touchdown_s - 0.1
@@ -247,7 +194,8 @@ def test_the_landing_is_planned_in_flight(bhr, tape):
 
     def loads(run):  # after the impact's first 20 ms
         late = np.flatnonzero(run.phase == "landing")[20:]
-        return np.max(np.abs(run.tau[late]) / Actuators(bhr).effort), run.foot_wrench[late, :, 2].sum(axis=1).max()
+        effort = bhr.limits.effort
+        return np.max(np.abs(run.tau[late]) / effort), run.foot_wrench[late, :, 2].sum(axis=1).max()
 
     (torque, force), (spring_torque, spring_force) = loads(planned), loads(spring)
     assert torque < 0.85 * spring_torque and force < 0.8 * spring_force  # 0.81; plans of three steps 0.6 to 0.7
@@ -272,31 +220,26 @@ def test_the_impact_turns_no_knee_faster_than_its_motor(bhr, mode):
     assert m.foot_distance_touchdown_m == pytest.approx(1.0, abs=0.02) and m.com_rise_m == pytest.approx(0.5, abs=0.01)
 
 
-def test_no_limit_is_exceeded(jump):
-    assert max(jump.metrics.overspeed_s.values()) == 0
-    assert jump.metrics.max_torque_ratio < 0.9
-
-
 def test_without_a_planned_landing_it_springs_and_says_so(bhr, tape, monkeypatch):
     def refuse(planner, touchdown):
         raise SolverError("no landing: the CoP would have to leave the sole", stage="landing")
 
     monkeypatch.setattr(LandingPlanner, "plan", refuse)
-    run = simulate(tape, bhr)
-    said = run.settings["landing"]
-    assert run.landed and (said["asked"], said["followed"]) == ("planned", "spring")
+    said = simulate(tape, bhr, stand_s=SHORT_S).settings["landing"]
+    assert (said["asked"], said["followed"]) == ("planned", "spring")
     assert said["reason"] == "no landing: the CoP would have to leave the sole"
 
 
 def test_the_touchdown_is_foreseen(bhr, tape):
     """From 0.15 s before it, in a jump that differs from the plan: CoM, velocity and momentum at the first contact."""
     run = simulate(tape, bhr, perturbation=Perturbation(delay_s=0.001), stand_s=SHORT_S)
-    forecast = Forecast(bhr, tape, Scene.flat())
+    forecast, gauge = Forecast(bhr, tape, level), Gauge(bhr)
     touch = int(np.argmax(run.phase == "landing"))
     early = touch - 150
-    assert forecast.time_left(run.q[early], run.v[early]) == pytest.approx(0.15, abs=0.003)
+    now = gauge.motion(run.q[early], run.v[early])
+    assert forecast.time_left(now) == pytest.approx(0.15, abs=0.003)
     error = pin.rpy.rpyToMatrix(0.0, Playback(tape, bhr).attitude_error(early, run.q[early])[1], 0.0)
-    there = touchdown_of_state(bhr, *forecast.state(run.q[early], run.v[early], error), impact=False)
+    there = touchdown_of_state(bhr, *forecast.state(now, error), impact=False)
     real = touchdown_of_state(bhr, run.q[touch], run.v[touch], impact=False)
     assert there.com == pytest.approx(real.com, abs=0.01)
     assert there.com_velocity == pytest.approx(real.com_velocity, abs=0.03)
@@ -304,43 +247,27 @@ def test_the_touchdown_is_foreseen(bhr, tape):
     assert there.trunk_pitch == pytest.approx(real.trunk_pitch, abs=0.02)
 
 
-def test_references_without_feed_forward_push_nothing():
-    t, com = np.array([0.0, 1.0]), np.array([[0.0, 0.6], [0.0, 0.7]])
-    plain = LandingReference(t, com, np.zeros((2, 2)), np.zeros(2))
-    assert plain.feed_forward(0.5)[0].tolist() == [0, 0] and plain.feed_forward(0.5)[1] == 0
-    pushing = replace(plain, com_acceleration=np.array([[0.0, 4.0], [2.0, 0.0]]), L_rate=np.array([1.0, 3.0]))
-    push, twist = pushing.feed_forward(0.5)
-    assert push == pytest.approx([1, 2]) and twist == pytest.approx(2)
-    assert pushing.feed_forward(1.0)[0].tolist() == [0, 0] and pushing.feed_forward(1.0)[1] == 0
-
-
-def test_a_ditch_swallows_a_short_jump(bhr, tape):
-    run = simulate(tape, bhr, scene=Scene.ditch(0.2, 1.4), stand_s=1.0)
-    assert not run.landed and "watched" not in run.reason
-
-
-def test_a_jump_over_the_edge_of_a_ditch_lands(bhr, tape):
-    run = simulate(tape, bhr, scene=Scene.ditch(0.2, 0.4))
-    assert run.landed and run.metrics.foot_distance_m > 0.58
+def test_a_ditch_swallows_a_short_jump_alone(bhr, tape):
+    wide, narrow = (simulate(tape, bhr, scene=Scene.level("ditch", {0.2: -1.0, x: 0.0})) for x in (1.4, 0.4))
+    assert not wide.landed and "watched" not in wide.reason
+    assert narrow.landed and narrow.metrics.foot_distance_m > 0.58
 
 
 def test_a_fall_is_called_a_fall(bhr, tape):
-    run = simulate_landing(tape, bhr, Disturbance(pitch_rad=0.6))
+    run = simulate(tape, bhr, disturbance=Disturbance(pitch_rad=0.6))
     assert not run.landed
     assert "touched the ground" in run.reason
     assert run.metrics.standing_s < 3
     assert run.t[-1] < 2.5  # not simulated for longer than it is worth
 
 
-def test_a_short_look_is_no_landing(bhr, tape):
-    run = simulate(tape, bhr, stand_s=1.0)
-    assert not run.landed and run.reason == "watched for 1.05 s only, not 3 s"
+def test_a_short_look_is_no_landing(look):
+    assert not look.landed and look.reason == "watched for 0.35 s only, not 3 s"
 
 
-@pytest.mark.parametrize("seed", [8, 10, 14])
-def test_a_wrong_posture_at_the_start_is_led_back_without_tipping(bhr, tape, seed):
+def test_a_wrong_posture_at_the_start_is_led_back_without_tipping(bhr, tape):
     """Joints up to three degrees off: put right at once, the trunk's way there tips the robot over its soles."""
-    wrong = Perturbation.draw(bhr, seed, Ranges.none(posture_deg=3.0))
+    wrong = Perturbation.draw(bhr, 8, Ranges.none(posture_deg=3.0))
     assert simulate(tape, bhr, perturbation=wrong).landed
 
 
@@ -356,16 +283,10 @@ def test_playback_leaves_a_wrong_posture_smoothly(bhr, tape):
     assert np.allclose(np.diff(gap, axis=0) / STEP_S, (rate[1:] + rate[:-1]) / 2, atol=1e-4)
     gone = int(np.flatnonzero((gap == 0).all(axis=1))[0])
     assert {command.feet for command in led[:gone]} == {"flat"} and not gap[gone:].any()
-
-
-def test_playback_takes_no_notice_of_what_sensors_err(bhr, tape):
-    wrong = tape.q[0].copy()
-    wrong[7:] += 0.019
-    plan, play, rest = Playback(tape, bhr), Playback(tape, bhr), np.zeros(len(bhr.joint_names))
-    play.approach(wrong)
-    for k in (1, 100, 500):
-        a, b = (p.command(k, tape.q[0], np.zeros(bhr.model.nv), rest) for p in (play, plan))
-        assert (a.q == b.q).all() and (a.rate == b.rate).all()
+    wrong[7:] += 0.019 - off  # so much do sensors err
+    careless = Playback(tape, bhr)
+    careless.approach(wrong)
+    assert (careless.command(1, wrong, np.zeros(bhr.model.nv), rest).q == due[0].q).all()
 
 
 def test_a_fall_before_touchdown_is_told_as_one(bhr, tape):
@@ -388,29 +309,31 @@ def test_standing_still_is_no_jump(bhr, tape):
 
 
 def test_events_from_forces():
-    def force(*parts):
-        return np.concatenate([np.full(n, f, float) for n, f in parts])
-
-    assert _events(force((100, 400), (300, 0), (100, 900))) == (100, 400)
-    assert _events(force((10, 400), (20, 0), (70, 400), (300, 4), (9, 900))) == (100, 400)  # a hop, then a jump
-    assert _events(force((100, 400), (300, 0), (10, 900), (200, 0), (10, 300))) == (100, 400)  # a bounce
-    assert _events(force((300, 0), (100, 900))) == (0, 300)  # begun in the air
-    assert _events(force((100, 400), (300, 0))) == (100, None)
-    assert _events(force((100, 400))) == (None, None)
+    for parts, rows in (
+        (((100, 400), (300, 0), (100, 900)), (100, 400)),
+        (((10, 400), (20, 0), (70, 400), (300, 4), (9, 900)), (100, 400)),  # a hop, then a jump
+        (((100, 400), (300, 0), (10, 900), (200, 0), (10, 300)), (100, 400)),  # a bounce
+        (((300, 0), (100, 900)), (0, 300)),  # begun in the air
+        (((100, 400), (300, 0)), (100, None)),
+        (((100, 400),), (None, None)),
+    ):
+        assert events(np.concatenate([np.full(n, f, float) for n, f in parts])) == rows
 
 
 def test_an_exploded_engine_is_an_error(bhr, tape):
-    recorder = Recorder(bhr, tape.q[-1], ("trunk", *bhr.foot.frames))
     nothing = Contacts(np.zeros((2, 6)), frozenset(), frozenset())
-    recorder.add(np.full(21, np.nan), np.zeros(20), np.zeros(14), nothing)
+    row = (np.full(21, np.nan), np.zeros(20), np.zeros(14), nothing)
     with pytest.raises(SolverError, match="the engine lost the robot"):
-        recorder.result((0, 0), {})
+        record(bhr, [row], ("trunk", *bhr.foot.frames), tape.q[-1])
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"mode": "velocity"}, "mode 'velocity': must be one of position, pd"),
+        ({"mode": "velocity"}, "mode 'velocity': must be one of position, pd, whole-body"),
+        ({"mode": None}, "mode None: must be one of position, pd, whole-body"),
+        ({"contact": "soft"}, "contact 'soft': must be one of hard, usual"),
+        ({"contact": None}, "contact None: must be one of hard, usual"),
         ({"landing": "soft"}, "landing 'soft': must be one of planned, spring"),
         ({"stand_s": 0}, r"stand_s = 0 s is outside 0 \.\.\. 60 s"),
         ({"stand_s": float("nan")}, "stand_s = nan s is outside"),

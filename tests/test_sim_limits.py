@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from fixtures_core import jump
 
+from jumplab.control.servo import SERVOS
 from jumplab.sim import INSTALLED, simulate_jump
-from jumplab.sim.playback import MODES, Actuators
 from jumplab.stages.planner import METHODS
 
 
@@ -18,7 +18,7 @@ def within_limits(robot, run, slaps=0):
 
     An ankle may be too fast in as many samples as ``slaps``.
     """
-    motors = Actuators(robot)
+    motors = robot.limits
     torque = np.abs(run.tau).max(axis=0) / motors.effort
     speed = np.abs(run.v[:, 6:]) / motors.speed
     assert run.metrics.max_speed_ratio == pytest.approx(speed.max())
@@ -28,9 +28,11 @@ def within_limits(robot, run, slaps=0):
     return run.landed and torque.max() <= 1 and speed.max() <= 1
 
 
+PLAYED = [(mode, INSTALLED[k % 2 - 1]) for k, mode in enumerate(SERVOS)]  # each mode, and each engine
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", INSTALLED)
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("mode", "engine"), PLAYED)
 @pytest.mark.parametrize("method", METHODS)
 def test_the_default_jump_stays_within_all_limits(bhr, method, mode, engine):
     run = simulate_jump(jump(1.0, 0.5, method=method).tape, bhr, mode=mode, engine=engine)
@@ -38,8 +40,7 @@ def test_the_default_jump_stays_within_all_limits(bhr, method, mode, engine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", INSTALLED)
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("mode", "engine"), PLAYED)
 def test_soles_that_are_aimed_flat_slap_no_ankle(bhr, mode, engine):
     """A sole that meets the ground 5 mrad off the level is turned flat within a millisecond, at 19 rad/s in MuJoCo."""
     run = simulate_jump(jump(0.5, 0.3).tape, bhr, mode=mode, engine=engine, reaim=True)

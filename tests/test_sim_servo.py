@@ -1,15 +1,18 @@
-"""The servo law of position mode against the plan, against Pinocchio, and against a drive that is simply stiff."""
+"""The servos of all modes against the plan, against Pinocchio, and against a drive that is simply stiff."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from jumplab.control import servo as law
+from jumplab.control.body import WholeBody
+from jumplab.control.kinematics import headed
+from jumplab.control.playback import AIR, FLAT, TOE, Command, Playback
+from jumplab.control.servo import STIFFNESS, PositionServo, TorqueServo, WholeBodyServo
+from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import STEP_S, Perturbation, simulate_jump
-from jumplab.sim.kinematics import headed
-from jumplab.sim.landing import BodyTerms
-from jumplab.sim.playback import AIR, FLAT, TOE, Actuators, Command, Motors, Playback
-from jumplab.sim.servo import GAINS, Servo
+from jumplab.sim.motors import Motors
 from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
@@ -26,17 +29,17 @@ def told(robot, posture, **changed) -> Command:
 
 def test_a_stance_takes_what_its_weight_takes(bhr):
     q = stance_configuration(bhr)
-    body = BodyTerms(bhr, 1.0)
+    body = WholeBody(bhr)
     body.update(q, np.zeros(bhr.model.nv))
     body.set_contact(both := np.array([True, True]))
-    tau = Servo(bhr).torque(told(bhr, q), q, np.zeros(bhr.model.nv))
+    tau = WholeBodyServo(bhr).torque(told(bhr, q), q, np.zeros(bhr.model.nv))
     pitch = [bhr.joint_names.index(name) for pair in bhr.joints.values() for name in pair]
     assert tau[pitch] == pytest.approx(body.gravity_torque(both)[pitch], abs=1e-3)
 
 
 def test_on_the_tape_it_asks_for_the_planned_torques_that_it_never_saw(bhr, tape):
     """Flat, on the toes and in the air; but where the tape jumps from one to the next."""
-    servo, player, effort = Servo(bhr, substeps=10**6), Playback(tape, bhr), Actuators(bhr).effort
+    servo, player, effort = WholeBodyServo(bhr, substeps=10**6), Playback(tape, bhr), bhr.limits.effort
     worst = {FLAT: 0.0, TOE: 0.0, AIR: 0.0}
     for row in range(0, len(tape.t) - 1, 7):
         step = round(float(tape.t[row]) / STEP_S)
@@ -55,7 +58,7 @@ def test_a_turned_world_changes_nothing(bhr, tape, stand):
     """The robot turned about the vertical, errors and all: the same torques. Feet on their toes turn about their own
     axis, not the world's."""
     row = {FLAT: 100, TOE: np.searchsorted(tape.t, tape.takeoff_time) - 30, AIR: -100}[stand]
-    rng, servo = np.random.default_rng(0), Servo(bhr)
+    rng, servo = np.random.default_rng(0), WholeBodyServo(bhr)
     q, v = pin.integrate(bhr.model, tape.q[row], rng.normal(size=bhr.model.nv) * 0.01), tape.v[row] + 0.01
     command = Command(q=tape.q[row, 7:], rate=tape.v[row, 6:], acceleration=tape.a[row, 6:], feet=stand)
     expected = servo.torque(command, q, v)
@@ -66,24 +69,25 @@ def test_a_turned_world_changes_nothing(bhr, tape, stand):
 def test_in_the_air_an_error_is_met_by_a_damper_of_the_free_body(bhr, tape):
     """The stated damping, softened by what the rates change within the step: an implicit step, solved another way."""
     q, v = tape.q[-200], np.zeros(bhr.model.nv)
-    servo, data, dt = Servo(bhr), bhr.model.createData(), STEP_S
+    servo, data, dt = WholeBodyServo(bhr), bhr.model.createData(), STEP_S
     error = np.random.default_rng(0).normal(size=14) * 1e-3
     free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e, feet=AIR), q, v) for e in (0 * error, error))
-    damping = GAINS.damping * Actuators(bhr).effort / Actuators(bhr).effort.max()
+    damping = law.DAMPING * bhr.limits.effort / bhr.limits.effort.max()
     mass = pin.crba(bhr.model, data, q)
     mass = np.triu(mass) + np.triu(mass, 1).T
     answer = np.linalg.inv(mass)[6:, 6:]  # rates per impulse
     stiff = np.diag(damping) @ np.linalg.inv(np.eye(14) + dt * answer @ np.diag(damping))
-    assert pulled - free == pytest.approx(stiff @ (GAINS.corner * error), abs=1e-9)
+    assert pulled - free == pytest.approx(stiff @ (law.CORNER * error), abs=1e-9)
 
 
 def test_on_the_ground_an_error_is_met_by_a_damper_of_a_robot_whose_feet_give_way(bhr):
     """The same where the feet stand, on springs of no mass instead of rows that hold them."""
     q, v, dt = stance_configuration(bhr), np.zeros(bhr.model.nv), STEP_S
-    servo, data = Servo(bhr), bhr.model.createData()
+    servo, data = WholeBodyServo(bhr), bhr.model.createData()
     error = np.random.default_rng(0).normal(size=14) * 1e-3
     free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e), q, v) for e in (0 * error, error))
-    damping = np.diag(np.r_[np.zeros(6), GAINS.damping * Actuators(bhr).effort / Actuators(bhr).effort.max()])
+    effort = bhr.limits.effort
+    damping = np.diag(np.r_[np.zeros(6), law.DAMPING * effort / effort.max()])
     mass = pin.crba(bhr.model, data, q)
     mass = np.triu(mass) + np.triu(mass, 1).T
     pin.computeJointJacobians(bhr.model, data, q)
@@ -92,39 +96,39 @@ def test_on_the_ground_an_error_is_met_by_a_damper_of_a_robot_whose_feet_give_wa
         placed = pin.updateFramePlacement(bhr.model, data, frame)
         jacobian = pin.getFrameJacobian(bhr.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         jacobian[:3] -= pin.skew(placed.rotation @ bhr.foot.center) @ jacobian[3:]
-        rows.append(jacobian * np.repeat([1.0, GAINS.lever_m], 3)[:, None])
+        rows.append(jacobian * np.repeat([1.0, law.LEVER_M], 3)[:, None])
     feet = np.vstack(rows)
-    wish = np.r_[np.zeros(6), GAINS.corner * error]
-    after = np.linalg.solve(mass + dt * damping + feet.T @ feet / GAINS.give, dt * damping @ wish)
+    wish = np.r_[np.zeros(6), law.CORNER * error]
+    after = np.linalg.solve(mass + dt * damping + feet.T @ feet / law.GIVE, dt * damping @ wish)
     assert pulled - free == pytest.approx((damping @ (wish - after))[6:], abs=1e-6)
 
 
 def test_torques_keep_to_the_share_of_the_motors(bhr):
     q, v = stance_configuration(bhr), np.zeros(bhr.model.nv)
     far = told(bhr, q, q=q[7:] + 10.0, share=0.2)
-    tau = Servo(bhr).torque(far, q, v)
-    assert np.abs(tau) == pytest.approx(0.2 * Actuators(bhr).effort)
-    assert np.array_equal(Servo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
+    tau = WholeBodyServo(bhr).torque(far, q, v)
+    assert np.abs(tau) == pytest.approx(0.2 * bhr.limits.effort)
+    assert np.array_equal(WholeBodyServo(bhr).torque(Command(tau=tau), q, v), tau)  # a torque is passed on
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_joint_beyond_its_no_load_speed_is_braked_with_all_its_motor_has(bhr, way):
-    q, v, motors = stance_configuration(bhr), np.zeros(bhr.model.nv), Actuators(bhr)
+    q, v, motors = stance_configuration(bhr), np.zeros(bhr.model.nv), bhr.limits
     hip = bhr.joint_names.index("left_hip_pitch")
     v[6 + hip] = way * 1.2 * motors.speed[hip]
     stop, on = (told(bhr, q, feet=AIR, rate=rate * way * 40.0) for rate in (np.zeros(14), np.ones(14)))
-    assert Servo(bhr).torque(stop, q, v)[hip] == pytest.approx(-way * motors.effort[hip])
-    assert Servo(bhr).torque(on, q, v)[hip] == 0.0  # it cannot be driven any faster
+    assert WholeBodyServo(bhr).torque(stop, q, v)[hip] == pytest.approx(-way * motors.effort[hip])
+    assert WholeBodyServo(bhr).torque(on, q, v)[hip] == 0.0  # it cannot be driven any faster
 
 
 def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
     """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
     q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
     for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
-        given = Servo(bhr, substeps=substeps).torque(Command(tau=tau, change=change), q, v)
+        given = WholeBodyServo(bhr, substeps=substeps).torque(Command(tau=tau, change=change), q, v)
         assert given == pytest.approx(tau + share * change, abs=1e-6)
     takeoff = round(tape.takeoff_time / STEP_S)
-    player, none = Playback(tape, bhr, "pd"), np.zeros(14)
+    player, none = Playback(tape, bhr), np.zeros(14)
     changes = [player.command(step, q, v, none).change for step in (100, takeoff - 1)]
     assert changes[0] == pytest.approx(change, abs=1e-6) and not np.any(changes[1])  # the ground lets go at once
 
@@ -135,10 +139,10 @@ def test_joints_whose_rates_are_right_are_where_substeps_bring_them(bhr, tape):
     for substeps in (1, 4):
         ahead = np.concatenate([q[:7], q[7:] + STEP_S / substeps / 2 * rate])
         v = np.concatenate([np.zeros(6), rate])
-        here, there = (Servo(bhr, substeps=n).torque(told(bhr, q, rate=rate, feet=AIR), ahead, v)
+        here, there = (WholeBodyServo(bhr, substeps=n).torque(told(bhr, q, rate=rate, feet=AIR), ahead, v)
                        for n in (substeps, 10**9))  # fmt: skip
         wish = told(bhr, ahead, rate=rate, feet=AIR)
-        assert here == pytest.approx(Servo(bhr, substeps=10**9).torque(wish, ahead, v), abs=1e-6)
+        assert here == pytest.approx(WholeBodyServo(bhr, substeps=10**9).torque(wish, ahead, v), abs=1e-6)
         assert np.abs(here - there).max() > 0.1
 
 
@@ -147,13 +151,13 @@ def test_a_gain_scales_what_is_delivered(bhr):
     delivered = Motors(bhr, {names[3]: 0.8, names[9]: 1.1}).deliver(tau, still)
     assert delivered[3] == pytest.approx(8) and delivered[9] == pytest.approx(11)
     assert np.delete(delivered, [3, 9]) == pytest.approx(10)
-    assert Motors(bhr, {}).deliver(1e3 * tau, still) == pytest.approx(Actuators(bhr).effort)
+    assert Motors(bhr, {}).deliver(1e3 * tau, still) == pytest.approx(bhr.limits.effort)
 
 
-@pytest.mark.parametrize("mode", ["position", "pd"])
+@pytest.mark.parametrize("mode", ["pd", "whole-body"])
 def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
-    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it, in both modes. A delay that is
-    known is led by: no difference is left that anyone would see."""
+    """Before touchdown, and open loop: a gain scales what is delivered, a delay ages it where torques are sent. A delay
+    that is known is led by: no difference is left that anyone would see."""
     weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
     late, known = Perturbation(delay_s=0.004), Perturbation(delay_s=0.004, known_delay_s=0.004)
     jumps = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
@@ -161,15 +165,65 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
     assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
-    assert abs(known.com_rise_m - asked.com_rise_m) < 0.006  # 2 % of the rise; 5.3 mm measured in position mode
+    assert abs(known.com_rise_m - asked.com_rise_m) < 0.006  # 2 % of the rise; 5.3 mm measured in whole-body mode
 
 
-@pytest.mark.parametrize("mode", ["position", "pd"])
-def test_what_is_sent_ahead_is_what_the_tape_takes_later(bhr, tape, mode):
+def test_late_targets_merely_begin_the_jump_later(bhr, tape):
+    """Position drives close their own loop: the same jump begins so many milliseconds on."""
+    jumps = [simulate_jump(tape, bhr, perturbation=Perturbation(delay_s=s), stand_s=0.01) for s in (0.0, 0.004)]
+    asked, late = (jump.metrics for jump in jumps)
+    assert late.touchdown_s - asked.touchdown_s == pytest.approx(0.004, abs=0.0011)
+    assert late.foot_distance_touchdown_m == pytest.approx(asked.foot_distance_touchdown_m, abs=2e-3)
+    assert late.com_rise_m == pytest.approx(asked.com_rise_m, abs=2e-3)
+    weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
+    assert simulate_jump(tape, bhr, perturbation=weak, stand_s=0.01).metrics.com_rise_m < asked.com_rise_m - 0.004
+
+
+@pytest.mark.parametrize("name", ["bhr", "g1_arms"])
+def test_drives_on_the_plan_give_its_torque(name):
+    """Whatever base, rates and other joints are: a drive knows its own joint, and has the planned torque where that has
+    no error; the angle that is sent stays within the joint's range."""
+    robot = Robot.load(name)
+    servo, motors, rng = PositionServo(robot), robot.limits, np.random.default_rng(3)
+    n = len(motors.effort)
+    q, rate = stance_configuration(robot), rng.uniform(-3, 3, n)
+    tau = rng.uniform(-1, 1, n) * np.minimum(motors.effort, 0.9 * servo.kp * np.minimum(
+        motors.upper - q[7:], q[7:] - motors.lower).clip(0.0))  # fmt: skip
+    command = Command(q=q[7:], rate=rate, acceleration=np.zeros(n), tau=tau)
+    sent = servo.drive(command, q, np.zeros(robot.model.nv))
+    assert sent.torque(q[7:], rate) == pytest.approx(tau, abs=1e-9)
+    elsewhere = servo.drive(command, rng.uniform(-1, 1, len(q)), rng.uniform(-1, 1, robot.model.nv))
+    assert np.array_equal(elsewhere.q, sent.q) and np.array_equal(elsewhere.tau, np.zeros(n))
+    off = np.zeros(n)
+    off[4] = 0.01
+    pulled = sent.torque(q[7:] + off, rate) - tau
+    assert pulled[4] == pytest.approx(-0.01 * servo.kp[4]) and not np.delete(pulled, 4).any()
+    braked = sent.torque(q[7:], rate + 10 * off) - tau
+    assert braked[4] == pytest.approx(-0.1 * servo.kd[4])
+    far = servo.drive(Command(q=motors.upper, rate=rate, acceleration=rate, tau=motors.effort), q, np.zeros(n + 6))
+    assert np.array_equal(far.q, motors.upper)
+    assert np.all(servo.kp <= STIFFNESS * motors.effort) and np.all(servo.kd > 0)
+
+
+def test_torque_servo_sends_the_plan_and_its_errors(bhr, tape):
+    """On the ground by the gains, in the air by the inertia of the free body: there joints accelerate as asked."""
+    servo, q, v = TorqueServo(bhr), tape.q[100], tape.v[100]
+    error = 1e-3 * np.arange(1, 15)
+    told = dict(q=q[7:] + error, rate=v[6:], acceleration=np.zeros(14), tau=tape.tau[100])
+    mended = servo.drive(Command(**told, feet=FLAT), q, v).torque(q[7:], v[6:]) - tape.tau[100]
+    knee, roll = (bhr.joint_names.index(f"left_{x}") for x in ("knee", "hip_roll"))
+    assert mended[knee] == pytest.approx(800 * error[knee]) and mended[roll] == pytest.approx(300 * error[roll])
+    mended = servo.drive(Command(**told, feet=AIR), q, v).torque(q[7:], v[6:]) - tape.tau[100]
+    mass = pin.crba(bhr.model, bhr.model.createData(), q)
+    wish = np.linalg.solve(mass, np.concatenate([np.zeros(6), mended]))[6:]
+    assert wish == pytest.approx(law.FLIGHT_BANDWIDTH * law.FLIGHT_CORNER * error, rel=1e-9)
+
+
+def test_what_is_sent_ahead_is_what_the_tape_takes_later(bhr, tape):
     """Commands with a lead are those without it so many steps on: on the tape, and off it by an error that stays."""
-    lead, servo, none = 3, Servo(bhr), np.zeros(14)
-    ahead, plain = Playback(tape, bhr, mode, lead * STEP_S), Playback(tape, bhr, mode)
-    effort, off = Actuators(bhr).effort, np.full(14, 5e-3)
+    lead, servo, none = 3, WholeBodyServo(bhr), np.zeros(14)
+    ahead, plain = Playback(tape, bhr, lead * STEP_S), Playback(tape, bhr)
+    effort, off = bhr.limits.effort, np.full(14, 5e-3)
 
     def sent(player, step, seen, error):
         row = int(np.searchsorted(tape.t, seen * STEP_S - 1e-9))

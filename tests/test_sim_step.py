@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from fixtures_core import jump
 
+from jumplab.control.landing import SOLE_SHARE
+from jumplab.control.step import BESIDE_M, SWING_S, RecoveryStep, beyond_hull
 from jumplab.sim import INSTALLED, Perturbation, Shove, simulate_jump
-from jumplab.sim.landing import SOLE_SHARE
-from jumplab.sim.step import BESIDE_M, SWING_S, RecoveryStep, beyond_hull
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trials
 
 AHEAD = Perturbation(shoves=(Shove("landing", 0.46, 25.0, 0.3),))
@@ -48,7 +48,7 @@ def test_the_foot_goes_where_a_pendulum_comes_to_rest(bhr, velocity, turned_rad)
     here, step = body((0.03, 0.0, 0.8), velocity, turned_rad), RecoveryStep(bhr, SOLE_SHARE)
     began = [step.look(t, here, np.full(2, 200.0)) or step.began_s for t in (0.10, 0.16, 0.17, 0.19)]
     assert began[:3] == [None] * 3 and began[3] == 0.19  # settled, and beyond for long enough
-    goal, dt, rate = step._goal, 1e-4, np.sqrt(9.8 / 0.8)
+    goal, dt, rate = step.goal, 1e-4, np.sqrt(9.8 / 0.8)
     for _ in range(round(SWING_S / dt)):
         here.com[:2] = here.com[:2] + here.com_velocity[:2] * dt
         here.com_velocity[:2] = here.com_velocity[:2] + step.com_acceleration(here) * dt

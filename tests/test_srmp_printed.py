@@ -4,14 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from fixtures_core import pendulum
 from paper.srmp_printed import (
     WINDOW_MARGIN,
     PrintedSequence,
     build_printed_flight,
     build_printed_launch,
     count_successes,
-    plan_as_printed,
 )
 
 from jumplab.errors import InputError
@@ -20,7 +18,7 @@ from jumplab.robot import Robot
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.task import JumpTask
 
-TARGETS = [JumpTask(x, h) for x in (0.0, 0.6, 1.2) for h in (0.1, 0.35, 0.6)]
+TARGETS = [JumpTask(x, h) for x in (0.0, 1.2) for h in (0.1, 0.6)]
 
 
 @cache
@@ -40,24 +38,19 @@ def state_at_end(printed) -> SrmpState:
 
 def test_printed_launches_are_solved_and_their_flights_are_not():
     count = count_successes(sequence(False), TARGETS)
-    assert (count.targets, count.launches, count.flights) == (9, 9, 0)
+    assert (count.targets, count.launches, count.flights) == (4, 4, 0)
 
 
 def test_the_window_alone_makes_every_flight_possible():
     count = count_successes(sequence(True), TARGETS)
-    assert (count.targets, count.launches, count.flights) == (9, 9, 9)
-
-
-def test_the_joint_problem_solves_the_same_targets():
-    for task in TARGETS:
-        assert pendulum(task.distance_m, task.height_m).solution.statistics.residual < 1e-5
+    assert (count.targets, count.launches, count.flights) == (4, 4, 4)
 
 
 def test_printed_momentum_lies_outside_what_any_inertia_could_turn_into_the_rotation():
     printed = result(1.2, 0.35, False)
     lean, t_f = printed.launch.phases["launch"].q[-1, 0], printed.task.flight_time()
     low, high = (-2 * lean * rho / t_f for rho in sequence(False).reach.inertia)
-    momentum = float(state_at_end(printed).angular_momentum)
+    momentum = float(state_at_end(printed).L)
     assert high < low < momentum  # both bounds negative: the jump needs backward rotation, the launch gives forward
     assert printed.flight_status == "Infeasible_Problem_Detected"
     assert not printed.solved
@@ -69,7 +62,7 @@ def test_printed_launch_meets_its_own_end_constraints():
     com, velocity = end.com.full().ravel(), end.com_velocity.full().ravel()
     assert 2 * com[0] + velocity[0] * 2 * task.takeoff_speed / task.gravity == pytest.approx(0.6, abs=1e-5)
     assert velocity[1] == pytest.approx(task.takeoff_speed, abs=1e-5)
-    for zero in (end.rod_force, end.pivot_torque, end.angular_momentum_rate):
+    for zero in (end.rod_force, end.pivot_torque, end.L_rate):
         assert float(zero) == pytest.approx(0.0, abs=1e-3 * mass)
 
 
@@ -93,7 +86,7 @@ def test_window_flight_begins_where_the_launch_ended_and_lands_symmetrically():
     assert flight.duration == pytest.approx(2 * printed.task.takeoff_speed / 9.8, abs=1e-9)
     t = np.linspace(0, flight.duration, 4001)
     rho = flight.sample(t)[0][:, 0]
-    turned = np.trapezoid(float(end.angular_momentum) / rho, t)
+    turned = np.trapezoid(float(end.L) / rho, t)
     assert flight.z[-1, 0] - flight.z[0, 0] == pytest.approx(turned, abs=1e-4)
 
 
@@ -101,7 +94,7 @@ def test_window_momentum_belongs_to_an_inertia_inside_the_range():
     printed = result(1.2, 0.1, True)
     low, high = sequence(True).reach.inertia
     lean = printed.launch.phases["launch"].q[-1, 0]
-    mean = float(state_at_end(printed).angular_momentum) * printed.task.flight_time() / (-2 * lean)
+    mean = float(state_at_end(printed).L) * printed.task.flight_time() / (-2 * lean)
     margin = WINDOW_MARGIN * (high - low)
     assert low + margin - 1e-4 < mean < high - margin + 1e-4
 
@@ -137,10 +130,3 @@ def test_problems_hold_the_printed_terms_and_no_others():
 def test_platform_is_refused_in_words():
     with pytest.raises(InputError, match=r"platform = 0\.3 m.*ask for 0 m"):
         sequence(False).plan(JumpTask(0.5, 0.4, 0.3))
-
-
-def test_one_call_does_the_same_as_the_kept_sequence():
-    once = plan_as_printed(Robot.load(), JumpTask(0.6, 0.35))
-    kept = result(0.6, 0.35, False)
-    assert once.launch.statistics.objective == pytest.approx(kept.launch.statistics.objective, rel=1e-9)
-    assert once.flight is None

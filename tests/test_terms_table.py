@@ -6,7 +6,7 @@ writes the file anew, and the change is read in the diff.
 
 import re
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from difflib import unified_diff
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,12 +17,13 @@ from jumplab.ocp import Bound, Problem
 from jumplab.robot import Robot
 from jumplab.robot.reach import reach
 from jumplab.stages import srmp
+from jumplab.stages.joint_qp import build_problem
 from jumplab.stages.joint_qp.settings import GENTLE, Options
 from jumplab.stages.srmp import SrmpSettings
 from jumplab.stages.whole_body import Contacts, Limits, Mesh, Weights, coordinates
-from jumplab.stages.whole_body.planner import jump_contacts
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.contacts import jump_contacts
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.terms import Body
 from jumplab.task import JumpTask
 
 TABLE = Path(__file__).with_name("terms.txt")
@@ -42,8 +43,8 @@ def program(body: Body, name: str, contacts: Contacts | None = None, *, flip: bo
         mesh = mesh.of_flip()
     free = coordinates.whole(body) if name == "spatial" else coordinates.even(body)
     contacts = contacts or jump_contacts(limits, mesh)
-    how = dict(name=name, free=free, tracking=name == "whole body")
-    return Schedule(body, contacts, limits, weights, **how).problem()
+    schedule = Schedule(body, contacts, limits, weights, free=free, tracking=name == "whole body")
+    return replace(schedule.problem(), name=name)
 
 
 def number(x) -> str:
@@ -100,6 +101,9 @@ def table() -> str:
         for part, fields in asdict(options).items():
             rows = fields.items() if isinstance(fields, dict) else [("", fields)]
             found += [f"{name}/{part} | {key} | {value}" for key, value in rows]
+    for row in build_problem(Options()).table():
+        head = " | ".join(row[key] for key in ("name", "equation", "kind", "value", "unit"))
+        found.append(f"joint qp/{row['phase']} | {head}")
     return "\n".join(found) + "\n"
 
 

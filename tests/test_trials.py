@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,8 +20,9 @@ from jumplab.io import folder as store
 from jumplab.show import margin_radar
 from jumplab.sim import Finding, Perturbation, Ranges, Scene, SensorNoise, Sign, SimulationResult, signs
 from jumplab.studies import margins
+from jumplab.studies import study as studies
 from jumplab.studies import trials as monte_carlo
-from jumplab.studies.trials import Trial, TrialKey, TrialSettings, run_trials, trial_log, wilson
+from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, run_trials, wilson
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -35,9 +35,10 @@ def folder(bhr, tmp_path):
     return tmp_path / "plan"
 
 
-def play(tape, robot, scene, settings, key):
+def play(plan, settings, key):
     """Stands in for a trial: lands by a coin that the key tosses."""
     toss = np.random.default_rng(key.robot_seed).uniform()
+    robot = plan.robot
     drawn = Perturbation.draw(robot, key.robot_seed)
     reason = "stood" if toss < 0.7 else f"left_arm touched the ground {toss:.2f} s after touchdown"
     return Trial(key, {}, monte_carlo.features(drawn, robot), toss < 0.7, reason, None)
@@ -57,14 +58,16 @@ def content(folder):
 
 
 def test_a_trial_is_the_simulation_it_says(folder, bhr):
-    tape, robot, summary = store.read_plan(folder)
-    settings = TrialSettings("pd", True, SensorNoise.typical())
-    key = TrialKey(3, 5, settings.hash, monte_carlo.plan_hash(summary))
-    trial = monte_carlo.run_trial(tape, robot, Scene.flat(), settings, key)
+    plan, settings = PlanOnFile.read(folder), TrialSettings("pd", True, SensorNoise.typical())
+    key, robot = TrialKey(3, 5, settings.hash, plan.hash), plan.robot
+    trial = monte_carlo.run_trial(plan, settings, key)
     drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    assert trial.perturbation == json.loads(json.dumps(drawn.to_json()))
+    assert trial.perturbation == drawn.to_json()
     assert trial.metrics.landed == trial.landed and trial.metrics.com_rise_m == pytest.approx(0.3, abs=0.05)
-    assert Trial.from_json(json.loads(json.dumps(trial.to_json()))) == trial
+    kept = json.dumps(trial.to_json())
+    assert json.dumps(Trial.from_json(json.loads(kept)).to_json()) == kept
+    older = json.loads(kept) | {"reason": "not honest: mass"}
+    assert Trial.from_json(older).reason == "failed checks of the run: mass"
     f = trial.features
     assert (f["friction"], f["delay_s"]) == (drawn.friction, drawn.delay_s)
     assert drawn.robot(robot).total_mass == pytest.approx(robot.total_mass * (1 + f["mass"]))
@@ -89,62 +92,56 @@ def test_a_lost_robot_is_a_failure(folder, monkeypatch):
     assert store.read_json(folder / "trials.json")["landed_metrics"]["com_rise_m"] is None
 
 
-@pytest.mark.parametrize("honesty", [(Finding("extra force", 20.0, 15.0, "N", "a carried base"),), ()])
-def test_a_run_that_is_not_honest_is_a_failure(folder, monkeypatch, honesty):
+def test_a_run_that_fails_a_check_is_a_failure(folder, monkeypatch):
     """However well it stands; the log says which check it failed."""
-    real = monte_carlo.simulate_jump
+    checks, real = (Finding("extra force", 20.0, 15.0, "N", "a carried base"),), monte_carlo.simulate_jump
     monkeypatch.setattr(
-        monte_carlo, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=honesty)
+        monte_carlo, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=checks)
     )
     trial = run_trials(folder, 1, jobs=1).trials[0]
     assert trial.metrics.landed and not trial.landed
-    doubt = "extra force: 20 N (at most 15; a carried base)" if honesty else "nothing was checked"
-    assert trial.reason == f"not honest: {doubt}; the run's own verdict: {trial.metrics.reason}"
+    doubt = "extra force: 20 N (at most 15; a carried base)"
+    assert trial.reason == f"failed checks of the run: {doubt}; the run's own verdict: {trial.metrics.reason}"
 
 
 def test_keys_differ_in_everything_that_matters(folder, monkeypatch):
-    summary = store.read_plan(folder)[2]
+    plan = PlanOnFile.read(folder)
     base = TrialSettings()
     others = [TrialSettings("pd"), TrialSettings(reaim=False), TrialSettings(noise=SensorNoise()),
               TrialSettings(ranges=replace(base.ranges, mass=0.06))]  # fmt: skip
     assert len({s.hash for s in (base, *others)}) == 5 and TrialSettings().hash == base.hash
     known = base.hash
-    monkeypatch.setattr(monte_carlo, "_code", lambda: "another controller")
+    monkeypatch.setattr("jumplab.studies.study.code", lambda: "another controller")
     assert base.hash != known
-    plans = [summary, summary | {"platform_edge_m": 0.3}, summary | {"target": {"platform_m": 0.1}}]
-    assert len({monte_carlo.plan_hash(s) for s in plans}) == 3
+    others = {}, {"platform_edge_m": 0.3}, {"target": {"platform_m": 0.1}}
+    assert len({replace(plan, summary=plan.summary | other).hash for other in others}) == 3
     seeds = {TrialKey(s, k, "", "").robot_seed for s in range(20) for k in range(50)}
     assert len(seeds) == 1000
 
 
-def test_the_code_that_decides_a_trial_is_all_listed(tmp_path):
-    """Whatever a trial imports, at any depth, and nothing else; a changed line there is another code."""
+def test_the_code_that_decides_a_trial_is_all_read(tmp_path):
+    """Whatever a trial imports, at any depth; a changed line there is another code, one that only shows is none."""
     graph = import_graph()
-    used = {f"jumplab.studies.{name}" for name in ("trials", "basin")}
-    used |= set().union(*(graph.find_upstream_modules(name) for name in used))
-    listed = {"jumplab." + part.removesuffix(".py").replace("/", ".") for part in monte_carlo.SOURCES}
-    assert all(any(f"{name}.".startswith(f"{room}.") for room in listed) for name in used)
-    assert all(any(f"{name}.".startswith(f"{room}.") for name in used) for room in listed)
+    used = graph.find_upstream_modules("jumplab.studies.trials")
+    assert not any(name.startswith(("jumplab.show", "jumplab.cli", "jumplab.api")) for name in used)
     root = tmp_path / "jumplab"
-    shutil.copytree(ROOT / "jumplab", root)
-    known = monte_carlo._code(root)
-    assert known == monte_carlo._code()
+    for file in ("sim/loop.py", "studies/trials.py", "cli/main.py"):
+        (root / file).parent.mkdir(parents=True)
+        (root / file).write_text("before\n")
+    known = studies.code(root)
     for file, decides in (("sim/loop.py", True), ("studies/trials.py", True), ("cli/main.py", False)):
-        (root / file).write_text((root / file).read_text() + "\n")
-        assert (monte_carlo._code(root) != known) == decides, file
-        known = monte_carlo._code(root)
+        (root / file).write_text("after\n")
+        studies.code.cache_clear()
+        assert (studies.code(root) != known) == decides, file
+        known = studies.code(root)
 
 
 def test_conditions_follow_the_settings():
     said = TrialSettings("pd", False, SensorNoise(), Ranges(mass=0.2), "mujoco").conditions
-    assert said["playback"] == "pd mode in MuJoCo" and said["re-aim"] == "no"
+    assert said["playback"].startswith("pd mode (planned torques") and "in MuJoCo, hard contact" in said["playback"]
+    assert said["re-aim"] == "no"
     assert "masses ±20 %" in said["drawn uniformly, each link and joint by itself"]
     assert said["measured (one standard deviation)"] == "the true state and foot forces"
-
-
-def test_bad_mode():
-    with pytest.raises(InputError, match=r"^mode 'velocity': must be one of position, pd$"):
-        TrialSettings("velocity")
 
 
 # ------------------------------------------------------------------------------------------ a series
@@ -161,7 +158,7 @@ def test_report_counts(folder, coins):
     assert said["settings"]["mode"] == "position" and said["settings"]["reaim"] and said["seed"] == 2
     assert said["settings"]["noise"] == vars(SensorNoise.typical())  # sensors err unless told otherwise
     assert said["conditions"] == {
-        "playback": "position mode in PyBullet",
+        "playback": "position mode (target angles and rates; a drive measures its own joint) in PyBullet, hard contact",
         "launch": "open loop",
         "re-aim": "the legs turn in the air against errors of trunk, speed and momentum, about all axes",
         "recovery step": "none",
@@ -171,17 +168,10 @@ def test_report_counts(folder, coins):
     }
     assert [t.key.index for t in report.trials] == list(range(40))
     lines = (folder / "trials.jsonl").read_text().splitlines()
-    assert {Trial.from_json(json.loads(line)).key for line in lines} == {t.key for t in report.trials}
+    assert {Trial.from_json(json.loads(line)["row"]).key for line in lines} == {t.key for t in report.trials}
 
 
-def test_wilson_is_its_formula():
-    z = 1.959963984540054
-    for k, n in ((0, 8), (5, 8), (190, 200), (200, 200)):
-        middle, half = (k + z * z / 2) / (n + z * z), z / (n + z * z) * np.sqrt(k * (n - k) / n + z * z / 4)
-        assert wilson(k, n) == pytest.approx((max(0, middle - half), min(1, middle + half)), abs=1e-9)
-
-
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit, MemoryError])
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])
 def test_a_stopped_series_goes_on_to_the_same_end(folder, coins, monkeypatch, stop):
     whole = run_trials(folder, 12, jobs=1)
     wanted = content(folder)
@@ -200,12 +190,15 @@ def test_a_stopped_series_goes_on_to_the_same_end(folder, coins, monkeypatch, st
         run_trials(folder, 12, jobs=1)
     assert "trials.json" not in names(folder)
     with open(folder / "trials.jsonl", "ab") as file:  # killed in the middle of a line
-        file.write(json.dumps(whole.trials[7].to_json()).encode()[:100])
+        file.write(json.dumps({"key": whole.trials[7].key.name, "row": {}}).encode()[:30])
     monkeypatch.setattr(monte_carlo, "run_trial", play)
     again = run_trials(folder, 12, jobs=1)
     assert again.resumed == 5 and again.trials == whole.trials and content(folder) == wanted
     third = run_trials(folder, 12, jobs=1)
     assert third.resumed == 12 and content(folder) == wanted
+    longer = run_trials(folder, 14, jobs=1)
+    assert longer.resumed == 12 and longer.trials[:12] == whole.trials
+    assert run_trials(folder, 3, jobs=1).trials == whole.trials[:3]
 
 
 def test_a_bar_only_where_it_is_wanted(folder, coins, capsys):
@@ -215,12 +208,6 @@ def test_a_bar_only_where_it_is_wanted(folder, coins, capsys):
     said = capsys.readouterr().err
     assert "4/4" in said and "3/4" in said  # the first three are there already
     assert report.count == 3
-
-
-def test_a_longer_series_begins_with_the_shorter_one(folder, coins):
-    short, long = run_trials(folder, 5, jobs=1), run_trials(folder, 9, jobs=1)
-    assert long.resumed == 5 and long.trials[:5] == short.trials
-    assert run_trials(folder, 3, jobs=1).trials == short.trials[:3]
 
 
 def test_other_settings_seeds_and_plans_do_not_mix(folder, bhr, coins):
@@ -236,20 +223,11 @@ def test_other_settings_seeds_and_plans_do_not_mix(folder, bhr, coins):
     assert other.resumed == 0 and other.plan != first.plan
 
 
-@pytest.mark.parametrize(
-    "junk",
-    [b"", b"\n\n", b"\xff\xfe{", b"[1, 2]\n", b"{}\n", b'{"schema": "jumplab-trials-0"}\n', b"null\n", b"[" * 5000],
-)
-def test_a_log_with_junk_is_read_around(folder, coins, junk):
-    (folder / "trials.jsonl").write_bytes(junk)
-    run_trials(folder, 3, jobs=1)
-    with trial_log(folder) as log:
-        assert len(log.done) == 3
-    assert (folder / "trials.jsonl").read_bytes().startswith(junk)
-
-
 def test_two_runs_at_once_are_refused(folder, coins):
-    with trial_log(folder), pytest.raises(InputError, match=r"trials\.jsonl: another 'jumplab trials' is writing it"):
+    with (
+        PlanOnFile.read(folder).study(),
+        pytest.raises(InputError, match=r"trials\.jsonl: another 'jumplab trials' is writing it"),
+    ):
         run_trials(folder, 3, jobs=1)
 
 
@@ -280,30 +258,13 @@ def test_bad_numbers(folder, arguments, sentence):
     assert str(e.value) == sentence and names(folder) == before
 
 
-@pytest.mark.parametrize("damage", ["truncated", "other robot", "older schema", "summary"])
-def test_damaged_plans_are_refused_in_one_sentence(folder, damage):
-    if damage == "truncated":
-        (folder / "plan.npz").write_bytes((folder / "plan.npz").read_bytes()[:2000])
-    elif damage == "other robot":
-        (folder / "robot.urdf").write_text((folder / "robot.urdf").read_text().replace("0.5", "0.51"))
-    elif damage == "older schema":
-        text = (folder / "summary.json").read_text()
-        (folder / "summary.json").write_text(text.replace(store.SCHEMA, "jumplab-result-0"))
-    else:
-        (folder / "summary.json").write_text((folder / "summary.json").read_text()[:300])
-    before = names(folder)
-    with pytest.raises(InputError) as e:
-        run_trials(folder, 2, jobs=1)
-    assert "\n" not in str(e.value) and str(folder) in str(e.value) and names(folder) == before
-
-
 # ------------------------------------------------------------------------------------------ causes, falls, margins
 
 
 def test_failures_are_counted_by_their_first_sign(folder, monkeypatch):
-    def failing(tape, robot, scene, settings, key):
+    def failing(plan, settings, key):
         found = (Sign("slip", 0.1), Sign("tip", 0.2)) if key.index < 3 else ()
-        return replace(play(tape, robot, scene, settings, key), landed=key.index == 4, signs=found).as_kept()
+        return replace(play(plan, settings, key), landed=key.index == 4, signs=found)
 
     monkeypatch.setattr(monte_carlo, "run_trial", failing)
     monkeypatch.setattr(monte_carlo.TrialReport, "values", lambda self, name: np.zeros(0))
@@ -329,10 +290,10 @@ def test_falls_are_kept_whole(folder, monkeypatch):
 def bears(limits):
     """Stands in for a trial: lands up to a payload, farther with re-aim."""
 
-    def trial(tape, robot, scene, settings, key):
+    def trial(plan, settings, key):
         trials.append(key)
         load, most = settings.ranges.payload_kg[0], limits[settings.reaim]
-        return replace(play(tape, robot, scene, settings, key), landed=load <= most or (load < 4 and key.index == 7))
+        return replace(play(plan, settings, key), landed=load <= most or (load < 4 and key.index == 7))
 
     trials: list[TrialKey] = []
     return trial, trials
@@ -359,9 +320,9 @@ def test_margins_are_bisected_and_resumed(folder, monkeypatch, most, shares):
 def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
     seen = []
 
-    def trial(tape, robot, scene, settings, key):
+    def trial(plan, settings, key):
         seen.append((settings.step, settings.feedback))
-        return replace(play(tape, robot, scene, settings, key), landed=True)
+        return replace(play(plan, settings, key), landed=True)
 
     def found(names, **how):
         seen.clear()
@@ -376,7 +337,7 @@ def test_margins_of_other_ways_and_their_picture(folder, monkeypatch):
 
     monkeypatch.setattr(monte_carlo, "run_trial", trial)
     with_step, usual = found(("payload_kg", "mass"), step=True), found(("payload_kg",))
-    found(("mass",), feedback=True)
+    found(("mass",), mode="whole-body", feedback=True)
     figure = margin_radar({"usual": usual, "one step": with_step})
     assert [ax.get_title("left") for ax in figure.axes] == ["plain", "re-aimed"]
     for ax in figure.axes:
@@ -403,8 +364,8 @@ def test_margins_of_what_is_not_there(folder):
 
 def whole_lines(folder):
     """Lines of the log, in any order, without what the kill has torn."""
-    with trial_log(folder) as log:
-        return {json.dumps(trial.to_json()) for trial in log.done.values()}
+    with PlanOnFile.read(folder).study() as study:
+        return {json.dumps(trial.to_json()) for trial in study.done.values()}
 
 
 @pytest.mark.slow
@@ -420,7 +381,7 @@ def test_killed_in_parallel_and_resumed_equals_serial(folder, tmp_path):
     for number, lines in ((signal.SIGINT, 1), (signal.SIGKILL, 2)):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
                                    env=os.environ | {"PYTHONPATH": str(ROOT)}, preexec_fn=heed)  # fmt: skip
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 900  # a process that hangs, not one that is slow on a busy machine
         log = other / "trials.jsonl"
         while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= lines):
             assert time.monotonic() < deadline

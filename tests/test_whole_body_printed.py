@@ -10,7 +10,7 @@ import pytest
 from fixtures_core import LIMBS, full_state, inverse_dynamics, jump, turned
 from paper.expansion import expand
 from paper.lagrange import five_links
-from paper.violations import violations
+from paper.violations import planar_motion, violations
 from paper.whole_body_printed import (
     LINK_OF_THETA,
     MOTION,
@@ -286,7 +286,7 @@ def test_touchdown_is_found_again_by_the_expansion(bhr, printed, ours):
 ])  # fmt: skip
 def test_each_fault_is_named(bhr, ours, name, change):
     """One fault put into a sound motion is found under its own name."""
-    motion = {k: np.array(ours.tape.extra[f"planar_{k}"]) for k in MOTION}
+    motion = planar_motion(ours.tape, bhr)
     change(motion)
     tape = replace(ours.tape, extra={f"planar_{k}": x for k, x in motion.items()})
     assert not table(SimpleNamespace(task=ours.task, tape=tape), bhr)[name]["kept"]

@@ -1,7 +1,8 @@
-"""Independent audit of a finished plan: a second code path that shares nothing with the planner but robot and tape.
+"""Independent audit of a finished plan: a second code path that shares nothing with the planner but
+robot and tape.
 
-In comes a tape with its robot, out goes an :class:`AuditReport`. Start reading at :func:`audit`; every limit stands in
-``limits.toml``.
+In comes a tape with its robot, out goes an :class:`AuditReport`. Start reading at :func:`audit`;
+every limit stands in ``limits.toml``.
 """
 
 from jumplab.auditing.audit import audit, write_audit

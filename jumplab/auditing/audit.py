@@ -1,14 +1,15 @@
-"""The audit itself: replay a tape, ask every group of checks, and leave the report in a result folder."""
+"""The audit itself: replay a tape, ask every group of checks, leave the report in a folder."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
-from jumplab.auditing.report import AuditReport
+from jumplab.auditing.report import LIMITS, AuditReport, Check, Measure
 from jumplab.errors import InputError, as_path, quoted, require_type
 from jumplab.io.files import write_file
 from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
@@ -19,9 +20,9 @@ from jumplab.task import JumpTask
 
 REPORT = "passport.json"
 GROUPS = (
-    motion.checks,
-    dynamics.checks,
-    contact.checks,
+    motion.record,
+    dynamics.balance,
+    contact.contact,
     dynamics.joints,
     motion.target,
     contact.collisions,
@@ -29,20 +30,22 @@ GROUPS = (
 )
 
 
-def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None) -> AuditReport:
+def audit(
+    tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: float | None = None
+) -> AuditReport:
     """Audit a finished plan with nothing but its tape and the robot's URDF.
 
-    Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid. A tape with numbers that are not finite,
-    or with phases out of order, gets a report with these two checks alone. Raises :class:`InputError` if the tape
-    belongs to another robot (joints, sizes or contact frames differ).
+    Every quantity is recomputed with Pinocchio on the tape's own 1 kHz grid. A tape with numbers
+    that are not finite, or with phases out of order, gets a report with these two checks alone.
+    Raises :class:`InputError` if the tape belongs to another robot (joints, sizes or contact frames
+    differ).
 
     Parameters
     ----------
-    tape, robot : launch and flight of the full robot, its URDF and configuration.
-    task : what was asked; without it the checks of distance, rise, turns and start are left out, g is 9.8 and the
-        landing surface is where the soles are at the end.
-    edge_m : where the landing surface of another height begins, ahead of the toes' first place [m]; by default 5 cm
-        behind the landing soles if it is higher, 5 cm ahead of the toes if it is lower.
+    task : what was asked; without it the checks of distance, rise, turns and start are left out, g
+        is 9.8, and the landing surface is where the soles are at the end.
+    edge_m : where the landing surface of another height begins, ahead of the toes' first place [m];
+        by default 5 cm behind the landing soles if it is higher, 5 cm ahead of the toes if lower.
     """
     require_type(tape, Tape, "the tape to audit")
     require_type(robot, Robot, "its robot")
@@ -52,10 +55,10 @@ def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: flo
     if edge_m is not None and not (number and math.isfinite(edge_m)):
         raise InputError(f"edge_m must be a finite number of metres, got {quoted(edge_m)}")
     open_tape(tape, robot, task)
-    checks = motion.form(tape)
+    checks = _checks(motion.form(tape))
     if all(c.passed for c in checks):
         r = replay(tape, robot, task, edge_m)
-        checks += [c for group in GROUPS for c in group(r)]
+        checks += _checks(measure for group in GROUPS for measure in group(r))
     manifest = {
         "robot": robot.name,
         "robot_hash": robot.hash,
@@ -66,13 +69,20 @@ def audit(tape: Tape, robot: Robot, task: JumpTask | None = None, *, edge_m: flo
     return AuditReport(tuple(checks), manifest)
 
 
-def write_audit(folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None) -> AuditReport:
-    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another folder).
+def _checks(measures: Iterable[Measure]) -> list[Check]:
+    return [LIMITS[name].check(*values) for name, *values in measures]
 
-    Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest, ``summary.json`` if it is
-    there; takes no lock, since the folder may be one that is being written. ``task`` is what was asked instead of the
-    target in ``summary.json``. Raises :class:`InputError` if a file is missing or damaged, or the folder cannot be
-    written to.
+
+def write_audit(
+    folder: str | Path, task: JumpTask | None = None, *, into: str | Path | None = None
+) -> AuditReport:
+    """Audit the plan in a result folder and write ``passport.json`` beside it (or into another
+    folder).
+
+    Reads ``plan.npz``, ``robot.urdf``, ``robot.toml`` and, for the target and the manifest,
+    ``summary.json`` if it is there; takes no lock, since the folder may be one that is being
+    written. ``task`` is what was asked instead of the target in ``summary.json``. Raises
+    :class:`InputError` if a file is missing or damaged, or the folder cannot be written to.
     """
     tell("audit")
     folder = as_path(folder, "a result folder")
@@ -81,11 +91,15 @@ def write_audit(folder: str | Path, task: JumpTask | None = None, *, into: str |
     summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
     edge = None
     if task is None:
-        task, edge = _task_of(summary), summary.get("platform_edge_m")
+        task = _task_of(summary)
+        edge = summary.get("platform_edge_m")
     report = audit(tape, humanoid, task, edge_m=edge)
     manifest = {**report.manifest, "plan_sha256": sha256(folder / PLAN), "planner": summary}
     report = dataclasses.replace(report, manifest=manifest)
-    write_file((folder if into is None else as_path(into, "the passport's folder")) / REPORT, report.to_json().encode())
+    write_file(
+        (folder if into is None else as_path(into, "the passport's folder")) / REPORT,
+        report.to_json().encode(),
+    )
     return report
 
 
@@ -93,7 +107,9 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: cannot be read ({type(e).__name__}); plan the jump again into this folder") from e
+        raise InputError(
+            f"{path}: cannot be read ({type(e).__name__}); plan the jump again into this folder"
+        ) from e
 
 
 def _task_of(summary: dict) -> JumpTask | None:

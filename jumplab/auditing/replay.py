@@ -13,10 +13,15 @@ from jumplab.auditing.report import METHOD
 from jumplab.errors import InputError, RobotError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.robot.description import SLIDING_RATE
+from jumplab.robot.motors import SLIDING_RATE
 from jumplab.task import GRAVITY, JumpTask
 
 BASE = ("base x", "base y", "base z", "base roll", "base pitch", "base yaw")
+
+
+def norm(x: np.ndarray) -> np.ndarray:
+    """Lengths (...) of vectors (..., n)."""
+    return np.linalg.norm(x, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -30,14 +35,14 @@ class Sole:
     z: float
 
     def points(self) -> np.ndarray:
-        """(2 n, 3) points on right and left edge: index 0 is the heel, n - 1 the toe, then the left edge likewise."""
+        """(2 n, 3) points: from heel to toe on the right edge, then on the left one."""
         x = np.linspace(self.heel, self.toe, METHOD.sole_points)
         return np.array([[xi, y, self.z] for y in (self.right, self.left) for xi in x])
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A tape, a robot's URDF and what follows from them, in N samples with K contact frames; vectors in world axes."""
+    """A tape of N samples with K contact frames, a robot's URDF, and what follows; world axes."""
 
     tape: Tape
     robot: Robot
@@ -51,19 +56,52 @@ class Replay:
     com_acceleration: np.ndarray
     momentum: np.ndarray  # (N, 3) angular momentum about the CoM [kg m^2/s]
     energy: np.ndarray  # (N,) kinetic, that of the motors' armature included, plus potential [J]
-    base: np.ndarray  # (N, 3) origin of the base link [m]
-    base_rotation: np.ndarray  # (N, 3, 3)
     foot: np.ndarray  # (N, K, 3) origin of each contact frame [m]
     foot_rotation: np.ndarray  # (N, K, 3, 3)
-    base_residual: np.ndarray  # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
+    # (N, 6) force [N] and moment about the CoM [N m] that nothing on the tape provides
+    base_residual: np.ndarray
     tau: np.ndarray  # (N, nv - 6) motor torques that the motion and the contact wrenches need [N m]
     lost: np.ndarray  # (N, nv - 6) of them, what the motors' friction takes [N m]
-    coordinates: tuple[str, ...]  # (nv,) names of the columns of v
-    gravity: float  # of the replayed model, positive [m/s^2]
-    mass: float  # of the URDF [kg]
-    weight: float  # m g [N]
-    carrying: np.ndarray  # (N, K) whether a foot is on the ground, as the tape says; what it says is checked
-    step: np.ndarray  # (N - 1,) time steps [s]; zero across take-off, and where a foot lands
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """(nv - 6,) names of the joints."""
+        return tuple(map(str, self.tape.joint_names))
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """(nv,) names of the columns of v."""
+        return (*BASE, *self.joints)
+
+    @cached_property
+    def gravity(self) -> float:
+        """Of the replayed model, positive [m/s^2]."""
+        return float(-self.model.gravity.linear[2])
+
+    @cached_property
+    def mass(self) -> float:
+        """Of the URDF [kg]."""
+        return float(pin.computeTotalMass(self.model))
+
+    @property
+    def weight(self) -> float:
+        """m g [N]."""
+        return self.mass * self.gravity
+
+    @cached_property
+    def step(self) -> np.ndarray:
+        """(N - 1,) time steps [s]; zero across take-off, and where a foot lands."""
+        return np.diff(self.tape.t)
+
+    @cached_property
+    def carrying(self) -> np.ndarray:
+        """(N, K) whether a foot is on the ground, as the tape says; what it says is checked."""
+        return carrying(self.tape)
+
+    @cached_property
+    def ground(self) -> np.ndarray:
+        """(N,) whether any foot is on the ground."""
+        return self.carrying.any(axis=1)
 
     @cached_property
     def pieces(self) -> list[slice]:
@@ -77,32 +115,22 @@ class Replay:
         return [p for p in self.pieces if not self.carrying[p].any()]
 
     @cached_property
-    def ground(self) -> np.ndarray:
-        """(N,) whether any foot is on the ground."""
-        return self.carrying.any(axis=1)
-
-    @cached_property
-    def until_last_stand(self) -> slice:
-        """Rows up to the last one with a foot on the ground."""
-        return slice(0, int(np.flatnonzero(self.ground)[-1]) + 1)
-
-    @cached_property
     def stands(self) -> list[tuple[int, slice]]:
         """(foot, rows) of each contact."""
-        out = []
+        stands = []
         for k, column in enumerate(self.carrying.T):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
-            out += [(k, slice(a, b)) for a, b in edges.reshape(-1, 2).tolist()]
-        return out
+            edges = np.flatnonzero(np.diff(column.astype(int), prepend=0, append=0))
+            stands += [(k, slice(a, b)) for a, b in edges.reshape(-1, 2).tolist()]
+        return stands
 
     @property
     def is_jump(self) -> bool:
-        """Whether both feet leave once, and the tape ends as they come down; else it is another schedule."""
-        return len(self.flights) == 1 and self.flights[0].stop == len(self.tape.t) and len(self.pieces) == 2
+        """Whether both feet leave once, and the tape ends as they come down."""
+        return len(self.pieces) == 2 and self.flights == self.pieces[1:]
 
     @cached_property
     def sole_points(self) -> np.ndarray:
-        """(N, K, 2 n, 3) points of the soles in the world [m], in the order of :meth:`Sole.points`."""
+        """(N, K, 2 n, 3) points of the soles in the world [m], ordered as :meth:`Sole.points`."""
         local = np.array([s.points() for s in self.soles])  # (K, P, 3)
         return self.foot[:, :, None] + np.einsum("nkij,kpj->nkpi", self.foot_rotation, local)
 
@@ -118,76 +146,99 @@ class Replay:
 
     @cached_property
     def platform(self) -> float:
-        """Height of the landing surface [m]: the task's, or without one that of the soles in the last sample."""
+        """Height of the landing surface [m]: the task's, else that of the soles at the end."""
         return self.task.platform_m if self.task else float(self.sole_points[-1, :, :, 2].min())
 
+    @property
+    def course_rad(self) -> float:
+        """Direction in which the surfaces change, from +x to the left [rad]."""
+        return self.task.along_rad if self.task else 0.0
+
     def along(self, points: np.ndarray) -> np.ndarray:
-        """How far points (..., 3) lie along the axis on which the surfaces change [m]: x, or the way to a side."""
-        if self.task is None or self.task.along_rad == 0:
-            return points[..., 0]
-        return np.cos(self.task.along_rad) * points[..., 0] + np.sin(self.task.along_rad) * points[..., 1]
+        """How far points (..., 3) [m] lie along the axis on which the surfaces change [m]."""
+        return points[..., :2] @ [np.cos(self.course_rad), np.sin(self.course_rad)]
 
     @cached_property
     def heading(self) -> float:
         """+1 for a jump along that axis, -1 against it."""
-        if self.task is not None and self.task.along_rad:
-            return 1.0
-        return 1.0 if self.toe_corners[-1, ..., 0].mean() >= self.toe_corners[0, ..., 0].mean() else -1.0
+        first, last = self.toe_corners[[0, -1], ..., 0].mean(axis=(1, 2))
+        return 1.0 if self.course_rad or last >= first else -1.0
 
     @cached_property
     def edge(self) -> float:
-        """Place of the step between the two surfaces [m], as given; or else where the world is most natural.
+        """Place of the step between the two surfaces [m], as given; or else where the world is most
+        natural.
 
-        A higher surface begins a little behind the sole that lands on it, not under the launching one if that can be;
-        the launching surface ends a little ahead of the launching sole if the landing one is lower.
+        A higher surface begins a little behind the sole that lands on it, not under the launching
+        one if that can be; the launching surface ends a little ahead of the launching sole if the
+        landing one is lower.
         """
+        ahead = self.along(self.sole_points[[0, -1]])
         if self.edge_m is not None:
-            first = float(self.toe_corners[0, ..., 0].mean())
-            if self.task is not None and self.task.along_rad:  # as far ahead of the soles' middle as the toes are
-                foot, middle = self.robot.foot, self.sole_points[0].mean(axis=(0, 1))
-                first = float(self.along(middle)) + foot.toe - float(foot.center[0])
-            return first + self.edge_m
-        ahead = self.heading * self.along(self.sole_points[[0, -1]])
-        launched, landed = float(ahead[0].max()), float(ahead[1].min())
+            foot = self.robot.foot
+            return float(ahead[0].mean()) + foot.toe - float(foot.center[0]) + self.edge_m
+        launched = float((self.heading * ahead[0]).max())
+        landed = float((self.heading * ahead[1]).min())
         up = min(max(landed - METHOD.edge_room_m, launched), landed)
         return self.heading * (up if self.platform > 0 else launched + METHOD.edge_room_m)
 
     def surface(self, x: np.ndarray) -> np.ndarray:
-        """Height of the surface at ``x`` along the axis on which it changes [m]."""
+        """Heights (...) of the surface at ``x`` (...) along the axis on which it changes [m]."""
         ahead = self.heading * (np.asarray(x) - self.edge)
         beyond = ahead > -1e-9 if self.platform > 0 else ahead > 1e-9
         return np.where(beyond, self.platform, 0.0)
 
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Running trapezoid integral over time of (N,) or (N, M) values, zero in the first row."""
-        steps = np.diff(self.tape.t).reshape(-1, *[1] * (values.ndim - 1))
-        areas = steps * (values[1:] + values[:-1]) / 2  # as scipy does, whose import takes longer than the whole audit
+        # as scipy does, whose import takes longer than the whole audit
+        areas = ((values[1:] + values[:-1]).T * self.step / 2).T
         return np.concatenate([np.zeros_like(values[:1]), np.cumsum(areas, axis=0)])
 
 
+def motors(robot: Robot, joints: tuple[str, ...], *keys: str) -> np.ndarray:
+    """(keys, joints) numbers of the motors, which no URDF knows."""
+    return np.array([[robot.actuators[name][key] for name in joints] for key in keys])
+
+
+def carrying(tape: Tape) -> np.ndarray:
+    """(N, K) whether a foot is down: by the tape's ``contacts``, else all feet until take-off."""
+    contacts = tape.extra.get("contacts")
+    if isinstance(contacts, np.ndarray) and contacts.shape == tape.f.shape[:2]:
+        return contacts > 0
+    return np.repeat((np.asarray(tape.phase) != "flight")[:, None], tape.f.shape[1], axis=1)
+
+
 def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Model, list[int]]:
-    """Pinocchio model from the URDF, and indices of the contact frames; raises InputError if the tape does not fit."""
+    """Pinocchio model, and contact frames; raises InputError if the tape does not fit."""
     try:
         model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
     except ValueError as e:
-        raise RobotError(f"robot {robot.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}") from e
+        raise RobotError(
+            f"robot {robot.name}: Pinocchio cannot read the URDF: {str(e).splitlines()[0]}"
+        ) from e
     model.gravity.linear = np.array([0.0, 0.0, -(task.gravity if task else GRAVITY)])
     if tuple(map(str, tape.joint_names)) != tuple(model.names[2:]):
         raise InputError(
-            f"tape: its joints are not those of the robot {robot.name!r} in the same order; plan the jump again with "
-            f"this robot"
+            f"tape: its joints are not those of the robot {robot.name!r} in the same order; plan "
+            "the jump again with this robot"
         )
-    n, k = len(tape.t), len(tape.contact_frames)
-    shapes = {"q": (n, model.nq), "v": (n, model.nv), "a": (n, model.nv), "tau": (n, model.nv - 6), "f": (n, k, 6)}
-    for name, shape in shapes.items():
-        if (found := getattr(tape, name).shape) != shape:
-            raise InputError(f"tape: {name} has shape {found}, the robot {robot.name!r} needs {shape}")
-    for name in tape.contact_frames:
-        if not model.existFrame(str(name)):
-            raise InputError(f"tape: the contact frame {str(name)!r} is not a link of the robot {robot.name!r}")
-    if k == 0:
+    frames = list(map(str, tape.contact_frames))
+    widths = {"q": model.nq, "v": model.nv, "a": model.nv, "tau": model.nv - 6}
+    needed = {name: (len(tape.t), width) for name, width in widths.items()}
+    for name, shape in (needed | {"f": (len(tape.t), len(frames), 6)}).items():
+        given = getattr(tape, name).shape
+        if given != shape:
+            raise InputError(
+                f"tape: {name} has shape {given}, the robot {robot.name!r} needs {shape}"
+            )
+    for name in frames:
+        if not model.existFrame(name):
+            raise InputError(
+                f"tape: the contact frame {name!r} is not a link of the robot {robot.name!r}"
+            )
+    if not frames:
         raise InputError("tape: it names no contact frame; a jump needs at least one foot")
-    return model, [model.getFrameId(str(name)) for name in tape.contact_frames]
+    return model, [model.getFrameId(name) for name in frames]
 
 
 def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None = None) -> Replay:
@@ -196,36 +247,18 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
     try:
         geometry = pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as e:
-        raise RobotError(f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}") from e
-    soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
+        raise RobotError(
+            f"robot {robot.name}: its collision shapes cannot be read: {str(e).splitlines()[0]}"
+        ) from e
     motion = _motion(tape, model, frames)
-    need = dict(zip(("base_residual", "tau"), _inverse_dynamics(tape, model, frames, motion), strict=True))
-    armature, need["lost"] = _motors(tape, robot)
-    need["tau"] = need["tau"] + armature * tape.a[:, 6:] + need["lost"]
-    motion["energy"] = motion["energy"] + (armature * tape.v[:, 6:] ** 2).sum(axis=1) / 2
-    gravity, mass = float(-model.gravity.linear[2]), float(pin.computeTotalMass(model))
-    rows = {"carrying": carrying(tape)}
-    told = {"gravity": gravity, "mass": mass, "weight": mass * gravity, "step": np.diff(tape.t)}
-    names = (*BASE, *map(str, tape.joint_names))
-    return Replay(
-        tape, robot, task, edge_m, model, geometry, soles, coordinates=names, **motion, **need, **rows, **told
-    )
-
-
-def carrying(tape: Tape) -> np.ndarray:
-    """(N, K) whether a foot is on the ground: the tape's ``contacts``, without them all feet until take-off."""
-    told = tape.extra.get("contacts")
-    if isinstance(told, np.ndarray) and told.shape == tape.f.shape[:2]:
-        return told > 0
-    return np.repeat((np.asarray(tape.phase) != "flight")[:, None], tape.f.shape[1], axis=1)
-
-
-def _motors(tape: Tape, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Of the motors, which no URDF knows: armature (nv - 6,) [kg m^2], torques (N, nv - 6) lost to friction [N m]."""
-    rows = [robot.actuators[name] for name in map(str, tape.joint_names)]
-    armature, dry, viscous = (np.array([row[key] for row in rows]) for key in ("armature", "friction", "damping"))
-    rate = tape.v[:, 6:]
-    return armature, dry * np.tanh(rate / SLIDING_RATE) + viscous * rate
+    rates = tape.v[:, 6:]
+    numbers = "armature", "friction", "damping"
+    armature, dry, viscous = motors(robot, tuple(map(str, tape.joint_names)), *numbers)
+    lost = dry * np.tanh(rates / SLIDING_RATE) + viscous * rates
+    motion["tau"] = motion["tau"] + armature * tape.a[:, 6:] + lost
+    motion["energy"] = motion["energy"] + (armature * rates**2).sum(axis=1) / 2
+    soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
+    return Replay(tape, robot, task, edge_m, model, geometry, soles, lost=lost, **motion)
 
 
 def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: int) -> Sole:
@@ -241,41 +274,38 @@ def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: in
         return Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
     corners = np.array(corners)
     low = corners[corners[:, 2] < corners[:, 2].min() + METHOD.same_level_m]
-    return Sole(low[:, 0].min(), low[:, 0].max(), low[:, 1].min(), low[:, 1].max(), low[:, 2].min())
+    (heel, right, z), (toe, left, _) = low.min(axis=0), low.max(axis=0)
+    return Sole(heel, toe, right, left, z)
 
 
 def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.ndarray]:
-    """The kinematic fields of :class:`Replay`, by name."""
-    data, mass, n, k = model.createData(), pin.computeTotalMass(model), len(tape.t), len(frames)
-    points = "com", "com_velocity", "com_acceleration", "momentum", "base"
-    found = {name: np.empty((n, 3)) for name in points} | {"energy": np.empty(n), "base_rotation": np.empty((n, 3, 3))}
-    found |= {"foot": np.empty((n, k, 3)), "foot_rotation": np.empty((n, k, 3, 3))}
-    com, velocity, acceleration, momentum, base, energy, rotation, foot, foot_rotation = found.values()
-    for i, (q, v, a) in enumerate(zip(tape.q, tape.v, tape.a, strict=True)):
+    """The mechanical fields of :class:`Replay`, by name; torques without what motors add."""
+    data = model.createData()
+    inverse = model.createData()
+    mass = pin.computeTotalMass(model)
+    rows = []
+    for q, v, a, wrenches in zip(tape.q, tape.v, tape.a, tape.f, strict=True):
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         pin.updateFramePlacements(model, data)
-        energy[i] = pin.computeMechanicalEnergy(model, data, q, v)
-        com[i], velocity[i], acceleration[i] = data.com[0], data.hg.linear / mass, data.dhg.linear / mass
-        momentum[i], base[i], rotation[i] = data.hg.angular, data.oMi[1].translation, data.oMi[1].rotation
-        for j, frame in enumerate(frames):
-            foot[i, j], foot_rotation[i, j] = data.oMf[frame].translation, data.oMf[frame].rotation
-    return found
-
-
-def _inverse_dynamics(tape: Tape, model: pin.Model, frames: list[int], motion: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Base residual (force, moment about the CoM; world axes) and joint torques."""
-    data = model.createData()
-    # (N, K, 2, 3) force and moment at the contact frame's origin, in its axes
-    local = np.einsum("nkji,nkcj->nkci", motion["foot_rotation"], tape.f.reshape(*tape.f.shape[:2], 2, 3))
-    contacts = [(model.frames[i].parentJoint, model.frames[i].placement) for i in frames]
-    need, external, none = np.empty_like(tape.v), pin.StdVec_Force(), pin.Force.Zero()
-    external.extend([none for _ in range(model.njoints)])
-    for i in range(len(tape.t)):
-        for joint, _ in contacts:
-            external[joint] = none
-        for (joint, place), wrench in zip(contacts, local[i], strict=True):
-            external[joint] = external[joint] + place.act(pin.Force(*wrench))
-        need[i] = pin.rnea(model, data, tape.q[i], tape.v[i], tape.a[i], external)
-    force, moment = (np.einsum("nij,nj->ni", motion["base_rotation"], need[:, k : k + 3]) for k in (0, 3))
-    moment -= np.cross(motion["com"] - motion["base"], force)
-    return np.concatenate([force, moment], axis=1), need[:, 6:]
+        external = [pin.Force.Zero() for _ in range(model.njoints)]
+        for frame, wrench in zip(frames, wrenches, strict=True):
+            # from the frame's origin in world axes to the joint that carries it
+            contact = pin.SE3(np.eye(3), data.oMf[frame].translation).act(pin.Force(wrench))
+            joint = model.frames[frame].parentJoint
+            external[joint] = external[joint] + data.oMi[joint].actInv(contact)
+        need = pin.rnea(model, inverse, q, v, a, external)
+        force, moment = data.oMi[1].rotation @ need[:6].reshape(2, 3, 1)
+        arm = data.com[0] - data.oMi[1].translation
+        row = {
+            "com": data.com[0].copy(),
+            "com_velocity": data.hg.linear / mass,
+            "com_acceleration": data.dhg.linear / mass,
+            "momentum": data.hg.angular.copy(),
+            "energy": pin.computeMechanicalEnergy(model, data, q, v),
+            "foot": [data.oMf[frame].translation.copy() for frame in frames],
+            "foot_rotation": [data.oMf[frame].rotation.copy() for frame in frames],
+            "base_residual": [*force[:, 0], *(moment[:, 0] - np.cross(arm, force[:, 0]))],
+            "tau": need[6:].copy(),
+        }
+        rows.append(row)
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}

@@ -1,13 +1,17 @@
-"""What an audit looks at and says: limits (all in ``limits.toml``), checks against them, and the report they make."""
+"""What an audit looks at and says: limits (``limits.toml``), checks, and the report of them."""
 
 from __future__ import annotations
 
+import itertools
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jumplab.errors import Shown
 from jumplab.io.folder import to_json
@@ -35,26 +39,8 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Method:
-    """Numbers of the audit that are no limits; the paper prints none of them."""
-
-    min_samples: int = 10  # per phase: fewer are no motion
-    mid_flight: tuple[float, float] = (0.3, 0.7)  # share of the flight: outside, the sole is near a surface
-    cop_force_n: float = 50.0  # per foot: below, the CoP is a quotient of two small numbers
-    heel_up_mm: float = 5.0  # heel height from which the foot counts as tipped
-    friction_force_n: float = 10.0  # per foot: below, the ratio is taken to this force instead
-    torsion_arm_m: float = 0.05  # half width of a sole: lever of the friction that resists turning on the spot
-    torque_floor: float = 0.01  # of the peak torque: left at the speed limit, so that shares stay finite
-    sole_points: int = 7  # along each edge of the sole: a platform's edge cannot pass between two of them
-    same_level_m: float = 1e-3  # corners this close to the lowest one belong to the sole
-    edge_room_m: float = 0.05  # from a sole to the edge of what it stands on: a playback that falls short still lands
-    collision_step: int = 2  # samples: the fastest hand moves 2 cm meanwhile, and contact between links lasts longer
-    block_m: float = 20.0  # size of the platform's block, larger than any jump
-
-
-@dataclass(frozen=True)
 class Limit:
-    """What a check allows: ``limit`` in ``unit``; ``note`` says what is measured, with braces for what is found."""
+    """What a check allows: ``limit`` in ``unit``; ``note`` says what is measured, with braces."""
 
     group: str
     name: str
@@ -63,29 +49,42 @@ class Limit:
     note: str
     at_least: bool = False
 
-    def check(self, value: float, time: float | None = None, where: str = "", **found: object) -> Check:
-        """Check of one value, which occurs at a time [s]; ``where`` is added to the note."""
-        note = self.note.format(**asdict(METHOD), **found) + where
-        return Check(self.group, self.name, value, self.limit, self.unit, time, note, self.at_least)
+    def check(
+        self,
+        values: ArrayLike,
+        t: ArrayLike | None = None,
+        labels: Sequence[str] | None = None,
+        numbers: Mapping[str, float | str] | None = None,
+    ) -> Check:
+        """Check of one value in SI units, or of the worst entry of (N,) or (N, M) values over the
+        times ``t`` (N,) [s].
 
-    def worst(self, values: np.ndarray, t: np.ndarray, labels: Sequence[str] | None = None, **found: object) -> Check:
-        """Check of the worst entry of ``values`` (N,) or (N, M) over the times ``t`` (N,) [s].
-
-        ``labels`` (M,) name the columns; the worst one's is added to the note. Not a number counts as worst; no rows at
-        all give the limit itself, with no time, since nothing was there to break it.
+        ``labels`` (M,) name the columns, the worst one's is added to the note; ``numbers`` fill the
+        note's braces. Not a number counts as worst; no rows at all give the limit itself, with no
+        time, since nothing was there to break it.
         """
-        values = np.asarray(values, float)
-        if values.size == 0:
-            return self.check(self.limit, None, " (nothing to check)", **found)
-        ranked = np.where(np.isnan(values), np.inf, -values if self.at_least else values)
-        at = np.unravel_index(int(np.argmax(ranked)), values.shape)
-        where = "" if labels is None else f"; worst: {labels[at[1]]}"
-        return self.check(float(values[at]) + 0.0, float(t[at[0]]), where, **found)  # no minus zero
+        x = np.asarray(values, float)
+        time = None
+        worst = self.limit
+        where = " (nothing to check)"
+        if x.size:
+            ranked = np.where(np.isnan(x), np.inf, -x if self.at_least else x)
+            at = np.unravel_index(np.argmax(ranked), x.shape)
+            worst = float(x[at]) * SCALES.get(self.unit.split()[0].rstrip(","), 1.0) + 0.0  # no -0
+            time = None if t is None else float(np.ravel(t)[at[0] if at else 0])
+            where = f"; worst: {labels[at[1]]}" if labels is not None else ""
+        note = self.note.format(**vars(METHOD), **(numbers or {})) + where
+        return Check(self.group, self.name, worst, self.limit, self.unit, time, note, self.at_least)
 
 
-METHOD = Method()
+SCALES = {"mm": 1e3, "mrad": 1e3, "ms": 1e3, "%": 100.0}  # from SI to the units of limits
 _TABLE = tomllib.loads(Path(__file__).with_name("limits.toml").read_text(encoding="utf-8"))
-LIMITS = {name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()}
+METHOD = SimpleNamespace(**_TABLE.pop("method"))  # its numbers that are no limits
+LIMITS = {
+    name: Limit(group, name, *row) for group, rows in _TABLE.items() for name, row in rows.items()
+}
+# what a group of checks yields: the name of a limit, then the arguments of its ``check``
+Measure = tuple[Any, ...]
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,7 +102,8 @@ class AuditReport(Shown):
         """How many checks passed, and which did not."""
         if self.passed:
             return f"all {len(self.checks)} checks passed"
-        return f"{len(self.failed)} of {len(self.checks)} checks failed: {', '.join(c.name for c in self.failed)}"
+        names = ", ".join(c.name for c in self.failed)
+        return f"{len(self.failed)} of {len(self.checks)} checks failed: {names}"
 
     @property
     def passed(self) -> bool:
@@ -128,15 +128,16 @@ class AuditReport(Shown):
     def table(self) -> str:
         """Plain text: one line per check, then one line per failure that says what was measured."""
         width = max((len(c.name) for c in self.checks), default=0)
-        lines, group = [], None
-        for c in self.checks:
-            if c.group != group:
-                group = c.group
-                lines.append(group)
-            sense = ">=" if c.at_least else "<="
-            when = "" if c.time is None else f"  at {c.time:.3f} s"
-            mark = "ok  " if c.passed else "FAIL"
-            lines.append(f"  {mark} {c.name:<{width}}  {c.value:>10.4g} {sense} {c.limit:<8.4g} {c.unit}{when}")
-        bad = self.failed
-        lines.append(f"{len(self.checks) - len(bad)} of {len(self.checks)} checks passed")
-        return "\n".join(lines + [f"FAIL {c.name}: {c.note}" for c in bad])
+        lines = []
+        for group, checks in itertools.groupby(self.checks, lambda c: c.group):
+            lines.append(group)
+            for c in checks:
+                sense = ">=" if c.at_least else "<="
+                when = "" if c.time is None else f"  at {c.time:.3f} s"
+                lines.append(
+                    f"  {'ok  ' if c.passed else 'FAIL'} {c.name:<{width}}  {c.value:>10.4g} "
+                    f"{sense} {c.limit:<8.4g} {c.unit}{when}"
+                )
+        passed = len(self.checks) - len(self.failed)
+        lines.append(f"{passed} of {len(self.checks)} checks passed")
+        return "\n".join(lines + [f"FAIL {c.name}: {c.note}" for c in self.failed])

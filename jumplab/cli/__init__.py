@@ -1,7 +1,8 @@
-"""The command line: what is typed comes in, text, a result folder and an exit code go out. Start reading in ``main``.
+"""The command line: what is typed comes in, text, a result folder and an exit code go out. Start
+reading in ``main``.
 
-``common`` says how a command is declared; ``jumps``, ``studies`` and ``robots`` hold the commands; ``notebooks`` checks
-what a notebook was given, and runs them.
+``options.toml`` lists what can be typed, ``common`` makes parsers of it; ``jumps``, ``studies`` and
+``robots`` hold the commands; ``notebooks`` checks what a notebook was given, and runs them.
 """
 
 from jumplab.cli.notebooks import check_parameters as check_parameters

@@ -1,192 +1,259 @@
-"""What the commands share: how one is declared, its options and what they take, and what is printed of a result."""
+"""What the commands share: how their options are read, the modules they load late, and what is
+printed of a result.
+"""
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from jumplab.errors import InfeasibleError, InputError
 from jumplab.sim import DEFAULT_ENGINE, ENGINES
 
-Option = tuple[tuple[str, ...], dict[str, Any]]  # what add_argument takes
-Kind = Callable[[str, str], Any]  # the value of an option, from its name and its text; raises InputError
+# the value of an option, from its name and its text; raises InputError
+Kind = Callable[[str, str], Any]
 Work = Callable[[argparse.Namespace], None]
+MOST_VALUES = 10_000
 
 
 class Late:
-    """A module that is imported when it is first used: help and refusals need not wait for the heavy libraries."""
+    """A module that is imported when it is first used: help and refusals need not wait for the
+    heavy libraries.
+    """
 
     def __init__(self, name: str):
-        self._name = name
+        self._name = f"jumplab.{name}"
 
     def __getattr__(self, attribute: str) -> Any:
         return getattr(import_module(self._name), attribute)
 
 
-def command(*options: Option, actions: Sequence[Work] = ()) -> Callable[[Work], Work]:
-    """Make a command of a function: its name and docstring are the command's; ``actions`` are commands below it."""
-
-    def mark(work: Work) -> Work:
-        work.options, work.actions = (*options, JSON, QUIET, DEBUG), actions
-        return work
-
-    return mark
+store = Late("io.folder")
+robots = Late("robot")
+pages = Late("show.viewer")
+tables = Late("show.tables")
+style = Late("show.style")
 
 
-def declare(parser: argparse.ArgumentParser, commands: Sequence[Work], dest: str = "command") -> None:
-    """Add a parser for each of these commands, and for those below them."""
-    below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
-    for work in commands:
-        text = work.__doc__ or ""
-        parser = below.add_parser(work.__name__.rstrip("_"), help=text[:1].lower() + text[1:].rstrip("."))
-        parser.set_defaults(work=work)
-        for names, how in work.options:
-            parser.add_argument(*names, **how)
-        if work.actions:
-            declare(parser, work.actions, "action")
-
-
-def opt(usage: str, text: str, default: Any = None, kind: Kind | tuple | None = None, **how: Any) -> Option:
-    """Declare an option, ``opt("--out DIR", "where to")``, or an argument, ``opt("DIR", "where from")``.
-
-    Parameters
-    ----------
-    usage : names, then the placeholder of the value. "DIR+" and "DIR*" take several values, "DIR..." may be repeated.
-        Without placeholder and choices it is a flag; one that has a default can also be undone with --no-.
-    default : a text is read as if it had been typed.
-    kind : what makes the value of the text, or a tuple of choices.
-    """
-    names = tuple(word for word in usage.split() if word.startswith("-"))
-    placeholder = usage.split()[-1]
-    for sign, meaning in (("+", {"nargs": "+"}), ("*", {"nargs": "*"}), ("...", {"action": "append"})):
-        if placeholder.endswith(sign):
-            how |= meaning
-            placeholder = placeholder.removesuffix(sign)
-    if isinstance(kind, tuple):
-        how["choices"] = kind
-    elif placeholder in names:
-        how["action"] = argparse.BooleanOptionalAction if isinstance(default, bool) else "store_true"
-    else:
-        how |= {"metavar": placeholder, "type": partial(kind, names[-1]) if kind else str}
-    return names or (placeholder.lower(),), {"help": text, "default": default, **how}
-
-
+# what options take ------------------------------------------------------------------------------
 def number(option: str, text: str) -> float:
-    """The number that an option was given."""
+    """The number that an option was given; refuses (:class:`InputError`) any other text."""
     try:
         return float(text)
     except ValueError:
         raise InputError(f"{option} must be a number, got {text!r}") from None
 
 
-def needing(what: str, fits: Callable[[Any], Any], make: Kind = lambda option, text: text) -> Kind:
-    """Kind of an option that must ``what``: refuses a value that does not fit."""
+def needing(what: str, fits: Callable[[str], Any]) -> Kind:
+    """Kind of an option that must ``what``: a text that does not fit is refused
+    (:class:`InputError`).
+    """
 
-    def kind(option: str, text: str) -> Any:
-        value = make(option, text)
-        if not fits(value):
+    def kind(option: str, text: str) -> str:
+        if not fits(text):
             raise InputError(f"{option} must {what}, got {text!r}")
-        return value
+        return text
 
     return kind
 
 
-def whole(least: int, most: int) -> Kind:
-    """Kind of an option that takes a whole number from ``least`` to ``most``."""
-    check = needing(
-        f"be a whole number from {least} to {most}", lambda x: least <= x <= most and x.is_integer(), number
-    )
-    return lambda option, text: int(check(option, text))
+def whole(option: str, text: str, least: int, most: int) -> int:
+    """The whole number from ``least`` to ``most`` (included) that an option was given; refuses
+    (:class:`InputError`) any other text.
+    """
+    value = number(option, text)
+    if not (least <= value <= most and value.is_integer()):
+        raise InputError(f"{option} must be a whole number from {least} to {most}, got {text!r}")
+    return int(value)
 
 
 def values_of(option: str, text: str) -> list[float]:
-    """Kind of an option that takes numbers, as FROM:TO:COUNT or with commas."""
+    """The numbers (n,) that an option was given, as FROM:TO:COUNT or with commas."""
     parts = text.split(":")
     if len(parts) == 1:
         return [number(option, part) for part in text.split(",")]
     if len(parts) != 3 or not parts[2].isdecimal() or not 1 <= int(parts[2]) <= MOST_VALUES:
-        raise InputError(f"{option} must be {VALUES} with COUNT from 1 to {MOST_VALUES}, got {text!r}")
-    first, last, count = number(option, parts[0]), number(option, parts[1]), int(parts[2])
+        raise InputError(
+            f"{option} must be {VALUES} with COUNT from 1 to {MOST_VALUES}, got {text!r}"
+        )
+    first = number(option, parts[0])
+    last = number(option, parts[1])
+    count = int(parts[2])
     return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
 
 
+def number_or_never(option: str, text: str) -> float | None:
+    """The number that an option was given, or None for "never"."""
+    return None if text == "never" else number(option, text)
+
+
+VALUES = "FROM:TO:COUNT or A,B,..."
+KINDS = {
+    "number": number,
+    "number or never": number_or_never,
+    "whole": whole,
+    "values": values_of,
+    "folder": needing("name a folder", str.strip),
+    "file": needing(
+        "name a file in a folder that exists",
+        lambda text: (
+            text.strip() and not Path(text).is_dir() and Path(text).resolve().parent.is_dir()
+        ),
+    ),
+    "page": needing("name a file that ends in .html", lambda text: text.lower().endswith(".html")),
+    "movie": needing(
+        "name a file that ends in .gif or .mp4",
+        lambda text: text.lower().endswith((".gif", ".mp4")),
+    ),
+}
+OPTIONS = tomllib.loads(Path(__file__).with_name("options.toml").read_text(encoding="utf-8"))
+CHOICES = OPTIONS["choices"] | {"engines": list(ENGINES)}
+SEVERAL = {"": {}, "+": {"nargs": "+"}, "*": {"nargs": "*"}, "...": {"action": "append"}}
+
+
+def declare(
+    parser: argparse.ArgumentParser, commands: Sequence[Work], dest: str = "command"
+) -> dict[str, argparse.ArgumentParser]:
+    """Add a parser for each of these commands, with its options; returns the parsers by name."""
+    below = parser.add_subparsers(dest=dest, metavar=dest.upper(), parser_class=type(parser))
+    for work in commands:
+        text = work.__doc__ or ""
+        name = work.__name__.rstrip("_")
+        one = below.add_parser(name, help=text[:1].lower() + text[1:].rstrip("."))
+        one.set_defaults(work=work)
+        options = dict(OPTIONS[name])
+        shared = {usage: OPTIONS["shared"][usage] for usage in options.pop("shared", ())}
+        for usage, how in (shared | options).items():
+            add_option(one, usage, **how)
+        add_common(one)
+    return below.choices
+
+
+def add_common(parser: argparse.ArgumentParser) -> None:
+    """Add the options of every command; without defaults, which would undo them where they stand
+    before COMMAND.
+    """
+    for usage, how in OPTIONS["every"].items():
+        add_option(parser, usage, default=argparse.SUPPRESS, **how)
+
+
+def add_option(
+    parser: argparse.ArgumentParser,
+    usage: str,
+    *,
+    kind: str | None = None,
+    choices: str | list[str] | None = None,
+    default: Any = None,
+    **settings: Any,
+) -> None:
+    """Add one option, as ``options.toml`` describes it."""
+    *names, last = usage.split()
+    placeholder = last.rstrip("+*.")
+    settings |= SEVERAL[last.removeprefix(placeholder)]
+    if last.startswith("-"):
+        names.append(last)
+    if choices:
+        settings["choices"] = CHOICES[choices] if isinstance(choices, str) else choices
+        default = DEFAULT_ENGINE if default == "installed" else default
+    elif last in names:
+        undone = isinstance(default, bool)
+        settings["action"] = argparse.BooleanOptionalAction if undone else "store_true"
+        default = False if default is None else default
+    else:
+        settings["metavar"] = placeholder
+    if kind:
+        ends = (
+            {"least": settings.pop("from"), "most": settings.pop("to")} if kind == "whole" else {}
+        )
+        settings["type"] = partial(KINDS[kind], (names or [placeholder])[-1], **ends)
+    if kind == "values":
+        settings["help"] += f": {VALUES}" + (f" (default {default})" if default else "")
+    parser.add_argument(*(names or [placeholder.lower()]), default=default, **settings)
+
+
+# what commands do -------------------------------------------------------------------------------
+def named(must: str, pair: str) -> tuple[str, str]:
+    """Name and value of what was given as NAME=VALUE; ``must`` begins the sentence that refuses
+    (:class:`InputError`) anything else.
+    """
+    name, equals, text = pair.partition("=")
+    if not (name and equals):
+        raise InputError(f"{must}, got {pair!r}")
+    return name, text
+
+
 def disturbances(option: str, pairs: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """What was given as NAME=SIZE or NAME=FROM:TO, several times."""
-    found: dict[str, tuple[float, ...]] = {}
+    """What was given as NAME=SIZE or NAME=FROM:TO, several times: name -> (size,) or (from, to)."""
+    sizes: dict[str, tuple[float, ...]] = {}
+    must = f"{option} must be NAME=SIZE or NAME=FROM:TO"
     for pair in pairs:
-        name, equals, text = pair.partition("=")
+        name, text = named(must, pair)
         numbers = text.split(":")
-        if not (name and equals) or len(numbers) > 2:
-            raise InputError(f"{option} must be NAME=SIZE or NAME=FROM:TO, got {pair!r}")
-        found[name] = tuple(number(f"{option} {name}", part) for part in numbers)
-    return found
-
-
-DISTURB = opt(
-    "--disturb NAME=SIZE...", "payload_kg=5, friction=0.3:1.0 ...; a wrong name shows all; may be repeated", []
-)
-VALUES, MOST_VALUES = "FROM:TO:COUNT or A,B,...", 10_000
-folder = needing("name a folder", str.strip)
-# without defaults, which would undo them where they stand before COMMAND
-DEBUG = opt("--debug", "show tracebacks", argparse.SUPPRESS)
-JSON = opt("--json", "one JSON object on stdout, refusals included, instead of text", argparse.SUPPRESS)
-QUIET = opt("--quiet", "say nothing but what goes wrong (and --json)", argparse.SUPPRESS)
-JOBS = opt("--jobs N", "processes side by side (default: one per core)", None, whole(1, 4096))
-SEED = opt("--seed S", "seed of the first robot (default 0)", None, whole(0, 2**31 - 1))
-PLAN = opt("DIR", "folder of a plan")
-MODE = opt("--mode", "how the joints follow the plan up to touchdown", "position", ("position", "pd"))
-ENGINE = opt("--engine", "physics engine of the simulation", DEFAULT_ENGINE, tuple(ENGINES))
-TRACKERS = ("unitree-csv", "gmr-pkl", "mjlab-npz", "beyondmimic-npz", "holosoma-npz", "mujoco")
-EXPORTED = ("csv", "npz", "urdf-replay", *TRACKERS)  # of jumplab.io.export
-FPS = opt("--fps N", "frames per second (default: 1000, 100 or, for trackers, 50 or 30)", None, number)
-METHODS = ("three-step", "direct")
-ROBOT = opt("--robot ROBOT", "shipped robot (see 'jumplab robot list') or path of a robot's TOML file", "bhr")
-JUMP = (
-    opt("--distance-m M", "travel of the feet [m] (default 1.0)", "1.0", number),
-    opt("--height-m M", "rise of the CoM in flight [m] (default 0.5)", "0.5", number),
-    ROBOT,
-)
+        if len(numbers) > 2:
+            raise InputError(f"{must}, got {pair!r}")
+        sizes[name] = tuple(number(f"{option} {name}", part) for part in numbers)
+    return sizes
 
 
 def without(args: argparse.Namespace, why: str, **options: Any) -> None:
-    """Refuse options that would be ignored: by name, and the value that each has if it was not given."""
+    """Refuse (:class:`InputError`) options that would be ignored: by name, and the value that each
+    has if it was not given.
+    """
     for name, default in options.items():
         if getattr(args, name) != default:
             raise InputError(f"--{name.replace('_', '-')} {why}; leave it away")
 
 
+def shared(args: argparse.Namespace) -> dict[str, Any]:
+    """Processes, and whether bars are shown: on a terminal, and not with --quiet."""
+    return {"jobs": args.jobs, "progress": False if "quiet" in args else None}
+
+
+@contextmanager
+def resumable(what: str = "trials") -> Iterator[None]:
+    """Say of work that is interrupted what is kept of it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted; finished {what} are kept, and the same command goes on from there"
+        ) from None
+
+
 def judge(audit: Any, folder: str) -> None:
-    """Say that the audit is clean, or refuse the plan."""
+    """Say that the audit of the plan in ``folder`` is clean, or refuse it
+    (:class:`InfeasibleError`).
+    """
+    count = len(audit.checks)
     failed = [check.name for check in audit.checks if not check.passed]
     if failed:
-        said = f"the plan fails {len(failed)} of {len(audit.checks)} checks of its audit ({', '.join(failed)})"
-        raise InfeasibleError(f"{said}; see passport.json in {folder!r}")
-    print(f"audit: all {len(audit.checks)} checks passed")
+        words = f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)})"
+        raise InfeasibleError(f"{words}; see passport.json in {folder!r}")
+    print(f"audit: all {count} checks passed")
 
 
 def print_summary(summary: Mapping[str, Any]) -> None:
     """Cost of the stages and what was planned."""
     print(f"{'stage':<22}{'iterations':>11}{'build':>10}{'solve':>10}")
+    line = "{stage:<22}{iterations:>11}{build_s:>8.2f} s{solve_s:>8.2f} s"
     for row in summary["stages"]:
-        print(f"{row['stage']:<22}{row['iterations']:>11}{row['build_s']:>8.2f} s{row['solve_s']:>8.2f} s")
-    side, yaw = summary.get("planned_side_m"), summary.get("planned_yaw_rad")
-    away = "" if side is None else f", side {side:.3f} m, turn {math.degrees(yaw):.1f} deg"
-    print(f"planned: distance {summary['planned_distance_m']:.3f} m, rise {summary['planned_rise_m']:.3f} m{away}")
-    if followed := summary.get("tracking"):
-        off = (f"{100 * followed[phase]['rho']['relative_rms']:.1f} % in {phase}" for phase in ("launch", "flight"))
-        print(f"inertia off stage 1's by {', '.join(off)} (rms)")
-
-
-def misses(target: Mapping[str, float], values: Callable[[str], Sequence[float]]) -> str:
-    """How far feet stand and point beyond a ``target``, least and most; ``values`` gives a metric of many jumps."""
-    rows = ("forward", "foot_distance_m", "distance_m", 1e3, "mm"), ("side", "side_m", "side_m", 1e3, "mm")
-    told = []
-    for word, name, asked, factor, unit in (*rows, ("heading", "yaw_rad", "yaw_rad", math.degrees(1), "deg")):
-        off = [factor * (x - target[asked]) for x in values(name)]
-        told.append(f"{word} {min(off):+.1f} ... {max(off):+.1f} {unit}")
-    return ", ".join(told)
+        print(line.format_map(row))
+    line = "planned: distance {planned_distance_m:.3f} m, rise {planned_rise_m:.3f} m"
+    if summary.get("planned_side_m") is not None:
+        line += ", side {planned_side_m:.3f} m, turn {turn_deg:.1f} deg"
+    turn = math.degrees(summary.get("planned_yaw_rad") or 0.0)
+    print(line.format_map({**summary, "turn_deg": turn}))
+    if phases := summary.get("tracking"):
+        shares = [
+            (name, 100 * phases[name]["rho"]["relative_rms"]) for name in ("launch", "flight")
+        ]
+        words = ", ".join(f"{share:.1f} % in {name}" for name, share in shares)
+        print(f"inertia off stage 1's by {words} (rms)")
 
 
 def print_simulation(metrics: Mapping[str, Any]) -> None:
@@ -195,10 +262,13 @@ def print_simulation(metrics: Mapping[str, Any]) -> None:
     distance, rise = ("none" if x is None else f"{x:.3f} m" for x in lengths)
     print(f"simulated: distance {distance}, rise {rise}")
     verdict = "stands" if metrics["landed"] else "FAILED"
-    print(f"landing: {verdict}, {metrics['standing_s']:.2f} s on its feet after touchdown ({metrics['reason']})")
-    failed = [finding for finding in metrics["honesty"] if not finding["passed"]]
+    line = f"landing: {verdict}, {{standing_s:.2f}} s on its feet after touchdown ({{reason}})"
+    print(line.format_map(metrics))
+    checks = metrics["checks"]
+    failed = [check for check in checks if not check["passed"]]
     if not failed:
-        print(f"honesty: all {len(metrics['honesty'])} checks of the run passed")
-    for finding in failed:
-        value = f"{finding['value']:.4g} {finding['unit']}".rstrip()
-        print(f"NOT HONEST: {finding['name']} {value}, at most {finding['limit']:.4g}: {finding['catches']}")
+        print(f"checks: all {len(checks)} of the run passed")
+    for check in failed:
+        value = "{value:.4g} {unit}".format_map(check).rstrip()
+        line = f"CHECK FAILED: {{name}} {value}, at most {{limit:.4g}}: {{catches}}"
+        print(line.format_map(check))

@@ -1,11 +1,12 @@
 """The command line, ``jumplab COMMAND`` (the same as ``python -m jumplab COMMAND``).
 
-Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad input, 3 infeasible or not within the
-limits, 4 internal failure, 130 and 143 interrupted.
+Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad input, 3 infeasible
+or not within the limits, 4 internal failure, 130 and 143 interrupted.
 """
 
 import argparse
 import contextlib
+import logging
 import os
 import re
 import signal
@@ -14,18 +15,27 @@ import traceback
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jumplab.cli.common import DEBUG, JSON, QUIET, command, declare, opt
+from jumplab.cli.common import add_common, declare
 from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
-from jumplab.cli.robots import robot
-from jumplab.cli.status import Status
-from jumplab.cli.studies import atlas, bench, certify, chain, clips, envelope, margins, sweep, trials
+from jumplab.cli.robots import check, list_, robot
+from jumplab.cli.studies import (
+    atlas,
+    bench,
+    certify,
+    chain,
+    clips,
+    envelope,
+    margins,
+    sweep,
+    trials,
+)
 from jumplab.errors import InputError, JumplabError
+from jumplab.show.waiting import on_terminal
 
 INTERNAL = 4
 
 
-@command(opt("SHELL", "bash, zsh or fish", None, ("bash", "zsh", "fish")))
 def completion(args: argparse.Namespace) -> None:
     """Completion of commands and options: eval "$(jumplab completion bash)"."""
     import shtab
@@ -39,11 +49,14 @@ COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that raises instead of printing its usage, and takes -1e-1 or -inf for numbers, not for options."""
+    """Parser that raises instead of printing its usage, and takes -1e-1 or -inf for numbers, not
+    for options.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, allow_abbrev=False, **kwargs)
-        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)", re.IGNORECASE)
+        numbers = r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)"
+        self._negative_number_matcher = re.compile(numbers, re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; '{self.prog} --help' shows what is possible")
@@ -51,84 +64,82 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jumplab", description="Plan a humanoid's jump, audit it, simulate it.")
-    for names, how in (JSON, QUIET, DEBUG):
-        parser.add_argument(*names, **how)
+    add_common(parser)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
-    declare(parser, COMMANDS)
+    below = declare(parser, COMMANDS)
+    declare(below["robot"], (check, list_), "action")
     return parser
 
 
-def _work(argv: Sequence[str], found: dict[str, Any]) -> None:
-    """Do what was typed; ``found`` is filled with what --json prints."""
+def _work(argv: Sequence[str], results: dict[str, Any]) -> None:
+    """Do what was typed; ``results`` is filled with what --json prints."""
     parser = _parser()
     for text in argv:  # argparse would make an empty list of it
         if re.fullmatch(r"-[^=]*=--", text):
             parser.error(f"{text}: '--' is not a value")
     args = parser.parse_args(argv)
     if args.version:
-        from importlib import metadata
+        from jumplab.io.folder import versions
 
-        found = next(metadata.Distribution.discover(name="jumplab"), None)
-        print(f"jumplab {found.version if found else '(not installed)'}")
+        print(f"jumplab {versions()['jumplab']}")
     elif args.command is None:
         *first, last = (work.__name__ for work in COMMANDS)
         parser.error(f"choose a command: {', '.join(first)} or {last}")
     else:
-        args.found, quiet = found, "quiet" in args
+        args.found = results
         with contextlib.ExitStack() as stack:
-            if not quiet:
-                stack.enter_context(Status(args.command))
-            if quiet or "json" in args:
-                stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+            if "quiet" not in args:
+                stack.enter_context(on_terminal(args.command))
+            if "quiet" in args or "json" in args:
+                nowhere = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(contextlib.redirect_stdout(nowhere))
             args.work(args)
     sys.stdout.flush()
 
 
-def _print_json(data: dict[str, Any]) -> None:
-    from jumplab.io.folder import to_json
-
-    print(to_json(data), end="", flush=True)
-
-
-def _tell(e: BaseException, heard: Interrupts, debug: bool) -> tuple[int, str]:
-    """Say in one sentence what has ended a command; returns the exit code and the sentence."""
-    if heard.number == signal.SIGTERM:
-        return heard.code, "terminated"
-    if isinstance(e, KeyboardInterrupt) or heard.number is not None:
-        code, said = CODES[signal.SIGINT], (isinstance(e, KeyboardInterrupt) and str(e)) or UNCHANGED
-    elif isinstance(e, JumplabError):
-        code, said = e.exit_code, str(e)
-    else:
-        first = (str(e).strip().splitlines() or ["no message"])[0]
-        hint = "" if debug else "; run it again with --debug for the traceback"
-        code, said = INTERNAL, f"internal failure, {type(e).__name__}: {first}{hint}"
-    if debug:
-        traceback.print_exception(e)
-    said = " ".join(said.split())
-    print(f"jumplab: {said}", file=sys.stderr)
-    return code, said
+def _explain(e: BaseException, number: int | None) -> tuple[int, str]:
+    """Exit code and sentence of what has ended a command, a signal of this ``number`` perhaps."""
+    if number == signal.SIGTERM:
+        return CODES[number], "terminated"
+    if isinstance(e, KeyboardInterrupt) or number is not None:
+        return CODES[signal.SIGINT], (isinstance(e, KeyboardInterrupt) and str(e)) or UNCHANGED
+    if isinstance(e, JumplabError):
+        return e.exit_code, str(e)
+    first = (str(e).strip().splitlines() or ["no message"])[0]
+    return INTERNAL, f"internal failure, {type(e).__name__}: {first}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code. Without ``argv`` the process is its own, and ends if interrupted."""
-    alone, argv = argv is None, sys.argv[1:] if argv is None else list(argv)
+    """Run one command; returns the exit code. Without ``argv`` the process is its own, and ends if
+    interrupted.
+    """
+    alone = argv is None
+    argv = sys.argv[1:] if argv is None else list(argv)
     sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
-    heard, found = Interrupts(alone), {}
+    interrupts = Interrupts(alone)
+    results = {}
+    code, sentence = 0, None
     try:
-        with heard.heeded():
-            _work(argv, found)
-            if heard.number is not None:  # and lost
+        with interrupts.heeded():
+            _work(argv, results)
+            if interrupts.number is not None:  # and lost
                 raise KeyboardInterrupt
     except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return INTERNAL
     except (KeyboardInterrupt, Exception) as e:
-        code, said = _tell(e, heard, "--debug" in argv)
-        if "--json" in argv:
-            _print_json({**found, "exit_code": code, "error": said})
-        if alone and heard.number is not None:
-            end_soon(code)
-        return code
+        code, sentence = _explain(e, interrupts.number)
+        sentence = " ".join(sentence.split())
+        if "--debug" in argv:
+            traceback.print_exception(e)
+        elif code == INTERNAL and not isinstance(e, JumplabError):
+            sentence += "; run it again with --debug for the traceback"
+        print(f"jumplab: {sentence}", file=sys.stderr)
     if "--json" in argv:
-        _print_json({**found, "exit_code": 0, "error": None})
-    return 0
+        from jumplab.io.folder import to_json
+
+        print(to_json({**results, "exit_code": code, "error": sentence}), end="", flush=True)
+    if alone and interrupts.number is not None:
+        logging.disable()  # papermill would tell that its kernel has died
+        end_soon(code)
+    return code

@@ -1,115 +1,124 @@
 """The command ``jumplab robot``: which robots there are, and whether a URDF is one."""
 
 import hashlib
-import os
 from argparse import Namespace
 from pathlib import Path
 
-from jumplab.cli.common import Late, command, folder, opt
+from jumplab.cli.common import Late, robots, store, style, tables
 from jumplab.errors import InputError, JumplabError, RobotError
 
-robots, checkup, describe = Late("jumplab.robot"), Late("jumplab.robot.checkup"), Late("jumplab.robot.description")
-store, jumper = Late("jumplab.io.folder"), Late("jumplab.robot_import.jumper")
-configs, urdfs = Late("jumplab.robot_import.config"), Late("jumplab.robot_import.urdf")
+checkup = Late("robot_import.checkup")
+files = Late("robot.files")
+jumper = Late("robot_import.jumper")
+urdfs = Late("robot_import.urdf")
 MARK = b"# unless edited, the sum of what is above: "
-tables, sheets, style = Late("jumplab.show.tables"), Late("jumplab.show.bodies"), Late("jumplab.show.style")
+sheets = Late("show.bodies")
 
 
-@command()
 def list_(args: Namespace) -> None:
     """The shipped robots."""
     rows = []
-    for name, file in describe.SHIPPED.items():
+    for name, file in files.SHIPPED.items():
+        row = {"name": name, "kg": None, "joints": None, "arms": "", "note": ""}
         try:
             if urdfs.DESCRIPTIONS in file.read_text(encoding="utf-8"):  # a list downloads nothing
-                raise RobotError(f"{name}: is downloaded when it is first loaded, with jumplab[descriptions]")
+                needs = "is downloaded when it is first loaded, with jumplab[descriptions]"
+                raise RobotError(f"{name}: {needs}")
             robot = robots.Robot.load(name)
-            kg, joints, note = robot.total_mass, len(robot.joint_names), ""
-            arms = "swing" if robot.joints["shoulder_pitch"] else "held"
+            row |= {"kg": robot.total_mass, "joints": len(robot.joint_names)}
+            row["arms"] = "swing" if robot.joints["shoulder_pitch"] else "held"
         except JumplabError as e:
-            kg, joints, arms, note = None, None, "", str(e).rpartition(": ")[2]
-        rows.append({"name": name, "kg": kg, "joints": joints, "arms": arms, "note": note})
+            row["note"] = str(e).rpartition(": ")[2]
+        rows.append(row)
     args.found["robots"] = rows
     print(tables.table(rows, digits=3))
 
 
-@command(
-    opt("URDF", "the robot's URDF or MJCF, or the name of a shipped robot", nargs="?"),
-    opt("--robot-description NAME", "instead of a file, one that robot_descriptions downloads, as g1_description"),
-    opt("--config TOML", "take the roles from this file instead of finding them", None, folder),
-    opt("--out DIR", "write a starter configuration and a picture into DIR", None, folder),
-    opt("--force", "overwrite a configuration in DIR that somebody has edited"),
-    opt("--repair WHAT...", "allow a repair: inertia or massless; may be repeated", []),
-)
 def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
-    if (args.urdf is None) == (args.robot_description is None):
-        raise InputError("jumplab robot check: name a URDF, or a robot by --robot-description; one of the two")
-    if args.urdf is None:
-        args.urdf = str(urdfs.described(args.robot_description))
-        print(f"robot description: {args.urdf}")
+    urdf = args.urdf
+    if (urdf is None) == (args.robot_description is None):
+        words = "name a URDF, or a robot by --robot-description; one of the two"
+        raise InputError(f"jumplab robot check: {words}")
+    if urdf is None:
+        urdf = str(urdfs.described(args.robot_description))
+        print(f"robot description: {urdf}")
     for word in args.repair:
         if word not in jumper.REPAIRS:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
-    if args.repair and (args.config is not None or args.urdf in describe.SHIPPED):
-        raise InputError("--repair is for a bare URDF; a configuration says itself what is repaired, so leave it away")
+    shipped = files.SHIPPED.get(urdf)
+    if args.repair and (args.config is not None or shipped):
+        words = "a configuration says itself what is repaired, so leave it away"
+        raise InputError(f"--repair is for a bare URDF; {words}")
     if args.config is not None:
         try:
             text = Path(args.config).read_text()
         except (OSError, ValueError) as e:
-            raise InputError(f"--config {args.config}: cannot be read as text ({type(e).__name__})") from e
-        result = checkup.check(args.urdf, text)
-    elif args.urdf not in describe.SHIPPED:
-        result = checkup.check(args.urdf, _draft(args.urdf, tuple(args.repair), args.out, args.force))
-    elif "[source]" in describe.SHIPPED[args.urdf].read_text():
-        result = checkup.examine(args.urdf)
+            words = f"cannot be read as text ({type(e).__name__})"
+            raise InputError(f"--config {args.config}: {words}") from e
+        result = checkup.check(urdf, text)
+    elif not shipped:
+        result = checkup.check(urdf, _draft(urdf, tuple(args.repair), args.out, args.force))
+    elif "[source]" in shipped.read_text():
+        result = checkup.examine(urdf)
     else:
-        said = "is the default robot, described as jumplab wants it; there is nothing to check"
-        raise InputError(f"{args.urdf!r} {said}")
-    args.found |= {"robot": result.robot.name, "notes": result.lines(), "roles": result.rows()}
+        words = "is the default robot, described as jumplab wants it; there is nothing to check"
+        raise InputError(f"{urdf!r} {words}")
+    robot = result.robot
+    args.found |= {"robot": robot.name, "notes": result.lines(), "roles": result.rows()}
     print(*result.lines(), sep="\n")
     print(tables.table(result.rows()))
     if args.out is not None:
-        caption = "Side view, moving joints from the front, and the five links of the sagittal plane, standing."
-        robot = result.robot
-        style.save_figure(sheets.robot_sheet(robot), robot.name, args.out, caption, robot=robot)
+        views = "Side view, moving joints from the front, and the five links of the sagittal plane"
+        picture = sheets.robot_sheet(robot)
+        style.save_figure(picture, robot.name, args.out, f"{views}, standing.", robot=robot)
         print(f"picture: {Path(args.out) / robot.name}.png")
 
 
-@command(actions=(check, list_))
 def robot(args: Namespace) -> None:
     """The robots that are there, and whether a URDF can jump."""
-    raise InputError("jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is possible")
+    words = "choose an action: check or list; 'jumplab robot --help' shows what is possible"
+    raise InputError(f"jumplab robot: {words}")
 
 
 def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
-    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an ``out``.
+    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an
+    ``out``.
 
     Faults of limits alone do not hinder the writing: they are mended there.
     """
-    found, faults = checkup.first_look(urdf, repair)
-    for note in found.roles.notes if found else ():
-        print(f"note: {note}")
-    for role, pair in found.roles.joints.items() if found and faults else ():
-        print(f"{role.replace('_', ' ')}: {', '.join(pair) or 'held'}")
-    if found:
-        print(f"sole: {found.sole.source}")
-    if out is not None and found and (not faults or found.faults == tuple(faults)):
-        path = Path(out) / f"{configs.read_toml(found.text, 'starter')['name']}.toml"
-        if os.path.exists(path) and not force and path.read_bytes() != _marked(path.read_bytes()):
-            raise InputError(f"{path}: has been edited; choose another --out, or overwrite it with --force")
-        try:
-            store.write_file(path, _marked(found.text.encode()))
-        except InputError as e:
-            raise InputError(f"{path}: cannot be written ({getattr(e.__cause__, 'strerror', e)})") from e
-        print(f"starter configuration: {path}")
+    draft, faults = checkup.first_look(urdf, repair)
+    if draft:
+        for note in draft.roles.notes:
+            print(f"note: {note}")
+        for role, pair in draft.roles.joints.items() if faults else ():
+            print(f"{role.replace('_', ' ')}: {', '.join(pair) or 'held'}")
+        print(f"sole: {draft.sole.source}")
+        if out is not None and (not faults or draft.faults == tuple(faults)):
+            _write(Path(out), draft.text, force)
     if faults:
-        print("".join(f"{sentence}\n" for sentence in faults[1:]), end="")
-        raise RobotError(faults[0] + (f" ({len(faults) - 1} further faults are printed above)" if faults[1:] else ""))
-    return found.text
+        first, *others = faults
+        print("".join(f"{sentence}\n" for sentence in others), end="")
+        above = f" ({len(others)} further faults are printed above)" if others else ""
+        raise RobotError(first + above)
+    return draft.text
+
+
+def _write(folder: Path, text: str, force: bool) -> None:
+    """Write a starter configuration, but not over one that somebody has edited."""
+    path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
+    if path.exists() and not force and path.read_bytes() != _marked(path.read_bytes()):
+        words = "has been edited; choose another --out, or overwrite it with --force"
+        raise InputError(f"{path}: {words}")
+    try:
+        store.write_file(path, _marked(text.encode()))
+    except InputError as e:
+        reason = getattr(e.__cause__, "strerror", e)
+        raise InputError(f"{path}: cannot be written ({reason})") from e
+    print(f"starter configuration: {path}")
 
 
 def _marked(text: bytes) -> bytes:
     """A configuration with a last line that tells whether it is still as it was written."""
-    own = text.rpartition(MARK)[0] or text
-    return own + MARK + hashlib.sha256(own).hexdigest()[:12].encode() + b"\n"
+    content = text.rpartition(MARK)[0] or text
+    return content + MARK + hashlib.sha256(content).hexdigest()[:12].encode() + b"\n"

@@ -1,54 +1,59 @@
-"""Positions, velocities and torques of a jump by the names of its joints, and as one table for pandas."""
+"""Positions, velocities and torques of a jump by the names of its joints, and as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumplab.errors import InputError
-from jumplab.io.tape import Tape
+from jumplab.errors import InputError, Shown
 from jumplab.robot import Robot
 
 if TYPE_CHECKING:
     from jumplab.io.motion import Record
 
-ROLES = {"hip": "hip_pitch", "ankle": "ankle_pitch", "shoulder": "shoulder_pitch"}  # short names of a robot's roles
+# short names of a robot's roles
+ROLES = {"hip": "hip_pitch", "ankle": "ankle_pitch", "shoulder": "shoulder_pitch"}
 
 
 class Columns(Mapping[str, np.ndarray]):
-    """Columns of a log by name: of a joint (N,), of a role such as "knee" (N, 2), left, then right."""
+    """Columns of a log by name: of a joint (N,), of a role such as "knee" (N, 2), left first."""
 
     def __init__(self, values: np.ndarray, robot: Robot, unit: str):
-        self._values, self.unit = values, unit
-        self._at = {name: k for k, name in enumerate(map(str, robot.joint_names))}
-        self._pairs = {role: [self._at[name] for name in pair] for role, pair in robot.joints.items() if pair}
+        self._values = values
+        self.unit = unit
+        self._joints = {name: k for k, name in enumerate(robot.joint_names)}
+        self._pairs = {
+            role: [self._joints[name] for name in pair]
+            for role, pair in robot.joints.items()
+            if pair
+        }
+        short = {name: self._pairs[role] for name, role in ROLES.items() if role in self._pairs}
+        self._columns = self._pairs | short | self._joints
 
     def __getitem__(self, name: str) -> np.ndarray:
-        if name in self._at:
-            return self._values[:, self._at[name]]
-        role = ROLES.get(name, name)
-        if role not in self._pairs:
-            raise InputError(f"there is no joint {name!r}; there are {', '.join([*self._pairs, *self._at])}")
-        return self._values[:, self._pairs[role]]
+        if name not in self._columns:
+            raise InputError(
+                f"there is no joint {name!r}; there are {', '.join([*self._pairs, *self._joints])}"
+            )
+        return self._values[:, self._columns[name]]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._at or ROLES.get(name, name) in self._pairs
+        return name in self._columns
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._at)
+        return iter(self._joints)
 
     def __len__(self) -> int:
-        return len(self._at)
+        return len(self._joints)
 
     def __repr__(self) -> str:
-        return f"<Columns [{self.unit}]: {', '.join(self._at)}; pairs {', '.join(self._pairs)}>"
+        return f"<Columns [{self.unit}]: {', '.join(self)}; pairs {', '.join(self._pairs)}>"
 
 
 class Named:
-    """A plan or a simulation whose columns have names; it has a ``tape``, or is a record itself, and a ``robot``."""
+    """A plan or a simulation, with a ``robot``, and a ``tape`` or itself a record."""
 
     __slots__ = ()
 
@@ -63,7 +68,7 @@ class Named:
 
     @property
     def angle(self) -> Columns:
-        """Joint angles [rad], (N,) per joint: ``angle["left_knee"]``, or both sides of a role: ``angle["knee"]``."""
+        """Angles [rad]: ``angle["left_knee"]`` (N,), of both sides ``angle["knee"]`` (N, 2)."""
         return self._columns(self._record.q[:, 7:], "rad")
 
     @property
@@ -78,11 +83,12 @@ class Named:
 
     @property
     def plots(self) -> Any:
-        """Pictures of it: ``plots.torques()``, ``plots.joints()`` and others, see ``dir(plots)``."""
-        return import_module("jumplab.show.cards").Plots(self)
+        """Pictures of it: ``plots.torques()``, ``plots.joints()``; see ``dir(plots)``."""
+        return Shown.pictures().Plots(self)
 
     def to_frame(self) -> Any:
-        """A ``pandas.DataFrame`` over time [s]: phase, base, then position, velocity and torque of every joint.
+        """A ``pandas.DataFrame`` over time [s]: phase, base, then position, velocity and torque of
+        every joint.
 
         Raises :class:`InputError` where pandas is not installed.
         """
@@ -90,20 +96,14 @@ class Named:
             import pandas
         except ImportError:
             raise InputError("a frame needs pandas: pip install pandas") from None
-        x, table = self._record, {"phase": self._record.phase}
+        x = self._record
         base = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-        table |= {f"base_{name}": x.q[:, k] for k, name in enumerate(base)}
-        for kind, columns in (
-            ("position_rad", self.angle),
-            ("velocity_rad_s", self.speed),
-            ("torque_N_m", self.torque),
-        ):
+        table = {f"base_{name}": x.q[:, k] for k, name in enumerate(base)}
+        kinds = {
+            "position_rad": self.angle,
+            "velocity_rad_s": self.speed,
+            "torque_N_m": self.torque,
+        }
+        for kind, columns in kinds.items():
             table |= {f"{name}_{kind}": column for name, column in columns.items()}
-        return pandas.DataFrame(table, index=pandas.Index(x.t, name="time_s"))
-
-
-def com_height(record: Tape | Any) -> np.ndarray:
-    """Height of the CoM (N,) [m], of a tape or of a simulation."""
-    if isinstance(record, Tape):
-        return (record.extra["com"] if "com" in record.extra else record.extra["planar_com"])[:, -1]
-    return record.com[:, 2]
+        return pandas.DataFrame({"phase": x.phase, **table}, index=pandas.Index(x.t, name="time_s"))

@@ -1,7 +1,9 @@
-"""Files that are written whole or not at all, locks, and the resumable log: a line of JSON per finished piece of work.
+"""Files that are written whole or not at all, locks, and the resumable log: a line of JSON per
+finished piece of work.
 
-Locks are those of the system, on the folder or the log itself: readers share, a writer is alone, and a process that
-dies gives them back. (The package filelock shares only through a database, and leaves a file of its own in the folder.)
+Locks are those of the system, on the folder or the log itself: readers share, a writer is alone,
+and a process that dies gives them back. (The package filelock shares only through a database, and
+leaves a file of its own in the folder.)
 """
 
 from __future__ import annotations
@@ -25,44 +27,48 @@ AT_SETTLE: list[Callable[[], None]] = []  # who wants to know, see settle
 
 
 def settle() -> None:
-    """To be called just before results are put in their places: whoever would stop the work raises here, or never."""
+    """Called just before results are in place: who would stop the work raises here, or never."""
     for call in list(AT_SETTLE):
         call()
 
 
 @contextlib.contextmanager
 def made(folder: Path) -> Iterator[list[Path]]:
-    """Make ``folder`` with its parents, and yield the new ones, innermost first; they go again if the block fails.
+    """Make ``folder`` with its parents, and yield the new ones, innermost first; they go again if
+    the block fails.
 
-    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in the block.
+    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in
+    the block.
     """
+    if "\0" in str(folder):
+        raise InputError(
+            f"{str(folder)!r} cannot be the name of a folder (embedded null byte); choose another "
+            "one"
+        )
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise InputError(f"{str(folder)!r} is a file; choose a folder")
     new = [p for p in (folder, *folder.parents) if not os.path.exists(p)]
     try:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except ValueError as e:  # a zero byte in the name
-            raise InputError(f"{str(folder)!r} cannot be the name of a folder ({e}); choose another one") from e
-        except OSError as e:
-            if os.path.exists(folder) and not os.path.isdir(folder):
-                raise InputError(f"{str(folder)!r} is a file; choose a folder") from e
-            raise
+        folder.mkdir(parents=True, exist_ok=True)
         yield new
     except BaseException as e:
         _unmake(new)
         if not isinstance(e, OSError):
             raise
         reason = e.strerror or type(e).__name__
-        raise InputError(f"the folder {str(folder)!r} cannot be written ({reason}); choose another one") from e
+        raise InputError(
+            f"the folder {str(folder)!r} cannot be written ({reason}); choose another one"
+        ) from e
 
 
 def _unmake(folders: list[Path]) -> None:
     for p in folders:
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError):
             p.rmdir()
 
 
 def ensure_writable(folder: str | Path) -> Path:
-    """Check that results can be written into ``folder``, and leave no trace; raises as :func:`made`."""
+    """Check that ``folder`` can be written into, and leave no trace; raises as :func:`made`."""
     folder = as_path(folder, "a result folder")
     with made(folder) as new:
         tempfile.TemporaryFile(dir=folder).close()
@@ -71,7 +77,7 @@ def ensure_writable(folder: str | Path) -> Path:
 
 
 def write_file(path: str | Path, content: bytes) -> Path:
-    """Write one file, whole or not at all, and make its folder; raises :class:`InputError` if that cannot be."""
+    """Write one file whole or not at all, and make its folder; raises :class:`InputError`."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{str(path)!r} is a folder; name a file")
@@ -79,7 +85,8 @@ def write_file(path: str | Path, content: bytes) -> Path:
         handle, half = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
-                os.fchmod(file.fileno(), 0o644)  # readable by all; temporary files are private by default
+                # readable by all; temporary files are private by default
+                os.fchmod(file.fileno(), 0o644)
                 file.write(content)
             os.replace(half, path)
         except BaseException:
@@ -92,15 +99,18 @@ def write_file(path: str | Path, content: bytes) -> Path:
 def locked(folder: Path, *, shared: bool = False, wait_s: float = LOCK_WAIT_S) -> Iterator[None]:
     """Hold the lock of an existing folder; readers share it, a writer has it alone.
 
-    Raises :class:`InputError` if another process keeps it for longer than ``wait_s`` [s]. A file system that knows no
-    locks grants it always: the hashes in the manifest then still tell a mix.
+    Raises :class:`InputError` if another process keeps it for longer than ``wait_s`` [s]. A file
+    system that knows no locks grants it always: the hashes in the manifest then still tell a mix.
     """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         deadline = time.monotonic() + wait_s
         while not _try_lock(fd, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
             if time.monotonic() > deadline:
-                raise InputError(f"another jumplab is writing into {str(folder)!r}; wait, or choose another folder")
+                raise InputError(
+                    f"another jumplab is writing into {str(folder)!r}; wait, or choose another "
+                    "folder"
+                )
             time.sleep(0.005)
         yield
     finally:
@@ -121,13 +131,14 @@ def _try_lock(fd: int, kind: int) -> bool:
 class Log(Generic[K, V]):
     """An open log; made by :func:`open_log`.
 
-    ``done`` is what its lines say, the last one of equal keys; damaged and foreign lines are left out. ``empty`` is
-    True if it had no line at all.
+    ``done`` is what its lines say, the last one of equal keys; damaged and foreign lines are left
+    out. ``empty`` is True if it had no line at all.
     """
 
     def __init__(self, file: BinaryIO, parse: Callable[[Any], tuple[K, V]]):
         file.seek(0)
-        content, self._file = file.read(), file
+        content = file.read()
+        self._file = file
         whole, _, rest = content.rpartition(b"\n")
         if rest.startswith(b"{"):  # killed in the middle of a line
             file.truncate(len(content) - len(rest))
@@ -135,45 +146,52 @@ class Log(Generic[K, V]):
         elif rest:
             file.write(b"\n")
         lines = content.splitlines()
-        self.empty, self.done = not lines, {}
+        self.empty = not lines
+        self.done = {}
         for line in lines:
-            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            with contextlib.suppress(
+                ValueError, KeyError, TypeError, AttributeError, RecursionError
+            ):
                 key, value = parse(json.loads(line))
                 self.done[key] = value
 
     def add(self, data: Mapping[str, Any]) -> None:
-        """Append one line, see :func:`append`."""
-        append(self._file, data)
-
-
-def append(file: BinaryIO, data: Mapping[str, Any]) -> None:
-    """Write one line at the end of a file that is open for appending; it is on the disk when this returns."""
-    file.write(json.dumps(data, allow_nan=False).encode() + b"\n")
-    file.flush()
-    os.fsync(file.fileno())
+        """Append one line of JSON; it is on the disk when this returns."""
+        self._file.write(json.dumps(data, allow_nan=False).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
 
 
 @contextlib.contextmanager
-def open_log(path: str | Path, command: str, parse: Callable[[Any], tuple[K, V]]) -> Iterator[Log[K, V]]:
-    """The log at ``path``, for one process at a time; it is made if it is missing, and goes if nothing is added.
+def open_log(
+    path: str | Path, command: str, parse: Callable[[Any], tuple[K, V]]
+) -> Iterator[Log[K, V]]:
+    """The log at ``path``, for one process at a time; it is made if it is missing, and goes if
+    nothing is added.
 
-    ``command`` of jumplab writes such logs; ``parse`` gives key and value of a line's data, or raises ValueError,
-    KeyError or TypeError if it is not ours. Raises :class:`InputError` if the file cannot be written, or another
-    process has it.
+    ``command`` of jumplab writes such logs; ``parse`` gives key and value of a line's data, or
+    raises ValueError, KeyError or TypeError if it is not ours. Raises :class:`InputError` if the
+    file cannot be written, or another process has it.
     """
     path = Path(path)
     try:
         file = open(path, "a+b")
     except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror}); choose a writable folder") from e
+        raise InputError(
+            f"{path}: cannot be written ({e.strerror}); choose a writable folder"
+        ) from e
     try:
         with file:
             if not _try_lock(file.fileno(), fcntl.LOCK_EX):
-                raise InputError(f"{path}: another 'jumplab {command}' is writing it; wait until that is done")
+                raise InputError(
+                    f"{path}: another 'jumplab {command}' is writing it; wait until that is done"
+                )
             try:
                 yield Log(file, parse)
             finally:
                 if os.fstat(file.fileno()).st_size == 0:
                     path.unlink(missing_ok=True)
     except OSError as e:
-        raise InputError(f"{path}: cannot be written ({e.strerror}); free some space, or choose another folder") from e
+        raise InputError(
+            f"{path}: cannot be written ({e.strerror}); free some space, or choose another folder"
+        ) from e

@@ -1,12 +1,13 @@
 """Result folders: written whole or not at all, checked when read.
 
-A plan's folder holds ``plan.npz`` (the tape), ``robot.urdf`` and ``robot.toml`` (the robot it was planned for) and
-``summary.json``, which comes last and whose ``manifest`` carries the SHA-256 of the others. What is said about that
-plan later (audit, simulation, trials) lies beside it.
+A plan's folder holds ``plan.npz`` (the tape), ``robot.urdf`` and ``robot.toml`` (the robot it was
+planned for) and ``summary.json``, which comes last and whose ``manifest`` carries the SHA-256 of
+the others. What is said about that plan later (audit, simulation, trials) lies beside it.
 
-New files are first written into ``.staging`` inside the folder. Renaming that to ``.commit`` is the one moment at which
-the new result exists; its files then replace the old ones. Killed before that moment, the old result stands; killed
-after it, the next reader or writer moves the rest. Readers and writers take turns by a lock on the folder.
+New files are first written into ``.staging`` inside the folder. Renaming that to ``.commit`` is the
+one moment at which the new result exists; its files then replace the old ones. Killed before that
+moment, the old result stands; killed after it, the next reader or writer moves the rest. Readers
+and writers take turns by a lock on the folder.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from jumplab.errors import InputError, as_path, require_type
-from jumplab.io.files import ensure_writable, locked, made, settle, write_file  # noqa: F401 - two of them for users of a result
+from jumplab.io.files import ensure_writable as ensure_writable
+from jumplab.io.files import locked, made, settle
+from jumplab.io.files import write_file as write_file
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.task import GRAVITY
@@ -35,37 +38,46 @@ from jumplab.task import GRAVITY
 T = TypeVar("T")
 Summary = Mapping[str, Any]
 SCHEMA = "jumplab-result-1"
-PLANNING = ("casadi", "pin", "cvxpy", "clarabel", "proxsuite")
-PACKAGES = ("jumplab", *PLANNING, "coal", "pybullet", "mujoco", "numpy", "scipy", "matplotlib")
-BUILDS = {"pybullet": "pybullet-arm64"}  # the same sources, built for later Pythons under another name
-PLAN, URDF, CONFIG, SUMMARY = "plan.npz", "robot.urdf", "robot.toml", "summary.json"
+# whose versions a result names; by the last three notebooks draw and pose their own programs
+PACKAGES = ("jumplab", "casadi", "pin", "proxsuite", "coal", "pybullet", "mujoco", "numpy", "scipy")
+PACKAGES += ("matplotlib", "cvxpy", "clarabel")
+# the same sources, built for later Pythons under another name
+BUILDS = {"pybullet": "pybullet-arm64"}
+PLAN = "plan.npz"
+URDF = "robot.urdf"
+CONFIG = "robot.toml"
+SUMMARY = "summary.json"
 HASHED = (PLAN, URDF, CONFIG)
-EXPORTS = (
-    "joints.csv",
-    "motion.npz",
-    "replay",
-    "unitree.csv",
-    "gmr.pkl",
-    "mjlab.npz",
-    "beyondmimic.npz",
-    "holosoma.npz",
-)
-EXPORTS += ("mujoco",)
+# of exports: name of the format -> file or folder, frames a second that its usual readers expect
+FORMATS = {
+    "csv": ("joints.csv", 1000.0),
+    "npz": ("motion.npz", 1000.0),
+    "urdf-replay": ("replay", 100.0),
+    "unitree-csv": ("unitree.csv", 30.0),
+    "gmr-pkl": ("gmr.pkl", 30.0),
+    "mjlab-npz": ("mjlab.npz", 50.0),
+    "beyondmimic-npz": ("beyondmimic.npz", 50.0),
+    "holosoma-npz": ("holosoma.npz", 50.0),
+    "mujoco": ("mujoco", 50.0),
+}
+EXPORTS = tuple(file for file, _ in FORMATS.values())
 # what a new simulation makes untrue and therefore removes, and what a new plan does
 OF_SIMULATION = ("jump.html", *(f"simulated_{name}" for name in EXPORTS))
 TRIALS = ("trials.jsonl", "trials.json", "basin.json", "margins.json")
 RESULTS = ("passport.json", "simulation.npz", "simulation.json", *TRIALS)
 CERTIFICATE = ("certificate.json", "certificate.html")
 OF_PLAN = (SUMMARY, "plan.html", *RESULTS, *CERTIFICATE, *EXPORTS, *OF_SIMULATION)
-_STAGING, _COMMIT = ".staging", ".commit"
+_STAGING = ".staging"
+_COMMIT = ".commit"
 
 
 @contextlib.contextmanager
 def transaction(folder: str | Path) -> Iterator[Path]:
-    """Yield an empty staging folder; if the block ends well, its files replace those of ``folder`` all at once.
+    """Yield an empty staging folder; if the block ends well, its files replace those of ``folder``
+    all at once.
 
-    If the block raises, or the process is killed before its end, ``folder`` is what it was before. Raises
-    :class:`InputError` if ``folder`` cannot be written.
+    If the block raises, or the process is killed before its end, ``folder`` is what it was before.
+    Raises :class:`InputError` if ``folder`` cannot be written.
     """
     folder = as_path(folder, "a result folder")
     staging = folder / _STAGING
@@ -75,17 +87,19 @@ def transaction(folder: str | Path) -> Iterator[Path]:
         staging.mkdir()
         try:
             yield staging
-            if not {_STAGING, _COMMIT} & set(folder.resolve().parts):  # else it is part of a larger one
+            # else it is part of a larger one
+            if not {_STAGING, _COMMIT} & set(folder.resolve().parts):
                 settle()
             staging.rename(folder / _COMMIT)
             _finish(folder)
         finally:
-            _finish(folder)  # Ctrl-C after the renaming: the new result exists, so let it be complete
+            # Ctrl-C after the renaming: the new result exists, so let it be complete
+            _finish(folder)
             shutil.rmtree(staging, ignore_errors=True)
 
 
 def _finish(folder: Path) -> None:
-    """Move what is committed to its place: the plan first, the summary last. Needs the lock; may be repeated."""
+    """Put what is committed in its place, the summary last. Needs the lock; may be repeated."""
     commit = folder / _COMMIT
     if not commit.is_dir():
         return
@@ -111,24 +125,20 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+@cache  # a sweep audits thousands of plans
 def versions() -> dict[str, str]:
     """Version of Python and of every package that shapes a result."""
-    return dict(_versions())
-
-
-@cache  # a sweep audits thousands of plans
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    numbers = {"python": platform.python_version()}
     for name in PACKAGES:
         for build in (name, BUILDS.get(name, name)):
             with contextlib.suppress(metadata.PackageNotFoundError):
-                found.setdefault(name, metadata.version(build))
-        found.setdefault(name, "not installed")
-    return found
+                numbers.setdefault(name, metadata.version(build))
+        numbers.setdefault(name, "not installed")
+    return numbers
 
 
 def to_json(data: Any) -> str:
-    """JSON text of nested mappings, sequences, NumPy values and paths; numbers that are not finite become null."""
+    """JSON of nested mappings, sequences, NumPy values, paths; null for what is not finite."""
     return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -150,15 +160,17 @@ def sha256(path: Path) -> str:
 
 
 def write_plan(
-    folder: str | Path, tape: Tape, robot: Robot, summary: Summary, complete: Callable[[Path], T] | None = None
+    folder: str | Path,
+    tape: Tape,
+    robot: Robot,
+    summary: Summary,
+    complete: Callable[[Path], T] | None = None,
 ) -> T | None:
     """Write a plan's folder; what an older plan left there, with its passport and simulation, goes.
 
-    Parameters
-    ----------
-    summary : becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the files.
-    complete : called with the folder before anybody else sees it, to add files to it (``write_audit``); what it
-        returns is returned.
+    ``summary`` becomes ``summary.json``, with a ``manifest`` added: versions, robot, hashes of the
+    files. ``complete`` is called with the folder before anybody else sees it, to add files to it
+    (``write_audit``); what it returns is returned.
     """
     require_type(tape, Tape, "the tape to write")
     require_type(robot, Robot, "its robot")
@@ -178,61 +190,69 @@ def write_plan(
         return complete(staging) if complete else None
 
 
-class Simulation(Protocol):
-    """A simulation's result, as :func:`write_simulation` needs it."""
-
-    def save(self, folder: Path, extra: dict | None = None) -> None:
-        """Write both files; ``extra`` are further entries of the second one."""
-
-
-def write_simulation(folder: str | Path, result: Simulation, summary: Summary) -> None:
-    """Write ``simulation.npz`` and ``simulation.json`` beside the plan that ``summary`` was read with.
+def write_simulation(folder: str | Path, result: Any, summary: Summary) -> None:
+    """Write a simulation (two files, by its ``save``) beside the plan that ``summary`` was read
+    with.
 
     Raises :class:`InputError` if the folder cannot be written, or has come to hold another plan.
     """
     require_type(summary, Mapping, "the summary")
     if not {"planned_distance_m", "planned_rise_m", "manifest"} <= set(summary):
-        raise InputError("the summary is not one that a plan was read with; take it from store.read_plan")
-    folder = as_path(folder, "a result folder")
+        raise InputError(
+            "the summary is not one that a plan was read with; take it from store.read_plan"
+        )
     planned = {name: summary[name] for name in ("planned_distance_m", "planned_rise_m")}
-    with transaction(folder) as staging:
-        _same_plan(folder, summary)
+    with _beside(folder, summary) as staging:
         result.save(staging, extra=planned)
 
 
 def write_trials(
-    folder: str | Path, report: Mapping[str, Any], summary: Summary, name: str, pages: Mapping[str, str] | None = None
+    folder: str | Path,
+    report: Mapping[str, Any],
+    summary: Summary,
+    name: str,
+    pages: Mapping[str, str] | None = None,
 ) -> None:
-    """Write file ``name``, and ``pages`` of text by name, beside the plan that ``summary`` was read with.
+    """Write file ``name``, and ``pages`` of text by name, beside the plan that ``summary`` was read
+    with.
 
     Raises as :func:`write_simulation`.
     """
-    with transaction(folder) as staging:
-        _same_plan(Path(folder), summary)
+    with _beside(folder, summary) as staging:
         for file, text in (pages or {}).items():
             (staging / file).write_text(text, encoding="utf-8")
         (staging / name).write_text(to_json(report), encoding="utf-8")
 
 
-def _same_plan(folder: Path, summary: Summary) -> None:
-    if _read_summary(folder)["manifest"]["files"] != summary["manifest"]["files"]:
-        raise InputError(f"{str(folder)!r} has been planned again in the meantime; simulate the new plan")
+@contextlib.contextmanager
+def _beside(folder: str | Path, summary: Summary) -> Iterator[Path]:
+    """A transaction on the folder of the plan that ``summary`` was read with."""
+    with transaction(folder) as staging:
+        if _read_summary(Path(folder))["manifest"]["files"] != summary["manifest"]["files"]:
+            raise InputError(
+                f"{str(folder)!r} has been planned again in the meantime; simulate the new plan"
+            )
+        yield staging
 
 
 def _read_summary(folder: Path) -> dict[str, Any]:
     path = folder / SUMMARY
     if not path.is_file():
-        raise InputError(f"{str(folder)!r} holds no finished plan ({SUMMARY} is missing); make one with 'jumplab plan'")
+        raise InputError(
+            f"{str(folder)!r} holds no finished plan ({SUMMARY} is missing); make one with "
+            "'jumplab plan'"
+        )
     summary = read_json(path)
     manifest = summary.get("manifest")
-    files = manifest.get("files") if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA else None
-    if not isinstance(files, dict) or not all(isinstance(files.get(name), str) for name in HASHED):
+    files = manifest.get("files") if isinstance(manifest, dict) else None
+    known = isinstance(files, dict) and manifest.get("schema") == SCHEMA
+    if not known or not all(isinstance(files.get(name), str) for name in HASHED):
         raise InputError(f"{path}: not a summary of schema {SCHEMA!r}; plan the jump again")
     return summary
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; raises :class:`InputError` in one sentence if it is missing or damaged."""
+    """Read a JSON object; raises :class:`InputError` if it is missing or damaged."""
     try:
         data = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as e:
@@ -243,15 +263,18 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
-    """Read a plan's folder: the tape, the robot it was planned for, under the target's gravity, and the summary.
+    """Read a plan's folder: the tape, the robot it was planned for, under the target's gravity, and
+    the summary.
 
-    Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the one that the
-    summary speaks of.
+    Raises :class:`InputError` if the folder holds no finished plan, or a file is damaged or not the
+    one that the summary speaks of.
     """
     folder = as_path(folder, "a result folder")
     try:
         if not folder.is_dir():
-            raise InputError(f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first")
+            raise InputError(
+                f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first"
+            )
         if (folder / _COMMIT).is_dir():  # a writer was killed
             with locked(folder):
                 _finish(folder)
@@ -259,9 +282,14 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
             summary = _read_summary(folder)
             for name in HASHED:
                 if sha256(folder / name) != summary["manifest"]["files"][name]:
-                    raise InputError(f"{folder / name}: changed or damaged since it was written; plan the jump again")
+                    raise InputError(
+                        f"{folder / name}: changed or damaged since it was written; plan the jump "
+                        "again"
+                    )
             urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
-            robot = Robot.from_text(urdf, config).under_gravity(summary["target"].get("gravity", GRAVITY))
+            robot = Robot.from_text(urdf, config).under_gravity(
+                summary["target"].get("gravity", GRAVITY)
+            )
             return Tape.load(folder / PLAN), robot, summary
     except (OSError, ValueError) as e:
         reason = (e.strerror if isinstance(e, OSError) else str(e)) or type(e).__name__

@@ -9,7 +9,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 
-Listener = Callable[[str, int, int], None]  # what is done, how much of it is, of how much (0: not known)
+# what is done, how much of it is, of how much (0: not known)
+Listener = Callable[[str, int, int], None]
 _LISTENERS: list[Listener] = []
 
 
@@ -21,7 +22,7 @@ def tell(what: str, done: int = 0, of: int = 0) -> None:
 
 @contextlib.contextmanager
 def told_to(listener: Listener) -> Iterator[None]:
-    """Within the block, ``listener`` is called whenever work of this process says what it is doing."""
+    """Within the block, ``listener`` is called whenever work says what it is doing."""
     _LISTENERS.append(listener)
     try:
         yield

@@ -1,8 +1,7 @@
-"""The public tape: one planned jump of the full robot, sampled at 1 kHz, and nothing that needs the planner to read."""
+"""The public tape: a planned jump of the full robot at 1 kHz, readable without the planner."""
 
 from __future__ import annotations
 
-import dataclasses
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -14,59 +13,70 @@ from jumplab.errors import InputError, Shown, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
+# of the arrays, in the order of the fields
 _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
 # what reading a cut, altered or foreign file may raise
-DAMAGE = (OSError, ValueError, TypeError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+DAMAGE = (
+    OSError,
+    ValueError,
+    TypeError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True, repr=False)
 class Tape(Shown):
     """Launch and flight of the full robot at 1 kHz.
 
-    Configurations are in Pinocchio's free-flyer order. Torques are what motors give: they move the links, turn the
-    motors' own armature, and overcome their friction, where these are known (:attr:`.Robot.actuators`); otherwise they
-    are the joints' torques of inverse dynamics. The instant of take-off appears twice, once per phase. ``extra``
-    (SRMP and planar solutions) is for study, and not needed to play the tape.
+    Configurations are in Pinocchio's free-flyer order. Torques are what motors give: they move the
+    links, turn the motors' own armature, and overcome their friction, where these are known
+    (:attr:`.Robot.actuators`); otherwise they are the joints' torques of inverse dynamics. The
+    instant of take-off appears twice, once per phase. ``extra`` (SRMP and planar solutions) is for
+    study, and not needed to play the tape.
     """
 
     t: np.ndarray  # (N,) time from the start of the launch [s]
-    q: np.ndarray  # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
-    v: np.ndarray  # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    # (N, nq) x y z qx qy qz qw of the base link in the world, then joint angles [m, rad]
+    q: np.ndarray
+    # (N, nv) base twist (linear, angular) in the base frame, then joint rates [m/s, rad/s]
+    v: np.ndarray
     a: np.ndarray  # (N, nv) time derivative of v [m/s^2, rad/s^2]
     tau: np.ndarray  # (N, nv - 6) motor torques at the joints [N m]
     phase: np.ndarray  # (N,) "launch" or "flight"
     contact_frames: np.ndarray  # (K,) names of the foot links; where wrenches act
-    f: np.ndarray  # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]
+    # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]
+    f: np.ndarray
     joint_names: np.ndarray  # (nv - 6,) in the order of q[7:]
     extra: dict = field(default_factory=dict)  # further arrays under their own names
 
     def __post_init__(self):
-        own = {name: getattr(self, name) for name in _DIMENSIONS}
         for name, count in _DIMENSIONS.items():
-            if np.ndim(own[name]) != count:
-                raise InputError(f"tape: {name} has {np.ndim(own[name])} dimensions, needs {count}")
-        for name in ("q", "v", "a", "tau", "phase", "f"):
-            if len(own[name]) != len(self.t):
-                raise InputError(f"tape: {name} has {len(own[name])} rows, t has {len(self.t)}")
-        for name in ("t", "q", "v", "a", "tau", "f"):
-            kind = np.asarray(own[name]).dtype.kind
-            if kind not in "fiu":
-                raise InputError(f"tape: {name} holds no real numbers (kind {kind!r})")
-        for x in (*own.values(), *self.extra.values()):
+            x = np.asarray(getattr(self, name))
+            if x.ndim != count:
+                raise InputError(f"tape: {name} has {x.ndim} dimensions, needs {count}")
+            if name not in ("contact_frames", "joint_names") and len(x) != len(self.t):
+                raise InputError(f"tape: {name} has {len(x)} rows, t has {len(self.t)}")
+            if name in ("t", "q", "v", "a", "tau", "f") and x.dtype.kind not in "fiu":
+                raise InputError(f"tape: {name} holds no real numbers (kind {x.dtype.kind!r})")
+        for x in self.arrays().values():
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
     def require_jump(self) -> None:
-        """Refuse (:class:`InputError`) a tape along another contact schedule, which nothing plays."""
-        told = self.extra.get("contacts")
-        if told is None:
+        """Refuse (:class:`InputError`) a tape along another contact schedule: nothing plays it."""
+        contacts = self.extra.get("contacts")
+        if contacts is None:
             return
-        carried = np.asarray(told) > 0
+        carried = np.asarray(contacts) > 0
         switches = np.flatnonzero(np.any(np.diff(carried, axis=0), axis=1))
         if len(switches) != 1 or carried[-1].any():
             raise InputError(
-                "the plan follows another contact schedule than a standing jump: only standing jumps can be simulated; "
-                "its tape can be audited, viewed and saved"
+                "the plan follows another contact schedule than a standing jump: only standing "
+                "jumps can be simulated; its tape can be audited, viewed and saved"
             )
 
     @property
@@ -81,7 +91,7 @@ class Tape(Shown):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays under the names of ``plan.npz``."""
-        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "extra"}
+        own = {name: getattr(self, name) for name in _DIMENSIONS}
         return {"schema": np.array(SCHEMA), **own, **self.extra}
 
     def save(self, path: str | Path) -> None:
@@ -90,21 +100,26 @@ class Tape(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Tape:
-        """Read ``plan.npz``; raises :class:`InputError` if it is missing, damaged or of another schema."""
+        """Read ``plan.npz``; raises :class:`InputError` if it is missing, damaged or foreign."""
         path = as_path(path, "a plan's file")
         try:
             if not path.is_file():
-                raise InputError(f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'")
+                raise InputError(
+                    f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'"
+                )
             with np.load(path, allow_pickle=False) as file:
                 data = {k: file[k] for k in file.files}
         except DAMAGE as e:
-            raise InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated") from e
+            raise InputError(
+                f"{path}: not a readable plan ({type(e).__name__}); it may be truncated"
+            ) from e
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:
-            raise InputError(f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again")
-        own = {}
-        for name in (f.name for f in dataclasses.fields(cls) if f.name != "extra"):
+            raise InputError(
+                f"{path}: schema {schema!r}, this version reads {SCHEMA!r}; plan the jump again"
+            )
+        for name in _DIMENSIONS:
             if name not in data:
                 raise InputError(f"{path}: the array {name!r} is missing")
-            own[name] = data.pop(name)
+        own = {name: data.pop(name) for name in _DIMENSIONS}
         return cls(**own, extra=data)

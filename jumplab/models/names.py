@@ -11,7 +11,8 @@ from jumplab.robot import SAGITTAL_JOINTS, Robot
 
 
 class ByJoint:
-    """One quantity of the joints by name: ``.left_knee`` is one's own, ``.knee`` left and right (2,), about +y.
+    """One quantity of the joints by name: ``.left_knee`` is one's own, ``.knee`` left and right
+    (2,), about +y.
 
     Parameters
     ----------
@@ -19,16 +20,15 @@ class ByJoint:
     """
 
     def __init__(self, robot: Robot, values: Any):
-        self._robot, self._values = robot, values
+        self._robot = robot
+        self._values = values
 
     def __getattr__(self, name: str) -> Any:
         robot = self._robot
-        own = {joint: ([k], [1.0]) for k, joint in enumerate(robot.joint_names)}
-        for role in SAGITTAL_JOINTS:
-            pair = [(joint, sign) for joint, row, sign in robot.role_signs() if SAGITTAL_JOINTS[row] == role]
-            if pair:  # else the arms are held
-                own[role] = [robot.joint_names.index(joint) for joint, _ in pair], [sign for _, sign in pair]
-        if name not in own:
-            raise AttributeError(f"there is no joint {quoted(name)}; there are {', '.join(own)}")
-        rows, signs = own[name]
-        return self._values[rows] * np.array(signs)
+        known = {joint: [(joint, 1.0)] for joint in robot.joint_names}
+        for joint, row, sign in robot.role_signs():
+            known.setdefault(SAGITTAL_JOINTS[row], []).append((joint, sign))
+        if name not in known:
+            raise AttributeError(f"there is no joint {quoted(name)}; there are {', '.join(known)}")
+        rows = [robot.joint_names.index(joint) for joint, _ in known[name]]
+        return self._values[rows] * np.array([sign for _, sign in known[name]])

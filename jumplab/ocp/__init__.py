@@ -1,8 +1,10 @@
 """An optimal-control solver that knows nothing of robots.
 
-In: a :class:`Problem` (phases, terms, bounds), and per target its parameters and a :class:`PhaseGuess` of every phase.
-Out: a :class:`Solution`, or a :class:`~jumplab.errors.SolverError` that names the terms in conflict.
-Start reading in :mod:`jumplab.ocp.problem`; then ``nlp.py``, which solves what ``assembly.py`` makes of it.
+In: a :class:`Problem` (phases, terms, bounds), and per target its parameters and a
+:class:`PhaseGuess` of every phase. Out: a :class:`Solution`, or a
+:class:`~jumplab.errors.SolverError` that names the terms in conflict. Start reading in
+:mod:`jumplab.ocp.problem`; then ``derivatives.py`` makes small functions of it, ``assembly.py``
+one sparse program, ``posing.py`` puts numbers in, ``nlp.py`` solves it.
 """
 
 import lazy_loader as lazy

@@ -1,9 +1,11 @@
-"""A problem with own terms, other weights, and some terms left out; what does not fit is refused before any solve."""
+"""A problem with own terms, other weights, and some terms left out; what does not fit is refused
+before any solve.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from numbers import Real
 from typing import Any
@@ -12,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from jumplab.errors import InputError, quoted, require_type
-from jumplab.ocp.derivatives import JERK_CHAIN, ElementBuilder
-from jumplab.ocp.problem import PhaseLayout, Problem, Term
+from jumplab.ocp.derivatives import JERK_CHAIN, Formulator, Part
+from jumplab.ocp.problem import Bound, Problem, Term, is_named
 
 
 def changed(
@@ -21,45 +23,66 @@ def changed(
     terms: Mapping[str, Iterable[Term]] | None = None,
     weights: Mapping[str, float] | None = None,
     off: Iterable[str] = (),
+    *,
+    look: Callable[[Problem, str, Term, str], str] | None = None,
 ) -> Problem:
-    """The problem with own terms, other weights, and terms and bounds left out; itself if nothing is asked for.
+    """The problem with own terms, other weights, and terms and bounds left out; itself if nothing
+    is asked for.
 
     Parameters
     ----------
-    terms : phase name -> further terms; by the problem's own name those at "problem", which join phases.
+    terms : phase name -> further terms; by the problem's own name those at "problem", which join
+        phases.
     weights : "term" or "phase/term" of a cost, own ones too -> weight.
     off : "term" or "phase/term" to leave out.
+    look : takes the problem, a phase's name, an own term and its name in sentences; refuses the
+        term if its expression does not fit, and returns a hash of it. If None, expressions are
+        columns of a :class:`.problem.Point`.
 
     An own cost of weight 0 is left out as well, so that it changes nothing, not even a digit.
 
     Raises
     ------
     InputError
-        In one sentence with the term's name: an unknown phase or name; a name taken twice; a weight that is no number
-        of 0 or more, or is a constraint's; an expression that fails, is no column, or uses symbols that are not its
+        In one sentence with the term's name: an unknown phase or name; a name taken twice; a weight
+        that is no number
+        of 0 or more, or is a constraint's; an expression that fails, is no column, or uses symbols
+        that are not its
         point's; bounds that do not fit; a link of the motion that is switched off.
     """
-    terms, weights, off = {k: tuple(v) for k, v in (terms or {}).items()}, dict(weights or {}), tuple(off)
-    for owner, extra in terms.items():
+    weights = dict(weights or {})
+    off = tuple(off)
+    if not (terms or weights or off):
+        return problem
+    for owner, extra in (terms or {}).items():
         for term in extra:
-            problem = _with(problem, owner, term)
+            problem = _with(problem, owner, term, look or _digest)
     problem.check_names([*weights, *off], "weight or switch")
     for name, weight in weights.items():
         problem = _weighted(problem, name, weight)
-    if identities := [t.name for owner, t in problem.terms() if t.identity and {t.name, f"{owner}/{t.name}"} & {*off}]:
-        raise InputError(f"term {identities[0]!r} links the motion to one; it cannot be switched off")
-    gone = {x for x in problem.own if any(t.weight == 0 for o, t in problem.terms() if (o, t.name) == x)}
-    gone |= {(o, x.name) for o, x in (*problem.terms(), *problem.bounds()) if {x.name, f"{o}/{x.name}"} & {*off}}
-    return _mapped(problem, lambda owner, x: None if (owner, x.name) in gone else x) if gone else problem
+    for owner, term in problem.terms():
+        if term.identity and is_named(owner, term, off):
+            raise InputError(
+                f"term {term.name!r} links the motion to one; it cannot be switched off"
+            )
+
+    def left(owner: str, x: Term | Bound) -> Term | Bound | None:
+        idle = (owner, x.name) in problem.own and x.weight == 0
+        return None if idle or is_named(owner, x, off) else x
+
+    return _mapped(problem, left)
 
 
-def _mapped(problem: Problem, change: Any) -> Problem:
+def _mapped(problem: Problem, change: Callable) -> Problem:
     """The problem with ``change(owner, term or bound)`` for each; left out where that is None."""
 
-    def each(owner, items):
+    def each(owner: str, items: tuple) -> tuple:
         return tuple(new for x in items if (new := change(owner, x)) is not None)
 
-    phases = tuple(replace(p, terms=each(p.name, p.terms), bounds=each(p.name, p.bounds)) for p in problem.phases)
+    phases = tuple(
+        replace(p, terms=each(p.name, p.terms), bounds=each(p.name, p.bounds))
+        for p in problem.phases
+    )
     out = replace(problem, phases=phases, joints=each(problem.name, problem.joints))
     left = {(owner, t.name) for owner, t in out.terms()}
     return replace(out, own={name: digest for name, digest in problem.own.items() if name in left})
@@ -67,12 +90,15 @@ def _mapped(problem: Problem, change: Any) -> Problem:
 
 def _weighted(problem: Problem, name: str, weight: Any) -> Problem:
     """The problem with another weight of a cost."""
-    found = [(o, x) for o, x in (*problem.terms(), *problem.bounds()) if name in (x.name, f"{o}/{x.name}")]
-    costs = {(o, x.name) for o, x in found if isinstance(x, Term) and x.is_cost}
+    costs = {(o, t.name) for o, t in problem.terms() if t.is_cost and is_named(o, t, (name,))}
     if not costs:
-        raise InputError(f"{problem.name}: {name!r} is a constraint and has no weight; switch it off instead")
+        raise InputError(
+            f"{problem.name}: {name!r} is a constraint and has no weight; switch it off instead"
+        )
     _check_weight(name, weight)
-    return _mapped(problem, lambda o, x: replace(x, weight=float(weight)) if (o, x.name) in costs else x)
+    return _mapped(
+        problem, lambda o, x: replace(x, weight=float(weight)) if (o, x.name) in costs else x
+    )
 
 
 def _check_weight(name: str, weight: Any) -> None:
@@ -80,57 +106,55 @@ def _check_weight(name: str, weight: Any) -> None:
         raise InputError(f"weight {name!r} = {quoted(weight)}: it must be a number of 0 or more")
 
 
-def _with(problem: Problem, owner: str, term: Term) -> Problem:
+def _with(problem: Problem, owner: str, term: Term, look: Callable) -> Problem:
     """The problem with one further term, checked."""
     require_type(term, Term, f"an own term of {problem.place(owner)!r}")
+    who = f"term {term.name!r} of {problem.place(owner)!r}"
     names = [p.name for p in problem.phases]
     joining = owner == problem.name
     if not joining and owner not in names:
         raise InputError(
-            f"term {term.name!r}: {problem.name!r} has no phase {owner!r}; it has {', '.join(names)}, and "
-            f"{problem.name!r} for terms that join them"
+            f"term {term.name!r}: {problem.name!r} has no phase {owner!r}; it has "
+            f"{', '.join(names)}, and {problem.name!r} for terms that join them"
         )
-    if joining != (term.at == "problem"):
-        where = f"at = 'problem' belongs to {problem.name!r} itself" if not joining else "it needs at = 'problem'"
-        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: {where}")
-    taken = {x.name for o, x in (*problem.terms(), *problem.bounds()) if o == owner} | {JERK_CHAIN}
-    if term.name in taken:
-        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: the name is taken; give it one of its own")
+    if joining and term.at != "problem":
+        raise InputError(f"{who}: it needs at = 'problem'")
+    if term.at == "problem" and not joining:
+        raise InputError(f"{who}: at = 'problem' belongs to {problem.name!r} itself")
+    if term.name in {JERK_CHAIN, *(x.name for o, x in problem.items() if o == owner)}:
+        raise InputError(f"{who}: the name is taken; give it one of its own")
     if "/" in term.name:
-        raise InputError(f"term {term.name!r} of {problem.place(owner)!r}: a name must not hold a '/'")
+        raise InputError(f"{who}: a name must not hold a '/'")
     if term.is_cost:
         _check_weight(term.name, term.weight)
-    digest = _digest(problem, owner, term)
-    phases = tuple(replace(p, terms=(*p.terms, term)) if p.name == owner else p for p in problem.phases)
+    phases = tuple(
+        replace(p, terms=(*p.terms, term)) if p.name == owner else p for p in problem.phases
+    )
     joints = (*problem.joints, term) if joining else problem.joints
-    return replace(problem, phases=phases, joints=joints, own={**problem.own, (owner, term.name): digest})
+    own = {**problem.own, (owner, term.name): look(problem, owner, term, who)}
+    return replace(problem, phases=phases, joints=joints, own=own)
 
 
-def _digest(problem: Problem, owner: str, term: Term) -> str:
+def _digest(problem: Problem, owner: str, term: Term, who: str) -> str:
     """Hash of the term's expression in the symbols of its points, the same in every process."""
-    alone = tuple(replace(p, terms=(term,) if p.name == owner else (), bounds=(), intervals=1) for p in problem.phases)
-    alone = replace(problem, phases=alone, joints=(term,) if owner == problem.name else ())
-    elements = ElementBuilder(alone, {p.name: PhaseLayout.of(p, 0) for p in alone.phases}).elements
-    (e,) = (e for e in elements if term in [*e.costs, *(t for t, _ in e.rows)])
-    f = e.formulas
+    place = "interval" if term.at == "mid" else term.at
+    f = Formulator(problem).formulas(Part(owner, place, (term,)))
     columns = [y for _, y in f.costs] + f.rows
     made = ca.Function("own", [f.local, f.data, f.parameters], columns, {"allow_free": True})
     if made.has_free():
         free = ", ".join(made.get_free()[:3])
-        raise InputError(
-            f"term {term.name!r} of {problem.place(owner)!r}: it uses symbols that are not its point's ({free})"
-        )
-    for t, rows in e.rows:
-        if t is term and not (callable(term.lower) or callable(term.upper)):  # those are read when solving
-            ends(f"term {term.name!r} of {problem.place(owner)!r}", term, rows)
+        raise InputError(f"{who}: it uses symbols that are not its point's ({free})")
+    # bounds that are functions are read when solving
+    if not (term.is_cost or callable(term.lower) or callable(term.upper)):
+        ends(who, term, columns[0].numel())
     return hashlib.sha256(made.serialize().encode()).hexdigest()
 
 
 def ends(who: str, term: Term, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bound (rows,) of an own term, both numbers.
 
-    ``who`` is the term in sentences. Raises InputError for bounds that are no numbers, do not fit the ``rows`` of its
-    expression, or exclude each other.
+    ``who`` is the term in sentences. Raises InputError for bounds that are no numbers, do not fit
+    the ``rows`` of its expression, or exclude each other.
     """
     values = []
     for side, bound in (("lower", term.lower), ("upper", term.upper)):
@@ -139,11 +163,14 @@ def ends(who: str, term: Term, rows: int) -> tuple[np.ndarray, np.ndarray]:
         except (TypeError, ValueError):
             raise InputError(f"{who}: {side} = {quoted(bound)} is no number") from None
         if value.size not in (1, rows) or np.any(np.isnan(value)):
+            count = f"{rows} row{'s' * (rows > 1)}"
             raise InputError(
-                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {rows} row{'s' * (rows > 1)}"
+                f"{who}: {side} = {quoted(bound)} does not fit its expression, which has {count}"
             )
         values.append(np.broadcast_to(value, (rows,)))
     low, high = values
     if np.any(low > high):
-        raise InputError(f"{who}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}")
+        raise InputError(
+            f"{who}: lower = {quoted(term.lower)} is above upper = {quoted(term.upper)}"
+        )
     return low, high

@@ -1,4 +1,6 @@
-"""What goes into a solve and what comes out: guesses, solutions at and between the nodes, multipliers, statistics."""
+"""What goes into a solve and what comes out: guesses, solutions at and between the nodes,
+multipliers, statistics.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jumplab.errors import Shown
-from jumplab.ocp.derivatives import chain
 from jumplab.ocp.problem import Problem
 
 
@@ -19,8 +20,11 @@ def resampled(old: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarra
     return np.array([np.interp(new, old, column) for column in values.T]).reshape(-1, len(new)).T
 
 
-def quintic(ends: list[tuple[np.ndarray, np.ndarray]], step: float, h: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(q, v, a) of the polynomials of fifth degree through q, v, a at both ``ends`` of a step, ``h`` after its start.
+def quintic(
+    ends: list[tuple[np.ndarray, np.ndarray]], step: float, h: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """(q, v, a) of the polynomials of fifth degree through q, v, a at both ``ends`` of a step,
+    ``h`` after its start.
 
     ``ends`` are (left, right) of q, v, a, each (n, nq); ``step`` [s]; ``h`` (n, 1) [s].
     """
@@ -40,7 +44,7 @@ def quintic(ends: list[tuple[np.ndarray, np.ndarray]], step: float, h: np.ndarra
 
 @dataclass(frozen=True, repr=False)
 class PhaseGuess(Shown):
-    """Initial values of one phase at its nodes; derivatives that are None are taken by differences."""
+    """Initial values of one phase at its nodes; derivatives that are None come by differences."""
 
     duration: float
     q: np.ndarray  # (N + 1, nq)
@@ -50,8 +54,9 @@ class PhaseGuess(Shown):
     constants: dict = field(default_factory=dict)
 
     def resampled(self, intervals: int) -> PhaseGuess:
-        """The same guess at the nodes of another mesh, by straight lines between its own."""
-        old, new = np.linspace(0, 1, len(self.q)), np.linspace(0, 1, intervals + 1)
+        """The same guess at (intervals + 1) nodes, by straight lines between its own."""
+        old = np.linspace(0, 1, len(self.q))
+        new = np.linspace(0, 1, intervals + 1)
         values = {key: x for key in "qvaz" if (x := getattr(self, key)) is not None}
         return replace(self, **{key: resampled(old, x, new) for key, x in values.items()})
 
@@ -68,33 +73,33 @@ class PhaseSolution(Shown):
     z: np.ndarray  # (N + 1, nz)
     duration: float  # [s]
     constants: dict  # the phase's further ones
-    exact: bool = True  # the jerks lead from node to node; else some coordinates follow from terms at the nodes
 
-    def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(q, v, a), each (n, nq), at times ``t`` since the phase began: the very motion that was optimised.
+    def sample(self, t: float | np.ndarray) -> tuple[np.ndarray, ...]:
+        """(q, v, a), each (n, nq), at times ``t`` (n,) [s] since the phase began.
 
-        Coordinates that follow from terms at the nodes pass through q, v, a of both neighbouring nodes.
+        Polynomials of fifth degree through q, v, a of both neighbouring nodes: where the jerk is
+        constant in between, they are the very motion that was optimised.
         """
         t = np.atleast_1d(np.asarray(t, float))
-        n = len(self.j)
+        n = len(self.t) - 1
         k = np.clip((t / self.duration * n).astype(int), 0, n - 1)
-        h = (t - self.t[k])[:, None]
-        if self.exact:
-            return chain(self.q[k], self.v[k], self.a[k], self.j[k], h)
-        return quintic([(x[k], x[k + 1]) for x in (self.q, self.v, self.a)], self.duration / n, h)
+        ends = [(x[k], x[k + 1]) for x in (self.q, self.v, self.a)]
+        return quintic(ends, self.duration / n, (t - self.t[k])[:, None])
 
     def guess(self, intervals: int | None = None) -> PhaseGuess:
-        """This solution as the start of another solve, on another mesh if asked."""
+        """This solution at its own or at (intervals + 1) nodes, as the start of another solve."""
         t = np.linspace(0, self.duration, (intervals or len(self.j)) + 1)
-        return PhaseGuess(self.duration, *self.sample(t), resampled(self.t, self.z, t), dict(self.constants))
+        return PhaseGuess(
+            self.duration, *self.sample(t), resampled(self.t, self.z, t), dict(self.constants)
+        )
 
 
 @dataclass(frozen=True, repr=False)
 class Multipliers(Shown):
     """Lagrange multipliers of a solution, free of its mesh: what each limit is worth.
 
-    Of limits along a phase they are per unit of its share. Box bounds have the names (phase, "bounds of nodes") and
-    (phase, "bounds of constants").
+    Of limits along a phase they are per unit of its share. Box bounds have the names (phase,
+    "bounds of nodes") and (phase, "bounds of constants").
     """
 
     rows: dict  # (owner, term name) -> shares of the phase (K,), values (K, C)
@@ -102,7 +107,9 @@ class Multipliers(Shown):
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the solver's own."""
+    """What a solve cost; ``functions_s`` is the CPU time of function evaluations, the rest is the
+    solver's own.
+    """
 
     iterations: int
     status: str
@@ -117,7 +124,9 @@ class Statistics:
 
 @dataclass(frozen=True, repr=False)
 class Solution(Shown):
-    """Result of one solve, every row met; what each cost and the tightest row of each constraint is, for people."""
+    """Result of one solve, every row met; what each cost and the tightest row of each constraint
+    is, for people.
+    """
 
     phases: dict[str, PhaseSolution]
     statistics: Statistics

@@ -1,4 +1,5 @@
-"""What can be found in a URDF that nobody has described yet: roles, soles, and a first TOML file to look through.
+"""What can be found in a URDF that nobody has described yet: roles, soles, and a first TOML file to
+look through.
 
 Which joint is which is found from how it moves its links, never from its name.
 """
@@ -7,46 +8,66 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, takewhile
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-import pinocchio as pin
 
-from jumplab.errors import RobotError
+from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.checks import PLAUSIBLE
-from jumplab.robot_import.config import LEG, ROLES, filled, texts
-from jumplab.robot_import.urdf import MOVING, Joint, Tree, parse, read_urdf
+from jumplab.robot_import.checks import MOST_RAD_S
+from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
+from jumplab.robot_import.write import filled, quote
 
 # None of these numbers is printed by the paper.
 SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
-PARALLEL = 0.999  # cosine: shoulders canted by less than 2.6 deg swing arms in the plane; others are held
-LOWEST = 0.15  # share of the robot's height within which the ankles are above the lowest joint: arms end higher
-EVEN_RAD = 0.3  # a knee whose range is as even as this says nothing of where the robot faces: its feet do
+# cosine: shoulders canted by less than 2.6 deg swing arms in the plane; others are held
+PARALLEL = 0.999
+# share of the robot's height within which the ankles are above the lowest joint: arms end higher
+LOWEST = 0.15
+# a knee whose range is as even as this says nothing of where the robot faces: its feet do
+EVEN_RAD = 0.3
 SAME_M = 0.02  # how far from mirror images two limbs may stand
 # ranges of joints that turn without stops, or whose stops nobody told: a person's, nearly
-ASSUMED_RAD = {"hip_pitch": (-2.0, 0.6), "knee": (0.0, 2.3), "ankle_pitch": (-0.9, 0.7), "other": (-0.4, 0.4)}
-ASSUMED_RAD["shoulder_pitch"] = (-2.0, 2.0)
+ASSUMED_RAD = {
+    "hip_pitch": (-2.0, 0.6),
+    "knee": (0.0, 2.3),
+    "ankle_pitch": (-0.9, 0.7),
+    "shoulder_pitch": (-2.0, 2.0),
+    "other": (-0.4, 0.4),
+}
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
 SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
-# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to ankle
-GUESS_X, GUESS_Y, GUESS_Z = (-0.143, 0.2), (-0.071, 0.071), -0.107
-STANCE_KNEE_RAD, STANCE_TRUNK_RAD = 0.5, 0.05  # as the default robot stands
+# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to
+# ankle
+GUESS_X = (-0.143, 0.2)
+GUESS_Y = (-0.071, 0.071)
+GUESS_Z = -0.107
+STANCE_KNEE_RAD = 0.5  # as the default robot stands
+STANCE_TRUNK_RAD = 0.05
 STANCE_ROOM_RAD = 0.15  # from the joint stops
-AXES = dict(zip("xyz", np.eye(3), strict=True))
+AXES = {
+    sign + name: row
+    for sign, s in (("+", 1.0), ("-", -1.0))
+    for name, row in zip("xyz", s * np.eye(3), strict=True)
+}
+# axes of the root across the robot and up, in the order in which they are tried
+GUESSES = ("+y+z", "+x+z", "+z+y", "+z-y", "+x+y", "+x-y", "+y+x", "+y-x", "+z+x", "+z-x")
+
+Chain = list[Joint]
 
 
 @dataclass(frozen=True)
 class Roles:
-    """What was found; ``assumed`` are limits of joints for which the URDF has none, as in a table [limits]."""
+    """What was found; ``assumed`` are limits that the URDF lacks, as in a table [limits]."""
 
     trunk: str  # link that carries both legs
     forward: str  # axis of the trunk's frame in the neutral pose, such as "+x"
     up: str
-    joints: dict[str, tuple[str, ...]]  # role -> (left, right); shoulder_pitch is () where the arms are held
+    # role -> (left, right); shoulder_pitch is () where the arms are held
+    joints: dict[str, tuple[str, ...]]
     feet: tuple[str, str]  # (left, right) links moved by the last joints of the legs
     assumed: dict[str, dict[str, float]]
     notes: tuple[str, ...]  # what a person should know, one sentence each
@@ -55,202 +76,237 @@ class Roles:
 def robot_axes(frame: np.ndarray, forward: str, up: str) -> np.ndarray:
     """(3, 3) from the axes of the URDF's root to x forward, y left, z up.
 
-    ``frame`` (3, 3) is the trunk's, in which ``forward`` and ``up`` are signed axes such as "+x" or "-y".
+    ``frame`` (3, 3) is the trunk's, in which ``forward`` and ``up`` are signed axes such as "+x" or
+    "-y".
     """
-    ahead, above = (frame @ AXES[text[-1]] * (-1.0 if text[0] == "-" else 1.0) for text in (forward, up))
+    ahead = frame @ AXES[forward]
+    above = frame @ AXES[up]
     return np.stack([ahead, np.cross(above, ahead), above])
 
 
-def _signed(vector: np.ndarray) -> str:
-    i = int(np.argmax(np.abs(vector)))
-    return ("-" if vector[i] < 0 else "+") + "xyz"[i]
-
-
-Chain = list[Joint]
-Limb = tuple[Chain, Chain]  # mirror images, on the negative and on the positive side of the lateral axis
-
-
 class _Finder:
-    def __init__(self, tree: Tree):
-        self.tree, self.pose = tree, tree.poses()
-        self.at = {j.name: self.pose[j.child].translation for j in tree.joints.values()}
-        self.axis = {j.name: self.pose[j.child].rotation @ j.axis for j in tree.joints.values()}
+    """Chains of joints, if the axes ``lateral`` and ``up`` (3,) lead across the robot and up."""
 
-    def moving(self, link: str, every_kind: bool = False) -> Chain:
-        """Joints above a link that could have a role, or that look like it."""
-        chain = self.tree.chain(link)
-        if every_kind:
-            kinds = (*MOVING, "planar")
-            return [j for j in chain if j.kind in kinds or (j.kind == "fixed" and j.element.find("axis") is not None)]
-        return [j for j in chain if j.driven]
+    def __init__(self, tree: Tree, guess: str, every_kind: bool = False):
+        self.tree = tree
+        self.lateral = AXES[guess[:2]]
+        self.up = AXES[guess[2:]]
+        self.at = {name: tree.pose[j.child].translation for name, j in tree.joints.items()}
+        self.axis = {name: tree.pose[j.child].rotation @ j.axis for name, j in tree.joints.items()}
+        self.tips = self._tips(every_kind)
+        self.legs = self._legs()
 
-    def tips(self, every_kind: bool = False) -> list[Chain]:
-        """The chains of all links that carry nothing."""
-        chains = [self.moving(link, every_kind) for link in self.tree.links if not self.tree.below[link]]
+    def _tips(self, every_kind: bool) -> list[Chain]:
+        """Chains of the joints that could have a role, or look like it, to all last links."""
+
+        def counts(j: Joint) -> bool:
+            axis = j.kind == "fixed" and j.element.find("axis") is not None
+            return j.driven or (every_kind and (j.kind in (*MOVING, "planar") or axis))
+
+        carrying = {joint.parent for joint in self.tree.joints.values()}
+        ends = [link for link in self.tree.elements if link not in carrying]
+        chains = [[j for j in self.tree.chain(link) if counts(j)] for link in ends]
         return [chain for chain in chains if chain]
 
-    def limbs(self, lateral: np.ndarray, every_kind: bool = False) -> list[Limb]:
-        """Pairs of chains whose tips mirror each other across the plane between the hips."""
-        unique = {c[-1].name: c for c in self.tips(every_kind)}
-        chains = [c for c in unique.values() if not any(c[-1] in o[:-1] for o in unique.values())]
+    def limbs(self) -> list[tuple[Chain, Chain]]:
+        """Pairs of chains whose tips mirror each other across the plane between the hips, on the
+        negative and on the positive side of the lateral axis.
+        """
+        unique = {c[-1]: c for c in self.tips}
+        inner = {joint for chain in self.tips for joint in chain[:-1]}
+        chains = [chain for tip, chain in unique.items() if tip not in inner]
         out = []
         for a, b in combinations(chains, 2):
             gap = self.at[b[-1].name] - self.at[a[-1].name]
-            side = float(gap @ lateral)
-            if len(a) != len(b) or abs(side) < SAME_M or np.linalg.norm(gap - side * lateral) > SAME_M:
-                continue
-            shared = sum(x is y for x, y in zip(a, b, strict=True))
-            if shared < len(a):
-                out.append((a[shared:], b[shared:]) if side > 0 else (b[shared:], a[shared:]))
+            side = float(gap @ self.lateral)
+            mirrored = abs(side) >= SAME_M >= np.linalg.norm(gap - side * self.lateral)
+            shared = sum(x is y for x, y in zip(a, b, strict=False))
+            if mirrored and shared < len(a) == len(b):
+                pair = (a[shared:], b[shared:])
+                out.append(pair if side > 0 else pair[::-1])
         return out
 
-    def pitch(self, chain: Chain, lateral: np.ndarray) -> Chain:
-        """Joints of a chain that turn about the lateral axis, more or less."""
-        return [j for j in chain if abs(self.axis[j.name] @ lateral) > SWINGS]
+    def turning(self, joint: Joint) -> float:
+        """Cosine [1] between a joint's axis and the lateral one."""
+        return abs(self.axis[joint.name] @ self.lateral)
 
-    def triple(self, chain: Chain, lateral: np.ndarray) -> tuple[Joint, Joint, Joint] | None:
-        """Hip, knee, ankle: the three pitch joints with the longest shorter segment between them, canted ones last."""
+    def pitch(self, chain: Chain) -> Chain:
+        """Joints of a chain about the lateral axis, more or less (by :data:`SWINGS`)."""
+        return [joint for joint in chain if self.turning(joint) > SWINGS]
 
-        def shorter(three: tuple[Joint, Joint, Joint]) -> float:
-            flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(lateral))
-            turning = np.prod([abs(self.axis[j.name] @ lateral) for j in three])
+    def triple(self, chain: Chain) -> tuple[Joint, ...]:
+        """Hip, knee, ankle: the three pitch joints with the longest shorter segment between them,
+        canted ones last; () if there are none.
+        """
+
+        def shorter(three: tuple[Joint, ...]) -> float:
+            flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(self.lateral))
+            turning = np.prod([self.turning(j) for j in three])
             return turning * min(np.linalg.norm(np.diff(flat, axis=0), axis=1))
 
-        best = max(combinations(self.pitch(chain, lateral), 3), key=shorter, default=None)
-        return best if best and shorter(best) > 1e-3 else None
+        best = max(combinations(self.pitch(chain), 3), key=shorter, default=())
+        return best if best and shorter(best) > 1e-3 else ()
 
-    def along(self, three: tuple[Joint, Joint, Joint], up: np.ndarray) -> bool:
-        """True if the leg hangs from hip to ankle, and ends where the robot does."""
-        leg, heights = self.at[three[2].name] - self.at[three[0].name], np.array([x @ up for x in self.at.values()])
-        low = self.at[three[2].name] @ up < heights.min() + LOWEST * np.ptp(heights)
-        return low and leg @ -up > STEEP * np.linalg.norm(leg)
+    def along(self, three: tuple[Joint, ...]) -> bool:
+        """True if the leg hangs (from hip to ankle), and ends where the robot does."""
+        if not three:
+            return False
+        hip, _, ankle = (self.at[joint.name] for joint in three)
+        heights = np.array([*self.at.values()]) @ self.up
+        low = ankle @ self.up < heights.min() + LOWEST * np.ptp(heights)
+        return low and (hip - ankle) @ self.up > STEEP * np.linalg.norm(hip - ankle)
 
-    def legs(self, every_kind: bool = False) -> tuple | None:
-        """(lateral, up, limb, triples) of the legs: the lowest mirrored pair with hip, knee and ankle; or None."""
-        for l_axis, u_axis in ("yz", "xz", "zy", "xy", "yx", "zx"):
-            lateral, found = AXES[l_axis], []
-            for limb in self.limbs(lateral, every_kind):
-                threes = [self.triple(chain, lateral) for chain in limb]
-                if None in threes:
-                    continue
-                hip, ankle = self.at[threes[0][0].name], self.at[threes[0][2].name]
-                up = AXES[u_axis] * (1.0 if u_axis == "z" else np.sign((hip - ankle) @ AXES[u_axis]))
-                if self.along(threes[0], up):
-                    found.append((lateral, up, limb, threes, ankle @ up))
-            if found:
-                return min(found, key=lambda x: x[-1])[:-1]
-        return None
+    def _legs(self) -> list[tuple[tuple[Joint, ...], Chain]]:
+        """(hip, knee, ankle) and chain of both legs: the lowest mirrored pair; [] without any."""
+        pairs = [[(self.triple(chain), chain) for chain in limb] for limb in self.limbs()]
+        pairs = [pair for pair in pairs if self.along(pair[0][0]) and pair[1][0]]
+        return min(pairs, key=lambda pair: self.at[pair[0][0][2].name] @ self.up, default=[])
+
+    def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
+        """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
+        beyond = chain[chain.index(three[2]) + 1 :]
+        still = takewhile(lambda joint: self.turning(joint) < SWINGS, beyond)
+        return [three[2], *still][-1].child
+
+    def ahead(self, forward: np.ndarray) -> float:
+        """How far the feet reach ahead of the ankles minus how far behind, half of it [m], if they
+        look along ``forward`` (3,).
+        """
+        out = []
+        for three, chain in self.legs:
+            foot = self.foot(three, chain)
+            axes = np.stack([forward, np.cross(self.up, forward), self.up])
+            x = self.tree.sole(foot, axes)[:, 0]
+            if not len(x):
+                x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
+            away = (self.tree.pose[foot].translation - self.at[three[2].name]) @ forward
+            out.append(float((np.max(x) + np.min(x)) / 2 + away))
+        return max(out)
+
+    def shoulders(self, notes: list[str]) -> tuple[Joint, ...]:
+        """The first pitch joints of the heaviest mirrored pair of limbs that are no legs, on the
+        side of the lateral axis last; or () with a note.
+        """
+        firsts = {chain[0] for _, chain in self.legs}
+        arms = [limb for limb in self.limbs() if not firsts & {chain[0] for chain in limb}]
+        if not arms:
+            notes.append("no arms were found: the shoulder is left out")
+            return ()
+        heaviest = max(arms, key=lambda limb: self.tree.carried(limb[0][0].child))
+        pair = tuple(chain[0] for chain in heaviest)
+        cosine = min(map(self.turning, pair))
+        if cosine > PARALLEL:
+            return pair
+        notes.append(
+            f"the arms are held: the first joint, {pair[0].name!r}, turns "
+            f"{np.degrees(np.arccos(cosine)):.1f} deg off the pitch axis"
+        )
+        return ()
 
 
 def find_roles(tree: Tree) -> Roles:
-    """Find legs, knees, feet, arms and the forward direction; raises :class:`RobotError` with what is missing."""
-    finder = _Finder(tree)
-    lateral, up, limb, threes = finder.legs() or _explain(finder)
-    knee = threes[0][1]
+    """Legs, knees, feet, arms and forward direction; else a :class:`RobotError` says why."""
+    finders = (_Finder(tree, guess) for guess in GUESSES)
+    finder = next((finder for finder in finders if finder.legs), None) or _explain(tree)
+    knee = finder.legs[0][0][1]
     middle = knee.limits.get("lower", 0.0) + knee.limits.get("upper", 0.0)
-    left = lateral * np.sign(finder.axis[knee.name] @ lateral) * (np.sign(middle) or 1.0)
-    if abs(middle) < EVEN_RAD:
-        ahead = np.cross(left, up)
-        soles = [(_foot(finder, x, chain, lateral), x[2].name) for x, chain in zip(threes, limb, strict=True)]
-        reach = [_ahead(finder, *sole, ahead, up) for sole in soles]
-        left = left * (1.0 if max(reach) >= 0 else -1.0)
-    forward = np.cross(left, up)
-    order = (1, 0) if left @ lateral > 0 else (0, 1)
-    joints = {role: tuple(threes[i][k].name for i in order) for k, role in enumerate(LEG)}
-    feet = tuple(_foot(finder, threes[i], limb[i], lateral) for i in order)
+    left = finder.lateral * np.sign(finder.axis[knee.name] @ finder.lateral)
+    left = left * (np.sign(middle) or 1.0)
+    if abs(middle) < EVEN_RAD and finder.ahead(np.cross(left, finder.up)) < 0:
+        left = -left
+    forward = np.cross(left, finder.up)
+    order = slice(None, None, -1 if left @ finder.lateral > 0 else 1)
     notes = []
-    joints["shoulder_pitch"] = _shoulders(finder, lateral, limb, order, notes)
-    ankles = joints["ankle_pitch"]
-    ahead = max(_ahead(finder, foot, ankle, forward, up) for foot, ankle in zip(feet, ankles, strict=True))
-    if ahead < -BACKWARD_M:
-        notes.append(f"the feet point backwards ({ahead:.3f} m) for a robot whose knees bend backwards; check forward")
-    trunk = tree.joining(*feet)
-    frame = finder.pose[trunk].rotation.T
-    assumed = _assumed(finder, trunk, feet, joints, left)
+    pairs = [*zip(*(three for three, _ in finder.legs), strict=True), finder.shoulders(notes)]
+    joints = {
+        role: tuple(joint.name for joint in pair[order])
+        for role, pair in zip(ROLES, pairs, strict=True)
+    }
+    feet = tuple(finder.foot(*leg) for leg in finder.legs)[order]
+    if (reach := finder.ahead(forward)) < -BACKWARD_M:
+        notes.append(
+            f"the feet point backwards ({reach:.3f} m) for a robot whose knees bend backwards; "
+            f"check forward"
+        )
+    ways = [tree.chain(foot) for foot in feet]
+    trunk = [tree.root, *(j.child for j in ways[0] if j in ways[1])][-1]
+    frame = tree.pose[trunk].rotation
+    ahead, above = (
+        max(AXES, key=lambda name: frame @ AXES[name] @ x) for x in (forward, finder.up)
+    )
+    assumed = _assumed(finder, leg_joints(tree, trunk, feet), joints, left)
     for name, limits in assumed.items():
-        told = ", ".join(f"{key} = {value:g}" for key, value in limits.items())
-        notes.append(f"joint {name!r}: {told} assumed, the URDF has none that can be meant; correct [limits.{name}]")
-    return Roles(trunk, _signed(frame @ forward), _signed(frame @ up), joints, feet, assumed, tuple(notes))
+        values = ", ".join(f"{key} = {value:g}" for key, value in limits.items())
+        notes.append(
+            f"joint {name!r}: {values} assumed, the URDF has none that can be meant; correct "
+            f"[limits.{name}]"
+        )
+    return Roles(trunk, ahead, above, joints, feet, assumed, tuple(notes))
 
 
-def _assumed(finder: _Finder, trunk: str, feet: tuple, joints: dict, left: np.ndarray) -> dict[str, dict[str, float]]:
-    """Ranges [rad] of joints that have none, by their role; speeds [rad/s] of joints beside the roles, not too high."""
-    out, roles, fastest = {}, {name: role for role, pair in joints.items() for name in pair}, PLAUSIBLE.speed_rad_s
-    roles = {j.name: "other" for foot in feet for j in finder.tree.path_between(trunk, foot) if j.driven} | roles
-    for joint in (finder.tree.joints[name] for name in roles):
-        low, high = ASSUMED_RAD[roles[joint.name]]
-        ends = (low, high) if finder.axis[joint.name] @ left > 0 else (0.0 - high, 0.0 - low)
-        lost = not {"lower", "upper"} <= set(joint.limits)
-        limits = dict(zip(("lower", "upper"), ends, strict=True)) if lost else {}
-        if roles[joint.name] == "other" and fastest < joint.limits.get("velocity", 0.0) <= 2 * fastest:
-            limits["velocity"] = fastest
+def _assumed(
+    finder: _Finder, in_legs: list[str], joints: dict, left: np.ndarray
+) -> dict[str, dict[str, float]]:
+    """Ranges [rad] of joints without any, by role; speeds [rad/s] of others, not too high."""
+    roles = dict.fromkeys(in_legs, "other")
+    roles |= {name: role for role, pair in joints.items() for name in pair}
+    out = {}
+    for name, role in roles.items():
+        given = finder.tree.joints[name].limits
+        limits = {}
+        if not {"lower", "upper"} <= set(given):
+            low, high = ASSUMED_RAD[role]
+            ends = (low, high) if finder.axis[name] @ left > 0 else (0.0 - high, 0.0 - low)
+            limits |= zip(("lower", "upper"), ends, strict=True)
+        if role == "other" and MOST_RAD_S < given.get("velocity", 0.0) <= 2 * MOST_RAD_S:
+            limits["velocity"] = MOST_RAD_S
         if limits:
-            out[joint.name] = limits
+            out[name] = limits
     return out
 
 
-def _foot(finder: _Finder, three: tuple, chain: Chain, lateral: np.ndarray) -> str:
-    """The link that stands: behind the ankle, before any toe joint (a pitch joint beyond the ankle)."""
-    at = chain.index(three[2])
-    while at + 1 < len(chain) and abs(finder.axis[chain[at + 1].name] @ lateral) < SWINGS:
-        at += 1
-    return chain[at].child
+def leg_joints(tree: Tree, trunk: str, feet: tuple[str, str]) -> list[str]:
+    """Names of the driven joints between a trunk and both feet (left, right)."""
+    return [j.name for foot in feet for j in tree.path_between(trunk, foot) if j.driven]
 
 
-def _ahead(finder: _Finder, foot: str, ankle: str, forward: np.ndarray, up: np.ndarray) -> float:
-    """How far the foot reaches ahead of the ankle minus how far behind, half of it [m]."""
-    pose = finder.pose[foot]
-    points = finder.tree.sole(foot, np.stack([forward, np.cross(up, forward), up]))[:, 0]
-    if not len(points):
-        points = (pose.rotation @ finder.tree.links[foot].inertia.lever)[None] @ forward
-    return float((points.max() + points.min()) / 2 + (pose.translation - finder.at[ankle]) @ forward)
-
-
-def _shoulders(
-    finder: _Finder, lateral: np.ndarray, legs: Limb, order: tuple[int, int], notes: list[str]
-) -> tuple[str, ...]:
-    """The first pitch joints of the heaviest mirrored pair of limbs that are no legs, or () with a note."""
-    firsts = {c[0].name for c in legs}
-    arms = [x for x in finder.limbs(lateral) if not firsts & {c[0].name for c in x}]
-    if not arms:
-        notes.append("no arms were found: the shoulder is left out")
-        return ()
-    pair = [limb[0] for limb in max(arms, key=lambda x: finder.tree.carried(x[0][0].child))]
-    cosine = min(abs(finder.axis[joint.name] @ lateral) for joint in pair)
-    if cosine > PARALLEL:
-        return tuple(pair[i].name for i in order)
-    cant = np.degrees(np.arccos(cosine))
-    notes.append(f"the arms are held: the first joint, {pair[0].name!r}, turns {cant:.1f} deg off the pitch axis")
-    return ()
-
-
-def _explain(finder: _Finder) -> NoReturn:
+def _explain(tree: Tree) -> NoReturn:
     """Raise with the reason why there are no two legs."""
-    tree, where, lateral = finder.tree, finder.tree.where, AXES["y"]
-    every = finder.legs(every_kind=True)
-    for three in every[3] if every else ():
+    finders = (_Finder(tree, guess, every_kind=True) for guess in GUESSES)
+    legs = next((finder.legs for finder in finders if finder.legs), [])
+    for three, _ in legs:
         for role, joint in zip(LEG, three, strict=True):
             if not joint.driven:
-                kind = f"mimics {joint.mimic[0]!r}" if joint.mimic else f"is of type {joint.kind!r}"
-                kind = "has effort = 0 N m" if joint.limits.get("effort") == 0 else kind
-                said = f"{where}: joint {joint.name!r} {kind}, but has the place of a {role.replace('_', ' ')}"
-                raise RobotError(f"{said}, which must be revolute with a range and a motor of its own")
-    tips = finder.tips()
-    hanging = [c for c in tips if (three := finder.triple(c, lateral)) and finder.along(three, AXES["z"])]
-    names = {c[-1].name for c in hanging}
-    if len(names) == 1:
-        said = f"{where}: one leg only: the chain that ends with joint {names.pop()!r} has no mirror image"
-        raise RobotError(f"{said} among {len(tree.links)} links; a jumper needs two legs")
-    best = max((finder.pitch(c, lateral) for c in tips), key=len, default=[])
+                kind = f"is of type {joint.kind!r}"
+                if joint.limits.get("effort") == 0:
+                    kind = "has effort = 0 N m"
+                elif joint.mimic:
+                    kind = f"mimics {joint.mimic[0]!r}"
+                raise tree.error(
+                    f"joint {joint.name!r} {kind}, but has the place of a "
+                    f"{role.replace('_', ' ')}, which must be revolute with a range and a motor "
+                    f"of its own"
+                )
+    finder = _Finder(tree, GUESSES[0])
+    hanging = {chain[-1].name for chain in finder.tips if finder.along(finder.triple(chain))}
+    if len(hanging) == 1:
+        raise tree.error(
+            f"one leg only: the chain that ends with joint {hanging.pop()!r} has no "
+            f"mirror image among {len(tree.elements)} links; a jumper needs two legs"
+        )
+    best = max(map(finder.pitch, finder.tips), key=len, default=[])
     shown = ", ".join(repr(j.name) for j in best[:4]) or "none"
-    said = f"{where}: no pair of mirrored legs with three revolute pitch joints (hip, knee, ankle) was found"
-    raise RobotError(f"{said}; the most on one chain about +-y are {len(best)} ({shown})")
+    raise tree.error(
+        f"no pair of mirrored legs with three revolute pitch joints (hip, knee, "
+        f"ankle) was found; the most on one chain about +-y are {len(best)} ({shown})"
+    )
 
 
-# the first description ------------------------------------------------------------------------------------------
+# the first description
+# ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Sole:
-    """Rectangle along the robot's axes, from the origin of the foot link [m]; ``source`` says where it comes from."""
+    """Rectangle along the robot's axes, from the foot link's origin [m], and its source."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -259,66 +315,72 @@ class Sole:
 
 
 def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
-    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that are at hand.
+    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that
+    are at hand.
 
-    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip to ankle, a sole is
-    guessed if the link ``foot`` has no shape.
+    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
+    to ankle, a sole is guessed if the link ``foot`` has no shape.
     """
-    low, links = tree.sole(foot, turn), tree.fixed_to(foot)
+    low = tree.sole(foot, turn)
     if len(low):
-        kinds = {shape.tag for link in links if len(tree.points(link)) for _, shape in tree.links[link].shapes}
-        (x0, y0, z), (x1, y1, _) = low.min(axis=0).tolist(), low.max(axis=0).tolist()
-        if x1 - x0 > SMALLEST_M and y1 - y0 > SMALLEST_M:
-            return Sole((x0, x1), (y0, y1), z, f"from its {' and '.join(sorted(kinds))}")
+        x, y, z = zip(low.min(axis=0).tolist(), low.max(axis=0).tolist(), strict=True)
+        if min(x[1] - x[0], y[1] - y[0]) > SMALLEST_M:
+            links = [link for link in tree.bodies[tree.carrier[foot]] if len(tree.points(link))]
+            kinds = sorted({shape.tag for link in links for _, shape in tree.shapes(link)})
+            return Sole(x, y, z[0], f"from its {' and '.join(kinds)}")
     x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
-    return Sole(x, y, leg_m * GUESS_Z, "GUESSED from the leg's length: the foot has no shape that is at hand")
+    source = "GUESSED from the leg's length: the foot has no shape that is at hand"
+    return Sole(x, y, leg_m * GUESS_Z, source)
 
 
-def starter(tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()) -> tuple[str, Roles, Sole]:
-    """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are written into it.
+def starter(
+    tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()
+) -> tuple[str, Roles, Sole]:
+    """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are
+    written into it.
 
-    ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person allows to be
-    repaired. Raises :class:`RobotError` if the URDF has no two legs.
+    ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person
+    allows to be repaired. Raises :class:`RobotError` if the URDF has no two legs.
     """
-    roles, pose = find_roles(tree), tree.poses()
-    turn = robot_axes(pose[roles.trunk].rotation, roles.forward, roles.up)
-    hip, ankle = (pose[tree.joints[roles.joints[role][0]].child].translation for role in ("hip_pitch", "ankle_pitch"))
-    sole = find_sole(tree, roles.feet[0], turn, float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]])))
+    roles = find_roles(tree)
+    turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
+    hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
+    leg_m = float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]]))
+    sole = find_sole(tree, roles.feet[0], turn, leg_m)
+    assumed = "".join(
+        f"\n[limits.{quote(joint)}]  # assumed\n"
+        + "".join(f"{key} = {x:g}\n" for key, x in limits.items())
+        for joint, limits in roles.assumed.items()
+    )
     text = filled(
         "starter.toml.in",
         notes="".join(f"# note: {note}\n" for note in roles.notes),
         name=name,
-        urdf=texts([Path(urdf).as_posix()])[1:-1],
+        urdf=quote(Path(urdf).as_posix()),
         roles=roles,
-        repair=texts(repair),
-        joints="\n".join(f"{role} = {texts(roles.joints[role])}" for role in ROLES),
-        feet=texts(roles.feet),
+        repair=quote(repair),
+        joints="\n".join(f"{role} = {quote(roles.joints[role])}" for role in ROLES),
+        feet=quote(roles.feet),
         sole=sole,
-        knee=_inside(tree, pose, turn, roles.joints["knee"], STANCE_KNEE_RAD),
+        knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
-        assumed="".join(
-            f"\n[limits.{texts([name])[1:-1]}]  # assumed\n" + "".join(f"{key} = {x:g}\n" for key, x in limits.items())
-            for name, limits in roles.assumed.items()
-        ),
-        shoulder=_inside(tree, pose, turn, roles.joints["shoulder_pitch"], 0.0),
+        assumed=assumed,
+        shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
     return text, roles, sole
 
 
-def _inside(tree: Tree, pose: dict[str, pin.SE3], turn: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
-    """The angle about the robot's left that is nearest to ``wish`` and well inside the range of both joints [rad]."""
-    low, high = -np.inf, np.inf
-    for joint in map(tree.joints.get, pair):
-        sign = float(np.sign((turn @ pose[joint.child].rotation @ joint.axis)[1]))
-        ends = sorted(sign * joint.limits.get(k, d) for k, d in (("lower", -np.pi), ("upper", np.pi)))
-        low, high = max(low, ends[0]), min(high, ends[1])
+def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
+    """The angle about ``left`` (3,) nearest to ``wish``, well inside both ranges [rad]."""
+    low = -np.inf
+    high = np.inf
+    for joint in (tree.joints[name] for name in pair):
+        sign = np.sign(left @ tree.pose[joint.child].rotation @ joint.axis)
+        ends = joint.limits.get("lower", -np.pi), joint.limits.get("upper", np.pi)
+        low = max(low, min(sign * np.array(ends)))
+        high = min(high, max(sign * np.array(ends)))
     room = min(STANCE_ROOM_RAD, (high - low) / 3)
     return float(np.clip(wish, low + room, high - room)) if low < high else wish
-
-
-def safe_name(text: str) -> str:
-    """A short name of letters, digits, - and _."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", text).strip("_")[:40] or "robot"
 
 
 @dataclass(frozen=True)
@@ -337,16 +399,18 @@ class Draft:
 def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`."""
     path = Path(path)
-    root = parse(read_urdf(path), path.name)
-    urdf_checks.check(root, path.name, repair)
-    tree = Tree(root, path.name, path, "inertia" in repair)
-    text, roles, sole = starter(tree, str(path.resolve()), safe_name(root.get("name") or path.stem), repair)
-    roles = replace(roles, notes=(*urdf_checks.notes(root, repair), *roles.notes))
+    tree = urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
+    # a short name of letters, digits, - and _
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
+    text, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
+    roles = replace(roles, notes=(*urdf_checks.notes(tree.xml, repair), *roles.notes))
     names = [name for pair in roles.joints.values() for name in pair]
-    names += [j.name for foot in roles.feet for j in tree.path_between(roles.trunk, foot) if j.driven]
+    names += leg_joints(tree, roles.trunk, roles.feet)
     wrong = [
         f"{sentence}, or tell it in [limits.{name}] of the configuration"
         for name in dict.fromkeys(names)
-        for sentence in urdf_checks.limit_faults(tree.joints[name].element, path.name, roles.assumed.get(name))
+        for sentence in urdf_checks.limit_faults(
+            tree.joints[name].element, path.name, roles.assumed.get(name)
+        )
     ]
     return Draft(text, roles, sole, tuple(wrong))

@@ -1,35 +1,40 @@
 """Pictures, tables and the 3-D page of robots, plans, simulations and studies.
 
-Every figure function takes results, draws, and returns a matplotlib figure; none solves, prints or shows. Colours are
-launch blue, flight orange, landing green; the reference is dashed, a limit thin and grey.
+Every figure function takes results, draws, and returns a matplotlib figure; none solves, prints or
+shows. Colours are launch blue, flight orange, landing green; the reference is dashed, a limit thin
+and grey.
 
 >>> jl.plots.use_style()  # once per notebook, for plots of your own
 >>> fig = jl.plots.joint_trajectories(plan.tape, robot)
->>> jl.plots.save_figure(fig, "joints", "figures", "Joints of the plan.", task=plan.task, robot=robot)
+>>> jl.plots.save_figure(fig, "joints", "figures", "Joints.", task=plan.task, robot=robot)
 
-A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN`` or ``PAGE_IN`` wide)
-and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what was asked for; :class:`Silhouette` with
-:func:`draw_robot`, :func:`strobe` or :func:`film_strip` draws bodies; :func:`legend_above` takes :func:`phase_handles`.
-The 3-D page is :func:`page`; tables are :func:`table`.
+A new figure is a function under :func:`styled` that begins with :func:`new_figure` (``COLUMN_IN``
+or ``PAGE_IN`` wide) and returns it. :func:`by_phase` draws curves, :func:`compare` curves over what
+was asked for; :class:`Silhouette` with :func:`draw_robot`, :func:`strobe` or :func:`film_strip`
+draws bodies; :func:`legend_above` takes :func:`phase_handles`. The 3-D page is :func:`page`; tables
+are :func:`table`.
 """
 
 import lazy_loader as lazy
 
 _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
-    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum envelope_map "
-    "margin_radar",
+    "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum",
+    "maps": "envelope_map margin_radar",
     # the jump in 3-D, the page of a certificate, tables
     "viewer": "Page page",
+    "movies": "Movie movie",
     "certificate": "certificate_page",
     "tables": "Table table versions",
-    # helpers: bodies, with the sheet of a robot; curves, colours and saving
-    "bodies": "robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points draw_ground "
-    "draw_path draw_com equal_scales",
-    "movies": "Movie movie",
     "cards": "card Plots",
-    "style": "use_style styled new_figure save_figure by_phase compare mark_time limits phase_handles legend_above "
-    "panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY "
-    "VERMILION INK LIMIT_STYLE REFERENCE_STYLE MIN_FONT_PT",
+    # helpers: bodies, with the sheet of a robot; curves, colours and saving
+    "bodies": """robot_sheet Silhouette draw_robot strobe film_strip draw_five_link five_link_points
+        draw_ground draw_path draw_com equal_scales""",
+    "style": """use_style styled new_figure save_figure by_phase compare mark_time limits
+        phase_handles legend_above panel_letters bare tint shade describe_task COLUMN_IN PAGE_IN
+        PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY VERMILION INK LIMIT_STYLE REFERENCE_STYLE
+        MIN_FONT_PT""",
 }
-__getattr__, __dir__, __all__ = lazy.attach(__name__, submod_attrs={k: names.split() for k, names in _NAMES.items()})
+__getattr__, __dir__, __all__ = lazy.attach(
+    __name__, submod_attrs={module: names.split() for module, names in _NAMES.items()}
+)

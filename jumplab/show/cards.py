@@ -1,9 +1,10 @@
-"""What a notebook shows of a result that stands alone in a cell: a line, a small table, a picture."""
+"""What a notebook shows of a result alone in a cell: a line, a small table, a picture."""
 
 from __future__ import annotations
 
 import base64
 import html
+import itertools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jumplab.errors import InputError, Shown
-from jumplab.show import jumps, style
 from jumplab.show.bodies import robot_sheet
+from jumplab.show.jumps import inertia_and_momentum, joint_trajectories, jump_strobe, margins
+from jumplab.show.maps import margin_radar
+from jumplab.show.style import (
+    COLUMN_IN,
+    LANDING,
+    LAUNCH,
+    LIMIT_STYLE,
+    PAGE_IN,
+    VERMILION,
+    Picture,
+    new_figure,
+    styled,
+)
 from jumplab.show.tables import Table, table
 from jumplab.stages.plan import JumpPlan
 
@@ -23,7 +36,7 @@ if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.studies.margins import MarginReport
     from jumplab.studies.trials import TrialReport
 
-Card = tuple[Table, style.Picture | None]
+Card = tuple[Table, Picture | None]
 
 
 def card(x: Shown) -> str | None:
@@ -32,102 +45,100 @@ def card(x: Shown) -> str | None:
     if make is None:
         return None
     rows, figure = make(x)
-    picture = "" if figure is None else _image(figure)
-    return f"<div><b>{html.escape(f'{type(x).__name__}: {x.line()}')}</b>{rows._repr_html_()}{picture}</div>"
-
-
-def _image(figure: style.Picture) -> str:
-    png = base64.b64encode(figure._repr_png_()).decode()
-    return f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
+    picture = ""
+    if figure is not None:
+        png = base64.b64encode(figure._repr_png_()).decode()
+        picture = f'<img src="data:image/png;base64,{png}" style="max-width: 100%">'
+    title = html.escape(f"{type(x).__name__}: {x.line()}")
+    return f"<div><b>{title}</b>{rows._repr_html_()}{picture}</div>"
 
 
 def _of_plan(plan: JumpPlan) -> Card:
-    task, peaks = plan.task, plan.summary["peak_torque_nm"]
-    name, most = max(peaks.items(), key=lambda x: x[1])
-    rows = [
-        {"": "travel [m]", "asked": task.distance_m, "planned": plan.planned_distance_m},
-        {"": "rise of the CoM [m]", "asked": task.height_m, "planned": plan.planned_rise_m},
-        {"": "time in the air [s]", "planned": float(plan.tape.t[-1] - plan.tape.takeoff_time)},
-        {"": f"largest torque [N m], {name}", "planned": most},
-        {"": "solving [s]", "planned": sum(row.solve_s for row in plan.statistics)},
-    ]
-    return table(rows, ["", "asked", "planned"]), jumps.jump_strobe(plan.tape, plan.robot)
+    peaks = plan.summary["peak_torque_nm"]
+    joint = max(peaks, key=peaks.get)
+    asked = {"travel [m]": plan.task.distance_m, "rise of the CoM [m]": plan.task.height_m}
+    planned = {
+        "travel [m]": plan.planned_distance_m,
+        "rise of the CoM [m]": plan.planned_rise_m,
+        "time in the air [s]": float(plan.tape.t[-1] - plan.tape.takeoff_time),
+        f"largest torque [N m], {joint}": peaks[joint],
+        "solving [s]": sum(row.solve_s for row in plan.statistics),
+    }
+    rows = [{"": name, "asked": asked.get(name), "planned": x} for name, x in planned.items()]
+    return table(rows), jump_strobe(plan.tape, plan.robot)
 
 
 def _of_run(run: SimulationResult) -> Card:
     m = run.metrics
-    rows = [
-        {"": "travel [m]", "simulated": m.foot_distance_m},
-        {"": "rise of the CoM [m]", "simulated": m.com_rise_m},
-        {"": "on its feet [s]", "simulated": m.standing_s},
-        {"": "largest share of a torque limit", "simulated": m.max_torque_ratio},
-        {"": "verdict", "simulated": run.reason},
-    ]
-    return table(rows), None if run.robot is None else jumps.jump_strobe(run, run.robot)
+    simulated = {
+        "travel [m]": m.foot_distance_m,
+        "rise of the CoM [m]": m.com_rise_m,
+        "on its feet [s]": m.standing_s,
+        "largest share of a torque limit": m.max_torque_ratio,
+        "verdict": run.reason,
+    }
+    figure = None if run.robot is None else jump_strobe(run, run.robot)
+    return table([{"": name, "simulated": x} for name, x in simulated.items()]), figure
 
 
 def _of_robot(robot: Robot) -> Card:
-    s, rows = robot.sagittal, []
-    for k, (role, pair) in enumerate(robot.joints.items()):
+    rows = []
+    for role, pair in robot.joints.items():
         row = {"role": role.replace("_", " "), "joints": ", ".join(pair) or "held"}
-        if pair:
-            numbers = {"from [rad]": s.lower[k], "to [rad]": s.upper[k], "N m": s.effort[k] / 2, "rad/s": s.speed[k]}
-            row |= {name: float(x) for name, x in numbers.items()}
-        rows.append(row)
-    return table(rows, ["role", "joints", "from [rad]", "to [rad]", "N m", "rad/s"]), robot_sheet(robot)
+        motor = robot.actuators[pair[0]] if pair else {}
+        columns = {"from [rad]": "lower", "to [rad]": "upper", "N m": "effort", "rad/s": "speed"}
+        rows.append(row | {name: motor.get(key) for name, key in columns.items()})
+    return table(rows), robot_sheet(robot)
 
 
 def _of_audit(report: AuditReport) -> Card:
-    groups: dict[str, list[Any]] = {}
-    for check in report.checks:
-        groups.setdefault(check.group, []).append(check)
-    rows = [
-        {"group": group, "passed": f"{sum(c.passed for c in checks)} of {len(checks)}",
-         "failed": ", ".join(c.name for c in checks if not c.passed)}
-        for group, checks in groups.items()
-    ]  # fmt: skip
+    rows = []
+    for group, some in itertools.groupby(report.checks, lambda check: check.group):
+        checks = list(some)
+        failed = [check.name for check in checks if not check.passed]
+        passed = f"{len(checks) - len(failed)} of {len(checks)}"
+        rows.append({"group": group, "passed": passed, "failed": ", ".join(failed)})
     return table(rows), _shares(report)
 
 
-@style.styled
+@styled
 def _shares(report: AuditReport) -> Figure | None:
     """How much of its limit each check uses, the fullest above."""
-    used = {c.name: c.value / c.limit for c in report.checks if not c.at_least and c.limit > 0 and np.isfinite(c.value)}
+    used = sorted(
+        (100 * check.value / check.limit, check.name)
+        for check in report.checks
+        if not check.at_least and check.limit > 0 and np.isfinite(check.value)
+    )
     if not used:
         return None
-    most = sorted(used.items(), key=lambda x: x[1])[-12:]
-    fig = style.new_figure(style.PAGE_IN, 2.4)
+    shares, names = zip(*used[-12:], strict=True)
+    fig = new_figure(PAGE_IN, 2.4)
     ax = fig.subplots()
-    colors = [style.LAUNCH if share <= 1 else style.VERMILION for _, share in most]
-    ax.barh([name for name, _ in most], [100 * share for _, share in most], color=colors)
-    ax.axvline(100, **style.LIMIT_STYLE)
+    ax.barh(names, shares, color=[LAUNCH if share <= 100 else VERMILION for share in shares])
+    ax.axvline(100, **LIMIT_STYLE)
     ax.set_xlabel("share of the limit used [%]")
     return fig
 
 
 def _of_trials(report: TrialReport) -> Card:
-    low, high = report.interval
-    rows = [{"": "landed", "robots": report.landed, "share": f"{report.success_rate:.1%} ({low:.1%} ... {high:.1%})"}]
-    rows += [{"": reason, "robots": count} for reason, count in report.reasons.items()]
-    rows += [{"": f"of the failures, began with: {cause}", "robots": count} for cause, count in report.causes.items()]
-    return table(rows, ["", "robots", "share"]), _scatter(report)
+    return table(report.rows()), _scatter(report)
 
 
-def _of_margins(report: MarginReport) -> Card:
-    return table([margin.row() for margin in report.margins], digits=3), jumps.margin_radar(report)
-
-
-@style.styled
+@styled
 def _scatter(report: TrialReport) -> Figure | None:
     """Travel and rise of the robots that landed."""
     values = [report.values(name) for name in ("foot_distance_m", "com_rise_m")]
     if not len(values[0]):
         return None
-    fig = style.new_figure(style.COLUMN_IN, 2.2)
+    fig = new_figure(COLUMN_IN, 2.2)
     ax = fig.subplots()
-    ax.plot(*values, linestyle="none", marker="o", markersize=3, color=style.LANDING)
+    ax.plot(*values, linestyle="none", marker="o", markersize=3, color=LANDING)
     ax.set(xlabel="travel of the feet [m]", ylabel="rise of the CoM [m]")
     return fig
+
+
+def _of_margins(report: MarginReport) -> Card:
+    return table([margin.row() for margin in report.margins], digits=3), margin_radar(report)
 
 
 CARDS: Mapping[str, Callable[[Any], Card]] = {
@@ -141,33 +152,33 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
 
 
 class Plots:
-    """Pictures of a plan or of a simulation: ``plan.plots.torques()``; each returns a matplotlib figure."""
+    """Pictures of a plan or of a simulation: ``plan.plots.torques()``; each returns a matplotlib
+    figure. Joints, torques and momentum are of plans.
+    """
 
     def __init__(self, of: JumpPlan | SimulationResult):
         self._of = of
 
     def __repr__(self) -> str:
-        return (
-            "<Plots: strobe(), joints(), torques(), momentum(); joints, torques and momentum are of plans in the plane>"
-        )
+        return "<Plots: strobe(), joints(), torques(), momentum()>"
 
     def strobe(self) -> Figure:
         """The jump in one picture."""
-        return jumps.jump_strobe(getattr(self._of, "tape", self._of), self._of.robot)
+        return jump_strobe(getattr(self._of, "tape", self._of), self._of.robot)
 
     def joints(self) -> Figure:
         """Angles and velocities of the joints, within their limits."""
-        return jumps.joint_trajectories(self._planar().tape, self._of.robot)
+        return joint_trajectories(self._planned().tape, self._of.robot)
 
     def torques(self) -> Figure:
         """Torque against speed of each joint; CoP and friction."""
-        return jumps.margins(self._planar().tape, self._of.robot)
+        return margins(self._planned().tape, self._of.robot)
 
     def momentum(self) -> Figure:
         """Inertia, CoM velocity and angular momentum, and dashed what stage 1 asked for."""
-        return jumps.inertia_and_momentum(self._planar().tape)
+        return inertia_and_momentum(self._planned().tape)
 
-    def _planar(self) -> JumpPlan:
-        if not (isinstance(self._of, JumpPlan) and self._of.task.in_plane):
-            raise InputError("this picture is of a plan in the plane; .strobe() shows any jump")
+    def _planned(self) -> JumpPlan:
+        if not isinstance(self._of, JumpPlan):
+            raise InputError("this picture is of a plan; .strobe() shows any jump")
         return self._of

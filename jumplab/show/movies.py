@@ -1,4 +1,5 @@
-"""A jump as a moving picture, MP4 or GIF, drawn without a display: MuJoCo by EGL or OSMesa, else PyBullet by software.
+"""A jump as a moving picture, MP4 or GIF: the bodies of the 3-D page, drawn by MuJoCo without a
+display.
 
 >>> jl.plots.movie(robot, run, scene).save("jump.gif")
 """
@@ -6,36 +7,43 @@
 from __future__ import annotations
 
 import base64
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
+from importlib import import_module, resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import matplotlib.colors as mcolors
+import imageio.v3 as images
 import numpy as np
+from PIL import Image, ImageDraw
+from scipy.ndimage import uniform_filter1d
 
 from jumplab.errors import InputError, require_type
 from jumplab.io.files import settle, write_file
 from jumplab.io.motion import Motion, Record
 from jumplab.io.progress import tell
 from jumplab.robot import Robot
-from jumplab.show.style import INK, PHASE_COLORS
+from jumplab.show.shapes import PAINTS, parts_of, trace
+from jumplab.show.style import INK
 from jumplab.sim.scene import Scene
+
+if TYPE_CHECKING:
+    import mujoco
 
 KINDS = {"gif": ("image/gif", (480, 270)), "mp4": ("video/mp4", (848, 480))}  # type, size [pixels]
 RATES = {"gif": 20.0, "mp4": 30.0}  # frames a second
-SPEED, AFTER_TOUCHDOWN_S = 0.5, 0.8  # how fast it is shown, and how much of the standing
-VIEW_M, FIELD_DEG, AZIMUTH_DEG, TILT_DEG = 3.5, 36.0, 115.0, -9.0  # the camera: distance, opening, direction
+LIBRARIES = {"egl": "MuJoCo, EGL", "osmesa": "MuJoCo, OSMesa"}  # of OpenGL without a display
+# how fast it is shown, and how much of the standing
+SPEED = 0.5
+AFTER_TOUCHDOWN_S = 0.8
+# the camera: distance, direction
+VIEW_M = 3.5
+AZIMUTH_DEG = 115.0
+TILT_DEG = -9.0
 GLIDE_S = 0.25  # the camera follows the trunk, smoothed over this time
-SKY, FLOOR, FLOOR_TOO = (0.93, 0.95, 0.97), (0.86, 0.88, 0.91), (0.80, 0.83, 0.87)
 SHOWN_M = -6.0, 8.0  # of the ground
-BONE, BONE_M, BONE_COLOR = "bone", 0.03, "#42474F"
 COLORS = 64  # of a GIF: more is larger, and looks the same
-
-Draw = Callable[[np.ndarray, np.ndarray, str], np.ndarray]  # q, where to look (3,) and colour to pixels (h, w, 3)
 
 
 @dataclass(frozen=True)
@@ -49,191 +57,131 @@ class Movie:
     drawn_by: str
 
     def save(self, path: str | Path) -> Path:
-        """Write the file, whole or not at all; raises :class:`InputError` if that cannot be."""
+        """Write the file (whole or not at all); raises :class:`InputError` if that cannot be."""
         return write_file(path, self.data)
 
     def _repr_html_(self) -> str:
         source = f"data:{KINDS[self.kind][0]};base64,{base64.b64encode(self.data).decode()}"
+        look = f'src="{source}" style="max-width: 100%"'
         if self.kind == "gif":
-            return f'<img src="{source}" alt="the jump" style="max-width: 100%">'
-        return f'<video src="{source}" style="max-width: 100%" controls loop autoplay muted playsinline></video>'
+            return f'<img {look} alt="the jump">'
+        return f"<video {look} controls loop autoplay muted playsinline></video>"
 
 
-def movie(robot: Robot, record: Record | Motion, scene: Scene | None = None, kind: str = "gif") -> Movie:
-    """A planned or simulated jump at half its speed, until it stands; launch, flight and landing in their colours.
+def movie(
+    robot: Robot, record: Record | Motion, scene: Scene | None = None, kind: str = "gif"
+) -> Movie:
+    """A planned or simulated jump at half its speed, until it stands; launch, flight and landing in
+    their colours.
 
-    ``kind`` is "gif" or "mp4". Raises :class:`InputError` for another one, or where nothing can draw.
+    ``kind`` is "gif" or "mp4" (20 or 30 frames a second). Raises :class:`InputError` for another
+    one, or where nothing can draw.
     """
     require_type(robot, Robot, "the robot of a movie")
     if kind not in KINDS:
         raise InputError(f"a movie must be one of {', '.join(KINDS)}, got {kind!r}")
-    motion = record if isinstance(record, Motion) else Motion.of(record)
+    motion = Motion.of(record)
     motion = motion.every(RATES[kind] / SPEED)
-    landing = np.flatnonzero(motion.phase == "landing")
-    last = motion.t[landing[0]] + AFTER_TOUCHDOWN_S if len(landing) else np.inf
-    rows = np.flatnonzero(motion.t <= last)
+    landing = motion.t[motion.phase == "landing"]
+    shown = motion.t <= (landing[0] + AFTER_TOUCHDOWN_S if len(landing) else np.inf)
+    q = motion.q[shown]
+    # where the camera looks [m]
     width = max(1, round(GLIDE_S * RATES[kind] / SPEED)) | 1
-    x = np.convolve(np.pad(motion.q[:, 0], width // 2, mode="edge"), np.ones(width) / width, mode="valid")
-    height, pictures = 0.85 * float(motion.q[0, 2]), []
-    with _drawer(robot, scene or Scene.flat(), KINDS[kind][1]) as (name, draw):
-        for number, k in enumerate(rows, 1):
-            tell("drawing frame", number, len(rows))
-            look = np.array([x[k], 0.0, height + 0.35 * max(0.0, motion.q[k, 2] - motion.q[0, 2])])
-            picture = draw(motion.q[k], look, PHASE_COLORS[str(motion.phase[k])])
-            pictures.append(_signed(picture, f"{motion.t[k] - motion.t[0]:.2f} s  (half speed)"))
-    return Movie(_encoded(pictures, kind), kind, len(pictures), len(pictures) / RATES[kind], name)
+    ahead = uniform_filter1d(motion.q[:, 0], width, mode="nearest")[shown]
+    rise = np.maximum(0.0, q[:, 2] - q[0, 2])
+    looks = np.column_stack([ahead, 0 * rise, 0.85 * q[0, 2] + 0.35 * rise])
+    pictures = []
+    name, renderer = _renderer(_world(robot, scene or Scene.flat()), KINDS[kind][1])
+    with renderer:
+        rows = zip(motion.t, trace(robot, q).joints, looks, motion.phase, strict=False)
+        for k, (t, poses, look, phase) in enumerate(rows, start=1):
+            tell("drawing frame", k, len(q))
+            picture = Image.fromarray(_draw(renderer, poses, look, str(phase)))
+            words = f"{t - motion.t[0]:.2f} s  (half speed)"
+            ImageDraw.Draw(picture).text((10, picture.height - 22), words, fill=INK)
+            pictures.append(picture)
+    return Movie(_encode(pictures, kind), kind, len(q), len(q) / RATES[kind], name)
 
 
-def write_movie(path: str | Path, robot: Robot, record: Record | Motion, scene: Scene | None = None) -> Movie:
-    """Draw a :func:`movie` and write it; its kind is the ending of ``path``."""
-    made = movie(robot, record, scene, Path(path).suffix.lower().removeprefix("."))
+def write_movie(
+    path: str | Path, robot: Robot, record: Record | Motion, scene: Scene | None = None
+) -> Movie:
+    """Draw a :func:`movie` (its kind is the ending of ``path``) and write it."""
+    film = movie(robot, record, scene, Path(path).suffix.lower().removeprefix("."))
     settle()
-    made.save(path)
-    return made
+    film.save(path)
+    return film
 
 
-def _signed(picture: np.ndarray, text: str) -> np.ndarray:
-    from PIL import Image, ImageDraw
-
-    image = Image.fromarray(picture)
-    ImageDraw.Draw(image).text((10, picture.shape[0] - 22), text, fill=INK)
-    return np.asarray(image)
-
-
-def _encoded(pictures: list[np.ndarray], kind: str) -> bytes:
-    import imageio.v3 as images
-    from PIL import Image
-
+def _encode(pictures: Sequence[Image.Image], kind: str) -> bytes:
     if kind == "mp4":
-        how = dict(plugin="FFMPEG", fps=RATES[kind], codec="libx264", pixelformat="yuv420p", macro_block_size=2)
-        with tempfile.TemporaryDirectory() as folder:
-            images.imwrite(path := Path(folder, "movie.mp4"), np.stack(pictures), **how)
-            return path.read_bytes()
-    palette = Image.fromarray(np.vstack(pictures[:: max(1, len(pictures) // 6)])).quantize(COLORS)
-    flat = [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
-    with tempfile.TemporaryFile() as file:
-        how = dict(save_all=True, append_images=flat[1:], duration=round(1000 / RATES[kind]), loop=0, optimize=False)
-        flat[0].save(file, "GIF", **how)
-        file.seek(0)
-        return file.read()
+        coding = dict(codec="libx264", pixelformat="yuv420p", macro_block_size=2, fps=RATES[kind])
+        frames = np.stack([np.asarray(picture) for picture in pictures])
+        return images.imwrite("<bytes>", frames, extension=".mp4", plugin="FFMPEG", **coding)
+    some = np.vstack([np.asarray(p) for p in pictures[:: max(1, len(pictures) // 6)]])
+    palette = Image.fromarray(some).quantize(COLORS)
+    plain = dict(palette=palette, dither=Image.Dither.NONE)
+    first, *others = (picture.quantize(**plain) for picture in pictures)
+    pause = round(1000 / RATES[kind])  # [ms]
+    buffer = io.BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=pause, loop=0)
+    return buffer.getvalue()
 
 
-# what draws -------------------------------------------------------------------------------------------------------
-@contextmanager
-def _drawer(robot: Robot, scene: Scene, size: tuple[int, int]) -> Iterator[tuple[str, Draw]]:
-    """The first renderer that works on this machine."""
-    failed = []
-    for name, make in (("MuJoCo, EGL", "egl"), ("MuJoCo, OSMesa", "osmesa"), ("PyBullet", "")):
+# what draws
+# ----------------------------------------------------------------------------------------------
+def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> tuple[str, mujoco.Renderer]:
+    """MuJoCo's renderer with the first library that works on this machine, and its name."""
+    import mujoco
+    from mujoco.rendering.classic import gl_context
+
+    failures = []
+    for library, name in LIBRARIES.items():
         try:
-            draw, close = _mujoco(robot, scene, size, make) if make else _bullet(robot, scene, size)
+            # else chosen by an environment variable that is read when MuJoCo is imported
+            gl_context.GLContext = import_module(f"mujoco.{library}").GLContext
+            return name, mujoco.Renderer(model, size[1], size[0])
         except Exception as e:  # drivers that are not there fail in many ways
-            failed.append(f"{name} ({type(e).__name__})")
-            continue
-        try:
-            yield name, draw
-        finally:
-            close()
-        return
-    raise InputError(f"nothing here can draw a movie: {', '.join(failed)}; install libegl1 or libosmesa6")
+            failures.append(f"{name} ({type(e).__name__})")
+    raise InputError(
+        f"nothing here can draw a movie: {', '.join(failures)}; install libegl1 or libosmesa6"
+    )
 
 
-def _mujoco(robot: Robot, scene: Scene, size: tuple[int, int], library: str) -> tuple[Draw, Callable[[], None]]:
+def _draw(renderer: mujoco.Renderer, poses: np.ndarray, look: np.ndarray, phase: str) -> np.ndarray:
+    """Pixels (h, w, 3) of the joints at ``poses`` (njoints - 1, 7), seen at ``look`` (3,) [m]."""
     import mujoco
 
-    context = import_module(f"mujoco.{library}").GLContext(*size)
-    context.make_current()
-    model, angles = _model(robot, scene)
-    data, seen, camera = mujoco.MjData(model), mujoco.MjvScene(model, 1000), mujoco.MjvCamera()
-    drawing, option = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100), mujoco.MjvOption()
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawing)
-    rectangle, everything = mujoco.MjrRect(0, 0, *size), mujoco.mjtCatBit.mjCAT_ALL
-    camera.distance, camera.azimuth, camera.elevation = VIEW_M, AZIMUTH_DEG, TILT_DEG
-    own = [g for g in np.flatnonzero(model.geom_bodyid) if not model.geom(g).name.startswith(BONE)]
-    pixels = np.empty((size[1], size[0], 3), np.uint8)
-
-    def draw(q: np.ndarray, look: np.ndarray, color: str) -> np.ndarray:
-        data.qpos[:3], data.qpos[3:7], data.qpos[angles] = q[:3], q[[6, 3, 4, 5]], q[7:]
-        model.geom_rgba[own] = (*mcolors.to_rgb(color), 1.0)
-        mujoco.mj_forward(model, data)
-        camera.lookat[:] = look
-        mujoco.mjv_updateScene(model, data, option, None, camera, everything, seen)
-        mujoco.mjr_render(rectangle, seen, drawing)
-        mujoco.mjr_readPixels(pixels, None, rectangle, drawing)
-        return pixels[::-1].copy()
-
-    def close() -> None:
-        drawing.free()
-        context.free()
-
-    return draw, close
+    model = renderer.model
+    for kind, color in PAINTS[phase].items():
+        model.material(kind).rgba = (*color, 1.0)
+    data = mujoco.MjData(model)
+    data.mocap_pos = poses[:, :3]
+    data.mocap_quat = poses[:, [6, 3, 4, 5]]
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.distance = VIEW_M
+    camera.azimuth = AZIMUTH_DEG
+    camera.elevation = TILT_DEG
+    camera.lookat = look
+    renderer.update_scene(data, camera)
+    return renderer.render()
 
 
-def _model(robot: Robot, scene: Scene):
-    """MuJoCo's model of robot and scene, for pictures alone, and where its joint angles lie in ``qpos``."""
+def _world(robot: Robot, scene: Scene) -> mujoco.MjModel:
+    """Sky and light of ``world.xml``, the ground, and the robot's parts on a body per joint."""
     import mujoco
 
-    spec = mujoco.MjSpec.from_string(robot.urdf)
-    spec.compiler.fusestatic, spec.compiler.discardvisual = False, False
-    spec.worldbody.first_body().add_freejoint()
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
-    spec.visual.global_.fovy = FIELD_DEG
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.2] * 3
-    spec.visual.headlight.specular = [0.0] * 3
-    kinds = mujoco.mjtTexture, mujoco.mjtBuiltin
-    spec.add_texture(name="sky", type=kinds[0].mjTEXTURE_SKYBOX, builtin=kinds[1].mjBUILTIN_FLAT, rgb1=SKY, rgb2=SKY,
-                     width=64, height=64)  # fmt: skip
-    spec.add_texture(name="floor", type=kinds[0].mjTEXTURE_2D, builtin=kinds[1].mjBUILTIN_CHECKER, rgb1=FLOOR,
-                     rgb2=FLOOR_TOO, width=256, height=256)  # fmt: skip
-    floor = spec.add_material(name="floor", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.0)
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
-    sun = dict(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[0.45] * 3, specular=[0.0] * 3, castshadow=True)
-    spec.worldbody.add_light(pos=[0.0, -1.0, 6.0], dir=[0.15, 0.3, -1.0], **sun)
-    for body in list(spec.bodies)[1:]:
-        _add_bones(body)
+    text = (resources.files("jumplab.show") / "world.xml").read_text(encoding="utf-8")
+    spec = mujoco.MjSpec.from_string(text)
     for half, middle, turn in scene.within(*SHOWN_M, 4.0).boxes():
         place = dict(size=half, pos=middle, quat=np.roll(turn, 1))
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **place, material="floor")
-    model = spec.compile()
-    return model, np.array([model.joint(name).qposadr[0] for name in robot.joint_names])
-
-
-def _add_bones(body: Any) -> None:
-    """Rods from a link's joint to those below it, so that the body hangs together."""
-    import mujoco
-
-    for number, child in enumerate(body.bodies):
-        ends = np.concatenate([np.zeros(3), child.pos])
-        if np.linalg.norm(child.pos) > BONE_M:
-            kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-            look = dict(size=[BONE_M, 0.0, 0.0], rgba=[*mcolors.to_rgb(BONE_COLOR), 1.0])
-            body.add_geom(type=kind, fromto=ends, name=f"{BONE} {body.name} {number}", **look)
-
-
-def _bullet(robot: Robot, scene: Scene, size: tuple[int, int]) -> tuple[Draw, Callable[[], None]]:
-    import pybullet as p
-    from pybullet_utils.bullet_client import BulletClient
-
-    client = BulletClient(p.DIRECT)
-    with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "robot.urdf").write_text(robot.urdf)
-        body = client.loadURDF(str(Path(folder, "robot.urdf")))
-    joints = {client.getJointInfo(body, j)[1].decode(): j for j in range(client.getNumJoints(body))}
-    for half, middle, turn in scene.within(*SHOWN_M, 1.2).boxes():
-        shape = client.createVisualShape(p.GEOM_BOX, halfExtents=half, rgbaColor=[*FLOOR, 1])
-        client.createMultiBody(0, -1, shape, middle, turn)
-    lens = client.computeProjectionMatrixFOV(FIELD_DEG, size[0] / size[1], 0.1, 30.0)
-    base = np.array(client.getDynamicsInfo(body, -1)[3])  # the engine's base is the link's centre of mass
-
-    def draw(q: np.ndarray, look: np.ndarray, color: str, client: BulletClient = client) -> np.ndarray:
-        place = client.multiplyTransforms(q[:3], q[3:7], base, [0, 0, 0, 1])
-        client.resetBasePositionAndOrientation(body, *place)
-        for name, angle in zip(robot.joint_names, q[7:], strict=True):
-            client.resetJointState(body, joints[name], angle)
-        for link in range(-1, client.getNumJoints(body)):
-            client.changeVisualShape(body, link, rgbaColor=(*mcolors.to_rgb(color), 1.0))
-        eye = client.computeViewMatrixFromYawPitchRoll(look, VIEW_M, AZIMUTH_DEG - 90.0, TILT_DEG, 0.0, 2)
-        how = dict(shadow=1, lightDirection=[0.5, -2.0, 5.0], renderer=p.ER_TINY_RENDERER)
-        image = client.getCameraImage(*size, eye, lens, **how)[2]
-        return np.asarray(image, np.uint8).reshape(size[1], size[0], 4)[..., :3].copy()
-
-    return draw, lambda: client.disconnect()  # keeps the client, which disconnects when it is forgotten
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, material="floor", **place)
+    bodies = [spec.worldbody.add_body(mocap=True) for _ in range(1, robot.model.njoints)]
+    for number, part in enumerate(parts_of(robot)[0]):
+        surface = dict(uservert=part.points.ravel(), userface=part.triangles.ravel())
+        shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open surfaces too
+        spec.add_mesh(name=f"{number}", inertia=shell, **surface)
+        look = dict(meshname=f"{number}", material=part.kind, contype=0, conaffinity=0)
+        bodies[part.joint - 1].add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, **look)
+    return spec.compile()

@@ -1,34 +1,46 @@
 // Plays the clips: sets the place of every joint and the colour of the phase, at any instant.
 "use strict";
+const INK = "#222222", MARK = "#D55E00", ARROW = "#B3125F", GHOST = 0.35; // GHOST: opacity of the plan beside the simulation
+const ROLES = { hip: INK, knee: MARK, ankle: "#9C5480" }; // not the colours of the phases, which lie behind
+// in the order of the values of a clip, after travel of the toes and rise of the CoM
+const CURVES = [
+  { title: "CoM height", unit: "m", limit: null, lines: { "": INK } },
+  { title: "left angle", unit: "°", limit: null, lines: ROLES },
+  { title: "torque / limit", unit: "", limit: 1, lines: ROLES },
+  { title: "ground force / weight", unit: "", limit: null, lines: { "": INK } },
+];
 const byId = (name) => document.getElementById(name);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const stage = byId("stage"), viewer = new MeshCat.Viewer(byId("pane"));
 const fill = viewer.set_3d_pane_size.bind(viewer); // the engine would fill the window
 viewer.set_3d_pane_size = () => stage.clientHeight && fill(stage.clientWidth, stage.clientHeight);
-for (const text of commands) viewer.handle_command_bytearray(bytes(text));
-const tell = (type, path, rest) => viewer.handle_command({ type, path, ...rest });
 
-tell("set_property", "/Lights/SpotLight/<object>", { property: "castShadow", value: true }); // Python's client knows no capitals
+// lights and a bright background
+const set = (path, properties) => {
+  for (const [property, value] of Object.entries(properties)) viewer.handle_command({ type: "set_property", path, property, value });
+};
+set("/Background", { top_color: [1, 1, 1], bottom_color: [0.9, 0.92, 0.95] });
+for (const path of ["/Axes", "/Grid", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX"]) set(path, { visible: false });
+set("/Lights/AmbientLight/<object>", { intensity: 0.7 });
+set("/Lights/FillLight/<object>", { intensity: 0.25 });
+set("/Lights/SpotLight", { visible: true });
+set("/Lights/SpotLight/<object>", { intensity: 0.38, angle: 0.55, penumbra: 0.6, position: [0.4, -1.6, 6], castShadow: true });
 viewer.scene_tree.find(["Lights", "SpotLight", "<object>"]).object.shadow.mapSize.set(2048, 2048);
 
-const { Color, ConeGeometry, CylinderGeometry, Group, Matrix4, Mesh, MeshPhongMaterial, Quaternion, Vector3 } = MeshCat.THREE;
+const { BoxGeometry, BufferGeometry, Color, ConeGeometry, CylinderGeometry, Float32BufferAttribute, Group, LineBasicMaterial,
+  LineSegments, Mesh, MeshPhongMaterial, Quaternion, SphereGeometry, Vector3 } = MeshCat.THREE;
+const world = viewer.scene_tree.find(["meshcat", "jump"]).object;
 const floats = (text) => text && new Float32Array(bytes(text).buffer);
 const clips = facts.clips.map((clip) => ({
   ...clip,
-  ...Object.fromEntries(["poses", "forces", "values"].map((name) => [name, floats(clip[name])])),
+  ...Object.fromEntries(["poses", "path", "forces", "values"].map((name) => [name, floats(clip[name])])),
   aside: 0,
   duration: (clip.frames - 1) / facts.fps,
-  painted: null,
 }));
 let duration = 0, now = 0, playing = false, before = 0, lead = clips[0];
 
-// Column-major matrix of the pose between two frames; `u` is the share of the way.
 const point = (poses, k) => new Vector3().fromArray(poses, k);
 const turn = (poses, k) => new Quaternion().fromArray(poses, k + 3);
-function between(poses, a, b, u) {
-  const place = point(poses, a).lerp(point(poses, b), u), attitude = turn(poses, a).slerp(turn(poses, b), u);
-  return new Matrix4().compose(place, attitude, new Vector3(1, 1, 1)).toArray();
-}
 
 const phaseAt = (clip, time) => clip.phases.filter(([start]) => start <= time + 1e-9).at(-1)[1];
 
@@ -37,7 +49,7 @@ function frames(clip, time) {
   const at = Math.min(time, clip.duration) * facts.fps, low = Math.min(Math.floor(at + 1e-9), clip.frames - 1);
   return [low, Math.min(low + 1, clip.frames - 1), Math.max(0, at - low)];
 }
-const columns = 2 + facts.curves.reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
+const columns = 2 + CURVES.reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
 function value(clip, column, time) {
   const [low, high, u] = frames(clip, time), at = (k) => clip.values[columns * k + column];
   return at(low) + u * (at(high) - at(low));
@@ -47,24 +59,67 @@ function base(clip, time) { // and how far the clip is moved aside
   return point(clip.poses, width * low).lerp(point(clip.poses, width * high), u).add(new Vector3(0, clip.aside, 0));
 }
 
+// what stands still: the ground with its grids, and lines across where the toes should be
+const dull = (settings) => new MeshPhongMaterial({ shininess: 12, specular: 0x222222, ...settings }); // so that a colour itself is seen
+const add = (parent, child, place, turned) => {
+  child.position.fromArray(place);
+  if (turned) child.quaternion.fromArray(turned);
+  child.castShadow = child.receiveShadow = true;
+  parent.add(child);
+  return child;
+};
+const shape = (points, triangles) => {
+  const geometry = new BufferGeometry().setAttribute("position", new Float32BufferAttribute(points, 3));
+  if (triangles) geometry.setIndex([...triangles]).computeVertexNormals();
+  return geometry;
+};
+function grid(box, step, lift, color) { // at whole multiples of the step
+  const [w, d, h] = box.size, z = h / 2 + lift, points = [], first = Math.ceil((box.middle[0] - w / 2) / step) * step;
+  for (let x = first - box.middle[0]; x <= w / 2; x += step) points.push(x, -d / 2, z, x, d / 2, z);
+  for (let y = -Math.floor(d / 2 / step) * step; y <= d / 2; y += step) points.push(-w / 2, y, z, w / 2, y, z);
+  return new LineSegments(shape(points), new LineBasicMaterial({ color }));
+}
+for (const box of facts.ground) {
+  const block = add(world, new Mesh(new BoxGeometry(...box.size), dull({ color: "#F4F5F7" })), box.middle, box.turn);
+  if (box.size[1] > facts.view.width - 1e-6) block.add(grid(box, 0.1, 0.0015, "#DDE1E7"), grid(box, 0.5, 0.002, "#AEB6C2"));
+}
+for (const [x, y, z] of facts.marks)
+  add(world, new Mesh(new BoxGeometry(0.012, facts.view.width, 0.003), dull({ color: MARK })), [x, y, z + 0.0025]);
+
+// the robots, a group for each joint, and beads along the paths of their CoM
+const parts = facts.parts.map((part) => ({ ...part, shape: shape(floats(part.points), floats(part.triangles)) }));
+for (const clip of clips) {
+  clip.group = add(world, new Group(), [0, 0, 0]);
+  clip.paints = Object.fromEntries(["trunk", "limb", "rest"].map((kind) => [kind, dull({ flatShading: parts.some((p) => p.faceted) })]));
+  clip.joints = Array.from({ length: clip.bodies }, () => add(clip.group, new Group(), [0, 0, 0]));
+  for (const { joint, kind, shape } of parts) add(clip.joints[joint], new Mesh(shape, clip.paints[kind]), [0, 0, 0]);
+  const bead = new SphereGeometry(0.007, 12, 8), landing = clip.phases.find(([, phase]) => phase === "landing");
+  let last = new Vector3(Infinity, 0, 0);
+  for (let k = 0; k < clip.frames && k / facts.fps < (landing ? landing[0] + 0.6 : Infinity); k++) { // later it hardly moves
+    const place = point(clip.path, 3 * k);
+    if (place.distanceTo(last) < 0.025) continue;
+    add(clip.group, new Mesh(bead, dull({ color: facts.css[phaseAt(clip, k / facts.fps)] })), place.toArray());
+    last = place;
+  }
+}
+
 function pose(clip, time) {
   const [low, high, u] = frames(clip, time), width = 7 * clip.bodies;
-  for (let j = 0; j < clip.bodies; j++) {
-    const matrix = between(clip.poses, low * width + 7 * j, high * width + 7 * j, u);
-    tell("set_transform", `/meshcat/jump/${clip.name}/${j + 1}`, { matrix });
-  }
+  clip.joints.forEach((joint, j) => {
+    const [a, b] = [low, high].map((frame) => width * frame + 7 * j);
+    joint.position.lerpVectors(point(clip.poses, a), point(clip.poses, b), u);
+    joint.quaternion.slerpQuaternions(turn(clip.poses, a), turn(clip.poses, b), u);
+  });
   press(clip, u < 0.5 ? low : high);
-  const phase = phaseAt(clip, time), alpha = ghosted(clip) ? facts.ghost : 1;
-  if (clip.painted !== phase + alpha) {
-    clip.painted = phase + alpha;
-    for (const kind of ["trunk", "limb", "rest"])
-      for (const path of clip[kind])
-        tell("set_property", path, { property: "color", value: [...facts.colors[phase][kind], alpha] });
+  for (const [kind, paint] of Object.entries(clip.paints)) {
+    paint.color.setRGB(...facts.colors[phaseAt(clip, time)][kind]);
+    paint.transparent = ghosted(clip);
+    paint.opacity = ghosted(clip) ? GHOST : 1;
   }
 }
 
 // forces of the ground, and where they act: an arrow for each foot, a dot for both, seen through the legs
-const solid = (shape) => new Mesh(shape, new MeshPhongMaterial({ color: facts.arrow, transparent: true, depthTest: false }));
+const solid = (shape) => new Mesh(shape, new MeshPhongMaterial({ color: ARROW, transparent: true, depthTest: false }));
 const ARROW_M = 0.4, HEAD_M = 0.07, LONGEST_M = 1.2; // length for the robot's weight, of the head, and at most
 for (const clip of clips.filter(({ forces }) => forces)) {
   clip.arrows = [0, 1].map(() => {
@@ -72,7 +127,7 @@ for (const clip of clips.filter(({ forces }) => forces)) {
     return arrow.add(shaft, head);
   });
   clip.dot = solid(new CylinderGeometry(0.035, 0.035, 0.008, 24).rotateX(Math.PI / 2));
-  viewer.scene_tree.find(["meshcat", "jump", clip.name]).object.add(...clip.arrows, clip.dot);
+  clip.group.add(...clip.arrows, clip.dot);
 }
 function press(clip, frame) {
   if (!clip.forces) return;
@@ -142,7 +197,7 @@ function choose() {
   lead = clips.find(shown);
   duration = Math.max(...clips.filter(shown).map((clip) => clip.duration));
   byId("time").max = duration;
-  for (const clip of clips) tell("set_property", `/meshcat/jump/${clip.name}`, { property: "visible", value: shown(clip) });
+  for (const clip of clips) clip.group.visible = shown(clip);
   const stops = lead.phases.flatMap(([start, phase], i) => {
     const end = i + 1 < lead.phases.length ? lead.phases[i + 1][0] : lead.duration;
     return [`${facts.css[phase]} ${(100 * start) / duration}% ${(100 * end) / duration}%`];
@@ -152,7 +207,7 @@ function choose() {
   byId("offset-m").textContent = `${gap} m`;
   for (const clip of clips) {
     clip.aside = gap * (clip.name === "plan" ? 0.5 : -0.5);
-    tell("set_transform", `/meshcat/jump/${clip.name}`, { matrix: new Matrix4().makeTranslation(0, clip.aside, 0).toArray() });
+    clip.group.position.y = clip.aside;
   }
   for (const plot of plots) plot.draw();
   seek(now);
@@ -160,8 +215,8 @@ function choose() {
 
 // curves, with the phases behind them
 const lines = (curve) => Object.entries(curve.lines);
-const plots = facts.curves.map((curve, i) => {
-  const first = 2 + facts.curves.slice(0, i).reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
+const plots = CURVES.map((curve, i) => {
+  const first = 2 + CURVES.slice(0, i).reduce((sum, { lines }) => sum + Object.keys(lines).length, 0);
   const [card, title, plot, canvas, cursor] = ["div", "h2", "div", "canvas", "div"].map((tag) => document.createElement(tag));
   title.append(curve.title + (curve.unit && ` [${curve.unit}]`));
   const numbers = lines(curve).map(([name, color]) => {
@@ -241,7 +296,7 @@ function look() {
   const place = eye.toArray().map((x, i) => x + far * offset[i] + (i === 1 ? raised : 0));
   viewer.camera.fov = (opening * 180) / Math.PI;
   viewer.camera.near = 0.1;
-  tell("set_property", "/Cameras/default/rotated/<object>", { property: "position", value: place });
+  set("/Cameras/default/rotated/<object>", { position: place });
   viewer.controls.target.set(...eye.toArray().map((x, i) => x + (i === 1 ? raised : 0)));
   viewer.controls.update();
 }

@@ -1,7 +1,8 @@
 """Colours, sizes, curves by phase, and saving: what makes two figures look alike.
 
-Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one when it is the last expression of a cell
-(:func:`save_figure` returns it), nothing is shown twice, and nothing has to be closed.
+Figures are :class:`Picture` objects, unknown to pyplot: a notebook shows one when it is the last
+expression of a cell (:func:`save_figure` returns it), nothing is shown twice, and nothing has to be
+closed.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 
-import matplotlib.colors as mcolors
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -32,7 +33,9 @@ PHASE_COLORS = {"launch": LAUNCH, "flight": FLIGHT, "landing": LANDING}
 INK = "#222222"  # text and outlines
 LIMIT, GROUND = "#999999", "#8C8C8C"
 
-COLUMN_IN, PAGE_IN = 3.5, 7.16  # width of one column of an IEEE page, and of both [in]
+# width of one column of an IEEE page, and of both [in]
+COLUMN_IN = 3.5
+PAGE_IN = 7.16
 DPI = 200  # of the PNG
 PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
 PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
@@ -40,12 +43,13 @@ MIN_FONT_PT = 6.5  # smallest text in any figure; tests look for smaller
 REFERENCE_STYLE = {"color": INK, "linestyle": (0, (4, 2)), "linewidth": 0.9}  # what was asked for
 LIMIT_STYLE = {"color": LIMIT, "linewidth": 0.7}  # a bound
 BAND = (0.928, 0.928, 0.928)  # fill of what is allowed between two bounds
-NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}  # keywords of Axes.annotate
+# keywords of Axes.annotate
+NOTE_STYLE = {"textcoords": "offset points", "fontsize": 7, "color": "#666666"}
 STYLE_FILE = Path(str(resources.files("jumplab.show") / "jumplab.mplstyle"))
 
 
 def use_style() -> None:
-    """A notebook's second cell: the package's style is matplotlib's, and cells that take long show a bar."""
+    """A notebook's second cell: this style is matplotlib's, and cells that take long show a bar."""
     plt.style.use(STYLE_FILE)
     show_waiting()
 
@@ -66,35 +70,44 @@ class Picture(Figure):
 
 @styled
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
-    """An empty figure of the style, width and height in inches."""
+    """An empty figure of the style, ``width`` and ``height`` [in]."""
     return Picture(figsize=(width, height))
 
 
 def tint(color: str, share: float) -> tuple[float, float, float]:
-    """``color`` mixed with white: share 1 is the colour itself, 0 is white."""
-    rgb = np.array(mcolors.to_rgb(color))
-    return tuple(float(x) for x in 1 - share * (1 - rgb))
+    """(r, g, b) of ``color`` mixed with white: share 1 is the colour itself, 0 is white."""
+    return tuple(1 - share * (1 - x) for x in to_rgb(color))
 
 
 def shade(color: str, share: float) -> tuple[float, float, float]:
-    """``color`` mixed with black: share 1 is the colour itself, 0 is black."""
-    return tuple(float(x) for x in share * np.array(mcolors.to_rgb(color)))
+    """(r, g, b) of ``color`` mixed with black: share 1 is the colour itself, 0 is black."""
+    return tuple(share * x for x in to_rgb(color))
 
 
-# curves of a jump -----------------------------------------------------------------------------------------------
+# curves of a jump
+# -----------------------------------------------------------------------------------------------
 def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs) -> list[Line2D]:
     """Plot ``y`` (N,) over ``t`` (N,), each run of one ``phase`` (N,) in that phase's colour.
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
-    phase, lines = np.asarray(phase), []
-    for part in np.split(np.arange(len(phase)), np.flatnonzero(phase[1:] != phase[:-1]) + 1):
-        lines += ax.plot(t[part], y[part], **({"color": PHASE_COLORS[str(phase[part[0]])]} | kwargs))
+    cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
+    lines = []
+    for rows in np.split(np.arange(len(phase)), cuts):
+        look = {"color": PHASE_COLORS[str(phase[rows[0]])]} | kwargs
+        lines += ax.plot(t[rows], y[rows], **look)
     return lines
 
 
-def compare(ax: Axes, curve: tuple, *references: tuple, label: str = "", marks: Iterable[float] = (), **kwargs) -> None:
-    """A curve (t, y, phase) :func:`by_phase`, references (t, y) dashed, ``marks`` where phases change [s]."""
+def compare(
+    ax: Axes,
+    curve: tuple,
+    *references: tuple,
+    label: str = "",
+    marks: Iterable[float] = (),
+    **kwargs,
+) -> None:
+    """A curve (t, y, phase), references (t, y) dashed, ``marks`` where phases change [s]."""
     by_phase(ax, *curve, **kwargs)
     for reference in references:
         ax.plot(*reference, **REFERENCE_STYLE)
@@ -103,7 +116,7 @@ def compare(ax: Axes, curve: tuple, *references: tuple, label: str = "", marks: 
 
 
 def mark_time(ax: Axes, times: Iterable[float]) -> None:
-    """Thin dotted vertical lines at the instants where phases change."""
+    """Thin dotted vertical lines at the ``times`` [s] where phases change."""
     for t in times:
         ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
 
@@ -114,8 +127,10 @@ def limits(ax: Axes, *bounds: float) -> None:
         ax.axhline(bound, **LIMIT_STYLE)
 
 
-def phase_handles(*phases: str, reference: str | None = None, limit: str | None = None) -> list[Line2D]:
-    """Legend entries: phases by name, then texts for the dashed reference and the thin limits."""
+def phase_handles(
+    *phases: str, reference: str | None = None, limit: str | None = None
+) -> list[Line2D]:
+    """Legend entries: phases by name, then texts (if any) for dashed reference and thin limits."""
     handles = [Line2D([], [], color=PHASE_COLORS[p], label=p) for p in phases]
     for text, look in ((reference, REFERENCE_STYLE), (limit, LIMIT_STYLE)):
         handles += [Line2D([], [], **look, label=text)] if text else []
@@ -130,63 +145,83 @@ def legend_above(fig: Figure, handles: list) -> None:
 def panel_letters(axes: Iterable[Axes]) -> None:
     """(a), (b), ... before the panels' titles."""
     for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
-        ax.set_title(f"({letter}) {ax.get_title(loc='left')}".rstrip())
+        title = f"({letter}) {ax.get_title(loc='left')}"
+        ax.set_title(title.rstrip())
 
 
 def bare(ax: Axes) -> None:
     """No frame, ticks or grid: for pictures rather than plots."""
-    ax.set(xticks=[], yticks=[])  # hidden ticks would still be laid out, which takes longer than the picture
+    # hidden ticks would still be laid out, which takes longer than the picture
+    ax.set(xticks=[], yticks=[])
     ax.set_axis_off()
     ax.grid(False)
 
 
-# saving ---------------------------------------------------------------------------------------------------------
+# saving
+# ----------------------------------------------------------------------------------------------
 @styled
 def save_figure(
-    fig: Figure, name: str, folder: str | Path, caption: str = "", *, task: Tasks = None, robot: Robot | None = None
+    fig: Figure,
+    name: str,
+    folder: str | Path,
+    caption: str = "",
+    *,
+    task: Tasks = None,
+    robot: Robot | None = None,
 ) -> Figure:
-    """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into ``folder``.
+    """Write NAME.png, NAME.pdf and NAME.txt (caption, target or targets, robot, versions) into
+    ``folder``.
 
-    The same figure gives the same bytes: the files carry neither dates nor versions of the software that wrote them.
-    It is laid out once, for the PNG; the PDF and what a notebook shows keep that layout. Returns the figure. Raises
-    :class:`InputError` if ``name`` is not a plain file name, or the folder cannot be written.
+    The same figure gives the same bytes: the files carry neither dates nor versions of the software
+    that wrote them. It is laid out once, for the PNG; the PDF and what a notebook shows keep that
+    layout. Returns the figure. Raises :class:`InputError` if ``name`` is not a plain file name, or
+    the folder cannot be written.
     """
     if not name or Path(name).name != name or name.startswith("."):
-        raise InputError(f"figure name {name!r}: must be a plain file name without ending, such as 'f08_joints'")
-    folder = Path(folder)
+        must = "must be a plain file name without ending, such as 'f08_joints'"
+        raise InputError(f"figure name {name!r}: {must}")
+    path = Path(folder, name)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        fig.savefig(folder / f"{name}.png", dpi=DPI, metadata=PNG_METADATA)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fig.savefig(f"{path}.png", dpi=DPI, metadata=PNG_METADATA)
         fig.set_layout_engine("none")
-        fig.savefig(folder / f"{name}.pdf", metadata=PDF_METADATA)
-        (folder / f"{name}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
+        fig.savefig(f"{path}.pdf", metadata=PDF_METADATA)
+        Path(f"{path}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
     except OSError as e:
-        raise InputError(f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}") from e
+        words = f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}"
+        raise InputError(words) from e
     return fig
 
 
+def made_with() -> str:
+    """The installed packages that shape a result, with their versions."""
+    pairs = versions().items()
+    return ", ".join(f"{name} {number}" for name, number in pairs if number != "not installed")
+
+
 def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -> str:
-    """What NAME.txt says: the caption, then target or targets, robot and versions, one line each."""
+    """What NAME.txt says: caption, target (or targets), robot and versions, one line each."""
     lines = [caption.strip() or "No caption."]
     tasks = [task] if isinstance(task, JumpTask) else list(task or ())
     if tasks:
-        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {'; '.join(map(describe_task, tasks))}.")
+        words = "; ".join(map(describe_task, tasks))
+        lines.append(f"Target{'s' if len(tasks) > 1 else ''}: {words}.")
     if robot is not None:
         lines.append(f"Robot: {robot.name}, {robot.total_mass:.1f} kg, description {robot.hash}.")
-    known = [f"{name} {version}" for name, version in versions().items() if version != "not installed"]
-    return "\n".join([*lines, f"Made with {', '.join(known)}.", ""])
+    return "\n".join([*lines, f"Made with {made_with()}.", ""])
 
 
 def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
-    way = "forward" if task.distance_m >= 0 else "backward"
-    parts = [f"{abs(task.distance_m):.2f} m {way}", f"CoM rise {task.height_m:.2f} m"]
+    words = [f"{abs(task.distance_m):.2f} m {'forward' if task.distance_m >= 0 else 'backward'}"]
     if task.side_m:
-        parts.insert(1, f"{abs(task.side_m):.2f} m to the {'left' if task.side_m > 0 else 'right'}")
+        words.append(f"{abs(task.side_m):.2f} m to the {'left' if task.side_m > 0 else 'right'}")
+    words.append(f"CoM rise {task.height_m:.2f} m")
     if task.yaw_rad:
-        parts.append(f"turn {np.degrees(task.yaw_rad):.0f} deg")
+        words.append(f"turn {np.degrees(task.yaw_rad):.0f} deg")
     if task.platform_m:
-        parts.append(f"landing {abs(task.platform_m):.2f} m {'higher' if task.platform_m > 0 else 'lower'}")
+        level = "higher" if task.platform_m > 0 else "lower"
+        words.append(f"landing {abs(task.platform_m):.2f} m {level}")
     if task.rotation_rad:
-        parts.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
-    return ", ".join(parts)
+        words.append(f"rotation {np.degrees(task.rotation_rad):.0f} deg")
+    return ", ".join(words)

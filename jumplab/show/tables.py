@@ -1,10 +1,10 @@
-"""Small tables for notebooks: rows of plain data, shown as HTML in a notebook and as text anywhere else."""
+"""Small tables: rows of plain data, as HTML in a notebook and as text anywhere else."""
 
 from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any
@@ -24,42 +24,47 @@ class Table:
 
     def __repr__(self) -> str:
         widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
-        lines = []
-        for row in (self.columns, ["-" * w for w in widths], *self.rows):
-            pairs = zip(row, widths, self.right, strict=True)
-            cells = (text.rjust(width) if right else text.ljust(width) for text, width, right in pairs)
-            lines.append("  ".join(cells).rstrip())
-        return "\n".join(lines)
+        sides = [">" if right else "<" for right in self.right]
+        form = "  ".join(f"{{:{side}{w}}}" for side, w in zip(sides, widths, strict=True))
+        lines = (self.columns, ["-" * width for width in widths], *self.rows)
+        return "\n".join(form.format(*line).rstrip() for line in lines)
 
     def _repr_html_(self) -> str:
-        def row(cells: Sequence[str], tag: str) -> str:
-            sides = ("right" if right else "left" for right in self.right)
-            pairs = zip(sides, map(html.escape, cells), strict=True)
-            return "".join(["<tr>", *(f'<{tag} style="text-align:{side}">{c}</{tag}>' for side, c in pairs), "</tr>"])
-
-        body = "".join(row(r, "td") for r in self.rows)
-        return f"<table><thead>{row(self.columns, 'th')}</thead><tbody>{body}</tbody></table>"
+        sides = ["right" if right else "left" for right in self.right]
+        cells = "".join(f'<td style="text-align:{side}">{{}}</td>' for side in sides)
+        row = f"<tr>{cells}</tr>"
+        head = row.replace("td", "th").format(*map(html.escape, self.columns))
+        body = "".join(row.format(*map(html.escape, line)) for line in self.rows)
+        return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
 
 
 def table(
-    rows: Iterable[Mapping], columns: Iterable[str] | None = None, *, digits: int = 4, decimals: int | None = None
+    rows: Iterable[Mapping],
+    columns: Iterable[str] | None = None,
+    *,
+    digits: int = 4,
+    decimals: int | None = None,
 ) -> Table:
-    """Rows of named values as a :class:`Table`; a missing value is left blank.
+    """Rows of named values as a :class:`Table`; a missing value (or None) is left blank.
 
-    ``columns`` says which keys, in which order, those of the first row if None; a mapping renames them. Numbers have
-    ``digits`` significant digits, or ``decimals`` places after the point if they are not whole by type.
+    ``columns`` says which keys, in which order, those of the first row if None; a mapping renames
+    them. Numbers have ``digits`` significant digits, or ``decimals`` places after the point if they
+    are not whole by type.
     """
     rows = list(rows)
     if columns is None:
         columns = list(rows[0]) if rows else []
-    names = dict(columns) if isinstance(columns, Mapping) else {c: c for c in columns}
+    names = columns if isinstance(columns, Mapping) else {name: name for name in columns}
     form = f".{digits}g" if decimals is None else f"z.{decimals}f"  # z: no minus before a zero
-    cells = [tuple(_text(r.get(key), form) for key in names) for r in rows]
-    right = tuple(bool(rows) and all(_number(r.get(key)) or r.get(key) is None for r in rows) for key in names)
-    return Table(tuple(names.values()), tuple(cells), right)
+    cells = tuple(tuple(_text(row.get(key), form) for key in names) for row in rows)
+    right = tuple(
+        bool(rows) and all(row.get(key) is None or _is_number(row[key]) for row in rows)
+        for key in names
+    )
+    return Table(tuple(names.values()), cells, right)
 
 
-def _number(x: Any) -> bool:
+def _is_number(x: Any) -> bool:
     return isinstance(x, Real) and not isinstance(x, bool)
 
 
@@ -68,13 +73,12 @@ def _text(x: Any, form: str) -> str:
         return ""
     if isinstance(x, bool | np.bool_):
         return "yes" if x else "no"
-    if isinstance(x, Integral):
-        return str(int(x))
-    if _number(x):
-        return f"{float(x):{form}}" if math.isfinite(x) else "—"
-    return str(x)
+    if not _is_number(x) or isinstance(x, Integral):
+        return str(x)
+    return f"{float(x):{form}}" if math.isfinite(x) else "—"
 
 
 def versions() -> Table:
     """The versions of Python and of every package that shapes a result."""
-    return table([{"package": name, "version": version} for name, version in folder.versions().items()])
+    rows = folder.versions().items()
+    return table([{"package": name, "version": version} for name, version in rows])

@@ -1,68 +1,77 @@
-"""The bar under a cell of a notebook that takes long: what is being done, how much of it, and since when."""
+"""One line on what is being done, and since when: on a terminal, or under a notebook's cell."""
 
 from __future__ import annotations
 
-import html
+import contextlib
 import os
 import sys
-import time
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, TextIO
+
+from tqdm import tqdm
 
 from jumplab.io.progress import told_to
 
-FIRST_S, REDRAW_S = 1.5, 0.25  # a cell that ends sooner shows nothing; later, the bar is kept up to date
+# what ends sooner shows nothing; later, the line is kept up to date
+FIRST_S = 1.0
+REDRAW_S = 0.25
+WIDTH = 110  # a longer line would wrap on most terminals
 
 
-class Waiting:
-    """Shows, below the cell that runs, what long work says of itself; gone when the cell has ended."""
+@contextlib.contextmanager
+def waiting(out: TextIO, head: str = "") -> Iterator[None]:
+    """Within the block, what long work says of itself is a line of ``out``, gone at the end."""
+    form = "{desc}, {elapsed_s:.0f} s"
+    timing = dict(delay=FIRST_S, mininterval=REDRAW_S, miniters=0)
+    count = ""
+    with tqdm(bar_format=form, leave=False, ncols=WIDTH, nrows=20, file=out, **timing) as bar:
 
-    def __init__(self, shell: Any):
-        self._began, self._drawn_s, self._bar, self._listening = 0.0, 0.0, None, None
-        self._counted: tuple[str, int, int] | None = None
-        shell.events.register("pre_run_cell", self._begin)
-        shell.events.register("post_run_cell", self._end)
+        def hear(what: str, done: int, of: int) -> None:
+            nonlocal count
+            if of:  # what is done later may be a part of it
+                count = f"{what} {done} of {of}"
+            words = filter(None, (count, "" if of else what))
+            bar.set_description_str(head + ", ".join(words), refresh=False)
+            bar.update(0)
 
-    def _begin(self, *_: Any) -> None:
-        self._end()
-        self._began, self._drawn_s, self._counted = time.monotonic(), 0.0, None
-        self._listening = told_to(self._hear)
-        self._listening.__enter__()
+        with told_to(hear):
+            yield
 
-    def _end(self, *_: Any) -> None:
-        if self._listening is not None:
-            self._listening.__exit__(None, None, None)
-        if self._bar is not None:
-            self._bar.update({"text/html": "", "text/plain": ""}, raw=True)
-        self._listening = self._bar = None
 
-    def _hear(self, what: str, done: int, of: int) -> None:
-        if of:
-            self._counted = (what, done, of)
-        passed = time.monotonic() - self._began
-        if passed < FIRST_S or passed - self._drawn_s < REDRAW_S:
-            return
-        from IPython.display import DisplayHandle
+def on_terminal(command: str) -> contextlib.AbstractContextManager:
+    """What a ``command`` is doing, on stderr if that is a terminal."""
+    out = sys.stderr
+    return waiting(out, f"jumplab {command}: ") if out.isatty() else contextlib.nullcontext()
 
-        self._drawn_s = passed
-        amount, told = "", [] if of else [what]
-        if self._counted is not None:  # what is done just now may be a part of it
-            name, done, of = self._counted
-            amount, told = f' value="{done}" max="{of}"', [f"{name} {done} of {of}", *told]
-        text = ", ".join(told)
-        bar = f"<progress{amount}></progress> {html.escape(text)}, {passed:.0f} s"
-        shown = {"text/html": bar, "text/plain": f"{text}, {passed:.0f} s"}
-        if self._bar is None:
-            self._bar = DisplayHandle()
-            self._bar.display(shown, raw=True)
+
+class _UnderCell:
+    """Takes a terminal's text, and shows its last line below the cell that runs."""
+
+    handle: Any = None
+
+    def write(self, text: str) -> None:
+        from IPython.display import display
+
+        line = {"text/plain": text.strip()}
+        if self.handle is None:
+            self.handle = display(line, raw=True, display_id=True)
         else:
-            self._bar.update(shown, raw=True)
+            self.handle.update(line, raw=True)
+
+    def flush(self) -> None:
+        """Nothing waits to be written."""
 
 
-def show_waiting() -> Waiting | None:
-    """Show bars from here on, if this is an open notebook; None elsewhere, and where the notebook is only executed."""
+def show_waiting() -> None:
+    """Show such a line from here on, if this is an open notebook that somebody looks at."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    if shell is None or not hasattr(shell, "kernel") or os.environ.get("JPY_SESSION_NAME") == "":
-        return None
-    if not hasattr(shell, "_jumplab_waiting"):
-        shell._jumplab_waiting = Waiting(shell)
-    return shell._jumplab_waiting
+    open_notebook = hasattr(shell, "kernel") and os.environ.get("JPY_SESSION_NAME") != ""
+    if open_notebook and not hasattr(shell, "_jumplab_waiting"):
+        shell._jumplab_waiting = cell = contextlib.ExitStack()
+
+        def begin(*_: Any) -> None:
+            cell.close()
+            cell.enter_context(waiting(_UnderCell()))
+
+        shell.events.register("pre_run_cell", begin)
+        shell.events.register("post_run_cell", lambda *_: cell.close())

@@ -1,68 +1,111 @@
-"""What the simulation wants of a physics engine, and which ones there are.
+"""What the simulation wants of a physics engine.
 
-Servo law, delay, motors, sensors, perturbations, log and checks are written once and know no engine. A further engine
-is a class with :class:`Engine`'s methods, a line in :data:`jumplab.sim.ENGINES`, and passes ``test_sim_world.py``.
+A further engine is a class with :class:`Engine`'s methods, a line in :data:`jumplab.sim.ENGINES`,
+and passes ``test_sim_world.py``; all else knows no engine.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from jumplab.control.kinematics import rotation
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.robot import Robot
-from jumplab.sim import DEFAULT_ENGINE, ENGINES, INSTALLED
+from jumplab.sim import CONTACTS, DEFAULT_ENGINE, ENGINES, INSTALLED
 from jumplab.sim.perturbation import FRICTION
 from jumplab.sim.scene import Contacts, Scene
 
-MASS_KG, ROUNDING = 1e-6, 1e-9  # by how much an engine's mass, and its friction, may differ from what was asked for
+# by how much an engine's mass, and its friction, may differ from what was asked for
+MASS_KG = 1e-6
+ROUNDING = 1e-9
 SOLE_POINTS = 8  # contact points of two flat rectangular soles
+# a x b = a[YZX] b[ZXY] - a[ZXY] b[YZX]
+YZX = np.array([1, 2, 0])
+ZXY = np.array([2, 0, 1])
 TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 
 
-class Engine(ABC):
-    """A robot in a scene, advanced in steps of :data:`jumplab.sim.STEP_S`. Use as a context manager.
+class Kept(NamedTuple):
+    """What an engine has, which need not be what it was told."""
 
-    Outside of an engine everything is Pinocchio's: ``q`` and ``v`` of the base *link* frame, joints in its order.
+    inertials: dict[str, pin.Inertia]  # of every link, in its frame
+    # between every link that can touch, and ground of 1 [1]
+    friction: dict[str, float]
+    ground_friction: list[float]  # of every block of the scene [1]
+    # largest damping, armature or dry friction of a joint, less what the robot's motors have and
+    # the engine was told, in SI units; zero is wanted
+    damping: float
+    gravity: list[float]  # (3,) [m/s^2]
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of the robot."""
+        return float(sum(link.mass for link in self.inertials.values()))
+
+
+class Presses(NamedTuple):
+    """What pressed on the robot in one step, one row a contact."""
+
+    link: np.ndarray  # (k,) which of the links
+    other: np.ndarray  # (k,) on which of them it pressed; -1 is the ground
+    place: np.ndarray  # (k, 3) world axes [m]
+    force: np.ndarray  # (k, 3) on the link, world axes [N]
+    surface: np.ndarray  # (k, 3) place on the link's own surface, in its frame [m]
+
+
+class Engine(ABC):
+    """A robot in a scene, advanced in steps of :data:`jumplab.sim.STEP_S`; a context manager.
+
+    Outside of an engine everything is Pinocchio's: ``q`` and ``v`` of the base *link* frame, joints
+    in its order.
 
     Parameters
     ----------
-    robot : the robot as it really is (perturbed, if at all).
-    q, v : initial configuration (nq,) and velocity (nv,), rest if ``v`` is None. Set once; nothing is ever reset.
+    robot : as it really is, perturbed or not.
+    q, v : where it begins, (nq,) and (nv,), at rest if ``v`` is None. Nothing is ever reset.
     friction : effective coefficient between robot and ground [1].
+    contact : how contacts give way, one of :data:`jumplab.sim.CONTACTS`, or the engine's own words.
 
-    Attributes
-    ----------
-    name : as in :data:`jumplab.sim.ENGINES`.  title : as in sentences.
-    links : names of the robot's links, the base first.
-    late_armature : whether the engine has no armature, and that of motors comes by :class:`.armature.Armature`.
-    substeps : semi-implicit steps that the engine takes within one of the simulation.
-
-    Raises
-    ------
-    RobotError
-        If the engine cannot read the robot.
-    JumplabError
-        If its mass or friction, read back, are not what was asked for.
+    Raises :class:`RobotError` if the engine cannot read the robot, :class:`JumplabError` if its
+    mass or friction, read back, are not what was asked for.
     """
 
-    name: str
-    title: str
-    substeps: int = 1
+    name: str  # as in :data:`jumplab.sim.ENGINES`
+    title: str  # as in sentences
+    known: Mapping[str, Any]  # contacts by name, those of :data:`jumplab.sim.CONTACTS`
+    contact: Any  # the one of them that this engine has
+    keeps_com: bool = True  # whether its base has the velocity of the CoM, or of the link's origin
+    # whether it has no armature, and that of motors comes by :class:`.armature.Armature`
     late_armature: bool = False
-    links: tuple[str, ...]
+    links: tuple[str, ...]  # names of the robot's links, the base first
 
-    def __init__(self, robot: Robot, q: np.ndarray, v=None, *, scene: Scene | None = None, friction: float = FRICTION):
-        self.robot, self.scene, self.beyond_sole_m = robot, scene or Scene.flat(), 0.0
+    def __init__(
+        self,
+        robot: Robot,
+        q: np.ndarray,
+        v=None,
+        *,
+        scene: Scene | None = None,
+        friction: float = FRICTION,
+        contact: str | Any = CONTACTS[0],
+    ):
+        self.robot = robot
+        self.contact = self.contact_of(contact)
+        self._contact_name = contact if isinstance(contact, str) else str(contact)
+        self.scene = scene or Scene.flat()
+        self.beyond_sole_m = 0.0
         try:
             self._build(friction)
             self._compare(friction)
             self._solid = self._feels_itself()
-            self._place(np.asarray(q, float), np.zeros(robot.model.nv) if v is None else np.asarray(v, float))
+            self._place(np.asarray(q, float), np.zeros(robot.model.nv) if v is None else v)
         except BaseException:
             self.close()
             raise
@@ -73,16 +116,30 @@ class Engine(ABC):
     def __exit__(self, *exc) -> None:
         self.close()
 
+    @classmethod
+    def contact_of(cls, contact: Any) -> Any:
+        """A contact by its name, or as it is; raises :class:`InputError` if it is none."""
+        if isinstance(contact, str) and contact in cls.known:
+            return cls.known[contact]
+        if not isinstance(contact, type(cls.known[CONTACTS[0]])):
+            raise InputError(f"contact {quoted(contact)}: must be one of {', '.join(CONTACTS)}")
+        return contact
+
     @abstractmethod
     def _build(self, friction: float) -> None:
-        """Make scene and robot, with damping, armature and friction of its motors, and none of the engine's own."""
+        """Make scene and robot, with damping, armature and friction of its motors, and none of the
+        engine's own.
+        """
 
     @abstractmethod
     def _tangled(self, angles: np.ndarray) -> bool:
-        """Whether the engine finds links in each other, high above the ground, with joints at ``angles`` (nv - 6,)."""
+        """Whether the engine finds links in each other, high above the ground, with joints at
+        ``angles`` (nv - 6,).
+        """
 
     def _feels_itself(self) -> bool:
-        rng, joints = np.random.default_rng(0), len(self.robot.joint_names)
+        rng = np.random.default_rng(0)
+        joints = len(self.robot.joint_names)
         return any(self._tangled(rng.uniform(-np.pi, np.pi, joints)) for _ in range(TANGLES))
 
     @abstractmethod
@@ -93,31 +150,9 @@ class Engine(ABC):
     def close(self) -> None:
         """Free the engine."""
 
-    @property
     @abstractmethod
-    def inertials(self) -> dict[str, pin.Inertia]:
-        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
-
-    @property
-    @abstractmethod
-    def gravity(self) -> list[float]:
-        """Gravity (3,) as the engine has it [m/s^2]."""
-
-    @property
-    @abstractmethod
-    def friction(self) -> dict[str, float]:
-        """Friction coefficient between every link that can touch, and the ground of 1, as the engine has it."""
-
-    @property
-    @abstractmethod
-    def ground_friction(self) -> list[float]:
-        """Friction coefficient of every block of the scene as the engine has it."""
-
-    @property
-    @abstractmethod
-    def damping(self) -> float:
-        """Largest damping, armature or dry friction of a joint as the engine has it, less what the robot's motors have
-        and the engine was told, in SI units; zero is wanted."""
+    def kept(self) -> Kept:
+        """What the engine has."""
 
     @abstractmethod
     def state(self) -> tuple[np.ndarray, np.ndarray]:
@@ -129,11 +164,13 @@ class Engine(ABC):
 
     @abstractmethod
     def applied(self) -> np.ndarray:
-        """Torque (nv - 6,) that the motors gave in the last step, before their own friction [N m]."""
+        """Torque (nv - 6,) that motors gave in the last step, before their own friction [N m]."""
 
     @abstractmethod
     def push(self, force: np.ndarray, place: np.ndarray) -> None:
-        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
+        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's
+        frame [N, m].
+        """
 
     @abstractmethod
     def step(self) -> None:
@@ -144,57 +181,107 @@ class Engine(ABC):
         """What touched, and how hard, in the last step."""
 
     def spring(self, soft_m: float) -> tuple[float, float]:
-        """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles, four points each,
-        sink by ``soft_m`` under the weight; the whole robot on it is critically damped."""
-        mass, gravity = self.robot.total_mass / SOLE_POINTS, self.robot.gravity
+        """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles,
+        four points each, sink by ``soft_m`` under the weight; the whole robot on it is critically
+        damped."""
+        mass = self.robot.total_mass / SOLE_POINTS
+        gravity = self.robot.gravity
         return mass * gravity / soft_m, 2 * mass * np.sqrt(gravity / soft_m)
 
-    @property
-    def mass_kg(self) -> float:
-        """Mass of the robot as the engine has it."""
-        return float(sum(link.mass for link in self.inertials.values()))
-
-    def inertia_error(self) -> float:
-        """Largest error of the engine's bodies, each with what is fixed to it: mass [kg], times place of its centre
-        [kg m], inertia [kg m^2] about the joint."""
+    def read_back(self) -> dict[str, Any]:
+        """What the engine has, as plain data: effective friction of each foot on each block, the
+        largest error of its bodies, each with what is fixed to it (mass [kg], times place of its
+        centre [kg m], inertia about the joint [kg m^2]), whether links collide, how far beyond the
+        stated sole a foot ever touched [m] ..."""
+        kept = self.kept()
         model = self.robot.model
         bodies = [pin.Inertia.Zero() for _ in model.inertias]
-        for name, inertia in self.inertials.items():
+        for name, inertia in kept.inertials.items():
             frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
             bodies[frame.parentJoint] += frame.placement.act(inertia)
-        pairs = zip(bodies[1:], list(model.inertias)[1:], strict=True)
-        return float(max(np.abs(a.toDynamicParameters() - b.toDynamicParameters()).max() for a, b in pairs))
-
-    def read_back(self) -> dict[str, Any]:
-        """What the engine has, not what it was told: effective friction of each foot on each block, the mass [kg], how
-        wrong inertias are, damping in the joints, gravity [m/s^2], whether links collide, how far beyond the stated
-        sole a foot ever touched [m], and where it is so, that armature comes late."""
-        feet = [self.friction[foot] for foot in self.robot.foot.frames]
-        friction = sorted({foot * block for foot in feet for block in self.ground_friction})
-        read = dict(friction=friction, mass_kg=self.mass_kg, inertia_error=self.inertia_error(), damping=self.damping)
-        read |= dict(gravity=self.gravity, self_collision=self._solid)
-        if self.late_armature:
-            read["late_armature"] = True
-        return dict(name=self.name, substeps=self.substeps, **read, beyond_sole_m=self.beyond_sole_m)
+        real, due = (
+            np.array([body.toDynamicParameters() for body in x])[1:]
+            for x in (bodies, model.inertias)
+        )
+        feet = [kept.friction[foot] for foot in self.robot.foot.frames]
+        return dict(
+            name=self.name,
+            contact=self._contact_name,
+            substeps=self.contact.substeps,
+            keeps_com=self.keeps_com,
+            friction=sorted({foot * block for foot in feet for block in kept.ground_friction}),
+            mass_kg=kept.mass_kg,
+            inertia_error=float(np.abs(real - due).max()),
+            damping=kept.damping,
+            gravity=kept.gravity,
+            self_collision=self._solid,
+            beyond_sole_m=self.beyond_sole_m,
+        ) | ({"late_armature": True} if self.late_armature else {})
 
     def _compare(self, friction: float) -> None:
-        for name, found in self.friction.items():
-            if abs(found - friction) > ROUNDING:
-                raise JumplabError(f"{self.title} kept friction {found:g} on {name} where {friction:g} was set")
-        if abs(self.mass_kg - self.robot.total_mass) > MASS_KG:
-            weight = f"{self.title}'s robot weighs {self.mass_kg:.4f} kg"
+        kept = self.kept()
+        for name, there in kept.friction.items():
+            if abs(there - friction) > ROUNDING:
+                raise JumplabError(
+                    f"{self.title} kept friction {there:g} on {name} where {friction:g} was set"
+                )
+        if abs(kept.mass_kg - self.robot.total_mass) > MASS_KG:
+            weight = f"{self.title}'s robot weighs {kept.mass_kg:.4f} kg"
             raise JumplabError(f"{weight}, Pinocchio's {self.robot.total_mass:.4f} kg")
+
+    def _contacts(self, presses: Presses, origins: np.ndarray, times: int = 1) -> Contacts:
+        """Mean of what pressed, gathered ``times`` times; moments are about the feet's ``origins``
+        (2, 3) [m].
+        """
+        link, other, place, force, surface = presses
+        ground = other < 0
+        on_foot = (link == self._foot_links) & ground
+        wrench = np.zeros((2, 6))
+        share = on_foot / times
+        wrench[:, :3] = share @ force
+        wrench[:, 3:] = share @ _cross(place, force) - _cross(origins, wrench[:, :3])
+        bearing = on_foot[0] | on_foot[1]
+        if bearing.any():
+            self._note_sole(surface[bearing])
+        touching = frozenset(self.links[k] for k in set(link[ground].tolist()))
+        pairs = zip(link[~ground].tolist(), other[~ground].tolist(), strict=True)
+        return Contacts(
+            wrench, touching, frozenset((self.links[k], self.links[o]) for k, o in pairs)
+        )
+
+    @cached_property
+    def _foot_links(self) -> np.ndarray:
+        return np.array([[self.links.index(name)] for name in self.robot.foot.frames])
 
     def _note_sole(self, points: np.ndarray) -> None:
         """Remember how far contact points (k, 3) in the foot's frame lay beyond the stated sole."""
         foot = self.robot.foot
-        side = np.abs(points[:, 1] - foot.center[1]) - foot.half_width
-        beyond = max((foot.heel - points[:, 0]).max(), (points[:, 0] - foot.toe).max(), side.max())
+        least = points.min(axis=0)
+        most = points.max(axis=0)
+        side = max(most[1] - foot.center[1], foot.center[1] - least[1]) - foot.half_width
+        beyond = max(foot.heel - least[0], most[0] - foot.toe, side)
         self.beyond_sole_m = max(self.beyond_sole_m, float(beyond))
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products (k, 3) of rows (k, 3); np.cross takes five times as long."""
+    return a.take(YZX, 1) * b.take(ZXY, 1) - a.take(ZXY, 1) * b.take(YZX, 1)
+
+
+def inertial(
+    mass: float, com: np.ndarray, quaternion: np.ndarray, moments: np.ndarray
+) -> pin.Inertia:
+    """Inertia of a link in its frame, from its CoM (3,) there [m], and moments (3,) [kg m^2] about
+    axes that are turned by ``quaternion`` (4,).
+    """
+    turn = rotation(np.asarray(quaternion))
+    return pin.Inertia(float(mass), np.asarray(com), turn @ np.diag(moments) @ turn.T)
+
+
 def engine_class(name: str = DEFAULT_ENGINE) -> type[Engine]:
-    """The class of an engine, imported now; raises :class:`InputError` if it is unknown or not installed."""
+    """The class of an engine, imported now; raises :class:`InputError` if it is unknown or not
+    installed.
+    """
     if not isinstance(name, str) or name not in ENGINES:
         raise InputError(f"engine {quoted(name)}: must be one of {', '.join(INSTALLED)}")
     module, kind, package, cure = ENGINES[name]
@@ -204,4 +291,6 @@ def engine_class(name: str = DEFAULT_ENGINE) -> type[Engine]:
         if e.name != package:
             raise
         others = "".join(f"take {other!r}, or " for other in INSTALLED if other != name)
-        raise InputError(f"engine {name!r}: the package {package} is not installed; {others}{cure}") from e
+        raise InputError(
+            f"engine {name!r}: the package {package} is not installed; {others}{cure}"
+        ) from e

@@ -3,117 +3,155 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import numpy as np
-import pinocchio as pin
 
+from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
-from jumplab.sim.engine import Engine
-from jumplab.sim.kinematics import inertial, rotation
+from jumplab.sim.engine import Engine, Kept, Presses, inertial
 from jumplab.sim.scene import REACH_M, Contacts
 
 
 @dataclass(frozen=True)
-class Softness:
-    """How a contact gives way; MuJoCo's names are those of its solref and solimp."""
+class Contact:
+    """How contacts give way and stick; defaults are MuJoCo's own, with its names in brackets."""
 
-    time_s: float = 0.001  # [s] a penetration fades; of the engine's steps it takes four, with two feet would bounce
-    damping_ratio: float = 1.0  # [1] nothing bounces
-    # [1] share of a contact's acceleration that is held off, at the surface and ``depth_m`` below. MuJoCo's contacts do
-    # not see what turning legs add to it (J' v): a share of 0.95 at the surface lets loaded toes lift off and fall back
-    impedance: tuple[float, float] = (0.5, 0.95)
-    depth_m: float = 1e-4  # [m] as deep as feet stand in Bullet's ground
+    # [s] a penetration fades (solref); of the engine's steps it takes two, with feet four
+    time_s: float = 0.02
+    damping_ratio: float = 1.0  # [1] nothing bounces (solref)
+    # [1] share of a contact's acceleration that is held off, at the surface and ``depth_m`` below
+    # (solimp)
+    impedance: tuple[float, float] = (0.9, 0.95)
+    depth_m: float = 1e-3  # [m] (solimp)
+    cone_ratio: float = 1.0  # [1] impedance of friction over that of pressure (impratio)
+    elliptic: bool = False  # friction cone; a pyramid within it otherwise (cone)
+    substeps: int = 1  # in one step of the simulation (timestep)
 
 
-SOFTNESS = Softness()  # as hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm
-SUBSTEPS = 4  # of 0.25 ms: one of 1 ms would make feet creep, and jumps 1 to 4 cm shorter
-SOFT_CONE_RATIO = 1000.0  # the same on soft ground, whose pressure gives way by far more
-CONE_RATIO = 10.0  # [1] impedance of friction over that of pressure; at 1, feet creep under load
-ITERATIONS, TOLERANCE = 100, 1e-12  # of the constraint solver; it takes five, and the check of forces sees the rest
+# As hard as Bullet's ground: in launch, toes sink by 0.1 mm and slip by less than 1 mm. MuJoCo's
+# contacts do not see what turning legs add to their acceleration (J' v): a share of 0.95 at the
+# surface lets loaded toes lift off and fall back. At a cone ratio of 1 feet creep under load, with
+# one step of 1 ms too, and jumps are 1 to 4 cm shorter
+HARD = Contact(
+    time_s=0.001,
+    impedance=(0.5, 0.95),
+    depth_m=1e-4,
+    cone_ratio=10.0,
+    elliptic=True,
+    substeps=4,
+)
+SOFT_CONE_RATIO = 1000.0  # on soft ground, whose pressure gives way by far more
+# of the constraint solver; it takes five, and the check of forces sees the rest
+ITERATIONS = 100
+TOLERANCE = 1e-12
 THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
-MOTOR = "damping", "armature", "friction"  # of a motor, as the engine has them
-FIRST = 1  # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective one
-SOFT_FIRST, SOFT_SHARE = 2, 0.1  # geoms of soft ground have it; small shares of acceleration make a plain spring
+FOUR = np.arange(4)  # edges of a friction pyramid: pressure +- coefficient times friction
+PYRAMID = np.array([[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1]], float)
+# of a motor, as the engine has them
+MOTOR = {"damping": "dof_damping", "armature": "dof_armature", "friction": "dof_frictionloss"}
+# geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective
+# one
+FIRST = 1
+# geoms of soft ground have it; small shares of acceleration make a plain spring
+SOFT_FIRST = 2
+SOFT_SHARE = 0.1
 
 
 class MujocoEngine(Engine):
-    """MuJoCo behind the interface of :class:`.engine.Engine`; ``softness`` may be set on the class for a study."""
+    """MuJoCo behind the interface of :class:`.engine.Engine`."""
 
-    name, title, substeps = "mujoco", "MuJoCo", SUBSTEPS
-    softness = SOFTNESS
+    name = "mujoco"
+    title = "MuJoCo"
+    keeps_com = False
+    known: ClassVar = {"hard": HARD, "usual": Contact()}
+    contact: Contact
 
     def _build(self, friction: float) -> None:
         spec = self._read()
+        contact = self.contact
         option = spec.option
-        option.timestep, option.gravity = STEP_S / SUBSTEPS, [0.0, 0.0, -self.robot.gravity]
-        option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio, option.iterations, option.tolerance = CONE_RATIO, ITERATIONS, TOLERANCE
+        option.timestep = STEP_S / contact.substeps
+        option.gravity = [0.0, 0.0, -self.robot.gravity]
+        option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        cone = mujoco.mjtCone
+        option.cone = cone.mjCONE_ELLIPTIC if contact.elliptic else cone.mjCONE_PYRAMIDAL
+        option.impratio = contact.cone_ratio
+        option.iterations = ITERATIONS
+        option.tolerance = TOLERANCE
         for geom in spec.geoms:
-            geom.friction, geom.priority = [friction, 0.0, 0.0], FIRST
+            geom.friction = [friction, 0.0, 0.0]
+            geom.priority = FIRST
         for half, centre, turn in self.scene.boxes():
-            how = dict(size=half, pos=centre, quat=np.roll(turn, 1), friction=[1.0, 0.0, 0.0])
-            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **how)
+            box = dict(size=half, pos=centre, quat=np.roll(turn, 1), friction=[1.0, 0.0, 0.0])
+            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, **box)
         for geom in spec.geoms:
-            geom.condim, geom.margin = 3, 0.0
-            geom.solref = [self.softness.time_s, self.softness.damping_ratio]
-            geom.solimp = [*self.softness.impedance, self.softness.depth_m, 0.5, 2.0]
+            geom.condim = 3
+            geom.margin = 0.0
+            geom.solref = [contact.time_s, contact.damping_ratio]
+            geom.solimp = [*contact.impedance, contact.depth_m, 0.5, 2.0]
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._model.jnt_solref[:] = [self.softness.time_s, self.softness.damping_ratio]
+        self._model.jnt_solref[:] = [contact.time_s, contact.damping_ratio]
         self._index_links()
         self._soften(friction)
-
-    def _motors(self) -> tuple[np.ndarray, ...]:
-        """Damping, armature and dry friction (nv,) of the engine's joints, to be written to: as :data:`MOTOR`."""
-        return self._model.dof_damping, self._model.dof_armature, self._model.dof_frictionloss
 
     def _soften(self, friction: float) -> None:
         """Make springs of soft blocks, which then decide their contacts, friction included.
 
-        A contact's force is share / (1 - share) / inverse mass times its reference acceleration, -b v - k r. The
-        inverse mass is the engine's own of a foot: under other links the ground is as much harder as they are heavier.
+        A contact's force is share / (1 - share) / inverse mass times its reference acceleration, -b
+        v - k r. The inverse mass is the engine's own of a foot: under other links the ground is as
+        much harder as they are heavier.
         """
         model = self._model
         inverse = float(np.mean([model.body_invweight0[body, 0] for body in self._feet]))
-        for geom, block in zip(np.flatnonzero(model.geom_bodyid == 0), self.scene.blocks, strict=True):
+        for geom, block in zip(
+            np.flatnonzero(model.geom_bodyid == 0), self.scene.blocks, strict=True
+        ):
             if block.soft_m:
                 k, b = np.array(self.spring(block.soft_m)) * inverse * (1 - SOFT_SHARE) / SOFT_SHARE
-                model.geom_solref[geom] = [-k * SOFT_SHARE, -b * SOFT_SHARE]  # by which the engine divides
+                # by which the engine divides
+                model.geom_solref[geom] = [-k * SOFT_SHARE, -b * SOFT_SHARE]
                 model.geom_solimp[geom, :2] = SOFT_SHARE
-                model.geom_priority[geom], model.geom_friction[geom, 0] = SOFT_FIRST, friction
+                model.geom_priority[geom] = SOFT_FIRST
+                model.geom_friction[geom, 0] = friction
                 model.opt.impratio = SOFT_CONE_RATIO
 
     def _read(self) -> mujoco.MjSpec:
         """The robot's URDF, its base free, every link kept, none of its pictures."""
         try:
             spec = mujoco.MjSpec.from_string(self.robot.urdf)
-            spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
+            spec.compiler.fusestatic = False
+            spec.compiler.discardvisual = True
             base = spec.worldbody.first_body()
             if base is None:
                 raise ValueError("it has no body of its own")
             base.add_freejoint()
             spec.copy().compile()
         except ValueError as e:
-            said = " ".join(str(e).split())
-            raise RobotError(f"robot {self.robot.name}: MuJoCo cannot read the URDF: {said}") from e
+            reason = " ".join(str(e).split())
+            raise RobotError(
+                f"robot {self.robot.name}: MuJoCo cannot read the URDF: {reason}"
+            ) from e
         return spec
 
     def _index_links(self) -> None:
         model = self._model
-        self.links = tuple(model.body(i).name for i in range(1, model.nbody))  # body i is links[i - 1]
+        # body i is links[i - 1]
+        self.links = tuple(model.body(i).name for i in range(1, model.nbody))
         joints = [model.joint(name) for name in self.robot.joint_names]
-        self._angles = np.array([joint.qposadr[0] for joint in joints])
-        self._rates = np.array([joint.dofadr[0] for joint in joints])
-        rows = [self.robot.actuators[name] for name in self.robot.joint_names]
-        self._stated = [np.zeros(model.nv) for _ in MOTOR]
-        for own, stated, key in zip(self._motors(), self._stated, MOTOR, strict=True):
-            stated[self._rates] = [row[key] for row in rows]
-            own[:] = stated
-        self._feet = {model.body(name).id: side for side, name in enumerate(self.robot.foot.frames)}
+        # where the engine has what Pinocchio's q and v begin with, and go on with
+        self._q = np.array([0, 1, 2, 4, 5, 6, 3, *(joint.qposadr[0] for joint in joints)])
+        self._v = np.array([*range(6), *(joint.dofadr[0] for joint in joints)])
+        self._motors = self.robot.limits
+        for key, there in MOTOR.items():
+            getattr(model, there)[self._v[6:]] = getattr(self._motors, key)
+        self._feet = [model.body(name).id for name in self.robot.foot.frames]
         self._torque = np.zeros(len(joints))
-        self._wrench, self._touching, self._colliding = np.zeros((2, 6)), set(), set()
+        self._felt: list[tuple[np.ndarray, ...]] = []
+        self._origins = np.zeros((2, 3))
 
     def close(self) -> None:
         """Free the engine."""
@@ -121,68 +159,59 @@ class MujocoEngine(Engine):
 
     def _tangled(self, angles: np.ndarray) -> bool:
         data = mujoco.MjData(self._model)
-        data.qpos[2], data.qpos[self._angles] = REACH_M, angles
+        data.qpos[2] = REACH_M
+        data.qpos[self._q[7:]] = angles
         mujoco.mj_forward(self._model, data)
         return bool(data.ncon)
 
     def _place(self, q: np.ndarray, v: np.ndarray) -> None:
-        data = self._data
-        data.qpos[:3], data.qpos[3:7], data.qpos[self._angles] = q[:3], q[[6, 3, 4, 5]], q[7:]
-        data.qvel[:3], data.qvel[3:6], data.qvel[self._rates] = rotation(q[3:7]) @ v[:3], v[3:6], v[6:]
+        self._data.qpos[self._q] = q
+        self._data.qvel[self._v] = v
+        self._data.qvel[:3] = rotation(q[3:7]) @ v[:3]
 
-    @property
-    def inertials(self) -> dict[str, pin.Inertia]:
-        """Mass, centre of mass and inertia of every link, in its frame, as the engine has them."""
+    def kept(self) -> Kept:
+        """What the engine has; ``ground_friction`` is what a block makes of a foot's."""
         has = self._model
-        rows = zip(has.body_mass, has.body_ipos, has.body_iquat[:, [1, 2, 3, 0]], has.body_inertia, strict=True)
-        return dict(zip(self.links, (inertial(*row) for row in list(rows)[1:]), strict=True))
-
-    @property
-    def gravity(self) -> list[float]:
-        """Gravity (3,) as the engine has it [m/s^2]."""
-        return self._model.opt.gravity.tolist()
-
-    @property
-    def friction(self) -> dict[str, float]:
-        """Friction coefficient between every link that can touch, and the ground, as the engine has it."""
-        robot = np.flatnonzero(self._model.geom_bodyid)
-        links = (self.links[self._model.geom_bodyid[geom] - 1] for geom in robot)
-        return {link: float(max(self._between(geom))) for link, geom in zip(links, robot, strict=True)}
+        quaternions = has.body_iquat[:, [1, 2, 3, 0]]
+        rows = zip(has.body_mass, has.body_ipos, quaternions, has.body_inertia, strict=True)
+        bodies = has.geom_bodyid
+        robot = np.flatnonzero(bodies)
+        foot = int(np.flatnonzero(np.isin(bodies, self._feet))[0])
+        motors = [(getattr(has, there), getattr(self._motors, k)) for k, there in MOTOR.items()]
+        return Kept(
+            dict(zip(self.links, [inertial(*row) for row in rows][1:], strict=True)),
+            friction={self.links[bodies[k] - 1]: float(max(self._between(k))) for k in robot},
+            ground_friction=(self._between(foot) / has.geom_friction[foot, 0]).tolist(),
+            damping=float(max(np.abs(x[self._v[6:]] - due).max() for x, due in motors)),
+            gravity=has.opt.gravity.tolist(),
+        )
 
     def _between(self, geom: int) -> np.ndarray:
-        """Friction coefficients between a geom of the robot and every block of the scene: the higher rank decides."""
-        rank, own = self._model.geom_priority, self._model.geom_friction[:, 0]
+        """Friction coefficients between a geom of the robot and every block of the scene: the
+        higher rank decides.
+        """
+        rank = self._model.geom_priority
+        friction = self._model.geom_friction[:, 0]
         ground = np.flatnonzero(self._model.geom_bodyid == 0)
-        ours = np.where(rank[ground] > rank[geom], own[ground], own[geom])
-        return np.where(rank[ground] == rank[geom], np.maximum(own[ground], own[geom]), ours)
-
-    @property
-    def ground_friction(self) -> list[float]:
-        """What every block of the scene makes of a foot's friction coefficient, as the engine has it [1]."""
-        foot = int(np.flatnonzero(np.isin(self._model.geom_bodyid, list(self._feet)))[0])
-        return (self._between(foot) / self._model.geom_friction[foot, 0]).tolist()
-
-    @property
-    def damping(self) -> float:
-        """Largest difference of a joint's damping, armature or dry friction from the stated, in SI units."""
-        pairs = zip(self._motors(), self._stated, strict=True)
-        return float(max(np.abs(x - stated).max() for x, stated in pairs))
+        ranked = np.where(rank[ground] > rank[geom], friction[ground], friction[geom])
+        larger = np.maximum(friction[ground], friction[geom])
+        return np.where(rank[ground] == rank[geom], larger, ranked)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """True configuration (nq,) and velocity (nv,) in Pinocchio's conventions."""
-        position, quaternion = self._data.qpos[:3], self._data.qpos[[4, 5, 6, 3]]
-        velocity, rate = rotation(quaternion).T @ self._data.qvel[:3], self._data.qvel[3:6]
-        return (
-            np.concatenate([position, quaternion, self._data.qpos[self._angles]]),
-            np.concatenate([velocity, rate, self._data.qvel[self._rates]]),
-        )
+        q = self._data.qpos[self._q]
+        v = self._data.qvel[self._v]
+        v[:3] = rotation(q[3:7]).T @ v[:3]
+        return q, v
 
     def set_torque(self, tau: np.ndarray) -> None:
         """Torque of every joint for the next step [N m]."""
-        self._data.qfrc_applied[self._rates] = tau
+        self._data.qfrc_applied[self._v[6:]] = tau
 
     def push(self, force: np.ndarray, place: np.ndarray) -> None:
-        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's frame [N, m]."""
+        """External force (3,) for the next step, world axes, at ``place`` (3,) in the base link's
+        frame [N, m].
+        """
         mujoco.mj_kinematics(self._model, self._data)
         arm = self._data.xpos[1] + self._data.xmat[1].reshape(3, 3) @ place - self._data.xipos[1]
         self._data.xfrc_applied[1] = [*force, *np.cross(arm, force)]
@@ -193,43 +222,51 @@ class MujocoEngine(Engine):
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""
-        self._wrench, self._touching, self._colliding = np.zeros((2, 6)), set(), set()
         mujoco.mj_kinematics(self._model, self._data)
-        origins = self._data.xpos.copy()
-        for _ in range(SUBSTEPS):
+        self._origins = self._data.xpos[self._feet]
+        self._felt = []
+        for _ in range(self.contact.substeps):
             mujoco.mj_step(self._model, self._data)
-            self._feel(origins)
-        self._torque = self._data.qfrc_applied[self._rates].copy()
+            if self._data.ncon and self._data.nefc:
+                self._felt.append(self._touches())
+        self._torque = self._data.qfrc_applied[self._v[6:]]
         self._data.xfrc_applied[1] = 0.0
 
     def contacts(self) -> Contacts:
-        """Mean forces of the ground on the feet, and all that touched, in the last step."""
-        return Contacts(self._wrench / SUBSTEPS, frozenset(self._touching), frozenset(self._colliding))
+        """Mean forces of the ground on the feet, and all that touched, in the last step; moments
+        are about where the feet were before it."""
+        if not self._felt:
+            return Contacts(np.zeros((2, 6)), frozenset(), frozenset())
+        felt = [np.concatenate(column) for column in zip(*self._felt, strict=True)]
+        acting = np.flatnonzero(felt[0][:, 0] > 0)
+        force, pairs, body, place, frame, depth, origin, turn = (x[acting] for x in felt)
+        frame = frame.reshape(-1, 3, 3)
+        way = np.where(pairs[:, 1] == body, 1.0, -1.0)[:, None]
+        arm = place + way * depth[:, None] / 2 * frame[:, 0] - origin
+        presses = Presses(
+            body - 1,
+            pairs.min(axis=1) - 1,
+            place,
+            way * (force[:, None, :] @ frame)[:, 0],
+            (arm[:, None, :] @ turn.reshape(-1, 3, 3))[:, 0],
+        )
+        return self._contacts(presses, self._origins, self.contact.substeps)
 
-    def _feel(self, origins: np.ndarray) -> None:
-        """Add the contacts of one substep; moments are about the links' ``origins`` (k, 3) before the step."""
-        data, contact = self._data, self._data.contact
-        acting = np.flatnonzero(contact.efc_address >= 0)
-        if not len(acting):
-            return
-        force = data.efc_force[contact.efc_address[acting, None] + THREE]  # along the axes of the contact's frame
-        pairs, places = self._model.geom_bodyid[contact.geom[acting]], contact.pos[acting]
-        pushes = np.einsum("ki,kij->kj", force, contact.frame[acting].reshape(-1, 3, 3))
-        points, depths = ([], []), contact.dist[acting, None] / 2 * contact.frame[acting].reshape(-1, 3, 3)[:, 0]
-        for k, (one, other) in enumerate(pairs.tolist()):
-            if force[k, 0] <= 0:
-                continue
-            if one and other:
-                self._colliding.add((self.links[one - 1], self.links[other - 1]))
-                continue
-            body = other or one
-            self._touching.add(self.links[body - 1])
-            side = self._feet.get(body)
-            if side is not None:
-                push, place = (pushes[k] if other else -pushes[k]), places[k]
-                self._wrench[side, :3] += push
-                self._wrench[side, 3:] += pin.skew(place - origins[body]) @ push
-                points[side].append(place + depths[k] if other else place - depths[k])  # on the robot's own surface
-        for body, side in self._feet.items():
-            if points[side]:
-                self._note_sole((np.array(points[side]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3))
+    def _touches(self) -> tuple[np.ndarray, ...]:
+        """The contacts of one substep: force (k, 3) along the axes of the contact, bodies (k, 2),
+        which of both is the robot's (k,), place (k, 3), axes (k, 9) and distance (k,), place (k, 3)
+        and attitude (k, 9) of that body.
+        """
+        data = self._data
+        contact = data.contact
+        if self.contact.elliptic:
+            force = data.efc_force.take(contact.efc_address[:, None] + THREE, mode="clip")
+        else:  # along the edges of a pyramid
+            edges = data.efc_force.take(contact.efc_address[:, None] + FOUR, mode="clip")
+            force = edges @ PYRAMID
+            force[:, 1:] *= contact.friction[:, :2]
+        force[contact.efc_address < 0] = 0.0  # of contacts that the solver left out
+        pairs = self._model.geom_bodyid[contact.geom]
+        body = pairs.max(axis=1)
+        where = contact.pos.copy(), contact.frame.copy(), contact.dist.copy()
+        return force, pairs, body, *where, data.xpos[body], data.xmat[body]

@@ -1,146 +1,154 @@
-"""How the simulated robot differs from the planned one; the paper's own differs "slightly" too (Sec. VI-B)."""
+"""How the simulated robot differs from the planned one; the paper's own differs "slightly" too
+(Sec. VI-B).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import Field, asdict, dataclass, field, fields, replace
+from itertools import pairwise, product
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
 
+from jumplab.control.estimator import SensorNoise
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.changes import MOMENTS, limits, scale
+from jumplab.robot.contact import on_feet
+from jumplab.robot.legs import bring_feet
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge, solved
 from jumplab.sim.scene import Scene
 
 FRICTION = 0.8  # rubber sole on dry floor; the ground has 1, and the engine multiplies the two
 LIGHT_KG = 0.01  # links below this are the massless dummies of multi-axis joints and are left alone
 PAYLOAD_SIDE_M = 0.1  # of the cube that a payload is
-PUSH_S, AFTER_S = 0.05, 1.0  # how long a shove lasts, and how long after the tape's end a landing is shoved
+# how long a shove lasts, and how long after the tape's end a landing is shoved
+PUSH_S = 0.05
+AFTER_S = 1.0
 PHASES = ("launch", "flight", "landing")
-BASE_GIVES = 1e4  # [1] how much more readily the base moves than a joint, to close the legs over the ground
-CLOSE_RAD, CLOSINGS = 1e-10, 20  # a wrong posture's feet are put back to so much; two or three steps do
+# [1] how much more readily the base moves than a joint, to close the legs over the ground
+BASE_GIVES = 100.0
+CLOSINGS = 20  # steps at most to put a wrong posture's feet back; two or three do
+# a cube, fixed to the base link; it touches nothing
+PAYLOAD = """<robot>
+  <link name="payload">
+    <inertial>
+      <origin xyz="0 0 0" rpy="0 0 0"/>
+      <mass value="{mass}"/>
+      <inertia ixx="{moment}" iyy="{moment}" izz="{moment}" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <joint name="payload_fixed" type="fixed">
+    <parent link="{base}"/>
+    <child link="payload"/>
+    <origin xyz="{place}" rpy="0 0 0"/>
+  </joint>
+</robot>"""
 
 
-def _up_to(default: Any, most: float, words: str, unit: str = "", least: float = 0.0, factor: float = 1.0) -> Any:
-    """A disturbance: its default, what is refused beyond, and how it is said (``factor`` times the number)."""
-    return field(default=default, metadata=dict(least=least, most=most, words=words, unit=unit, factor=factor))
+Pair = tuple[float, float]  # from ... to
+Vector = tuple[float, float, float]
+ByName = dict[str, float]  # of links or joints
+NONE = 0.0, 0.0
+FACTORS = {"%": 100.0, "m": 1e3}  # of what is said, by how its unit begins
+
+
+def _up_to(default: Any, most: float, words: str, unit: str = "", least: float = 0.0) -> Any:
+    """A disturbance: its default, what is refused beyond, and how it is said."""
+    return field(default=default, metadata=dict(least=least, most=most, words=words, unit=unit))
 
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far robots and worlds differ: the uniform draws of :meth:`Perturbation.draw`, every link and joint by itself.
+    """How far robots and worlds differ: the uniform draws of :meth:`Perturbation.draw`, every link
+    and joint by itself.
 
-    A pair is drawn from ... to, a single number is the half-width around nothing. What is beyond the last number of a
-    field's declaration is refused with an :class:`InputError`. The last thirteen are off unless they are asked for.
+    A pair is drawn from ... to, a single number is the half-width around nothing. What is beyond
+    the last number of a field's declaration is refused with an :class:`InputError`. The last
+    thirteen are off unless they are asked for.
     """
 
-    mass: float = _up_to(0.05, 0.2, "masses", "%", factor=100)  # [1], relative
-    com_m: float = _up_to(0.015, 0.05, "centres of mass", "mm per axis", factor=1e3)  # [m], each axis
-    inertia: float = _up_to(0.10, 0.5, "inertias", "%", factor=100)  # [1], relative
-    friction: tuple[float, float] = _up_to((0.5, 1.0), 1.0, "friction", least=0.3)  # [1]
-    delay_s: tuple[float, float] = _up_to((0.0, 0.004), 0.008, "commands", "ms late", factor=1e3)  # [s]
+    mass: float = _up_to(0.05, 0.2, "masses", "%")  # [1], relative
+    com_m: float = _up_to(0.015, 0.05, "centres of mass", "mm per axis")  # [m], each axis
+    inertia: float = _up_to(0.10, 0.5, "inertias", "%")  # [1], relative
     # [1], relative error of every torque, typical of current-controlled drives
-    motor_gain: float = _up_to(0.05, 0.3, "motors", "%", factor=100)
-    payload_kg: tuple[float, float] = _up_to((0.0, 0.0), 5.0, "a payload in the trunk's box of", "kg")  # [kg]
+    motor_gain: float = _up_to(0.05, 0.3, "motors", "%")
+    friction: Pair = _up_to((0.5, 1.0), 1.0, "friction", least=0.3)  # [1]
+    delay_s: Pair = _up_to((0.0, 0.004), 0.008, "commands", "ms late")  # [s]
+    payload_kg: Pair = _up_to(NONE, 5.0, "a payload in the trunk's box of", "kg")  # [kg]
     # [1], share by which the limit curve of every motor lies lower, and by which it ends sooner
-    torque_loss: tuple[float, float] = _up_to((0.0, 0.0), 0.2, "torque limits lower by", "%", factor=100)
-    speed_loss: tuple[float, float] = _up_to((0.0, 0.0), 0.1, "speed limits lower by", "%", factor=100)
+    torque_loss: Pair = _up_to(NONE, 0.2, "torque limits lower by", "%")
+    speed_loss: Pair = _up_to(NONE, 0.1, "speed limits lower by", "%")
     # [1/kW], share of all speed limits that is lost per power drawn by the joints
-    sag_per_kw: tuple[float, float] = _up_to((0.0, 0.0), 0.05, "speed limits lost to the battery", "%/kW", factor=100)
-    ground_m: float = _up_to(0.0, 0.04, "the ground of the landing higher by", "mm", factor=1e3)  # [m]
-    ground_tilt_deg: float = _up_to(0.0, 4.0, "tilted, in pitch and in roll, by", "degrees")  # [degrees]
-    soft_m: tuple[float, float] = _up_to((0.0, 0.0), 0.03, "ground that gives way by", "mm", factor=1e3)  # [m]
-    # [N s], each a force on the trunk for 50 ms, horizontal in any direction, at any moment of that phase
-    shove_launch_n_s: tuple[float, float] = _up_to((0.0, 0.0), 25.0, "a shove in launch of", "N s")
-    shove_flight_n_s: tuple[float, float] = _up_to((0.0, 0.0), 25.0, "a shove in flight of", "N s")
-    shove_landing_n_s: tuple[float, float] = _up_to((0.0, 0.0), 25.0, "a shove within 1 s of the landing of", "N s")
+    sag_per_kw: Pair = _up_to(NONE, 0.05, "speed limits lost to the battery", "%/kW")
+    ground_m: float = _up_to(0.0, 0.04, "the ground of the landing higher by", "mm")  # [m]
+    # [degrees]
+    ground_tilt_deg: float = _up_to(0.0, 4.0, "tilted, in pitch and in roll, by", "degrees")
+    soft_m: Pair = _up_to(NONE, 0.03, "ground that gives way by", "mm")  # [m]
+    # [N s], each a force on the trunk for 50 ms, horizontal in any direction, at any moment of that
+    # phase
+    shove_launch_n_s: Pair = _up_to(NONE, 25.0, "a shove in launch of", "N s")
+    shove_flight_n_s: Pair = _up_to(NONE, 25.0, "a shove in flight of", "N s")
+    shove_landing_n_s: Pair = _up_to(NONE, 25.0, "a shove within 1 s of the landing of", "N s")
     posture_deg: float = _up_to(0.0, 3.0, "joints off at the start by", "degrees")  # [degrees]
-    sensors: tuple[float, float] = _up_to((1.0, 1.0), 4.0, "sensor errors times")  # [1]
+    sensors: Pair = _up_to((1.0, 1.0), 4.0, "sensor errors times")  # [1]
 
     def __post_init__(self):
         for f in fields(self):
-            value, least, most = getattr(self, f.name), f.metadata["least"], f.metadata["most"]
+            value = getattr(self, f.name)
             pair = isinstance(f.default, tuple)
-            numbers = value if isinstance(value, tuple | list) else (value,)
-            good = len(numbers) == (2 if pair else 1) and isinstance(value, tuple | list) == pair
-            if not good or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers):
+            numbers = value if pair and isinstance(value, tuple | list) else [value]
+            good = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+            if not good or len(numbers) != 1 + pair:
                 wanted = "two numbers, from and to" if pair else "one number, a half-width"
                 raise InputError(f"the range {f.name} must be {wanted}, got {quoted(value)}")
-            if not (least <= numbers[0] <= numbers[-1] <= most):
-                said = " ... ".join(f"{x:g}" for x in numbers)
-                raise InputError(f"the range {f.name} = {said} is outside {least:g} ... {most:g}; choose a smaller one")
+            least = f.metadata["least"]
+            most = f.metadata["most"]
+            if not least <= numbers[0] <= numbers[-1] <= most:
+                given = " ... ".join(f"{x:g}" for x in numbers)
+                raise InputError(
+                    f"the range {f.name} = {given} is outside {least:g} ... {most:g}; "
+                    "choose a smaller one"
+                )
 
     @classmethod
     def none(cls, **some: Any) -> Ranges:
         """Nothing differs, but for ``some``."""
-        off = dict(mass=0.0, com_m=0.0, inertia=0.0, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.0)
-        return cls(**(off | some))
+        nothing = dict.fromkeys(("mass", "com_m", "inertia", "motor_gain"), 0.0)
+        return cls(**(nothing | dict(friction=(FRICTION, FRICTION), delay_s=NONE) | some))
 
     @property
     def known_delay_s(self) -> float:
-        """What a laboratory measures beforehand [s]: the middle of the delays. What a robot is off it, nobody knows."""
+        """What a laboratory measures beforehand [s]: the middle of the delays. What a robot is off
+        it, nobody knows.
+        """
         return sum(self.delay_s) / 2
 
     def __str__(self) -> str:
-        links = f"masses ±{100 * self.mass:g} %, centres of mass ±{1000 * self.com_m:g} mm per axis, "
-        links += f"inertias ±{100 * self.inertia:g} %, motors ±{100 * self.motor_gain:g} %, "
-        slow, late = (1000 * x for x in self.delay_s)
-        delay = f"commands {slow:g} ... {late:g} ms late and sent {1000 * self.known_delay_s:g} ms ahead"
-        said = links + f"friction {self.friction[0]:g} ... {self.friction[1]:g}, " + delay
-        return ", ".join([said, *(self._says(f) for f in fields(self)[6:] if getattr(self, f.name) != f.default)])
+        words = [self._says(f) for f in fields(self)[:6]]
+        words[-1] += f" and sent {1000 * self.known_delay_s:g} ms ahead"
+        words += [self._says(f) for f in fields(self)[6:] if getattr(self, f.name) != f.default]
+        return ", ".join(words)
 
-    def _says(self, f: Any) -> str:
-        value, how = getattr(self, f.name), f.metadata
-        low, high = (how["factor"] * x for x in (value if isinstance(value, tuple | list) else (-value, value)))
-        amount = f"±{high:g}" if low == -high != 0 else f"{low:g} ... {high:g}"
-        return f"{how['words']} {amount} {how['unit']}".rstrip()
+    def _says(self, f: Field) -> str:
+        factor = FACTORS.get(f.metadata["unit"][:1], 1.0)
+        value = getattr(self, f.name)
+        if isinstance(f.default, tuple):
+            amount = " ... ".join(f"{factor * x:g}" for x in value)
+        else:
+            amount = f"±{factor * value:g}"
+        return f"{f.metadata['words']} {amount} {f.metadata['unit']}".rstrip()
 
 
 # a "slight" difference: about a fifth of a workshop's uncertainty
-SLIGHT = Ranges(0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01)
-
-
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations of what is wrong with the sensors; zero means exact.
-
-    White noise is that of one sample at 1 kHz; biases and the error of the first attitude are drawn once per run.
-    """
-
-    joint_rad: float = 0.0  # [rad] white
-    joint_rate: float = 0.0  # [rad/s] white
-    encoder_step_rad: float = 0.0  # [rad] quantisation of the joint angles
-    tilt_rad: float = 0.0  # [rad] roll and pitch as they are believed to be before the jump
-    gyro: float = 0.0  # [rad/s] white
-    gyro_bias: float = 0.0  # [rad/s]
-    accel: float = 0.0  # [m/s^2] white
-    accel_bias: float = 0.0  # [m/s^2]
-    force: float = 0.0  # [N] white, each foot
-
-    @classmethod
-    def typical(cls) -> SensorNoise:
-        """16-bit encoders on gears with some play; a mid-range inertial unit, zeroed at rest."""
-        return cls(5e-4, 0.05, 1e-4, tilt_rad=5e-3, gyro=0.02, gyro_bias=1e-3, accel=0.2, accel_bias=0.05, force=3.0)
-
-    def times(self, factor: float) -> SensorNoise:
-        """Sensors that are so much worse."""
-        return SensorNoise(**{name: factor * value for name, value in vars(self).items()})
-
-    def __str__(self) -> str:
-        if self == SensorNoise():
-            return "the true state and foot forces"
-        joints = (
-            f"joint angles (±{1000 * self.joint_rad:g} mrad in steps of {1000 * self.encoder_step_rad:g}) and rates "
-        )
-        inertial = f"gyro (±{self.gyro:g}, bias ±{self.gyro_bias:g} rad/s), accelerometer (±{self.accel:g}, bias "
-        rest = f"±{self.accel_bias:g} m/s^2), foot forces (±{self.force:g} N), tilt before the jump "
-        return joints + f"(±{self.joint_rate:g} rad/s), " + inertial + rest + f"(±{1000 * self.tilt_rad:g} mrad)"
+SLIGHT = Ranges(
+    0.01, 0.002, 0.02, friction=(FRICTION, FRICTION), delay_s=(0.0, 0.0), motor_gain=0.01
+)
 
 
 @dataclass(frozen=True)
@@ -159,7 +167,7 @@ class Push:
 
     step: int  # from the run's begin, with which it begins
     steps: int  # that it lasts
-    force_n: tuple[float, float, float]  # world axes
+    force_n: Vector  # world axes
 
     def at(self, step: int) -> bool:
         """Whether it acts in this step."""
@@ -168,29 +176,38 @@ class Push:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """One robot of the population: factors and shifts by link or joint name; what is not named is as planned."""
+    """One robot of the population: factors and shifts by link or joint name; what is not named is
+    as planned.
+    """
 
     seed: int = 0  # of the draw, also seeds the sensor noise
-    mass: dict[str, float] = field(default_factory=dict)  # link -> factor [1]
-    inertia: dict[str, float] = field(default_factory=dict)  # link -> factor [1]
-    com: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # link -> shift in its frame [m]
+    mass: ByName = field(default_factory=dict)  # link -> factor [1]
+    inertia: ByName = field(default_factory=dict)  # link -> factor [1]
+    # link -> shift in its frame [m]
+    com: dict[str, Vector] = field(default_factory=dict)
     friction: float = FRICTION  # lateral coefficient of the whole robot against ground of 1 [1]
     delay_s: float = 0.0  # age of a command when it reaches the motors, rounded to milliseconds
-    known_delay_s: float = (
-        0.0  # what it is believed to be, rounded likewise; the tape's commands are sent so much ahead
-    )
-    motor_gain: dict[str, float] = field(default_factory=dict)  # joint -> torque delivered per torque commanded [1]
+    # what that is believed to be, rounded likewise; the tape's commands are sent so much ahead
+    known_delay_s: float = 0.0
+    # joint -> torque delivered per torque commanded [1]
+    motor_gain: ByName = field(default_factory=dict)
     noise: SensorNoise = SensorNoise()  # on measurements
     payload_kg: float = 0.0  # fixed to the trunk ...
-    payload_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # ... at this place in the base link's frame
-    torque_loss: dict[str, float] = field(default_factory=dict)  # joint -> share by which its torque limit is lower [1]
-    speed_loss: dict[str, float] = field(default_factory=dict)  # joint -> the same of speed limit and corner speed [1]
-    sag_per_kw: float = 0.0  # share of the speed limits that is lost per power the joints draw [1/kW]
+    # ... at this place in the base link's frame
+    payload_m: Vector = (0.0, 0.0, 0.0)
+    # joint -> share by which its torque limit is lower [1]
+    torque_loss: ByName = field(default_factory=dict)
+    # joint -> the same of speed limit and corner speed [1]
+    speed_loss: ByName = field(default_factory=dict)
+    # share of the speed limits that is lost per power the joints draw [1/kW]
+    sag_per_kw: float = 0.0
     ground_m: float = 0.0  # by how much the ground of the landing is higher
-    ground_tilt_rad: tuple[float, float] = (0.0, 0.0)  # its pitch and roll, about where the soles shall land
+    # its pitch and roll, about where the soles shall land
+    ground_tilt_rad: tuple[float, float] = (0.0, 0.0)
     soft_m: float = 0.0  # by how much the ground gives way under the weight on flat soles
     shoves: tuple[Shove, ...] = ()
-    posture_rad: dict[str, float] = field(default_factory=dict)  # joint -> wished error at the start
+    # joint -> wished error at the start
+    posture_rad: ByName = field(default_factory=dict)
 
     def __post_init__(self):
         if not 0 < self.friction <= 2:
@@ -203,102 +220,121 @@ class Perturbation:
     def draw(
         cls, robot: Robot, seed: int, ranges: Ranges = Ranges(), noise: SensorNoise = SensorNoise()
     ) -> Perturbation:
-        """Draw every number uniformly and independently from ``ranges``; the same seed gives the same robot.
+        """Draw every number uniformly and independently from ``ranges``; the same seed gives the
+        same robot.
 
-        Nothing that is drawn is known to the controllers; of the delay they know the middle of its range.
+        Nothing that is drawn is known to the controllers; of the delay they know the middle of its
+        range.
         """
         rng = np.random.default_rng(seed)
-        masses = ((link.get("name"), link.find("inertial/mass")) for link in ET.fromstring(robot.urdf).iter("link"))
-        names = [name for name, mass in masses if mass is not None and float(mass.get("value")) > LIGHT_KG]
+        # a stream of its own, all of it drawn whatever the ranges: a wider one changes no other
+        # number
+        more = np.random.default_rng([seed, 2])
+        links = _heavy_links(robot)
 
-        def around(half_width, size=None):
-            return rng.uniform(-half_width, half_width, size)
+        def factors(names: Sequence[str], half_width: float) -> ByName:
+            drawn = 1 + rng.uniform(-half_width, half_width, len(names))
+            return dict(zip(names, drawn.tolist(), strict=True))
 
-        drawn = cls(
-            seed,
-            {name: 1 + float(around(ranges.mass)) for name in names},
-            {name: 1 + float(around(ranges.inertia)) for name in names},
-            {name: tuple(around(ranges.com_m, 3).tolist()) for name in names},
-            float(rng.uniform(*ranges.friction)),
-            float(rng.uniform(*ranges.delay_s)),
-            ranges.known_delay_s,
-            {name: 1 + float(around(ranges.motor_gain)) for name in robot.joint_names},
-            noise,
+        def each(low: float, high: float) -> ByName:
+            drawn = more.uniform(low, high, len(robot.joint_names)).tolist()
+            return dict(zip(robot.joint_names, drawn, strict=True)) if low or high else {}
+
+        half_rad = float(np.radians(ranges.posture_deg))
+        tilt_rad = np.radians(ranges.ground_tilt_deg)
+        return cls(  # in the order of the draws
+            seed=seed,
+            mass=factors(links, ranges.mass),
+            inertia=factors(links, ranges.inertia),
+            com={k: tuple(rng.uniform(-ranges.com_m, ranges.com_m, 3).tolist()) for k in links},
+            friction=float(rng.uniform(*ranges.friction)),
+            delay_s=float(rng.uniform(*ranges.delay_s)),
+            known_delay_s=ranges.known_delay_s,
+            motor_gain=factors(robot.joint_names, ranges.motor_gain),
+            payload_kg=float(more.uniform(*ranges.payload_kg)),
+            payload_m=tuple(more.uniform(*_trunk_box(robot, ranges.payload_kg[1])).tolist()),
+            torque_loss=each(*ranges.torque_loss),
+            speed_loss=each(*ranges.speed_loss),
+            sag_per_kw=float(more.uniform(*ranges.sag_per_kw)),
+            ground_m=ranges.ground_m * more.uniform(-1, 1) + 0.0,
+            ground_tilt_rad=tuple((tilt_rad * more.uniform(-1, 1, 2) + 0.0).tolist()),
+            soft_m=float(more.uniform(*ranges.soft_m)),
+            shoves=_shoves(more, ranges),
+            posture_rad=each(-half_rad, half_rad),
+            noise=noise.times(float(more.uniform(*ranges.sensors))),
         )
-        return replace(drawn, **_further(robot, np.random.default_rng([seed, 2]), ranges, noise))
 
     def robot(self, robot: Robot) -> Robot:
-        """The robot as it really is: ``robot`` with masses, inertias, centres of mass, payload and limits changed."""
-        if not (self.mass or self.inertia or self.com or self.payload_kg or self.torque_loss or self.speed_loss):
-            return robot
+        """The robot as it really is: ``robot`` with masses, inertias, centres of mass, payload and
+        limits changed.
+        """
         lost = {"effort": self.torque_loss, "speed": self.speed_loss}
-        factors = {what: {name: 1 - x for name, x in told.items()} for what, told in lost.items()}
-        root = ET.fromstring(limits(robot, factors, {})[0] if any(lost.values()) else robot.urdf)
-        for link in root.iter("link"):
-            name, inertial = link.get("name"), link.find("inertial")
-            if inertial is None:
-                continue
+        if not (self.mass or self.inertia or self.com or self.payload_kg or any(lost.values())):
+            return robot
+        left = {k: {name: 1 - x for name, x in losses.items()} for k, losses in lost.items()}
+        root = ET.fromstring(limits(robot, left, {})[0])
+        for link in root.iterfind("link[inertial]"):
+            name = link.get("name")
+            inertial = link.find("inertial")
             factor = self.mass.get(name, 1.0)
             scale(inertial.find("mass"), ("value",), factor)
-            # a heavier link of the same shape has more inertia too; the further factor is a change of shape
+            # a heavier link of the same shape has more inertia too; the further factor is a change
+            # of shape
             scale(inertial.find("inertia"), MOMENTS, factor * self.inertia.get(name, 1.0))
             origin = inertial.find("origin")
             xyz = np.array(origin.get("xyz").split(), float) + self.com.get(name, (0.0, 0.0, 0.0))
             origin.set("xyz", " ".join(f"{x:.12g}" for x in xyz))
         if self.payload_kg:
-            _load(root, self.payload_kg, self.payload_m)
+            values = dict(base=robot.model.frames[2].name, mass=f"{self.payload_kg:.12g}")
+            moment = f"{self.payload_kg * PAYLOAD_SIDE_M**2 / 6:.12g}"
+            place = " ".join(f"{x:.12g}" for x in self.payload_m)
+            root.extend(ET.fromstring(PAYLOAD.format(**values, moment=moment, place=place)))
         real = Robot.from_text(ET.tostring(root, encoding="unicode"), robot.config_text)
         return real.under_gravity(robot.gravity)
 
     def ground(self, scene: Scene, robot: Robot, tape: Tape | None) -> Scene:
-        """The ground as it really is; raises :class:`InputError` where the landing's cannot differ from the start's."""
+        """The ground as it really is; raises :class:`InputError` where the landing's cannot differ
+        from the start's.
+        """
         if self.ground_m or any(self.ground_tilt_rad):
             ends = _of_one_jump(tape).q[[0, -1]]
             scene = scene.landing_moved(robot, ends, self.ground_m, *self.ground_tilt_rad)
-        if not self.soft_m:
-            return scene
-        blocks = tuple(replace(block, soft_m=max(block.soft_m, self.soft_m)) for block in scene.blocks)
-        return replace(scene, name=f"{scene.name}, soft", blocks=blocks)
+        if self.soft_m:
+            blocks = [replace(x, soft_m=max(x.soft_m, self.soft_m)) for x in scene.blocks]
+            scene = replace(scene, name=f"{scene.name}, soft", blocks=tuple(blocks))
+        return scene
 
     def pushes(self, tape: Tape | None) -> tuple[Push, ...]:
         """The shoves as forces, in the steps of a planned jump."""
         if not self.shoves:
             return ()
-        takeoff, end = _of_one_jump(tape).takeoff_time, float(tape.t[-1])
-        spans = dict(zip(PHASES, ((0.0, takeoff), (takeoff, end), (end, end + AFTER_S)), strict=True))
-        found = []
+        takeoff = _of_one_jump(tape).takeoff_time
+        end = float(tape.t[-1])
+        spans = dict(zip(PHASES, pairwise((0.0, takeoff, end, end + AFTER_S)), strict=True))
+        pushes = []
         for shove in self.shoves:
             begin, until = spans[shove.phase]
-            size, steps = shove.impulse_n_s / PUSH_S, round(PUSH_S / STEP_S)
-            force = size * np.cos(shove.direction_rad), size * np.sin(shove.direction_rad), 0.0
+            way = np.array([np.cos(shove.direction_rad), np.sin(shove.direction_rad), 0.0])
+            force = tuple((shove.impulse_n_s / PUSH_S * way).tolist())
             at = round((begin + shove.share * (until - begin - PUSH_S)) / STEP_S)
-            found.append(Push(at, steps, tuple(map(float, force))))
-        return tuple(found)
+            pushes.append(Push(at, round(PUSH_S / STEP_S), force))
+        return tuple(pushes)
 
     def start(self, robot: Robot, q: np.ndarray) -> np.ndarray:
-        """The configuration (nq,) in which it really starts: with its wrong posture, but both soles as in ``q``.
+        """The configuration (nq,) in which it really starts: with its wrong posture, but both soles
+        as in ``q``.
 
-        Legs that stand are a closed chain: of the errors wished, this is the nearest posture whose feet do not move.
+        Legs that stand are a closed chain: of the errors wished, this is the nearest posture whose
+        feet do not move.
         """
         if not self.posture_rad:
             return q
-        gauge, wrong = Gauge(robot), q.copy()
+        gauge = Gauge(robot)
+        wrong = q.copy()
         wrong[7:] += [self.posture_rad.get(name, 0.0) for name in robot.joint_names]
-        pin.framesForwardKinematics(gauge.model, gauge.data, q)
-        there = [gauge.data.oMf[frame].copy() for frame in gauge.frames]
-        local = pin.ReferenceFrame.LOCAL
-        for _ in range(CLOSINGS):
-            pin.computeJointJacobians(gauge.model, gauge.data, wrong)
-            pin.updateFramePlacements(gauge.model, gauge.data)
-            rows = np.vstack([pin.getFrameJacobian(gauge.model, gauge.data, f, local) for f in gauge.frames])
-            pairs = zip(gauge.frames, there, strict=True)
-            miss = np.concatenate([pin.log6(gauge.data.oMf[f].actInv(place)).vector for f, place in pairs])
-            if np.abs(miss).max() < CLOSE_RAD:
-                break
-            light = BASE_GIVES * rows.T
-            light[6:] = rows.T[6:]
-            wrong = pin.integrate(gauge.model, wrong, light @ solved(rows @ light + 1e-12 * np.eye(12), miss))
-        return wrong
+        feet = dict(zip(on_feet(robot, np.zeros(3)), gauge.places(q), strict=True))
+        give = np.repeat([BASE_GIVES, 1.0], [6, len(robot.joint_names)])
+        return bring_feet(gauge.model, gauge.data, wrong, feet, give, steps=CLOSINGS)[0]
 
     def to_json(self) -> dict:
         """All numbers as plain data."""
@@ -307,64 +343,50 @@ class Perturbation:
 
 def _of_one_jump(tape: Tape | None) -> Tape:
     if tape is None:
-        raise InputError("a shove, and other ground for the landing, belong to one jump; leave them away in a chain")
+        raise InputError(
+            "a shove, and other ground for the landing, belong to one jump; "
+            "leave them away in a chain"
+        )
     return tape
 
 
-def _further(robot: Robot, rng: np.random.Generator, ranges: Ranges, noise: SensorNoise) -> dict[str, Any]:
-    """What a stream of its own draws, all of it whatever the ranges: a wider one changes no other number."""
-
-    def each(low: float, high: float) -> dict[str, float]:
-        drawn = rng.uniform(low, high, len(robot.joint_names))
-        return dict(zip(robot.joint_names, drawn.tolist(), strict=True)) if (low, high) != (0, 0) else {}
-
-    low, high = _trunk_box(robot) if ranges.payload_kg[1] else (np.zeros(3), np.zeros(3))
-    found = dict(payload_kg=float(rng.uniform(*ranges.payload_kg)), payload_m=tuple(rng.uniform(low, high).tolist()))
-    found |= dict(torque_loss=each(*ranges.torque_loss), speed_loss=each(*ranges.speed_loss))
-    found |= dict(
-        sag_per_kw=float(rng.uniform(*ranges.sag_per_kw)), ground_m=ranges.ground_m * rng.uniform(-1, 1) + 0.0
-    )
-    found |= dict(ground_tilt_rad=tuple(np.radians(ranges.ground_tilt_deg * rng.uniform(-1, 1, 2) + 0.0).tolist()))
-    found |= dict(soft_m=float(rng.uniform(*ranges.soft_m)))
-    pushes = []
+def _shoves(rng: np.random.Generator, ranges: Ranges) -> tuple[Shove, ...]:
+    """One in each phase, or none where the range ends at nothing."""
+    out = []
     for phase in PHASES:
-        range_n_s = getattr(ranges, f"shove_{phase}_n_s")
-        share, impulse, direction = rng.uniform(), rng.uniform(*range_n_s), rng.uniform(-np.pi, np.pi)
-        pushes += [Shove(phase, float(share), float(impulse), float(direction))] if range_n_s[1] else []
-    half = float(np.radians(ranges.posture_deg))
-    found |= dict(shoves=tuple(pushes), posture_rad=each(-half, half))
-    return found | dict(
-        noise=noise if ranges.sensors == (1.0, 1.0) else noise.times(float(rng.uniform(*ranges.sensors)))
-    )
+        low, high = getattr(ranges, f"shove_{phase}_n_s")
+        share, impulse, turn = rng.uniform((0.0, low, -np.pi), (1.0, high, np.pi)).tolist()
+        out += [Shove(phase, share, impulse, turn)] if high else []
+    return tuple(out)
 
 
-def _trunk_box(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), least and greatest, of the box around the base link's collision shapes, in its frame [m]."""
-    base, corners = robot.model.frames[2].name, []
-    shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION).geometryObjects
-    for shape in (g for g in shapes if robot.model.frames[g.parentFrame].name == base):
-        shape.geometry.computeLocalAABB()
-        low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
-        ends = [np.where([k & 1, k & 2, k & 4], high, low) for k in range(8)]
-        corners += [shape.placement.act(end) for end in ends]
+def _heavy_links(robot: Robot) -> list[str]:
+    """Names of all links but massless dummies."""
+    links = ET.fromstring(robot.urdf).iterfind("link[inertial]")
+    masses = {link.get("name"): float(link.find("inertial/mass").get("value")) for link in links}
+    return [name for name, mass in masses.items() if mass > LIGHT_KG]
+
+
+def _trunk_box(robot: Robot, payload_kg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,), least and greatest, of the box around the base link's collision shapes, in its
+    frame [m]; nothing without a payload.
+    """
+    if not payload_kg:
+        return np.zeros(3), np.zeros(3)
+    model = robot.model
+    shapes = pin.buildGeomFromUrdfString(model, robot.urdf, pin.GeometryType.COLLISION)
+    corners = []
+    for shape in shapes.geometryObjects:
+        if model.frames[shape.parentFrame].name == model.frames[2].name:
+            shape.geometry.computeLocalAABB()
+            box = shape.geometry.aabb_local
+            ends = product(*np.transpose([box.min_, box.max_]))
+            corners += [shape.placement.act(np.array(end)) for end in ends]
     if not corners:
-        raise InputError(f"robot {robot.name}: its trunk has no shape to carry a payload_kg; leave that away")
+        raise InputError(
+            f"robot {robot.name}: its trunk has no shape to carry a payload_kg; leave that away"
+        )
     return np.min(corners, axis=0), np.max(corners, axis=0)
-
-
-def _load(root: ET.Element, mass_kg: float, place_m: Sequence[float]) -> None:
-    """Fix a cube to the base link of a URDF, in place; it touches nothing."""
-    below = {joint.find("child").get("link") for joint in root.findall("joint")}
-    base = next(link.get("name") for link in root.findall("link") if link.get("name") not in below)
-    moment = f"{mass_kg * PAYLOAD_SIDE_M**2 / 6:.12g}"
-    inertial = ET.SubElement(ET.SubElement(root, "link", name="payload"), "inertial")
-    ET.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=f"{mass_kg:.12g}")
-    ET.SubElement(inertial, "inertia", {k: moment if k[1] == k[2] else "0" for k in MOMENTS})
-    joint = ET.SubElement(root, "joint", name="payload_fixed", type="fixed")
-    ET.SubElement(joint, "parent", link=base)
-    ET.SubElement(joint, "child", link="payload")
-    ET.SubElement(joint, "origin", xyz=" ".join(f"{x:.12g}" for x in place_m), rpy="0 0 0")
 
 
 def is_pair(name: str) -> bool:
@@ -372,22 +394,24 @@ def is_pair(name: str) -> bool:
     return isinstance(getattr(Ranges, name, None), tuple)
 
 
-def ranges_of(told: Mapping[str, tuple[float, ...]], base: Ranges | None = None) -> Ranges:
-    """``base`` (nothing differs if None) with what was told: name -> from, to; a single number is a half-width, or goes
-    from nothing to there. Raises :class:`InputError` for names that :class:`Ranges` lacks, and for what it refuses.
+def ranges_of(asked: Mapping[str, tuple[float, ...]], base: Ranges | None = None) -> Ranges:
+    """``base`` (nothing differs if None) with what is asked: name -> from, to; a single number is a
+    half-width, or goes from nothing to there. Raises :class:`InputError` for names that
+    :class:`Ranges` lacks, and for what it refuses.
     """
-    base, known = base or Ranges.none(), {f.name: f for f in fields(Ranges)}
-    found = {}
-    for name, values in told.items():
-        if name not in known:
-            raise InputError(f"no disturbance is called {quoted(name)}; there are {', '.join(known)}")
-        if not isinstance(known[name].default, tuple):
-            if len(values) != 1:
-                raise InputError(f"the range {name} is a half-width: give it one number, got {len(values)}")
-            found[name] = values[0]
+    nothing = Ranges.none()
+    changed = {}
+    for name, values in asked.items():
+        if not hasattr(nothing, name):
+            known = ", ".join(f.name for f in fields(Ranges))
+            raise InputError(f"no disturbance is called {quoted(name)}; there are {known}")
+        if is_pair(name):
+            low = getattr(nothing, name)[0]
+            changed[name] = tuple(sorted((low, *values)) if len(values) == 1 else values)
         elif len(values) == 1:
-            nothing = getattr(Ranges.none(), name)[0]
-            found[name] = tuple(sorted((nothing, values[0])))
+            changed[name] = values[0]
         else:
-            found[name] = tuple(values)
-    return replace(base, **found)
+            raise InputError(
+                f"the range {name} is a half-width: give it one number, got {len(values)}"
+            )
+    return replace(base or nothing, **changed)

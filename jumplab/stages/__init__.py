@@ -6,8 +6,8 @@ __getattr__, __dir__, __all__ = lazy.attach(
     __name__,
     submodules=["joint_qp", "plan", "planner", "reconstruction", "srmp", "whole_body"],
     submod_attrs={
-        "plan": ["JumpPlan", "StageRow"],
-        "planner": ["Planner", "make_tape", "motion_of_joints"],
-        "reconstruction": ["planar_columns", "planar_quantities", "to_link_angles"],
+        "plan": ["JumpPlan", "StageRow", "make_tape"],
+        "planner": ["Planner", "motion_of_joints"],
+        "reconstruction": ["planar_columns", "to_link_angles"],
     },
 )

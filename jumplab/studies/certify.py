@@ -1,12 +1,16 @@
-"""Do two physics agree on a plan? Its audit, then every engine in both modes: the robot as planned, and perturbed ones.
+"""Do two physics agree on a plan? Its audit, then every engine in two modes: the robot as planned,
+and perturbed ones; and the robot as planned on contacts as each engine has them by default.
 
-Engines differ in how feet meet the ground. What a jump owes to that, and not to its plan, shows where they are apart.
+Engines differ in how feet meet the ground. What a jump owes to that, and not to its plan, shows
+where they are apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,93 +19,109 @@ import numpy as np
 
 from jumplab.auditing import AuditReport, audit
 from jumplab.io import folder as store
-from jumplab.io.tape import Tape
 from jumplab.robot import Robot
-from jumplab.sim import ENGINES, Metrics, Perturbation, Scene, SensorNoise, simulate_jump
+from jumplab.sim import ENGINES, Perturbation, SensorNoise
 from jumplab.sim.engine import engine_class
-from jumplab.sim.playback import MODES
-from jumplab.studies import trials as series
-from jumplab.studies.trials import Trial, TrialKey, TrialSettings, short_hash
+from jumplab.studies.study import Plain, Task, check_numbers, short_hash
+from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, run_trial
 from jumplab.task import JumpTask
 
-SCHEMA, (NAME, PAGE) = "jumplab-certificate-1", store.CERTIFICATE
+MODES = "position", "pd"  # which need no more than joints measure
+SCHEMA = "jumplab-certificate-1"
+(NAME, PAGE) = store.CERTIFICATE
+# of perturbed robots, in whichever mode and engine
+CONDITIONS = {name: x for name, x in TrialSettings().conditions.items() if name != "playback"}
 
 
-@dataclass(frozen=True)
-class Limits:
-    """How far apart engines may be and still agree: for the robot as planned, and in the median of perturbed ones."""
-
-    touchdown_s: float = 0.005  # [s] of touchdown; five control cycles, 1.5 cm of a fall at 3 m/s
-    place_m: float = 0.01  # [m] of the toes at touchdown and in the end; a twentieth of a foot
-    rise_m: float = 0.01  # [m] of the CoM in flight
-    pitch_rad: float = float(np.radians(1.0))  # [rad] of the trunk at touchdown: a foot 1.5 cm off
-    yaw_rad: float = float(np.radians(3.0))  # [rad] of the feet in the end: what a playback may miss
-    pitch_rate: float = 0.2  # [rad/s] of the trunk at touchdown; a degree more in 0.1 s
-    impulse_share: float = 0.1  # [1] of the ground's vertical impulse in the 0.1 s after touchdown, relative
-    force_share: float = 0.15  # [1] of its largest 20 ms mean, relative; shorter peaks are made by the engine's step
-    verdict_share: float = 0.97  # [1] of perturbed robots that stand in all engines or fall in all, at least
+TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+LIMITS = TABLE["limits"]
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is compared: name, unit of ``value`` of a jump's metrics, its field of :class:`Limits`, relative or not."""
+    """What is compared: its name and unit, a field of a jump's metrics, one of :data:`LIMITS`."""
 
     name: str
     unit: str
+    metric: str
     limit: str
-    value: Callable[[Metrics], float | None]
-    relative: bool = False
+    relative: bool = False  # to its mean
+
+    def of(self, trial: Trial) -> float | None:
+        """Its value in one jump [its unit]; None if that did not get so far."""
+        value = trial.metrics and getattr(trial.metrics, self.metric)
+        return value[1] if isinstance(value, tuple) else value  # of an impulse, the vertical part
+
+    def apart(self, trials: Iterable[Trial]) -> float | None:
+        """Largest minus least [its unit], of their mean if it is relative [1]; None unless all got
+        so far.
+        """
+        values = [self.of(trial) for trial in trials]
+        if None in values:
+            return None
+        return (max(values) - min(values)) / (abs(float(np.mean(values))) if self.relative else 1)
+
+    def with_unit(self, value: float) -> str:
+        """A difference [its unit] as text; relative ones have no unit."""
+        return f"{value:.3g}" if self.relative else f"{value:.3g} {self.unit}"
 
 
-QUANTITIES = (
-    Quantity("time of touchdown", "s", "touchdown_s", lambda m: m.touchdown_s),
-    Quantity("toes at touchdown", "m", "place_m", lambda m: m.foot_distance_touchdown_m),
-    Quantity("toes in the end", "m", "place_m", lambda m: m.foot_distance_m),
-    Quantity("rise of the CoM", "m", "rise_m", lambda m: m.com_rise_m),
-    Quantity("trunk pitch at touchdown", "rad", "pitch_rad", lambda m: m.touchdown_trunk_pitch_rad),
-    Quantity("trunk pitch rate at touchdown", "rad/s", "pitch_rate", lambda m: m.touchdown_trunk_rate),
-    Quantity(
-        *("vertical impulse of landing", "N s", "impulse_share"),
-        lambda m: m.landing_impulse and m.landing_impulse[1],
-        relative=True,
-    ),
-    Quantity("largest force of landing", "N", "force_share", lambda m: m.landing_force_n, relative=True),
-)
-
-
-AWAY = (
-    Quantity("side in the end", "m", "place_m", lambda m: m.side_m),
-    Quantity("heading in the end", "rad", "yaw_rad", lambda m: m.yaw_rad),
-)
+QUANTITIES = tuple(Quantity(**x) for x in TABLE["quantities"])
+AWAY = tuple(Quantity(**x) for x in TABLE["away"])  # of a jump out of the plane, besides
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One quantity in all engines; ``apart`` is None where a jump did not get so far."""
+    """One quantity in all engines."""
 
     quantity: Quantity
-    values: dict[str, float | None]  # by engine
-    apart: float | None  # largest minus least, of their mean if the quantity is relative
+    values: dict[str, float | None]  # of the robot as planned, by engine
+    apart: float | None  # of that; None where a jump did not get so far
     limit: float
-
-    @classmethod
-    def between(cls, quantity: Quantity, trials: Mapping[str, Trial], limits: Limits) -> Difference:
-        """How far apart one robot's jumps are, by engine."""
-        values = {name: trial.metrics and quantity.value(trial.metrics) for name, trial in trials.items()}
-        found, apart = [x for x in values.values() if x is not None], None
-        if len(found) == len(values):
-            apart = (max(found) - min(found)) / (abs(float(np.mean(found))) if quantity.relative else 1.0)
-        return cls(quantity, values, apart, getattr(limits, quantity.limit))
+    # median and largest of perturbed robots that came down in all engines, if there are any
+    spread: dict[str, float] | None
 
     @property
     def within(self) -> bool:
-        """True if the engines agree."""
+        """True if the engines agree on the robot as planned."""
         return self.apart is not None and self.apart <= self.limit
 
-    def to_json(self) -> dict[str, Any]:
+    @property
+    def failures(self) -> list[str]:
+        """Why the engines do not agree, in sentences."""
+        q = self.quantity
+        sentences = []
+        if self.apart is None:
+            sentences.append(f"{q.name} was not measured in every engine")
+        elif not self.within:
+            apart = f"the engines are {q.with_unit(self.apart)} apart in {q.name}"
+            sentences.append(f"{apart}, at most {q.with_unit(self.limit)}")
+        if self.spread and (middle := self.spread["median"]) > self.limit:
+            apart = f"perturbed robots are {q.with_unit(middle)} apart in {q.name} (median)"
+            sentences.append(f"{apart}, at most {self.limit:.3g}")
+        return sentences
+
+    def row(self) -> Plain:
+        """A line of a table: in each engine, how far apart, and at most; then how far perturbed
+        robots are.
+        """
+        q = self.quantity
+        spread = self.spread or {}
+        return {
+            "as planned": f"{q.name}{', share' if q.relative else f' [{q.unit}]'}",
+            **self.values,
+            "apart": self.apart,
+            "at most": self.limit,
+            "agree": self.within,
+            "robots, median": spread.get("median"),
+            "largest": spread.get("largest"),
+        }
+
+    def to_json(self) -> Plain:
         """Plain data, in SI units."""
-        q, found = self.quantity, dict(apart=self.apart, limit=self.limit, within=self.within)
-        return dict(name=q.name, unit=q.unit, relative=q.relative, **self.values, **found)
+        q = self.quantity
+        verdict = dict(apart=self.apart, limit=self.limit, within=self.within)
+        return dict(name=q.name, unit=q.unit, relative=q.relative, **self.values, **verdict)
 
 
 @dataclass(frozen=True)
@@ -109,78 +129,85 @@ class ModeReport:
     """What the engines made of the plan in one mode of playback."""
 
     mode: str
-    planned: dict[str, Trial]  # by engine: the robot as planned, exact sensors, no correction in the air
-    robots: dict[str, tuple[Trial, ...]]  # by engine: perturbed robots, the same in each
-    settings: TrialSettings  # of those, but for the engine
-    limits: Limits
-    quantities: tuple[Quantity, ...] = QUANTITIES  # that are compared; out of the plane also :data:`AWAY`
+    # by engine: the robot as planned, exact sensors, no correction in the air
+    planned: dict[str, Trial]
+    pairs: tuple[dict[str, Trial], ...]  # every perturbed robot's jump by engine
+    in_plane: bool  # whether the jump stays there
+
+    @cached_property
+    def differences(self) -> list[Difference]:
+        """One per quantity."""
+        differences = []
+        for q in (*QUANTITIES, *(() if self.in_plane else AWAY)):
+            values = {engine: q.of(trial) for engine, trial in self.planned.items()}
+            others = [q.apart(pair.values()) for pair in self.pairs]
+            others = [x for x in others if x is not None]
+            spread = (
+                {"median": float(np.median(others)), "largest": max(others)} if others else None
+            )
+            apart = q.apart(self.planned.values())
+            differences.append(Difference(q, values, apart, LIMITS[q.limit], spread))
+        return differences
 
     @property
-    def differences(self) -> tuple[Difference, ...]:
-        """Of the robot as planned."""
-        return tuple(Difference.between(q, self.planned, self.limits) for q in self.quantities)
-
-    @property
-    def pairs(self) -> list[dict[str, Trial]]:
-        """Every perturbed robot's jump by engine."""
-        return [dict(zip(self.robots, jumps, strict=True)) for jumps in zip(*self.robots.values(), strict=True)]
+    def unlike(self) -> dict[int, dict[str, Trial]]:
+        """The perturbed robots, by number, that stand in one engine and fall in another."""
+        return {
+            k: pair
+            for k, pair in enumerate(self.pairs)
+            if len({trial.landed for trial in pair.values()}) > 1
+        }
 
     @property
     def same(self) -> int:
         """How many perturbed robots stand in all engines, or fall in all."""
-        return sum(len({trial.landed for trial in pair.values()}) == 1 for pair in self.pairs)
+        return len(self.pairs) - len(self.unlike)
 
-    def apart(self, quantity: Quantity) -> np.ndarray:
-        """How far apart each perturbed robot's jumps are, of those that came down in all engines."""
-        found = (Difference.between(quantity, pair, self.limits).apart for pair in self.pairs)
-        return np.array([x for x in found if x is not None])
+    @property
+    def landed(self) -> dict[str, int]:
+        """How many perturbed robots land, by engine."""
+        return {name: sum(pair[name].landed for pair in self.pairs) for name in self.planned}
 
     @property
     def failures(self) -> list[str]:
         """Why the engines do not agree on a landing, in sentences."""
-        told = [f"{self.mode} mode: {engine} does not land it: {t.reason}"
-                for engine, t in self.planned.items() if not t.landed]  # fmt: skip
-        for d in self.differences:
-            unit = "" if d.quantity.relative else f" {d.quantity.unit}"
-            if d.apart is None:
-                told.append(f"{self.mode} mode: {d.quantity.name} was not measured in every engine")
-            elif not d.within:
-                apart = f"the engines are {d.apart:.3g}{unit} apart in {d.quantity.name}"
-                told.append(f"{self.mode} mode: {apart}, at most {d.limit:.3g}{unit}")
-        for q in self.quantities:
-            apart, limit = self.apart(q), getattr(self.limits, q.limit)
-            if len(apart) and np.median(apart) > limit:
-                middle = f"{np.median(apart):.3g}{'' if q.relative else f' {q.unit}'}"
-                told.append(
-                    f"{self.mode} mode: perturbed robots are {middle} apart in {q.name} (median), at most {limit:.3g}"
-                )
-        if self.same < self.limits.verdict_share * len(self.pairs):
-            least = f"at least {100 * self.limits.verdict_share:g} % are asked for"
-            told.append(f"{self.mode} mode: {self.same} of {len(self.pairs)} perturbed robots fare alike, {least}")
-        return told
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data, in SI units."""
-        spread = {q.name: self.apart(q) for q in self.quantities}
-        robots = [
-            {"number": k, "same": len({t.landed for t in pair.values()}) == 1}
-            | {name: {"landed": t.landed, "reason": t.reason} for name, t in pair.items()}
-            | {"apart": {q.name: Difference.between(q, pair, self.limits).apart for q in self.quantities}}
-            for k, pair in enumerate(self.pairs)
+        sentences = [
+            f"{engine} does not land it: {t.reason}"
+            for engine, t in self.planned.items()
+            if not t.landed
         ]
+        for difference in self.differences:
+            sentences += difference.failures
+        if self.same < LIMITS["verdict_share"] * len(self.pairs):
+            least = f"at least {100 * LIMITS['verdict_share']:g} % are asked for"
+            sentences.append(
+                f"{self.same} of {len(self.pairs)} perturbed robots fare alike, {least}"
+            )
+        return [f"{self.mode} mode: {sentence}" for sentence in sentences]
+
+    def to_json(self) -> Plain:
+        """Plain data, in SI units."""
+        robots = []
+        for k, pair in enumerate(self.pairs):
+            apart = {d.quantity.name: d.quantity.apart(pair.values()) for d in self.differences}
+            row = {"number": k, "same": k not in self.unlike, "apart": apart}
+            robots.append(row | _verdicts(pair))
         return {
-            "as_planned": {name: {"landed": t.landed, "reason": t.reason} for name, t in self.planned.items()},
+            "as_planned": _verdicts(self.planned),
             "differences": [d.to_json() for d in self.differences],
             "perturbed": {
-                "conditions": {k: v for k, v in self.settings.conditions.items() if k != "playback"},
+                "conditions": CONDITIONS,
                 "count": len(self.pairs),
-                "landed": {name: sum(t.landed for t in jumps) for name, jumps in self.robots.items()},
+                "landed": self.landed,
                 "same_verdict": self.same,
-                "apart": {name: dict(median=float(np.median(x)), largest=float(x.max())) if len(x) else None
-                          for name, x in spread.items()},
+                "apart": {d.quantity.name: d.spread for d in self.differences},
                 "robots": robots,
             },
-        }  # fmt: skip
+        }
+
+
+def _verdicts(trials: Mapping[str, Trial]) -> dict[str, Plain]:
+    return {name: {"landed": t.landed, "reason": t.reason} for name, t in trials.items()}
 
 
 @dataclass(frozen=True)
@@ -189,25 +216,31 @@ class Certificate:
 
     audit: AuditReport
     modes: tuple[ModeReport, ...]
+    # by engine: the robot as planned, in the first mode, on the engine's own contacts
+    usual: Mapping[str, Trial]
     task: JumpTask
     robot: Robot
     plan: str  # its hash
     seed: int
-    limits: Limits
     resumed: int = 0  # simulations that an earlier run had made
 
     @property
     def failures(self) -> list[str]:
         """What stands against the plan, in sentences; none if it is certified."""
         checks = [f"the plan fails the audit's check {check.name}" for check in self.audit.failed]
-        return [*checks, *(told for mode in self.modes for told in mode.failures)]
+        falls = [
+            f"usual contact: {engine} does not land it: {trial.reason}"
+            for engine, trial in self.usual.items()
+            if not trial.landed
+        ]
+        return checks + [sentence for mode in self.modes for sentence in mode.failures] + falls
 
     @property
     def passed(self) -> bool:
         """True if audit and engines agree that the plan lands."""
-        return self.audit.passed and not self.failures
+        return not self.failures
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Plain:
         """The content of ``certificate.json``; depends on plan, seed, code and packages alone."""
         checks = dict(passed=self.audit.passed, checks=len(self.audit.checks))
         return {
@@ -219,73 +252,67 @@ class Certificate:
             "plan": self.plan,
             "seed": self.seed,
             "audit": checks | {"failed": [check.name for check in self.audit.failed]},
-            "limits": asdict(self.limits),
+            "limits": LIMITS,
             "modes": {mode.mode: mode.to_json() for mode in self.modes},
+            "usual_contact": _verdicts(self.usual),
             "versions": store.versions(),
         }
+
+
+def _as_planned(plan: PlanOnFile, mode: str, engine: str, **how: Any) -> dict[str, Task]:
+    """The robot as planned, with exact sensors and no correction in the air, as a study's work."""
+    exact = TrialSettings(mode, reaim=False, noise=SensorNoise(), engine=engine, **how)
+    key = TrialKey(0, 0, short_hash(["as planned", exact.hash]), plan.hash)
+    return {key.name: joblib.delayed(run_trial)(plan, exact, key, Perturbation())}
 
 
 def certify(
     folder: str | Path,
     n: int = 10,
     seed: int = 0,
-    limits: Limits = Limits(),
     *,
     page: Callable[[Certificate], str] | None = None,
     jobs: int | None = None,
     progress: bool | None = None,
 ) -> Certificate:
-    """Audit the plan in ``folder``, and let all engines play it in both modes: as planned, and on ``n`` other robots.
+    """Audit the plan in ``folder``, and let all engines play it in two modes: as planned, and on
+    ``n`` other robots (the same in all).
 
     Parameters
     ----------
-    n, seed : perturbed robots, drawn and controlled as those of :func:`jumplab.studies.trials.run_trials`, the same in
-        each engine. Finished simulations are kept in ``trials.jsonl``: a stopped run goes on from there.
-    page : makes the text of ``certificate.html``, written at one stroke with ``certificate.json``; no page if None.
-    jobs, progress : as of :func:`jumplab.studies.trials.run_trials`.
+    n, seed, jobs, progress : as of :func:`jumplab.studies.trials.run_trials`. Finished simulations
+        are kept in ``trials.jsonl``: a stopped run goes on from there.
+    page : makes the text of ``certificate.html``, written with ``certificate.json``, if there is to
+        be one.
 
     Raises
     ------
     InputError, RobotError
-        For numbers that cannot be meant, a folder without a whole plan, an engine that is not installed, or a robot
-        that one of them cannot read.
+        For numbers that cannot be meant, a folder without a whole plan, an engine that is not
+        installed, or a robot that one of them cannot read.
     """
-    series.check_numbers(n, seed, jobs)
+    check_numbers(n, seed, jobs)
     for engine in ENGINES:
         engine_class(engine)
-    tape, robot, summary = store.read_plan(folder)
-    tape.require_jump()
-    task, scene, plan = JumpTask(**summary["target"]), Scene.of_plan(summary, robot), series.plan_hash(summary)
-    report = audit(tape, robot, task, edge_m=summary["platform_edge_m"])
-    work: dict[TrialKey, series.Task] = {}
-    planned, others = {}, {}
-    for case in ((mode, engine) for mode in MODES for engine in ENGINES):
-        mode, engine = case
-        exact = TrialSettings(mode, reaim=False, noise=SensorNoise(), engine=engine)
-        planned[case] = TrialKey(0, 0, short_hash(["as planned", exact.hash]), plan)
-        work[planned[case]] = joblib.delayed(play_planned)(tape, robot, scene, exact, planned[case])
-        settings = TrialSettings(mode, engine=engine)
-        others[case] = [TrialKey(seed, index, settings.hash, plan) for index in range(n)]
-        work |= {key: joblib.delayed(series.run_trial)(tape, robot, scene, settings, key) for key in others[case]}
-    trials, resumed = series.run_series(folder, work, jobs, progress)
-    done = dict(zip(work, trials, strict=True))
-    modes = tuple(
-        ModeReport(
-            mode,
-            {engine: done[planned[mode, engine]] for engine in ENGINES},
-            {engine: tuple(done[key] for key in others[mode, engine]) for engine in ENGINES},
-            TrialSettings(mode),
-            limits,
-            QUANTITIES if task.in_plane else (*QUANTITIES, *AWAY),
-        )
-        for mode in MODES
-    )
-    found = Certificate(report, modes, task, robot, plan, seed, limits, resumed)
-    store.write_trials(folder, found.to_json(), summary, NAME, {PAGE: page(found)} if page else {})
-    return found
-
-
-def play_planned(tape: Tape, robot: Robot, scene: Scene, settings: TrialSettings, key: TrialKey) -> Trial:
-    """Simulate the robot as planned."""
-    how = dict(mode=settings.mode, reaim=settings.reaim, engine=settings.engine, scene=scene)
-    return Trial(key, Perturbation().to_json(), {}, *series.judged(lambda: simulate_jump(tape, robot, **how))).as_kept()
+    plan = PlanOnFile.read(folder)
+    task = JumpTask(**plan.summary["target"])
+    report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
+    modes = []
+    total = ((n + 1) * len(MODES) + 1) * len(ENGINES)
+    with plan.study(total=total, jobs=jobs, progress=progress) as study:
+        for mode in MODES:
+            trials = {}
+            for engine in ENGINES:
+                work = _as_planned(plan, mode, engine)
+                work |= plan.trials(TrialSettings(mode, engine=engine), seed, range(n))
+                trials[engine] = study.results(work)
+            jumps = zip(*trials.values(), strict=True)
+            first, *pairs = (dict(zip(ENGINES, jump, strict=True)) for jump in jumps)
+            modes.append(ModeReport(mode, first, tuple(pairs), task.in_plane))
+        softly = partial(_as_planned, plan, MODES[0], contact="usual")
+        usual = {engine: study.results(softly(engine))[0] for engine in ENGINES}
+    where = task, plan.robot, plan.hash, seed, study.resumed
+    certificate = Certificate(report, tuple(modes), usual, *where)
+    pages = {PAGE: page(certificate)} if page else {}
+    plan.write(NAME, certificate.to_json(), pages)
+    return certificate

@@ -1,7 +1,8 @@
 """What a G1 can do within its motors' curves, and by how much they forbid the rest: the rows of ``acrobatics.json``.
 
 ``python -m paper.acrobatics`` in the folder of the notebooks plans every jump of :data:`ASKED` that has no row yet;
-those that are planned clean are played back in both engines, in position mode. Notebook 07 prints the rows.
+those that are planned clean are played back in both engines, those on file in mode "whole-body". Notebook 07 prints
+the rows.
 """
 
 from __future__ import annotations

@@ -21,13 +21,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jumplab.auditing import audit
+from jumplab.errors import SolverError
 from jumplab.io.files import write_file
 from jumplab.robot import Robot
 from jumplab.show.style import COLUMN_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlanner
+from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import even
-from jumplab.stages.whole_body.terms import Body
 from jumplab.studies.atlas import Atlas
 from jumplab.task import JumpTask
 
@@ -56,6 +57,53 @@ def shares(plans: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         first = stage.removeprefix("direct, ").partition(",")[0].removeprefix("3 ")
         out[first] = out.get(first, 0.0) + 1e3 * took
     return out | {"tape": 1e3 * (plan["plan_s"] - plan["solver_s"])}
+
+
+FRESH = "new process"
+KEPT = "new process, functions on file"
+ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+COLD = """
+import time
+began = time.perf_counter()
+import json, sys
+from pathlib import Path
+from jumplab.stages.planner import Planner
+from jumplab.robot import Robot
+from jumplab.task import JumpTask
+robot, task = Robot.load(sys.argv[1]), JumpTask(float(sys.argv[2]), float(sys.argv[3]))
+plan = Planner(robot, keep=sys.argv[4] == "keep").plan(task)
+plan_s, wall_s = time.process_time(), time.perf_counter() - began
+solver_s, build_s = sum(x.cpu_s for x in plan.attempts), plan.statistics[0].build_s
+iterations = sum(x.iterations for x in plan.attempts)
+status = Path("/proc/self/status")  # of this process alone; what rusage says begins with the parent's peak
+peak_gib = float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**20 if status.exists() else None
+from jumplab.auditing.audit import audit
+clean = audit(plan.tape, robot, task).passed
+print(json.dumps(dict(solver_s=solver_s, plan_s=plan_s, wall_s=wall_s, build_s=build_s, iterations=iterations,
+                      clean=clean, peak_gib=peak_gib)))
+"""
+
+
+def new_processes(robot: str, task: JumpTask, repeats: int) -> dict[str, list[dict[str, Any]]]:
+    """Plans in new processes that build everything, and in others that find functions on file.
+
+    All find Python's bytecode there.
+    """
+    out: dict[str, list[dict[str, Any]]] = {FRESH: [], KEPT: []}
+    with TemporaryDirectory() as kept:
+        environment = os.environ | ONE_THREAD | {"JUMPLAB_CACHE": kept, "PYTHONPYCACHEPREFIX": f"{kept}/bytecode"}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        for k in range(repeats + 1):  # the first ones fill the folder
+            for name, how in ((FRESH, "fresh"), (KEPT, "keep")):
+                place = repr(task.distance_m), repr(task.height_m)
+                command = [sys.executable, "-c", COLD, robot, *place, how]
+                done = subprocess.run(command, capture_output=True, text=True, env=environment)
+                if done.returncode:
+                    last = done.stderr.strip().splitlines()[-1]
+                    raise SolverError(f"the new process failed: {last}", stage="bench")
+                if k:
+                    out[name].append({"target": {}, **json.loads(done.stdout)})
+    return out
 
 
 AREA_M = (0.4, 0.2)  # distance and height around the target that every atlas spans

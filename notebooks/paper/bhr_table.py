@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
-from jumplab.robot.description import SHIPPED
+from jumplab.robot.files import SHIPPED
 
 URDF_PATH = SHIPPED["bhr"].with_name("bhr.urdf")
 

@@ -25,12 +25,13 @@ from jumplab.sim import STEP_S, SimulationResult
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import STEPS_S, motion_of_joints
-from jumplab.stages.reconstruction import planar_quantities, to_link_angles
+from jumplab.stages.reconstruction import to_link_angles
 from jumplab.stages.srmp import SrmpPlan, SrmpPlanner
 from jumplab.stages.whole_body import Mesh, WholeBodyPlan, WholeBodyPlanner
-from jumplab.stages.whole_body.starts import Motion
+from jumplab.stages.whole_body.motions import Motion
 from jumplab.task import GRAVITY, JumpTask
 from paper.expansion import expand
+from paper.planar import planar_quantities
 
 HOLDS, CHANGED, FAILS, OPEN = "holds", "holds with a change", "does not hold", "cannot be checked here"
 STARTS = ("crouch", "stage 2", "looser stage 3")
@@ -195,9 +196,9 @@ def _from_start(name: str, task: JumpTask, first: SrmpPlan, whole: WholeBodyPlan
 def _mapped(first: SrmpPlan, robot: Robot) -> JointPlan:
     """Stage 2 as the planner does it: with long steps, or where those find no way with the usual ones."""
     try:
-        return map_to_joints(first, robot, STEPS_S, "direct")
+        return map_to_joints(first, robot, STEPS_S)
     except SolverError:
-        return map_to_joints(first, robot, method="direct")
+        return map_to_joints(first, robot)
 
 
 def _motion_of(plan: WholeBodyPlan, mesh: Mesh) -> Motion:
@@ -267,7 +268,7 @@ def drawn_in(run: SimulationResult, robot: Robot) -> dict[str, float]:
     for name, moved in (("legs", ~arm), ("arms", arm)):
         q = opened.copy()
         q[7:][moved] = folded[7:][moved]
-        change[name] = float(body.motion(q, rest).rho - body.motion(opened, rest).rho)
+        change[name] = float(body.terms(q, rest).rho - body.terms(opened, rest).rho)
     ends = {"lift-off": rho[0], "least": rho.min(), "greatest": rho.max(), "touchdown": rho[-1]}
     return {**{name: float(x) for name, x in ends.items()}, **change}
 

@@ -106,7 +106,7 @@ def link_models(robot: Robot) -> Figure:
         draw_ground(ax, -1.0, 1.0)
         bare(ax)
         ax.set(xlim=(-0.9, 0.9), ylim=(-0.15, height), aspect="equal")
-    _dimension(axes[0], -0.8, 0.0, front.top(q))
+    _dimension(axes[0], -0.8, 0.0, max(outline[:, 1].max() for _, outline in front.outlines(q)))
     axes[0].text(-0.42, -0.08, "side", ha="center", va="top")
     axes[0].text(0.42, -0.08, "front", ha="center", va="top")
     _nine_links(axes[1], front, q)

@@ -48,6 +48,7 @@ from jumplab.stages.srmp.landing import LandingPlan
 from jumplab.task import GRAVITY
 from paper.diagrams import arrow, ellipse
 from paper.experiments import trunk_pitch as trunk_angle  # of a flip: whole turns count
+from paper.tracking import compared
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import SimulationResult
@@ -343,13 +344,15 @@ def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> 
 
 # tracking -------------------------------------------------------------------------------------------------------
 @styled
-def mapped_tracking(plan: JointPlan) -> Figure:
+def mapped_tracking(plan: JointPlan, srmp: SrmpPlan, robot: Robot) -> Figure:
     """CoM, angular momentum, inertia and foot distance with stage 1's dashed, and below their differences."""
     fig = new_figure(PAGE_IN, 3.2)
     axes = fig.subplots(2, 4, sharex=True)
     flight = plan.phase == "flight"
     takeoff = plan.t[plan.rows("flight").start]
-    for column, (title, unit, scale, every, got, want) in zip(axes.T, _tracked(plan), strict=True):
+    for column, (title, unit, scale, every, got, want) in zip(
+        axes.T, _tracked(*compared(plan, srmp, robot)), strict=True
+    ):
         rows = np.ones(len(plan.t), bool) if every else flight
         t, phase = plan.t[rows], plan.phase[rows]
         for y, reference in zip(got.T, want.T, strict=True):
@@ -368,12 +371,11 @@ def mapped_tracking(plan: JointPlan) -> Figure:
     return fig
 
 
-def _tracked(plan: JointPlan):
+def _tracked(a, r):
     """(title, unit, scale of the difference, whole jump or flight only, actual (n, k), reference (n, k)) per column."""
-    a, r, planar = plan.actual, plan.reference, [0, 2]
-    length = [np.linalg.norm(x["foot_com"][:, planar], axis=1)[:, None] for x in (a, r)]
+    length = [np.linalg.norm(x["foot_com"], axis=1)[:, None] for x in (a, r)]
     return (
-        ("CoM, $x$ and $z$", "m", 1000.0, True, a["com"][:, planar], r["com"][:, planar]),
+        ("CoM, $x$ and $z$", "m", 1000.0, True, a["com"], r["com"]),
         ("angular momentum $L$", "kg m$^2$/s", 1.0, True, a["L"][:, None], r["L"][:, None]),
         ("inertia $\\rho$", "kg m$^2$", 1.0, True, a["rho"][:, None], r["rho"][:, None]),
         ("sole to CoM", "m", 1000.0, False, *length),
@@ -510,7 +512,7 @@ def _true_flight(ax: Axes, tape: Tape, body: Silhouette, shift: float) -> float:
 # contacts -------------------------------------------------------------------------------------------------------
 @styled
 def contact_comparison(reactions: Mapping[str, Mapping[str, np.ndarray]], robot: Robot) -> Figure:
-    """Heel height and CoP of several launches over each other, by name; see :func:`ground_reaction` for their form.
+    """Heel height and CoP of several launches over each other, by name; see :func:`jumplab.show.jumps.ground_reaction`.
 
     The last is drawn in the launch's colour, those before it in vermilion: what is right, and what is wrong.
     """
@@ -525,11 +527,12 @@ def contact_comparison(reactions: Mapping[str, Mapping[str, np.ndarray]], robot:
         bottom.annotate(name, (1, 100 * bound), (3, 0), **beside)
     for k, (name, r) in enumerate(reactions.items(), start=1):
         color = LAUNCH if k == len(reactions) else VERMILION
-        top.plot(r["t"], 100 * r["heel_z"], color=color, label=name)
-        bottom.plot(r["t"], 100 * r["cop_x"], color=color)
+        heels, places = (np.reshape(r[key], (len(r["t"]), -1)) for key in ("heel_z", "cop_x"))
+        top.plot(r["t"], 100 * heels[:, 0], color=color, label=name)  # the left foot's
+        bottom.plot(r["t"], 100 * places[:, 0], color=color)
     top.set_ylabel("heel height [cm]")
     top.legend(loc="upper left")
-    cop = np.concatenate([r["cop_x"] for r in reactions.values()])
+    cop = np.concatenate([np.ravel(r["cop_x"]) for r in reactions.values()])
     low = max(float(np.nanmin(cop)), heel - CUT_M) if np.isfinite(cop).any() else heel
     high = min(float(np.nanmax(cop)), CUT_M) if np.isfinite(cop).any() else 0.0
     bottom.set(xlabel="time [s]", ylabel="CoP from the toe [cm]")

@@ -11,7 +11,7 @@ import pinocchio as pin
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.stance import configuration
-from jumplab.stages.reconstruction import planar_quantities
+from paper.planar import planar_quantities
 
 
 def expand(
@@ -45,7 +45,7 @@ def expand(
     a[:, [0, 2]], a[:, 4] = _into_body(pitch, base_a - cross), accels[:, 3]
     if wrench is None:
         now = angles, rates, accels, motion["toe_acceleration"]
-        wrench = planar_quantities(robot, *now, gravity, ("ground_wrench",))["ground_wrench"]
+        wrench = planar_quantities(robot, *now, gravity)["ground_wrench"]
     wrench = np.where(flying[:, None], 0.0, wrench)
     f, tau = _forces(robot.under_gravity(gravity), q, v, a, wrench, toe, ~flying)
     phase, names = np.where(flying, "flight", "launch"), (np.array(robot.foot.frames), np.array(robot.joint_names))
@@ -89,7 +89,7 @@ def _forces(robot, q, v, a, wrench, toe, on_ground):
         tau[k] = pin.rnea(model, data, q[k], v[k], a[k], forces)[6:]
     for k in np.flatnonzero(~on_ground):
         tau[k] = pin.rnea(model, data, q[k], v[k], a[k])[6:]
-    return wrenches, tau + robot.lost_torque(v[:, 6:]) if robot.lossy else tau
+    return wrenches, tau + robot.limits.lost(v[:, 6:]) if robot.limits.lossy else tau
 
 
 def _foot_wrenches(robot, data, q, wrench, toe):

@@ -48,7 +48,7 @@ from paper.render import BELOW_M, TITLE_IN, Camera, Renderer, draw_frames, frame
 
 if TYPE_CHECKING:  # pictures need no simulator
     from jumplab.sim import Metrics, Scene, SimulationResult
-    from jumplab.studies.chain import ChainResult, ChainTrial
+    from jumplab.studies.chain import ChainResult
     from jumplab.studies.trials import Trial
     from jumplab.task import JumpTask
     from paper.measurement import Measurement
@@ -399,16 +399,16 @@ def chain_path(result: ChainResult) -> Figure:
 
 
 @styled
-def chain_errors(result: ChainResult, trials: Sequence[ChainTrial] = ()) -> Figure:
+def chain_errors(result: ChainResult, trials: Sequence[dict] = ()) -> Figure:
     """Distance error of each jump, and planning time against air time; grey the perturbed robots."""
     fig = new_figure(PAGE_IN, 2.3)
     error, clock = fig.subplots(1, 2)
     number = 1 + np.arange(len(result.jumps))
     for trial in trials:
         grey = dict(color=tint(INK, 0.45), linewidth=0.7, marker=".", markersize=3)
-        error.plot(1 + np.arange(len(trial.errors_m)), 1000 * np.array(trial.errors_m), **grey)
+        error.plot(1 + np.arange(len(trial["errors_m"])), 1000 * np.array(trial["errors_m"]), **grey)
         clock.plot(
-            [1 + p["jump"] for p in trial.plans], [p["solve_s"] for p in trial.plans], **grey | {"linestyle": ""}
+            [1 + p["jump"] for p in trial["plans"]], [p["solve_s"] for p in trial["plans"]], **grey | {"linestyle": ""}
         )
     error.plot(number, 1000 * result.errors_m, color=shade(PHASE_COLORS["landing"], 0.9), marker="o", markersize=4)
     limits(error, -1000 * TOLERANCE_M, 1000 * TOLERANCE_M)
@@ -498,7 +498,7 @@ def chain_strobe(result: ChainResult) -> Figure:
     frames.append((1.0, result.jumps[-1].simulation.q[-1], "landing"))
     strengths, postures, phases = zip(*sorted(frames, key=lambda f: f[0]), strict=True)  # robots in the air in front
     left, right = span(result)
-    top = max(map(body.top, postures)) + GROUND_M
+    top = max(points[:, 1].max() for q in postures for _, points in body.outlines(q)) + GROUND_M
     fig = new_figure(PAGE_IN, min(LEGEND_IN + PAGE_IN * (top + GROUND_M) / (right - left), CHAIN_TALLEST_IN))
     ax = fig.subplots()
     strobe(ax, body, postures, [PHASE_COLORS[p] for p in phases], strengths=strengths)

@@ -26,12 +26,14 @@ from jumplab.io.files import open_log
 from jumplab.robot import Robot
 from jumplab.show.style import PAGE_IN, PURPLE, REFERENCE_STYLE, VERMILION, legend_above, new_figure
 from jumplab.stages.joint_qp import map_to_joints
-from jumplab.stages.planner import METHODS, STEPS_S, Planner, make_tape, motion_of_joints
+from jumplab.stages.plan import make_tape
+from jumplab.stages.planner import METHODS, STEPS_S, Planner, motion_of_joints
 from jumplab.stages.whole_body import Weights, WholeBodyPlan, WholeBodyPlanner
+from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.coordinates import Coordinates, even
+from jumplab.stages.whole_body.motions import Motion, along
 from jumplab.stages.whole_body.problem import Schedule
-from jumplab.stages.whole_body.starts import Motion, along
-from jumplab.stages.whole_body.terms import Body
+from jumplab.stages.whole_body.starts import GIVEN
 from jumplab.task import JumpTask
 
 LOG = Path(__file__).with_name("hard_cases.jsonl")
@@ -92,8 +94,8 @@ def _planner(kind: str, variant: int) -> Planner:
 def _begun(method: str) -> WholeBodyPlanner:
     """The last program of a method, which begins with the motion that it is given and with nothing else."""
     body = Body(Robot.load())
-    planner = WholeBodyPlanner(body.robot, body=body, free=even(body), tracking=method == METHODS[0], starts=())
-    planner.nlp.prepare()
+    planner = WholeBodyPlanner(body.robot, body=body, free=even(body), tracking=method == METHODS[0])
+    _ = planner.nlp.solver  # made now, not when it is timed
     return planner
 
 
@@ -120,11 +122,11 @@ def _solved(planner: Planner, method: str, case: Case) -> tuple[WholeBodyPlan, A
     else:
         srmp = planner.stage("srmp").plan(task)
         try:
-            joints = map_to_joints(srmp, robot, STEPS_S, "direct")
+            joints = map_to_joints(srmp, robot, STEPS_S)
         except SolverError:
-            joints = map_to_joints(srmp, robot, method="direct")
+            joints = map_to_joints(srmp, robot)
         motion = motion_of_joints(joints, last, srmp.toe_s)
-    body = last.plan(task, srmp, begin=_noisy(motion, last.free, case))
+    body = last.plan(task, srmp, begin=_noisy(motion, last.free, case), starts=GIVEN)
     return body, make_tape(body, srmp)
 
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from jumplab.errors import InputError, JumplabError
 from jumplab.models.full import FullBody
+from jumplab.ocp import Phase, Term
 from jumplab.robot import Robot
-from jumplab.stages.joint_qp import JointMapper, JointPlan, Limits, Options
-from jumplab.stages.joint_qp.flight import FlightQp
-from jumplab.stages.joint_qp.launch import LaunchQp
-from jumplab.stages.joint_qp.problem import Layout, StepQp
+from jumplab.stages.changes import StageChanges
+from jumplab.stages.joint_qp import Affine, JointMapper, JointPlan
+from jumplab.stages.joint_qp.programs import LaunchQp
 from jumplab.stages.srmp import SrmpPlan
 from paper.joint_qp_studies import alone
 from paper.joint_violations import joint_violations
+from paper.tracking import tracking
 
 CHOICES = {
     "base_rows": (3, 6),
@@ -29,7 +28,7 @@ CHOICES = {
     "hip_rule": ("mirror", "sum"),
     "inertia": ("row", "term"),
 }
-SIDES = {"A": ("A", "b"), "E": ("E", "e")}
+WITH_TARGET = ("com", "force", "moment", "foot")  # costs that are halved without the 1/2
 LOADED_N, HEEL_UP_M = 20.0, 0.0025  # a foot has a CoP, and a heel is up, beyond these
 
 
@@ -66,92 +65,76 @@ class Form:
 PRINTED = Form(base_rows=3, half=False, heel="always", contact="free", pairs="hips", hip_rule="sum", inertia="row")
 
 
-def without(qp: StepQp, matrix: str, gone: np.ndarray) -> StepQp:
-    """The program without some rows (a mask) of A or E."""
-    blocks, labels = {}, dict(qp.layout.labels)
-    for name, (own, rows) in qp.layout.blocks.items():
-        if own == matrix:
-            rows = slice(int((~gone[: rows.start]).sum()), int((~gone[: rows.stop]).sum()))
-        if rows.start < rows.stop:
-            blocks[name] = own, rows
-    labels[matrix] = tuple(np.array(labels[matrix])[~gone])
-    return replace(qp, layout=Layout(blocks, labels), **{k: getattr(qp, k)[~gone] for k in SIDES[matrix]})
+def _halved(rows: Affine) -> Affine:
+    """The same wish by half."""
+    return Affine(rows.matrix, rows.offset / 2, rows.labels)
 
 
-def _read(qp: StepQp, form: Form, hips: Mapping[str, Any], targets: int) -> StepQp:
-    """Readings that both phases share; the first ``targets`` rows of A are those with a target."""
-    b, E, e = qp.b.copy(), qp.E.copy(), qp.e.copy()
-    mirror = qp.layout.at("symmetry")
-    if not form.half:
-        b[:targets] /= 2
-    if form.hip_rule == "sum":
-        E[mirror], e[mirror] = np.abs(E[mirror]), 0.0
-    gone = np.zeros(len(e), bool)
-    gone[form.base_rows : 6] = True
-    if form.pairs == "hips":
-        gone[mirror] = [label.removeprefix("symmetry ") not in hips for label in qp.layout.labels["E"][mirror]]
-    return without(replace(qp, b=b, E=E, e=e), "E", gone)
+def _summed(rows: Affine) -> Affine:
+    """The printed sum of accelerations, whatever the axes."""
+    return Affine(np.abs(rows.matrix), np.zeros(len(rows)), rows.labels)
+
+
+def _some(rows: Affine, names: Sequence[str]) -> Affine:
+    """The rows of some labels."""
+    kept = [k for k, label in enumerate(rows.labels) if label in names]
+    return rows[kept].named([rows.labels[k] for k in kept])
+
+
+def _read(term: Term, phase: str, form: Form, hips: Sequence[str]) -> Term | None:
+    """One term of a phase in some form; None if the form has none such."""
+
+    def after(change: Callable[[Affine], Affine], of: Term = term) -> Term:
+        return replace(of, expression=lambda p: change(of.expression(p)))
+
+    if term.name in WITH_TARGET and not form.half:
+        return after(_halved)
+    if term.name == "base dynamics" and form.base_rows < 6:
+        return after(lambda rows: _some(rows, rows.labels[: form.base_rows]))
+    if term.name == "symmetry":
+        summed = after(_summed) if form.hip_rule == "sum" else term
+        return summed if form.pairs == "all" else after(lambda rows: _some(rows, hips), summed)
+    if (phase, term.name, form.inertia) == ("flight", "inertia", "row"):
+        return replace(term, weight=None)
+    return None if term.name == "foot pitch or toe moment" and form.contact == "free" else term
 
 
 class PrintedLaunch(LaunchQp):
-    """The launch QP in some form."""
+    """The launch's QPs in some form."""
 
-    def __init__(self, *args, form: Form):
-        super().__init__(*args)
-        self.form = form
-        if form.contact == "free":
-            self.on_toes = np.zeros_like(self.on_toes)
-            self.inertia_weights = self._inertia_weights()
+    form = Form()
 
-    def _heel_floor(self, terms, k):
-        if self.form.contact == "consistent" and not self.on_toes[k]:
-            return super()._heel_floor(terms, k)
-        if self.form.heel == "always":
-            return np.zeros(2)
-        return self._near_ground(terms)
-
-    def matrices(self, terms, target, start) -> StepQp:
-        """As the library's, then read in the form."""
-        qp = super().matrices(terms, target, start)
-        if self.form.contact == "free":
-            gone = np.zeros(len(qp.e), bool)
-            gone[qp.layout.at("foot pitch or toe moment")] = True
-            qp = without(qp, "E", gone)
-        return _read(qp, self.form, self.body.pair_names(("hip",)), 9)
-
-
-class PrintedFlight(FlightQp):
-    """The flight QP in some form."""
-
-    def __init__(self, *args, form: Form):
-        super().__init__(*args)
-        self.form = form
-
-    def matrices(self, terms, target, start) -> StepQp:
-        """As the library's, then read in the form."""
-        qp = _read(super().matrices(terms, target, start), self.form, self.body.pair_names(("hip",)), 6)
-        if self.form.inertia == "term":
-            return qp
-        gone = np.zeros(len(qp.b), bool)
-        gone[qp.layout.at("inertia")] = True
-        qp = without(qp, "A", gone)
-        blocks = {**qp.layout.blocks, "inertia": ("E", slice(len(qp.e), len(qp.e) + 1))}
-        labels = {**qp.layout.labels, "E": (*qp.layout.labels["E"], "inertia rho")}
-        e = np.append(qp.e, target.inertia_accel - terms.drift_rho)
-        return replace(qp, E=np.vstack([qp.E, terms.J_rho]), e=e, layout=Layout(blocks, labels))
+    def target(self, k, now):
+        """What a step asks for; with a free contact no step is on the toes."""
+        target = super().target(k, now)
+        if self.form.contact == "free" or target.on_toes:
+            target.heel_floor = np.zeros(2) if self.form.heel == "always" else self.heel_floor(now)
+        return target
 
 
 class PrintedMapper(JointMapper):
     """Stage 2 in some form; the other arguments are those of :class:`jumplab.stages.joint_qp.JointMapper`."""
 
-    def __init__(self, srmp_plan: Any, robot: Robot, form: Form = PRINTED, **how):
-        self.launch_qp, self.flight_qp = partial(PrintedLaunch, form=form), partial(PrintedFlight, form=form)
-        super().__init__(srmp_plan, robot, **how)
+    def __init__(self, srmp: SrmpPlan, robot: Robot, form: Form = PRINTED, **how):
+        super().__init__(srmp, robot, **how)
+        arms = robot.joints["shoulder_pitch"]
+        above = (robot.joint_names[left - 6] for left, *_ in self.body.pairs["launch"])
+        hips = [name for name in above if name not in arms]
+
+        def phase(p: Phase) -> Phase:
+            terms = (_read(term, p.name, form, hips) for term in p.terms)
+            return replace(p, terms=tuple(t for t in terms if t is not None))
+
+        self.problem = replace(self.problem, phases=tuple(map(phase, self.problem.phases)))
+        toe_s = srmp.toe_s if form.contact == "consistent" else 0.0
+        given = self.body, self.options, self.problem.phases[0]
+        self.launch = PrintedLaunch(*given, self.reference.launch, toe_s, self.q0)
+        self.launch.form = form
 
 
-def map_as_read(srmp_plan: Any, robot: Robot, form: Form = PRINTED, method: str = "direct", **how) -> JointPlan:
+def map_as_read(srmp: SrmpPlan, robot: Robot, form: Form = PRINTED, **how) -> JointPlan:
     """Stage 2's roll-out in some form, see :func:`jumplab.stages.joint_qp.map_to_joints`."""
-    return PrintedMapper(srmp_plan, robot, form, **how).run(method)
+    return PrintedMapper(srmp, robot, form, **how).run()
 
 
 READ = {  # one reading at a time, everything else as the library's; then all of them
@@ -177,14 +160,14 @@ def readings_tried(srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, JointPlan], 
     tried, said, rows = {}, {}, []
     for name, form in READ.items():
         row = {"form": name, "torque limits": "fails with and without"}
-        for torque in (1.0, None):
+        for off in ((), ("torque",)):
             try:
-                tried[name] = map_as_read(srmp, robot, form, options=Options(limits=Limits(torque_share=torque)))
+                tried[name] = map_as_read(srmp, robot, form, changes=StageChanges(off=off))
             except JumplabError as e:
                 said.setdefault(name, str(e).partition("; relax")[0])
                 continue
-            row["torque limits"] = "yes" if torque else "left out"
-            r = {**tried[name].tracking, **joint_violations(tried[name], robot)}
+            row["torque limits"] = "left out" if off else "yes"
+            r = {**tracking(tried[name], srmp, robot), **joint_violations(tried[name], robot)}
             row |= {"take-off speed, off by [%]": 100 * r["takeoff_velocity"]}
             row |= {"L, off by [%]": 100 * r["launch_momentum"], "force from nowhere [N, N m]": r["base_force"]}
             row |= {"L lost in flight": r["flight_momentum"]}
@@ -195,14 +178,11 @@ def readings_tried(srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, JointPlan], 
 
 def cop_behind_toe_mm(plan: JointPlan, robot: Robot) -> float:
     """How far the CoP of a loaded left foot gets behind its toe while the heel is up [mm]."""
-    body, behind, foot = FullBody(robot), 0.0, robot.foot
+    body, behind = FullBody(robot), 0.0
     for k in range(plan.rows("launch").stop - 1):
-        x, following = (body.motion(plan.q[i], plan.v[i]) for i in (k, k + 1))
-        f = plan.f[k, 0]
-        if f[2] > LOADED_N and x.heel[0, 2] - x.toe[0, 2] > HEEL_UP_M:
-            middle = (x.foot_rotation[0] + following.foot_rotation[0]) / 2  # of the step
-            moment = f[3:] - np.cross(middle @ [foot.toe, 0.0, foot.sole_z], f[:3])
-            behind = max(behind, 1000 * moment[1] / f[2])
+        x, f = body.terms(plan.q[k], plan.v[k]), plan.f[k, 0]
+        if f[2] > LOADED_N and x.heel.place[0, 2] - x.tip.place[0, 2] > HEEL_UP_M:
+            behind = max(behind, 1000 * f[4] / f[2])
     return float(behind)
 
 

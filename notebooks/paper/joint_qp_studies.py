@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -12,21 +13,66 @@ import numpy as np
 from scipy.linalg import null_space
 
 from jumplab.models.full import FullTerms
+from jumplab.ocp.qp import Block, Qp, QpAnswer, QpSolver
 from jumplab.robot import Robot
-from jumplab.stages.joint_qp import DirectSolver, JointMapper, JointPlan, Options, map_to_joints
-from jumplab.stages.joint_qp.problem import State, StepQp
+from jumplab.stages.joint_qp import JointMapper, JointPlan, Options, map_to_joints
+from jumplab.stages.joint_qp.rollout import State
 from jumplab.stages.joint_qp.settings import GENTLE
-from jumplab.stages.joint_qp.solve import CLARABEL
 from jumplab.stages.planner import STEPS_S, motion_of_joints
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body import WholeBodyPlanner
 from jumplab.task import JumpTask
+from paper.tracking import tracking
 
+CLARABEL = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
 QUANTITIES = ("M", "H", "J", "A_f", "A_c", "B_c", "J_rho", "drift_rho")
 ZERO = cp.Constant(0.0)
 
 
 # ------------------------------------------------------------------------- programs in cvxpy
+
+
+class CvxpySolver:
+    """The library's programs by cvxpy and Clarabel; one problem with Parameters (DPP) for each shape, turned into
+    standard form once.
+    """
+
+    def __init__(self):
+        self.problems: dict[tuple, tuple[cp.Problem, cp.Variable, list[cp.Parameter]]] = {}
+
+    def solve(self, qp: Qp) -> QpAnswer:
+        """Solve one step; whether the answer can be trusted is asked again by who takes it."""
+        matrices = wide(qp)
+        shape = tuple(x.shape for x in matrices)
+        if shape not in self.problems:
+            self.problems[shape] = self._posed(matrices)
+        problem, x, parameters = self.problems[shape]
+        for parameter, value in zip(parameters, matrices, strict=True):
+            parameter.value = value
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an inaccurate answer is judged by its rows, not by a warning
+            problem.solve(solver=cp.CLARABEL, warm_start=False, enforce_dpp=True, **CLARABEL)
+        value = np.full(qp.size, np.nan) if x.value is None else x.value
+        iterations = int(problem.solver_stats.num_iters or 0)
+        return QpAnswer(value, iterations, str(problem.status), problem.status == "optimal")
+
+    def _posed(self, matrices: Sequence[np.ndarray]) -> tuple[cp.Problem, cp.Variable, list[cp.Parameter]]:
+        A, b, E, e, G, h = given = [cp.Parameter(x.shape) for x in matrices]
+        x = cp.Variable(A.shape[1])
+        return cp.Problem(cp.Minimize(cp.sum_squares(A @ x - b) / 2), [E @ x == e, G @ x <= h]), x, given
+
+
+def wide(qp: Qp) -> tuple[np.ndarray, ...]:
+    """A, b, E, e, G and h of min 1/2 |A x - b|^2, E x = e, G x <= h: the roots of the weights multiplied in, sides that
+    are free left out.
+    """
+    costs, equal, limits = (list(x.values()) for x in (qp.costs, qp.equalities, qp.limits))
+    roots = np.sqrt(np.concatenate([x.weight for x in costs]))
+    parts = [(np.vstack([x.matrix for x in xs]), np.concatenate([x.low for x in xs])) for xs in (costs, equal, limits)]
+    (A, b), (E, e), (G, low) = parts
+    high = np.concatenate([x.high for x in limits])
+    below, above = np.isfinite(low), np.isfinite(high)
+    return roots[:, None] * A, roots * b, E, e, np.vstack([-G[below], G[above]]), np.r_[-low[below], high[above]]
 
 
 @dataclass
@@ -36,7 +82,7 @@ class Written:
     Attributes
     ----------
     qp : the library's programs of that phase.  x : the unknowns.  given : the Parameters.
-    wishes : block -> residual.  equal, below : block -> what is 0, or at most 0.
+    wishes : block -> residual.  equal, above : block -> what is 0, or at least 0.
     between : block -> lowest value, expression, highest value.
     steps : with ``k``, ``numbers`` by the names of the Parameters, and ``weights`` by block.
     problem, weight : the program, and the Parameters of its weights by block, once it is put together.
@@ -47,7 +93,7 @@ class Written:
     given: SimpleNamespace
     wishes: dict[str, cp.Expression]
     equal: dict[str, cp.Expression]
-    below: dict[str, cp.Expression]
+    above: dict[str, cp.Expression]
     between: dict[str, tuple]
     steps: Sequence[SimpleNamespace]
     problem: cp.Problem | None = None
@@ -61,14 +107,17 @@ class Written:
             self.weight[name].value = np.broadcast_to(value, self.weight[name].shape)
 
     def rows(self) -> dict[str, tuple]:
-        """Block -> matrix, slope, lowest and highest value of its rows, as filled; weights' roots multiplied in."""
+        """Block -> slope, lowest and highest value of its rows that are in force; weights' roots multiplied in."""
         self.x.value, out = np.zeros(self.x.size), {}
-        written = {"A": self.wishes, "E": self.equal, "G": self.below, "R": self.between}
-        for name, matrix, x in ((name, matrix, x) for matrix, part in written.items() for name, x in part.items()):
-            low, x, high = x if matrix == "R" else (ZERO, x, ZERO)
-            root = np.sqrt(self.weight[name].value) if matrix == "A" else np.ones(x.size)
+        free = cp.Constant(np.inf)
+        sides = {name: (ZERO, x, ZERO) for name, x in {**self.wishes, **self.equal}.items()}
+        sides |= {name: (ZERO, x, free) for name, x in self.above.items()} | self.between
+        for name, (low, x, high) in sides.items():
+            root = np.sqrt(self.weight[name].value) if name in self.weight else np.ones(x.size)
             slope = root[:, None] * x.grad[self.x].T.toarray()
-            out[name] = matrix, slope, root * (low.value - x.value), root * (high.value - x.value)
+            used = slope.any(axis=1)
+            ends = (np.broadcast_to(root * (side.value - x.value), x.size)[used] for side in (low, high))
+            out[name] = slope[used], *ends
         return out
 
 
@@ -86,16 +135,15 @@ def shared_numbers(terms: FullTerms, wish: Any, qp: Any, state: State, step_s: f
     """
     out = {name: getattr(terms, name) for name in QUANTITIES}
     out |= {name: getattr(wish, name) for name in ("joints", "trunk", "symmetry")}
-    out["tau_min"], out["tau_max"] = qp.joints.torque(terms.v[6:])
-    out["acc_min"], out["acc_max"] = qp.joints.acceleration(state.q[7:], state.v[6:], step_s)
+    out["tau_min"], out["tau_max"] = qp.body.motors.range(terms.v[6:])
+    out["acc_min"], out["acc_max"] = qp.joint_range(state.q[7:], state.v[6:], step_s)
     return out
 
 
-def alone(mapper: JointMapper, qp: Any, k: int, plan: JointPlan) -> tuple[FullTerms, StepQp, np.ndarray]:
-    """Step ``k`` of a phase of ``plan`` again: quantities in its middle, its program, the direct solver's optimum."""
-    row = plan.rows(qp.name).start + k
-    terms, _, matrices = mapper.problem(qp, k, plan.state(row))
-    return terms, matrices, DirectSolver(matrices).solve(matrices, qp.name, plan.t[row]).x
+def alone(mapper: JointMapper, qp: Any, k: int, plan: JointPlan) -> tuple[FullTerms, Qp, np.ndarray]:
+    """Step ``k`` of a phase of ``plan`` again: quantities in its middle, its program, the library's optimum."""
+    terms, _, program = mapper.step(qp, k, plan.state(plan.rows(qp.phase.name).start + k))
+    return terms, program, QpSolver().solve(program).x
 
 
 def against_library(it: Written, mapper: JointMapper, plan: JointPlan) -> tuple[list[dict], list[dict]]:
@@ -104,38 +152,49 @@ def against_library(it: Written, mapper: JointMapper, plan: JointPlan) -> tuple[
     Returns
     -------
     By block, the largest difference of its rows over all steps, relative; by step, what Clarabel makes of the written
-    program against the direct solver's optimum of the library's. ``bound`` is what a duality gap of Clarabel's
+    program against the optimum of the library's own solver. ``bound`` is what a duality gap of Clarabel's
     tolerance leaves open of the unknowns, by the least eigenvalue of the Hessian on the null space of E.
     """
-    gaps = {name: 0.0 for part in (it.wishes, it.equal, it.below, it.between) for name in part}
-    optima, sizes, contact = [], {}, plan.contact[plan.rows(it.qp.name)]
+    gaps = {name: 0.0 for part in (it.wishes, it.equal, it.above, it.between) for name in part}
+    rows = plan.rows(it.qp.phase.name)
+    optima, sizes, contact = [], dict.fromkeys(gaps, 0), plan.contact[rows]
     for step in it.steps:
         it.fill(step)
         it.problem.solve(solver=cp.CLARABEL, enforce_dpp=True, **CLARABEL)
         found = it.x.value, it.problem.value
-        _, q, best = alone(mapper, it.qp, step.k, plan)
-        theirs = {"A": (q.A, q.b, q.b), "E": (q.E, q.e, q.e), "G": (q.G, q.h, q.h), "R": (q.R, q.lower, q.upper)}
-        for name, (matrix, *own) in it.rows().items():
-            pairs = [(mine, other[q.layout.at(name)]) for mine, other in zip(own, theirs[matrix], strict=True)]
-            sizes[name] = len(own[0])
-            gap = max(np.abs(mine - other).max() / max(1.0, np.abs(other).max()) for mine, other in pairs)
-            gaps[name] = max(gaps[name], gap)
-        seen = {"t [s]": plan.t[plan.rows(it.qp.name)][step.k], "contact": contact[step.k], "status": it.problem.status}
-        optima.append(seen | _apart(q, best, *found, it.qp.first))
-    blocks = [{"phase": it.qp.name, "block": x, "rows": sizes[x], "difference": gap} for x, gap in gaps.items()]
+        _, program, best = alone(mapper, it.qp, step.k, plan)
+        for name, own in it.rows().items():
+            theirs = _in_force(program[name])
+            sizes[name] = max(sizes[name], len(own[0]))
+            for mine, other in zip(own, theirs, strict=True):
+                ends = np.isfinite(other)
+                assert np.array_equal(ends, np.isfinite(mine)), name
+                off = np.abs(mine[ends] - other[ends]) / max(1.0, np.abs(other[ends]).max(initial=0.0))
+                gaps[name] = max(gaps[name], float(off.max(initial=0.0)))
+        seen = {"t [s]": plan.t[rows][step.k], "contact": contact[step.k], "status": it.problem.status}
+        optima.append(seen | _apart(program, best, *found, it.qp.first))
+    blocks = [{"phase": it.qp.phase.name, "block": x, "rows": sizes[x], "difference": gap} for x, gap in gaps.items()]
     return blocks, optima
 
 
-def _apart(q: StepQp, best: np.ndarray, x: np.ndarray, cost: float, first: int) -> dict[str, float | None]:
+def _in_force(block: Block) -> tuple[np.ndarray, ...]:
+    """Slope, lowest and highest value of a library's block of rows that are limited, weights' roots multiplied in."""
+    root = np.ones(len(block.low)) if block.weight is None else np.sqrt(block.weight)
+    used = np.isfinite(block.low) | np.isfinite(block.high)
+    return root[used, None] * block.matrix[used], (root * block.low)[used], (root * block.high)[used]
+
+
+def _apart(qp: Qp, best: np.ndarray, x: np.ndarray, cost: float, first: int) -> dict[str, float | None]:
     """How far ``x`` and its cost are from the optimum ``best``; accelerations begin at column ``first``."""
-    free, scale, off = q.A @ null_space(q.E), max(1.0, q.objective(best)), 1e6 * np.abs(x - best)
+    A, _, E, *_ = wide(qp)
+    free, scale, off = A @ null_space(E), max(1.0, qp.objective(best)), 1e6 * np.abs(x - best)
     flattest = np.linalg.eigvalsh(free.T @ free)[0]
     return {
         "largest force [N]": np.abs(best[:first]).max() if first else None,
         "force, difference [µN, µN m]": off[:first].max() if first else None,
         "largest acceleration [rad/s²]": np.abs(best[first:]).max(),
         "acceleration, difference [µrad/s²]": off[first:].max(),
-        "cost, difference [1e-6]": 1e6 * abs(cost - q.objective(best)) / scale,
+        "cost, difference [1e-6]": 1e6 * abs(cost - qp.objective(best)) / scale,
         "bound [SI/1000]": 1e3 * np.sqrt(2 * CLARABEL["tol_gap_rel"] * scale / flattest),
     }
 
@@ -148,8 +207,8 @@ def weights_tried(srmp: SrmpPlan, robot: Robot, phase: str, name: str, values: S
     top, rows = np.array([robot.actuators[joint]["speed"] for joint in robot.joint_names]), []
     for value in values:
         options = Options(**{phase: replace(getattr(Options(), phase), **{name: value})})
-        plan = map_to_joints(srmp, robot, method="direct", options=options)
-        e, share = plan.tracking, (np.abs(plan.v[plan.rows("launch"), 6:]) / top).max(axis=0)
+        plan = map_to_joints(srmp, robot, options=options)
+        e, share = tracking(plan, srmp, robot), (np.abs(plan.v[plan.rows("launch"), 6:]) / top).max(axis=0)
         row = {"weight": f"{value:g}", "take-off speed [%]": 100 * e["takeoff_velocity"]}
         row |= {f"rho in {x}, rms [%]": 100 * e[f"{x}_inertia_rms"] for x in ("launch", "flight")}
         row |= {"sole to CoM, rms [mm]": 1000 * e["flight_foot_rms"], "at touchdown [mm]": 1000 * e["touchdown_foot"]}
@@ -168,12 +227,11 @@ def choices_tried(task: JumpTask, srmp: SrmpPlan, robot: Robot) -> list[dict]:
         "gentle weights": {"options": GENTLE},
     }
     for name, how in choices.items():
-        plan = map_to_joints(srmp, robot, method="direct", **{"step_s": STEPS_S, **how})
+        plan = map_to_joints(srmp, robot, **{"step_s": STEPS_S, **how})
         led = whole.plan(task, srmp, begin=motion_of_joints(plan, whole, srmp.toe_s))
-        row = {"choice": name, "steps": plan.statistics.steps}
-        row |= {"take-off speed [%]": 100 * plan.tracking["takeoff_velocity"]}
-        row |= {"L at take-off [%]": 100 * plan.tracking["takeoff_momentum"]}
-        row |= {f"rho in {x} [%]": 100 * plan.tracking[f"{x}_inertia_rms"] for x in ("launch", "flight")}
+        e, row = tracking(plan, srmp, robot), {"choice": name, "steps": plan.statistics.steps}
+        row |= {"take-off speed [%]": 100 * e["takeoff_velocity"], "L at take-off [%]": 100 * e["takeoff_momentum"]}
+        row |= {f"rho in {x} [%]": 100 * e[f"{x}_inertia_rms"] for x in ("launch", "flight")}
         row |= {"stage 3, iterations": sum(x.iterations for x in led.attempts)}
         rows.append({**row, "stage 3, cost": led.solution.statistics.objective})
     return rows

@@ -37,20 +37,20 @@ def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None
     largest F_xy / F_z; ``torque_excess`` counts from the motor's line; ``asymmetry`` is of mirrored joints.
     """
     body, launch, flight = FullBody(robot, gravity), plan.rows("launch"), plan.rows("flight")
-    nodes = [body.motion(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
+    nodes = [body.terms(q, v) for q, v in zip(plan.q, plan.v, strict=True)]
     first = [k for k in range(len(plan.t)) if k + 1 not in (launch.stop, flight.stop)]  # nodes at which a step begins
     steps = [_middle(plan, body, k) for k in first]
     on_ground = len(range(*launch.indices(len(plan.t)))) - 1
     out = {"base_force": _base_force(body, steps, plan.a[first], plan.f[first])}
-    out |= _ground(robot, plan.f[first][:on_ground], steps[:on_ground], plan.contact[first][:on_ground])
+    out |= _ground(robot, plan.f[first][:on_ground], plan.contact[first][:on_ground])
     out |= _joints(robot, plan, plan.tau[first], np.array([x.v[6:] for x in steps]))
-    left, right, sign = (np.array(x) for x in zip(*body.pairs, strict=True))
+    left, right, sign = (np.array(x) for x in zip(*body.pairs["flight"], strict=True))
     joints, rates = plan.q[:, 1:], plan.v  # angle of tangent column i is q[i + 1]: a quaternion has four numbers
     out["asymmetry"] = float(max(np.abs(x[:, right] - sign * x[:, left]).max() for x in (joints, rates)))
     flying = nodes[flight]
-    toe, rising = np.array([x.toe for x in nodes[launch]]), nodes[: flight.start + len(flying) // 2]
+    toe, rising = np.array([x.tip.place for x in nodes[launch]]), nodes[: flight.start + len(flying) // 2]
     out["toe_drift"] = float(np.abs(toe - toe[0]).max())
-    lowest = min(np.r_[x.toe[:, 2], x.heel[:, 2]].min() for x in rising)
+    lowest = min(np.r_[x.tip.place[:, 2], x.heel.place[:, 2]].min() for x in rising)
     out["penetration"] = float(max(0.0, toe[0, :, 2].mean() - lowest))
     start, t = flying[0], (plan.t[flight] - plan.t[flight.start])[:, None]
     parabola = start.com + start.com_velocity * t + np.array([0.0, 0.0, -body.gravity]) * t**2 / 2
@@ -61,16 +61,16 @@ def joint_violations(plan: JointPlan, robot: Robot, gravity: float | None = None
 
 def touchdown_rows(plan: JointPlan, robot: Robot) -> list[dict]:
     """The last posture of a roll-out beside the bounds that stage 3 sets to its own."""
-    aims, deg, x = Limits(), np.degrees, FullBody(robot).motion(plan.q[-1], plan.v[-1])
+    aims, deg, x = Limits(), np.degrees, FullBody(robot).terms(plan.q[-1], plan.v[-1])
     angles = to_link_angles(robot, plan.q, plan.v, plan.a)[0][-1]
     _, knee, _, _ = robot.sagittal.joint_angles(angles)  # hip, knee, ankle, shoulder
-    ground = FullBody(robot).motion(plan.q[0], plan.v[0]).toe[0, 2]
+    ground = FullBody(robot).terms(plan.q[0], plan.v[0]).tip.place[0, 2]
     found = {
         ("trunk pitch", "deg"): (deg(angles[3]), *deg(aims.touchdown_pitch)),
         ("knee", "deg"): (deg(knee), *deg(aims.touchdown_knee)),
         ("foot pitch", "deg"): (deg(x.foot_pitch[0]), 0.0, 0.0),
-        ("toe above the ground", "mm"): (1000 * (x.toe[0, 2] - ground), 0.0, 0.0),
-        ("heel above the ground", "mm"): (1000 * (x.heel[0, 2] - ground), 0.0, 0.0),
+        ("toe above the ground", "mm"): (1000 * (x.tip.place[0, 2] - ground), 0.0, 0.0),
+        ("heel above the ground", "mm"): (1000 * (x.heel.place[0, 2] - ground), 0.0, 0.0),
         ("fastest joint", "rad/s"): (np.abs(plan.v[-1, 6:]).max(), 0.0, aims.touchdown_joint_rate),
     }
     rows = []
@@ -87,20 +87,14 @@ def _middle(plan: JointPlan, body: FullBody, k: int) -> FullTerms:
 
 
 def _base_force(body, steps, accelerations, wrenches) -> float:
-    """Largest base row of pin.rnea less the wrenches (N, 2, 6) at the origins of the foot frames, about the base."""
-    model, scratch, foot = body.model, body.model.createData(), body.robot.foot
+    """Largest base row of pin.rnea less the wrenches (N, 2, 6) at the tiptoes, about the base."""
+    model, scratch = body.model, body.model.createData()
     needed = np.array([pin.rnea(model, scratch, x.q, x.v, a)[:6] for x, a in zip(steps, accelerations, strict=True)])
     turn, base = np.array([x.base_rotation for x in steps]), np.array([x.q[:3] for x in steps])
-    toe, force = np.array([x.toe for x in steps]), wrenches[..., :3]
-    origin = toe - _arms(steps, foot)
-    moment = (wrenches[..., 3:] + np.cross(origin - base[:, None], force)).sum(1)
+    toe, force = np.array([x.tip.place for x in steps]), wrenches[..., :3]
+    moment = (wrenches[..., 3:] + np.cross(toe - base[:, None], force)).sum(1)
     given = [np.einsum("nij,ni->nj", turn, x) for x in (force.sum(1), moment)]  # in the axes of the base
     return float(np.abs(needed - np.concatenate(given, 1)).max())
-
-
-def _arms(terms, foot) -> np.ndarray:
-    """From the origins of the foot frames to the tiptoes (N, 2, 3), world axes."""
-    return np.array([x.foot_rotation for x in terms]) @ np.array([foot.toe, 0.0, foot.sole_z])
 
 
 def _joints(robot, plan, tau, tau_rates) -> dict[str, float]:
@@ -118,10 +112,9 @@ def _joints(robot, plan, tau, tau_rates) -> dict[str, float]:
     }
 
 
-def _ground(robot, wrenches, terms, contact) -> dict[str, float]:
-    """Unilaterality, friction and CoP of each foot, from the wrenches at the foot frames."""
-    foot, force = robot.foot, wrenches[..., :3]
-    moment = wrenches[..., 3:] - np.cross(_arms(terms, foot), force)  # about the tiptoes
+def _ground(robot, wrenches, contact) -> dict[str, float]:
+    """Unilaterality, friction and CoP of each foot, from the wrenches at the tiptoes."""
+    foot, force, moment = robot.foot, wrenches[..., :3], wrenches[..., 3:]
     loaded = force[..., 2] >= LOADED_N
     back = np.where(contact == "toe", 0.0, foot.heel - foot.toe)[:, None]
     lift = np.where(loaded, force[..., 2], 1.0)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from jumplab.control import Estimator, SensorNoise
 from jumplab.robot import Robot
-from jumplab.sim import Estimator, SensorNoise, SimulationResult
-from jumplab.sim.estimator import Sensors
+from jumplab.sim import SimulationResult
+from jumplab.sim.sensors import Sensors
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Measurement:
 def measure(result: SimulationResult, robot: Robot, noise: SensorNoise | None = None, seed: int = 0) -> Measurement:
     """Read the sensors of a simulated jump, and estimate its state as the robot itself would.
 
-    Encoders, inertial unit and foot forces go through :class:`jumplab.sim.Estimator`; CoM, L and rho are those
+    Encoders, inertial unit and foot forces go through :class:`jumplab.control.Estimator`; CoM, L and rho are those
     of the planned robot in the estimated state.
 
     Parameters

@@ -20,8 +20,9 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 from jumplab.robot import Robot
-from jumplab.show.bodies import ABOVE_M, LIMB_SHARE
+from jumplab.show.bodies import ABOVE_M
 from jumplab.show.jumps import AFTER_TOUCHDOWN_S
+from jumplab.show.shapes import LIMB_SHARE
 from jumplab.show.style import PAGE_IN, PHASE_COLORS, VERMILION, bare, new_figure, shade, styled, tint
 from jumplab.sim.scene import Scene
 

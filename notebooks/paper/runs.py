@@ -17,9 +17,10 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.sim import ENGINES, SimulationResult, simulate_jump
 from jumplab.sim.result import STAND_S
-from jumplab.studies.basin import landing_basin
-from jumplab.studies.trials import Trial, TrialSettings, in_parallel, run_trials, wilson
+from jumplab.studies.study import in_parallel
+from jumplab.studies.trials import Trial, TrialSettings, run_trials, wilson
 from jumplab.task import JumpTask
+from paper.basin import landing_basin
 
 LOG, ROBOTS = Path(__file__).with_name("trials.jsonl"), 250  # drawn in each engine
 
@@ -67,13 +68,9 @@ def on_softer_ground(
 
 
 def _on_ground(tape: Tape, robot: Robot, time_s: float) -> SimulationResult:
-    from jumplab.sim.mujoco import SOFTNESS, MujocoEngine
+    from jumplab.sim.mujoco import HARD
 
-    MujocoEngine.softness = replace(SOFTNESS, time_s=time_s)
-    try:
-        return simulate_jump(tape, robot, engine="mujoco")
-    finally:
-        MujocoEngine.softness = SOFTNESS
+    return simulate_jump(tape, robot, engine="mujoco", contact=replace(HARD, time_s=time_s))
 
 
 def study(folder: str | Path, path: Path = LOG) -> None:

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from jumplab import api
+from jumplab.control.servo import SERVOS
 from jumplab.errors import JumplabError, RobotError
-from jumplab.robot.description import SHIPPED, Robot
+from jumplab.robot.description import Robot
+from jumplab.robot.files import SHIPPED
 from jumplab.sim import INSTALLED
-from jumplab.sim.playback import MODES
 from jumplab.studies.envelope import Cell, Envelope, envelope
 from jumplab.task import JumpTask
 from paper.humanoids import SHARES, leg_m
@@ -39,7 +40,7 @@ def measured(robot: Robot) -> dict[str, Any]:
     far, high = ([round(share * leg, 3) for share in shares] for shares in (FAR, HIGH))
     cells = [
         [c.distance_m, c.height_m, c.solved, c.limiting, round(c.share, 3) if c.solved else None]
-        for c in envelope(robot, far, high, tell=lambda line: print(robot.name, line, flush=True)).cells
+        for c in envelope(robot, far, high).cells
     ]
     planner = "planar" if robot.planar else "spatial"
     told = {"hash": robot.hash, "planner": planner, "kg": round(robot.total_mass, 1), "leg_m": round(leg, 3)}
@@ -47,7 +48,7 @@ def measured(robot: Robot) -> dict[str, Any]:
 
 
 def _stands(jump: dict[str, Any], engine: str) -> bool:
-    return any(jump["runs"][f"{engine}, {mode}"]["stands"] for mode in MODES)
+    return any(jump["runs"][f"{engine}, {mode}"]["stands"] for mode in SERVOS)
 
 
 def jumped(robot: Robot, size: float) -> dict[str, Any]:
@@ -59,7 +60,7 @@ def jumped(robot: Robot, size: float) -> dict[str, Any]:
     except JumplabError as e:
         return row | {"reason": str(e)}
     row["clean"] = api.audit(plan).passed
-    for engine, mode in product(INSTALLED, MODES):
+    for engine, mode in product(INSTALLED, SERVOS):
         run = api.simulate(plan, engine=engine, mode=mode)
         row["runs"][f"{engine}, {mode}"] = {
             "stands": run.landed,

@@ -7,6 +7,7 @@ import pinocchio as pin
 from scipy.optimize import root
 
 from jumplab.errors import InfeasibleError
+from jumplab.models.full import FullBody
 from jumplab.robot import Robot
 from jumplab.robot.stance import com_from_toe, configuration
 from jumplab.stages.srmp import SrmpPlan
@@ -28,7 +29,9 @@ def touchdown_of_plan(plan: SrmpPlan, robot: Robot, *, impact: bool = True) -> T
     com, velocity, momentum, rho = -flight.foot_com[-1], flight.com_velocity[-1], flight.L[-1], float(flight.rho[-1])
     if impact:
         q = configuration(robot, _posture(robot, com), toe=-robot.sagittal.sole_center)
-        velocity, momentum = after_impact(robot, q, _rigid_motion(robot, q, velocity, momentum))
+        body = FullBody(robot)
+        x = body.terms(q, after_impact(body.terms(q, _rigid_motion(robot, q, velocity, momentum))))
+        velocity, momentum = x.com_velocity[[0, 2]], x.momentum[4]
     return Touchdown(com, velocity, float(momentum), rho)
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from jumplab import sim
 from jumplab.auditing import audit
+from jumplab.control.servo import SERVOS
 from jumplab.errors import JumplabError
 from jumplab.io.files import open_log
 from jumplab.io.tape import Tape
@@ -38,9 +40,8 @@ from jumplab.show.style import (
     new_figure,
     tint,
 )
-from jumplab.sim.playback import MODES
 from jumplab.stages.planner import JumpPlan, Planner
-from jumplab.studies.envelope import most_used
+from jumplab.studies.grid import most_used
 from jumplab.studies.trials import TrialKey, TrialSettings, run_trial, wilson
 from jumplab.task import JumpTask
 
@@ -94,11 +95,12 @@ def solve(planner: Planner, kind: str, target: Sequence[float]) -> dict[str, Any
     row |= {"cost": plan.whole_body.solution.statistics.objective, "limiting": most, "share": share}
     row |= {"clean": report.passed}
     if kind == "landed":
-        row["runs"] = {f"{e}, {mode}": played(plan, e, mode) for e, mode in product(sim.INSTALLED, MODES)}
+        row["runs"] = {f"{e}, {mode}": played(plan, e, mode) for e, mode in product(sim.INSTALLED, SERVOS)}
     if kind == "perturbed":
         settings = TrialSettings()
         keys = [TrialKey(0, k, settings.hash, "") for k in range(ROBOTS)]
-        drawn = (run_trial(plan.tape, plan.robot, sim.Scene.flat(), settings, key) for key in keys)
+        there = SimpleNamespace(tape=plan.tape, robot=plan.robot, scene=sim.Scene.flat())
+        drawn = (run_trial(there, settings, key) for key in keys)
         row["robots"] = [trial.landed for trial in drawn]
     return row
 

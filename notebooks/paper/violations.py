@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import InputError
+from jumplab.io.tape import Tape
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
+from jumplab.robot.contact import moving, on_feet, point_motion
 from jumplab.task import JumpTask
 from paper.whole_body_printed import MOTION, PaperCoordinates, PrintedPlan, planar_numbers
 
@@ -45,7 +47,7 @@ def violations(plan: Any, robot: Robot) -> tuple[dict, ...]:
         up, turned = _heel_up(nodes, planar_numbers(robot, nodes, task.gravity))
         note = f"; at nodes {turned.sum()} of {len(up)}"
     else:
-        motion = {k: plan.tape.extra[f"planar_{k}"] for k in MOTION} | dict(flying=plan.tape.phase == "flight")
+        motion = planar_motion(plan.tape, robot) | dict(flying=plan.tape.phase == "flight")
         planned = plan.tape.f.sum(axis=1)[:, [0, 2]]
     x = planar_numbers(robot, motion, task.gravity)
     down = {k: v[~motion["flying"]] for k, v in {**x, **{k: motion[k] for k in MOTION}}.items()}
@@ -56,6 +58,18 @@ def violations(plan: Any, robot: Robot) -> tuple[dict, ...]:
     )
     keys = ("name", "amount", "unit", "limit", "note")
     return tuple(dict(zip(keys, r, strict=True), kept=bool(r[1] <= r[3])) for r in rows)
+
+
+def planar_motion(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
+    """Columns of a tape by the names of ``MOTION``; rates of the left toes' middle (n, 2) from the joints' motion."""
+    known = {k: np.array(tape.extra[f"planar_{k}"]) for k in MOTION if f"planar_{k}" in tape.extra}
+    model, data, toes, rows = robot.model, robot.model.createData(), on_feet(robot, robot.foot.tip)[0], []
+    for q, v, a in zip(tape.q, tape.v, tape.a, strict=True):
+        moving(model, data, q, v)
+        at = point_motion(model, data, toes)
+        rows.append([at.velocity[:3], (at.jacobian @ a + at.drift)[:3]])
+    velocity, acceleration = np.array(rows)[..., [0, 2]].transpose(1, 0, 2)
+    return {"toe_velocity": velocity, "toe_acceleration": acceleration} | known
 
 
 def _heel_up(motion, x) -> tuple[np.ndarray, np.ndarray]:

@@ -18,18 +18,18 @@ import numpy as np
 
 from jumplab.errors import SolverError
 from jumplab.io.tape import RATE_HZ
-from jumplab.models.planar import PlanarState, evaluator, symbols
 from jumplab.ocp.nlp import Nlp, PhaseGuess, Solution
 from jumplab.ocp.problem import Bound, Phase, Point, Problem, Term
 from jumplab.robot import SAGITTAL_JOINTS, Robot, SagittalModel
+from jumplab.robot.files import ROLES
 from jumplab.robot.reach import rod_of
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
 from jumplab.robot.stance import stance_angles
-from jumplab.robot_import.config import ROLES
 from jumplab.stages.joint_qp import JointPlan, map_to_joints
 from jumplab.stages.srmp import SrmpPlan
 from jumplab.stages.whole_body.settings import Weights
 from jumplab.task import GRAVITY, JumpTask
+from paper.planar import PlanarState, evaluator, symbols
 
 COORDINATES = ("x", "z", "pitch", *SAGITTAL_JOINTS)
 # absolute angles of foot, shank, thigh, trunk and arm from theta; rates and accelerations likewise
@@ -244,7 +244,7 @@ class PrintedWholeBody:
 
         ``joints`` is stage 2's plan, made here if None (raises what stage 2 raises).
         """
-        joints = joints or map_to_joints(srmp, self.robot, method="direct")
+        joints = joints or map_to_joints(srmp, self.robot)
         plan, part = PrintedPlan(srmp.task), srmp.launch
         refs = {k: self._at_nodes(part.t, getattr(part, k)).T for k in ("rho", "rho_rate", "L_rate")}
         refs["velocity"] = self._at_nodes(part.t, part.com_velocity).T

@@ -21,7 +21,14 @@ FLIPS, FLIP_ROBOTS, FLIP_SEED = Path(__file__).with_name("flips.jsonl"), 200, 11
 WORLDS = {
     "shove of 15 N s in flight": Ranges.none(shove_flight_n_s=(15.0, 15.0)),
     "ground of the landing ±3 cm, ±3 degrees": Ranges.none(ground_m=0.03, ground_tilt_deg=3.0),
-    "twice the usual ranges": Ranges(0.10, 0.03, 0.20, (0.3, 1.0), (0.0, 0.008), 0.10),  # friction: the least there is
+    "twice the usual ranges": Ranges(
+        mass=0.10,
+        com_m=0.03,
+        inertia=0.20,
+        friction=(0.3, 1.0),  # the least there is
+        delay_s=(0.0, 0.008),
+        motor_gain=0.10,
+    ),
     "the usual ranges": Ranges(),
 }
 # robots that jump re-aimed there; the first ROBOTS of them also plain

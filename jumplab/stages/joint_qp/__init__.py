@@ -1,26 +1,23 @@
-"""Stage 2: mapping momentum and inertia to the joints with one QP per time step (Sec. IV of the paper).
+"""Stage 2: mapping momentum and inertia to the joints with one QP per time step (Sec. IV of the
+paper).
 
-``map_to_joints(srmp_plan, robot)`` does it all. To look inside, :class:`JointMapper` hands out the quantities, targets
-and matrices of any step. Own terms, weights and blocks left out go to
-both; :func:`terms_table` lists all blocks.
+``map_to_joints(srmp, robot)`` does it all. To look inside, :class:`JointMapper` hands out the
+quantities, targets and programs of any step.
 """
 
-from jumplab.stages.joint_qp.changes import changed, terms_table
-from jumplab.stages.joint_qp.own import Affine, StepPoint
+from jumplab.stages.joint_qp.point import Affine, StepPoint
 from jumplab.stages.joint_qp.rollout import JointMapper, JointPlan, map_to_joints
 from jumplab.stages.joint_qp.settings import Limits, Options
-from jumplab.stages.joint_qp.solve import CvxpySolver, DirectSolver
+from jumplab.stages.joint_qp.terms import build_problem, changed_problem
 
 __all__ = [
     "Affine",
-    "CvxpySolver",
-    "DirectSolver",
     "JointMapper",
     "JointPlan",
     "Limits",
     "Options",
     "StepPoint",
-    "changed",
+    "build_problem",
+    "changed_problem",
     "map_to_joints",
-    "terms_table",
 ]

@@ -3,64 +3,64 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from jumplab.errors import InputError, Shown, SolverError
-from jumplab.models.full import FullBody, FullMotion, FullTerms
-from jumplab.ocp import Term
+from jumplab.errors import InputError, Shown, SolverError, require_type
+from jumplab.models.full import FullBody, FullTerms
+from jumplab.ocp import Problem
+from jumplab.ocp.qp import Qp, QpSolver
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
-from jumplab.stages.joint_qp.changes import changed
-from jumplab.stages.joint_qp.flight import FlightQp
-from jumplab.stages.joint_qp.launch import WRENCH, LaunchQp
-from jumplab.stages.joint_qp.problem import State, StepQp
-from jumplab.stages.joint_qp.reference import FlightReference, LaunchReference
+from jumplab.stages.changes import StageChanges
+from jumplab.stages.joint_qp.programs import FlightQp, LaunchQp, PhaseQp
 from jumplab.stages.joint_qp.settings import GENTLE, Options
-from jumplab.stages.joint_qp.solve import SOLVERS, Answer
+from jumplab.stages.joint_qp.terms import changed_problem
+from jumplab.stages.joint_qp.words import checked
+from jumplab.stages.srmp import SrmpPlan
 
-CORRECTIONS = (1.0, 0.5, 0.0)  # shares of a misprediction that the next guess takes over; the second one is damped
-PREDICTED_RATE = 0.4  # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
+# shares of a misprediction that the next guess takes over; the second one is damped
+CORRECTIONS = (1.0, 0.5, 0.0)
+# [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
+PREDICTED_RATE = 0.4
 LONGEST_STEP_S = 0.02  # the feedback (damping 40 1/s) would ring with longer steps
 SHORTEST_STEP_S = 0.0005  # half the control cycle; shorter steps are a typing error
 
 
-def tracking(actual: dict, reference: dict, n: int) -> dict[str, float]:
-    """Errors against stage 1. The first ``n`` rows are the launch.
-
-    Keys: ``takeoff_velocity`` (share of the take-off speed), ``takeoff_momentum`` and ``launch_momentum`` (share of the
-    peak of L in the launch; at take-off, and the largest), ``launch_inertia_rms``, ``flight_inertia_rms`` (share of the
-    mean of rho), ``launch_com`` (largest distance [m]), ``flight_foot_rms`` and ``touchdown_foot`` [m].
+class State(NamedTuple):
+    """Configuration (nq,), rates (nv,) at the start of a step, and accelerations (nv,): the last
+    known, or a guess.
     """
-    off = {k: x - reference[k] for k, x in actual.items()}
-    speed, foot = reference["com_velocity"][n - 1], np.linalg.norm(off["foot_com"], axis=1)
-    momentum = np.abs(off["L"][:n]) / max(np.abs(reference["L"][:n]).max(), 1e-9)
 
-    def rms(x, size):
-        return np.sqrt(np.mean(x**2)) / size
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
 
-    found = {
-        "takeoff_velocity": np.linalg.norm(off["com_velocity"][n - 1]) / np.linalg.norm(speed),
-        "takeoff_momentum": momentum[-1],
-        "launch_momentum": momentum.max(),
-        "launch_inertia_rms": rms(off["rho"][:n], reference["rho"][:n].mean()),
-        "flight_inertia_rms": rms(off["rho"][n:], reference["rho"][n:].mean()),
-        "launch_com": np.linalg.norm(off["com"][:n], axis=1).max(),
-        "flight_foot_rms": rms(foot, 1.0),
-        "touchdown_foot": foot[-1],
-    }
-    return {k: float(x) for k, x in found.items()}
+
+class Step(NamedTuple):
+    """One step as it was solved; arrays as in :class:`JointPlan`, times [s]."""
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    predicted: np.ndarray
+    f: np.ndarray
+    tau: np.ndarray
+    iterations: int
+    solve_s: float
+    residual: float
+
+
+AT_NODES = Step._fields[:6]  # what a plan holds at every node
 
 
 @dataclass(frozen=True)
 class Statistics:
     """What the roll-out cost: steps, solver iterations, and time [s] in the solver and in all."""
 
-    method: str
     steps: int
     iterations: int
     solve_s: float
@@ -70,11 +70,10 @@ class Statistics:
 
 @dataclass(frozen=True, repr=False)
 class JointPlan(Shown):
-    """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once per phase.
+    """Result of stage 2 at the N nodes of launch and flight; the instant of take-off appears once
+    per phase.
 
-    Wrenches and torques are those in the middle of the step that begins at the node. ``actual`` and ``reference`` say
-    what the motion does and what stage 1 asks for, by name: com (from the pivot) [m], com_velocity [m/s],
-    L [kg m^2/s], rho [kg m^2], and in flight foot_com (mean of both soles relative to the CoM) [m].
+    What a step holds stands at the node where it begins, and again at a phase's last node.
     """
 
     t: np.ndarray  # (N,) [s]
@@ -82,16 +81,15 @@ class JointPlan(Shown):
     contact: np.ndarray  # (N,) "flat", "toe" or "air"
     q: np.ndarray  # (N, nq) Pinocchio configuration
     v: np.ndarray  # (N, nv) rates
-    a: np.ndarray  # (N, nv) accelerations held from this node to the next; a phase's last node repeats the one before
+    a: np.ndarray  # (N, nv) accelerations, held over the step
     predicted: np.ndarray  # (N, nv) accelerations that the step's QP was written for
-    f: np.ndarray  # (N, 2, 6) wrenches on the feet, force then moment, world axes, at the origins of their frames
-    tau: np.ndarray  # (N, nv - 6) joint torques [N m]
-    actual: dict[str, np.ndarray]
-    reference: dict[str, np.ndarray]
-    tracking: dict[str, float]  # summary of errors, see the function
+    f: np.ndarray  # (N, 2, 6) force, then moment at both tiptoes, world axes [N, N m]
+    tau: np.ndarray  # (N, nv - 6) joint torques [N m] in the middle of the step
     statistics: Statistics
-    options: Options  # of the QPs that made it
-    gentle: str = ""  # why it follows stage 1 less closely than usual: what the usual weights ended in
+    options: Options  # of the QPs that made it ...
+    problem: Problem  # ... and their terms
+    # why it follows stage 1 less closely than usual: what the usual weights ended in
+    gentle: str = ""
 
     def rows(self, phase: str) -> slice:
         """Rows of one phase."""
@@ -99,20 +97,13 @@ class JointPlan(Shown):
         return slice(int(inside[0]), int(inside[-1]) + 1)
 
     def state(self, k: int) -> State:
-        """State at row ``k``, as :meth:`JointMapper.problem` wants it."""
+        """State at row ``k``, as :meth:`JointMapper.step` wants it."""
         return State(self.q[k], self.v[k], self.a[k])
 
 
-@dataclass
-class Rolled:
-    """One phase as it is rolled out: state and quantities at the nodes, what each step was solved with, times [s]."""
-
-    states: list[State]
-    nodes: list[FullMotion] = field(default_factory=list)
-    terms: list[FullTerms] = field(default_factory=list)  # in the middle of the step
-    predicted: list[np.ndarray] = field(default_factory=list)  # accelerations (nv,)
-    answers: list[Answer] = field(default_factory=list)
-    solve_s: float = 0.0
+def nodes(duration: float, step_s: float) -> np.ndarray:
+    """Even node times (n + 1,) from 0 to ``duration`` [s], no further apart than ``step_s``."""
+    return np.linspace(0.0, duration, max(int(np.ceil(duration / step_s - 1e-9)), 1) + 1)
 
 
 class JointMapper:
@@ -120,201 +111,170 @@ class JointMapper:
 
     Parameters
     ----------
-    srmp_plan : stage 1's result, with ``launch`` and ``flight``.  robot : the robot.
-    step_s : step of the roll-out [s], at most, or one each for flat feet, toes and flight; each is divided evenly.
-    options : gains, weights, limits.  q0 : (nq,) start at rest, soles flat; the robot's stance by default.
-    terms, weights, off : own terms, factors on weights, blocks left out, see :func:`.changes.changed`.
-    """
+    srmp : stage 1's plan.  robot : the robot.
+    step_s : step of the roll-out [s], at most, or one each for flat feet, toes and flight; each is
+        divided evenly.
+    options : gains, weights, limits.  q0 : (nq,) start at rest, soles flat; the robot's stance by
+        default.
+    changes : own terms, factors on weights, terms left out, see :func:`.terms.changed_problem`.
 
-    launch_qp: Callable[..., LaunchQp] = LaunchQp
-    flight_qp: Callable[..., FlightQp] = FlightQp
+    Attributes
+    ----------
+    launch : the launch's QPs.  problem : the terms of both phases.  body : nine-link quantities.
+    reference : stage 1's plan at the nodes.
+    """
 
     def __init__(
         self,
-        srmp_plan: Any,
+        srmp: SrmpPlan,
         robot: Robot,
         step_s: float | tuple[float, float, float] = 0.01,
-        options: Options | None = None,
+        options: Options = Options(),
         q0: np.ndarray | None = None,
-        *,
-        terms: Mapping[str, Iterable[Term]] | None = None,
-        weights: Mapping[str, float] | None = None,
-        off: Sequence[str] = (),
+        changes: StageChanges = StageChanges(),
     ):
-        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s, step_s, step_s)
+        require_type(srmp, SrmpPlan, "stage 1's plan")
+        parts = step_s if isinstance(step_s, tuple) and len(step_s) == 3 else (step_s,) * 3
         for step in parts:
             if not (isinstance(step, int | float) and SHORTEST_STEP_S <= step <= LONGEST_STEP_S):
                 limits = f"{SHORTEST_STEP_S} and {LONGEST_STEP_S} s"
                 raise InputError(f"stage 2: step_s = {step!r} s, must be a number between {limits}")
-        self.body = FullBody(robot, getattr(getattr(srmp_plan, "task", None), "gravity", None))
+        self.body = FullBody(robot, srmp.task.gravity)
         self.q0 = stance_configuration(robot) if q0 is None else np.asarray(q0, float)
         if self.q0.shape != (self.body.nq,) or not np.all(np.isfinite(self.q0)):
-            raise InputError(f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite")
-        self.options = options or Options()
-        if terms or weights or off:
-            self.options = changed(self.options, self.body, self.q0, terms, weights, off)
-        self.flight_reference = FlightReference.sample(srmp_plan, parts[2])
-        toe_s = getattr(srmp_plan, "toe_s", None)
-        toe = (toe_s, parts[1]) if isinstance(step_s, tuple) and toe_s is not None else None
-        launch = LaunchReference.sample(srmp_plan, parts[0], toe)
-        self.launch = self.launch_qp(self.body, self.q0, launch, self.options, toe_s)
+            raise InputError(
+                f"stage 2: q0 has shape {self.q0.shape}, must be ({self.body.nq},) and finite"
+            )
+        self.options = options
+        self.problem = changed_problem(self.body, self.q0, self.options, changes)
+        flat_s = srmp.launch_s - srmp.toe_s
+        launch_t = np.append(nodes(flat_s, parts[0]), flat_s + nodes(srmp.toe_s, parts[1])[1:])
+        self.reference = srmp.at(launch_t, nodes(srmp.flight_s, parts[2]))
+        given = self.body, self.options, self.problem.phases[0]
+        self.launch = LaunchQp(*given, self.reference.launch, srmp.toe_s, self.q0)
 
     def flight_from(self, takeoff: State) -> FlightQp:
         """The flight's QPs, beginning at a take-off state."""
-        ground, start = float(self.launch.toe0[:, 2].mean()), self.body.motion(takeoff.q, takeoff.v)
-        return self.flight_qp(self.body, self.launch.nominal, start, self.flight_reference, self.options, ground)
+        ground = float(self.launch.toe0[:, 2].mean())
+        start = self.body.terms(takeoff.q, takeoff.v)
+        given = self.body, self.options, self.problem.phases[1]
+        return FlightQp(*given, self.reference.flight, self.launch.nominal, start, ground)
 
-    def middle(self, start: State, guess: np.ndarray, h: float) -> FullTerms:
-        """Quantities in the middle of a step, predicted with a guess of its accelerations (nv,).
+    def step(self, qp: PhaseQp, k: int, start: State) -> tuple[FullTerms, Any, Qp]:
+        """Quantities in the middle of step ``k`` of a phase, target, and its program, to look at.
 
-        The QP's matrices are taken there (midpoint rule), so that a step's drift is of third order.
+        ``qp`` is :attr:`launch` or one from :meth:`flight_from`; ``start.a`` guesses the step's
+        accelerations. The QP's matrices are taken in the middle (midpoint rule), so that a step's
+        drift is of third order. With ``start = plan.state(row)`` it is the QP that made the plan,
+        up to what its prediction missed.
         """
-        q = pin.integrate(self.body.model, start.q, start.v * (h / 2) + guess * (h * h / 8))
-        return self.body.terms(q, start.v + guess * (h / 2))
+        target = qp.target(k, self.body.terms(start.q, start.v))
+        half = qp.steps[k] / 2
+        moved = pin.integrate(self.body.model, start.q, half * start.v + half**2 / 2 * start.a)
+        middle = self.body.terms(moved, start.v + half * start.a)
+        return middle, target, qp.qp(middle, target)
 
-    def problem(self, qp: LaunchQp | FlightQp, k: int, start: State) -> tuple[FullTerms, Any, StepQp]:
-        """Quantities in the middle of step ``k`` of a phase, target, and the matrices of its QP, to look at.
-
-        ``qp`` is :attr:`launch` or one from :meth:`flight_from`; ``start.a`` guesses the step's accelerations. With
-        ``start = plan.state(row)`` it is the QP that made the plan, up to what its prediction missed.
+    def solved(self, qp: PhaseQp, k: int, state: State, solver: Any) -> Step:
+        """Step ``k`` of a phase from the ``state`` at its start, solved again where the guess of
+        its accelerations is too far off.
         """
-        target = qp.target(k, self.body.motion(start.q, start.v))
-        terms = self.middle(start, start.a, qp.steps[k])
-        return terms, target, qp.matrices(terms, target, start)
+        h = qp.steps[k]
+        solve_s = residual = 0.0
+        for share in CORRECTIONS:
+            middle, _, program = self.step(qp, k, state)
+            began = time.perf_counter()
+            answer = solver.solve(program)
+            solve_s += time.perf_counter() - began
+            residual = max(residual, checked(qp.phase, program, answer, qp.t[k]))
+            a = answer.x[qp.first :]
+            predicted = state.a
+            if np.abs(a - predicted).max() * h / 2 < PREDICTED_RATE:
+                break
+            state = state._replace(a=predicted + share * (a - predicted))
+        f = np.zeros(12)
+        f[: qp.first] = answer.x[: qp.first]
+        tau = (middle.M @ a + middle.H - middle.J.T @ f)[6:]
+        spent = answer.iterations, solve_s, residual
+        return Step(state.q, state.v, a, predicted, f.reshape(2, 6), tau, *spent)
 
-    def roll(self, qp: LaunchQp | FlightQp, solver_type: type, state: State) -> Rolled:
-        """Solve and integrate all steps of one phase."""
-        out, solver, before = Rolled(states=[state]), None, state.a
+    def roll(self, qp: PhaseQp, solver: Any, state: State) -> tuple[list[Step], State]:
+        """All steps of one phase from the state at its start, and the state at its end."""
+        steps = []
+        before = state.a
         for k, h in enumerate(qp.steps):
-            node = self.body.motion(state.q, state.v)
-            target = qp.target(k, node)
-            guess = 2 * state.a - before
-            for share in CORRECTIONS:
-                terms = self.middle(state, guess, h)
-                matrices = qp.matrices(terms, target, state)
-                solver = solver or solver_type(matrices)
-                began = time.perf_counter()
-                answer = solver.solve(matrices, qp.name, qp.t[k])
-                out.solve_s += time.perf_counter() - began
-                a, predicted = answer.x[qp.first :], guess
-                if np.abs(a - guess).max() * h / 2 < PREDICTED_RATE:
-                    break
-                guess = guess + share * (a - guess)
-            q = pin.integrate(self.body.model, state.q, state.v * h + a * (h * h / 2))
-            before, state = state.a, State(q, state.v + a * h, a)
-            out.states.append(state)
-            out.nodes.append(node)
-            out.terms.append(terms)
-            out.predicted.append(predicted)
-            out.answers.append(answer)
-        out.nodes.append(self.body.motion(state.q, state.v))
-        return out
+            step = self.solved(qp, k, state._replace(a=2 * state.a - before), solver)
+            before = state.a
+            q = pin.integrate(self.body.model, step.q, step.v * h + step.a * (h * h / 2))
+            state = State(q, step.v + step.a * h, step.a)
+            steps.append(step)
+        return steps, state
 
-    def run(self, method: str = "cvxpy") -> JointPlan:
-        """Roll out launch and flight with "cvxpy" or "direct"."""
-        if not isinstance(method, str) or method not in SOLVERS:
-            raise InputError(f"stage 2: method {method!r} is unknown; it must be one of {', '.join(SOLVERS)}")
-        solver_type = SOLVERS[method]
-        began, rest = time.perf_counter(), np.zeros(self.body.nv)
-        launch = self.roll(self.launch, solver_type, State(self.q0, rest, rest))
-        takeoff = launch.states[-1]
-        flight = self.roll(self.flight_from(takeoff), solver_type, takeoff)
-        total, answers = time.perf_counter() - began, launch.answers + flight.answers
-        iterations, worst = sum(x.iterations for x in answers), max(x.residual for x in answers)
-        spent = Statistics(method, len(answers), iterations, launch.solve_s + flight.solve_s, total, worst)
-        return self._plan(launch, flight, spent)
+    def run(self, solver: Any = None) -> JointPlan:
+        """Roll out launch and flight.
 
-    def _plan(self, launch: Rolled, flight: Rolled, statistics: Statistics) -> JointPlan:
-        """Put both phases together, and freeze them."""
-        n, m = len(launch.terms), len(flight.terms)
-        terms, states = launch.terms + flight.terms, launch.states + flight.states
-        held = np.r_[0:n, n - 1, n : n + m, n + m - 1]  # node -> step that begins there; the last of a phase repeats
-        a = np.array([x.a for x in launch.states[1:] + flight.states[1:]])  # (n + m, nv)
-        F = np.zeros((n + m, 2, 6))
-        F[:n] = np.array([x.x[:WRENCH] for x in launch.answers]).reshape(n, 2, 6)
-        tau = np.array([(x.M @ ai + x.H - x.J.T @ Fi.ravel())[6:] for x, ai, Fi in zip(terms, a, F, strict=True)])
-        data = {
-            "t": np.concatenate([self.launch.t, self.launch.t[-1] + self.flight_reference.t]),
-            "phase": np.repeat(["launch", "flight"], [n + 1, m + 1]),
-            "contact": np.array([*np.where(self.launch.on_toes, "toe", "flat"), *["air"] * m])[held],
-            "q": np.array([x.q for x in states]),
-            "v": np.array([x.v for x in states]),
-            "a": a[held],
-            "predicted": np.array(launch.predicted + flight.predicted)[held],
-            "tau": tau[held],
-            "f": self._at_origins(terms, F)[held],
+        ``solver`` has a method ``solve(qp)``; :class:`jumplab.ocp.qp.QpSolver` if None. Raises
+        :class:`SolverError` if a QP has no trustworthy answer; names phase, time and the rows that
+        conflict.
+        """
+        began = time.perf_counter()
+        rest = np.zeros(self.body.nv)
+        launch, takeoff = self.roll(self.launch, solver or QpSolver(), State(self.q0, rest, rest))
+        flight, end = self.roll(self.flight_from(takeoff), solver or QpSolver(), takeoff)
+        rows = [
+            *launch,
+            launch[-1]._replace(q=takeoff.q, v=takeoff.v),
+            *flight,
+            flight[-1]._replace(q=end.q, v=end.v),
+        ]
+        on_toes = sum(self.launch.on_toes)
+        times = [len(launch) - on_toes, on_toes + 1, len(flight) + 1]
+        columns = {
+            "t": np.append(self.launch.t, self.launch.t[-1] + self.reference.flight.t),
+            "phase": np.repeat(["launch", "launch", "flight"], times),
+            "contact": np.repeat(["flat", "toe", "air"], times),
+            **{name: np.array([getattr(row, name) for row in rows]) for name in AT_NODES},
         }
-        actual, reference = self._series(launch.nodes + flight.nodes, n + 1)
-        for x in (*data.values(), *actual.values(), *reference.values()):
+        for x in columns.values():
             x.setflags(write=False)
-        seen = {"actual": actual, "reference": reference, "tracking": tracking(actual, reference, n + 1)}
-        return JointPlan(**data, **seen, statistics=statistics, options=self.options)
-
-    def _at_origins(self, terms, F) -> np.ndarray:
-        """Wrenches moved from the tiptoes to the origins of the foot frames."""
-        foot, out = self.body.robot.foot, F.copy()
-        arm = np.array([x.foot_rotation @ [foot.toe, 0.0, foot.sole_z] for x in terms])  # origin to tiptoe (N, 2, 3)
-        out[..., 3:] += np.cross(arm, F[..., :3])
-        return out
-
-    def _series(self, terms, n):
-        """What the motion does and what stage 1 asked for, by name."""
-        pivot, launch, flight = self.launch.pivot, self.launch.reference, self.flight_reference
-        actual = {
-            "com": np.array([x.com - pivot for x in terms]),
-            "com_velocity": np.array([x.com_velocity for x in terms]),
-            "L": np.array([x.momentum[4] for x in terms]),
-            "rho": np.array([x.rho for x in terms]),
-            "foot_com": np.array([x.foot_com.mean(0) for x in terms[n:]]),
-        }
-        reference = {
-            "com": np.concatenate([launch.com.value, flight.com.value]),
-            "com_velocity": np.concatenate([launch.com.rate, flight.com.rate]),
-            "L": np.concatenate([launch.momentum.rate, np.full(len(terms) - n, flight.L)]),
-            "rho": np.concatenate([launch.inertia.value, flight.inertia.value]),
-            "foot_com": flight.foot.value,
-        }
-        return actual, reference
+        steps = Step(*zip(*launch, *flight, strict=True))
+        statistics = Statistics(
+            len(steps.q),
+            sum(steps.iterations),
+            sum(steps.solve_s),
+            time.perf_counter() - began,
+            max(steps.residual),
+        )
+        made = dict(statistics=statistics, options=self.options, problem=self.problem)
+        return JointPlan(**columns, **made)
 
 
 def map_to_joints(
-    srmp_plan: Any,
+    srmp: SrmpPlan,
     robot: Robot,
     step_s: float | tuple[float, float, float] = 0.01,
-    method: str = "cvxpy",
     options: Options | None = None,
     q0: np.ndarray | None = None,
-    *,
-    terms: Mapping[str, Iterable[Term]] | None = None,
-    weights: Mapping[str, float] | None = None,
-    off: Sequence[str] = (),
+    changes: StageChanges = StageChanges(),
 ) -> JointPlan:
     """Map stage 1's momentum and inertia trajectories to the joints of the full robot (Sec. IV).
 
     Parameters
     ----------
-    srmp_plan : object with ``launch`` and ``flight``, each with the arrays of stage 1 at a fixed step.
-    robot : the robot.  step_s : step of the roll-out [s], or one each for flat feet, toes and flight.
-    method : "cvxpy" (Clarabel) or "direct" (ProxQP); the same QPs, the same optimum.
-    options : gains, weights, limits; by default those of :class:`Options` or, where they find no way, ``GENTLE``; the
-        plan's ``gentle`` then says why.
-    q0 : (nq,) start at rest; the robot's stance by default.
-    terms : "launch" or "flight" -> own terms, costs or constraints on a :class:`.own.StepPoint`.
-    weights : "block" or "phase/block" -> factor on its weight.  off : "block" or "phase/block" to leave out.
+    srmp, robot, step_s, q0, changes : see :class:`JointMapper` (step_s [s], q0 (nq,)).
+    options : gains, weights, limits; by default those of :class:`Options` or, where they find no
+        way, ``GENTLE``; the plan's ``gentle`` then says why.
 
     Raises
     ------
-    InputError : the reference has gaps, NaN or wrong lengths, an option is unknown, or a term does not fit.
+    InputError : an option is unknown, or a term does not fit.
     SolverError : a QP has no trustworthy answer; names phase, time and the rows that conflict.
     """
-    changes: dict[str, Any] = {"q0": q0, "terms": terms, "weights": weights, "off": off}
-    if options is not None:
-        return JointMapper(srmp_plan, robot, step_s, options, **changes).run(method)
-    try:
-        return JointMapper(srmp_plan, robot, step_s, Options(), **changes).run(method)
-    except SolverError as firm:
+    firm = None
+    for choice in (Options(), GENTLE) if options is None else (options,):
         try:
-            plan = JointMapper(srmp_plan, robot, step_s, GENTLE, **changes).run(method)
-        except SolverError:
-            raise firm from None
-        return replace(plan, gentle=str(firm))
+            plan = JointMapper(srmp, robot, step_s, choice, q0, changes).run()
+        except SolverError as e:
+            firm = firm or e
+        else:
+            return replace(plan, gentle=str(firm or ""))
+    raise firm

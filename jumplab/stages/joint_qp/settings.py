@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jumplab.ocp import Term
+import numpy as np
+
 from jumplab.task import FRICTION
 
 
@@ -15,13 +16,19 @@ class Gain:
     stiffness: float
     damping: float
 
+    def back(self, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Acceleration (...,) that takes an ``error`` (...,) with its ``rate`` (...,) away."""
+        return -self.stiffness * error - self.damping * rate
+
 
 @dataclass(frozen=True)
 class Gains:
-    """Feedback around the feed-forward references (Sec. IV-B: "PD controllers cooperating with feedforward").
+    """Feedback around the feed-forward references (Sec. IV-B: "PD controllers cooperating with
+    feedforward").
 
-    All are critically damped: 20 rad/s where a reference is followed (steps of 10 ms ring with 50), 30 for the CoM,
-    which must be back on its way at take-off, 5 to 10 where something is only suggested.
+    All are critically damped: 20 rad/s where a reference is followed (steps of 10 ms ring with 50),
+    30 for the CoM, which must be back on its way at take-off, 5 to 10 where something is only
+    suggested.
     """
 
     com: Gain = Gain(900.0, 60.0)
@@ -31,8 +38,10 @@ class Gains:
     posture: Gain = Gain(25.0, 10.0)
     trunk: Gain = Gain(25.0, 10.0)
     foot_level: Gain = Gain(100.0, 20.0)
-    contact: Gain = Gain(400.0, 40.0)  # Baumgarte: tiptoes, flat feet and the symmetry of left and right
-    momentum_drift: Gain = Gain(100.0, 20.0)  # Baumgarte in flight: CoM and momentum back to their ballistic values
+    # Baumgarte: tiptoes, flat feet and the symmetry of left and right
+    contact: Gain = Gain(400.0, 40.0)
+    # Baumgarte in flight: CoM and momentum back to their ballistic values
+    momentum_drift: Gain = Gain(100.0, 20.0)
     ground: Gain = Gain(400.0, 40.0)  # barrier of heel and toe above the ground
 
 
@@ -41,18 +50,24 @@ class LaunchWeights:
     """Weights of the launch QP's squared terms."""
 
     com: float = 1.0  # [cost] / [m/s^2]^2, A_c theta'' + B_c - c''_ref
-    force: float = 1e-3  # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
+    # [cost] / [N]^2, linear rows of A_f F - B_f; about 1/m^2 of com, so as strong
+    force: float = 1e-3
     # both forwards, feet flat: on the toes an error in x grows as in a falling pendulum
     com_x: float = 900.0
     force_x: float = 0.9
-    moment: float = 50.0  # [cost] / [N m]^2, angular rows of A_f F - B_f; L is what the flight cannot mend
-    inertia: float = 0.05  # [cost] / [kg m^2/s^2]^2, feet flat; a hip at its stop then keeps rho, not the CoM's height
-    inertia_toe: float = 1.2e-4  # the same on the toes: more drives the ankle to its speed limit and costs speed
-    inertia_fade_s: float = 0.2  # [s] before the heel rises, from the one to the other: the CoM's height returns
+    # [cost] / [N m]^2, angular rows of A_f F - B_f; L is what the flight cannot mend
+    moment: float = 50.0
+    # [cost] / [kg m^2/s^2]^2, feet flat; a hip at its stop then keeps rho, not the CoM's height
+    inertia: float = 0.05
+    # the same on the toes: more drives the ankle to its speed limit and costs speed
+    inertia_toe: float = 1.2e-4
+    # [s] before the heel rises, from the one to the other: the CoM's height returns
+    inertia_fade_s: float = 0.2
     posture: float = 1e-4  # [cost] / [rad/s^2]^2, joints towards the stance with swung arms
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
     wrench: float = 1e-6  # [cost] / [N, N m]^2, regulariser: shares the load between the feet
-    acceleration: float = 1e-5  # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
+    # [cost] / [m/s^2, rad/s^2]^2, regulariser: makes the Hessian regular
+    acceleration: float = 1e-5
 
 
 @dataclass(frozen=True)
@@ -60,7 +75,8 @@ class FlightWeights:
     """Weights of the flight QP's squared terms."""
 
     foot: float = 1.0  # [cost] / [m/s^2]^2, J_rd theta'' + drift - p''_rd
-    inertia: float = 1.0  # [cost] / [kg m^2/s^2]^2, J_rho theta'' + drift - rho''_ref where it is no hard row
+    # [cost] / [kg m^2/s^2]^2, J_rho theta'' + drift - rho''_ref
+    inertia: float = 1.0
     foot_level: float = 1e-2  # [cost] / [rad/s^2]^2, sole parallel to the ground
     posture: float = 1e-3  # [cost] / [rad/s^2]^2, joints towards the stance
     trunk: float = 1e-4  # [cost] / [rad/s^2]^2, trunk towards its posture
@@ -69,41 +85,45 @@ class FlightWeights:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the motion may use of ground and joints. ``None`` switches a family of rows off."""
+    """What the motion may use of ground and joints; whole families of rows are left out by the name
+    of their term.
+    """
 
-    friction: float | None = FRICTION
-    cop_margin_m: float | None = 0.0  # inside the sole's edges
-    unilateral: bool = True  # F_z >= 0 at each foot
-    torque_share: float | None = 1.0  # of the peak torque, with the speed line of the actuator
-    speed_share: float | None = 1.0  # of the speed limit
-    range_margin_rad: float | None = 0.01  # to the joint stops
-    stop_rate: float = 20.0  # [1/s]: a stop is approached at most at this times the angle left, so it comes as no shock
-    stop_share: float = 0.5  # of the peak torque, with which a joint, moving alone in the stance, brakes before a stop
+    friction: float = FRICTION
+    torque_share: float = 1.0  # of the peak torque, with the speed line of the actuator
+    range_margin_rad: float = 0.01  # to the joint stops
+    # [1/s]: a stop is approached at most at this times the angle left, so it comes as no shock
+    stop_rate: float = 20.0
+    # of the peak torque, with which a joint, moving alone in the stance, brakes before a stop
+    stop_share: float = 0.5
     near_ground_m: float = 0.03  # below this height the heel (and in flight the toe) must not sink
 
 
 @dataclass(frozen=True)
 class Options:
-    """Everything adjustable about stage 2; own terms, and blocks left out, are set by :func:`.changes.changed`."""
+    """Everything adjustable about stage 2 but its terms, see :func:`.terms.changed_problem`."""
 
     gains: Gains = Gains()
     launch: LaunchWeights = LaunchWeights()
     flight: FlightWeights = FlightWeights()
     limits: Limits = Limits()
-    arm_rad: float = -1.5  # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
-    terms: tuple[tuple[str, Term], ...] = ()  # (phase, own term)
-    off: tuple[str, ...] = ()  # "phase/block" of what is left out
-
-    def own(self, phase: str) -> tuple[Term, ...]:
-        """Own terms of a phase that are not left out."""
-        return tuple(term for p, term in self.terms if p == phase and f"{p}/{term.name}" not in self.off)
+    # shoulder angle of the posture that the joints lean towards, forward negative: arms swing up
+    arm_rad: float = -1.5
 
 
-# For a stage 1 that asks for more than the joints can give: followed firmly, it drives them into their stops. This
-# follows less closely, but arrives: the CoM at 20 rad/s and no stronger forwards, L and rho weaker
+# For a stage 1 that asks for more than the joints can give: followed firmly, it drives them into
+# their stops. This follows less closely, but arrives: the CoM at 20 rad/s and no stronger forwards,
+# L and rho weaker
 GENTLE = Options(
     gains=Gains(com=Gain(400.0, 40.0)),
     launch=LaunchWeights(
-        com=3.0, force=3e-3, com_x=3.0, force_x=3e-3, moment=1.0, inertia=3e-3, inertia_toe=6e-5, inertia_fade_s=0.01
+        com=3.0,
+        force=3e-3,
+        com_x=3.0,
+        force_x=3e-3,
+        moment=1.0,
+        inertia=3e-3,
+        inertia_toe=6e-5,
+        inertia_fade_s=0.01,
     ),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -12,13 +13,11 @@ import numpy as np
 from jumplab.errors import Shown, SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
-from jumplab.ocp.cache import remembered
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
-from jumplab.robot.reach import Reach, reach, shipped_reach
+from jumplab.robot.reach import Reach, reach
 from jumplab.stages.changes import StageChanges
-from jumplab.stages.srmp.problem import SYMMETRY_OFF, build_problem
-from jumplab.stages.srmp.reachable import check_reachable
+from jumplab.stages.srmp.problem import build_problem
 from jumplab.stages.srmp.settings import SrmpSettings
 from jumplab.task import JumpTask
 
@@ -26,7 +25,9 @@ from jumplab.task import JumpTask
 # plan ------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class SrmpMotion:
-    """Columns that all parts of a jump have; positions from the middle of the sole where it stands or took off."""
+    """Columns that all parts of a jump have; positions from the middle of the sole where it stands
+    or took off.
+    """
 
     t: np.ndarray  # (n,) since this part began [s]
     com: np.ndarray  # (n, 2) x and z [m]
@@ -36,7 +37,8 @@ class SrmpMotion:
     rho: np.ndarray  # (n,) [kg m^2]
     rho_rate: np.ndarray  # (n,) [kg m^2/s]
     rho_accel: np.ndarray  # (n,) [kg m^2/s^2]
-    lean: np.ndarray  # (n,) angle of the line from the sole to the CoM against the vertical, theta_l [rad]
+    # (n,) angle of the line from the sole to the CoM against the vertical, theta_l [rad]
+    lean: np.ndarray
 
     @property
     def duration_s(self) -> float:
@@ -62,12 +64,13 @@ class SrmpFlight(SrmpMotion):
 
     foot_com: np.ndarray  # (n, 2) middle of the sole relative to the CoM [m]
     foot_com_rate: np.ndarray  # (n, 2) [m/s]
-    foot_com_accel: np.ndarray  # (n, 2) [m/s^2]
 
 
 @dataclass(frozen=True, repr=False)
 class SrmpPlan(Shown):
-    """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept in, the target."""
+    """Result of stage 1: sampled launch and flight, the solution itself, the envelope it was kept
+    in, the target.
+    """
 
     task: JumpTask
     launch: SrmpStance
@@ -90,11 +93,16 @@ class SrmpPlan(Shown):
         """Duration of the flight [s]."""
         return self.flight.duration_s
 
+    def at(self, launch_t: np.ndarray, flight_t: np.ndarray) -> SrmpPlan:
+        """The same plan at other times (n,) since launch and flight began [s]."""
+        return sample_plan(self.task, self.solution, self.reach, launch_t, flight_t)
+
 
 # planner ------------------------------------------------------------------------------------------
 SAMPLE_S = 0.005  # a hundred samples and more over each part
 OPTIONS = {  # of ipopt
-    "neg_curv_test_tol": 1e-12,  # adds to an indefinite Hessian only if the step itself meets negative curvature
+    # adds to an indefinite Hessian only if the step itself meets negative curvature
+    "neg_curv_test_tol": 1e-12,
     "bound_mult_init_method": "mu-based",  # first multipliers of limits that fit the barrier
     "mu_init": 0.01,
     "mu_min": 1e-6,  # a hundredth of the tolerances
@@ -104,7 +112,7 @@ OPTIONS = {  # of ipopt
 
 
 def parameters(task: JumpTask, envelope: Reach, start: np.ndarray | None = None) -> dict:
-    """Parameter values of the stage-1 problem for a target; ``start`` (4,) instead of the stance."""
+    """Parameters of stage 1's problem for a target; ``start`` (4,) instead of the stance."""
     return dict(
         start=envelope.start if start is None else start,
         distance=task.distance_m,
@@ -116,46 +124,44 @@ def parameters(task: JumpTask, envelope: Reach, start: np.ndarray | None = None)
 
 
 def naive_guess(task: JumpTask, envelope: Reach, settings: SrmpSettings) -> dict[str, PhaseGuess]:
-    """Start values that know only the target: crouch and rise on a straight line, constant inertia, steady turning."""
-    n_flat, n_toe, n = settings.intervals
-    phi0, t_f = envelope.start[1], task.flight_time(min(task.platform_m, 0.9 * task.height_m))
-    # durations [s], time of the crouch and lean [rad] with the fewest iterations at the hardest targets
-    flat_s, toe_s, bottom, reach_rad = 0.5, 0.12, 0.75, 0.45
-    share = flat_s / (flat_s + toe_s)
-    s = np.concatenate([np.linspace(0, share, n_flat + 1), np.linspace(share, 1, n_toe + 1)])
-    crouch = 0.62 * phi0  # a knee bend of about a right angle
-    length = np.interp(s, [0, bottom, 1], [phi0, crouch, 0.9 * phi0])
-    vel_x = 0.8 * task.distance_m / t_f
-    lean = reach_rad * np.tanh(vel_x) * s**2
-    radius = np.sqrt(np.clip(envelope.start[3] ** 2 * length / phi0, 0.01, None))
-    q = np.stack([lean, length, 0.4 * s, radius], -1)
-    flat, toe = q[: n_flat + 1], q[n_flat + 1 :]
-    rho = envelope.mass * radius[-1] ** 2
-    spin = (task.rotation_rad - 2 * lean[-1]) / t_f
-    com_x, com_z = length[-1] * np.sin(lean[-1]), length[-1] * np.cos(lean[-1])
-    constants = dict(L=rho * spin, com_x=com_x, com_z=com_z, vel_x=vel_x, vel_z=task.takeoff_speed, leg=0.94 * phi0)
-    theta = (lean[-1] + spin * t_f * np.linspace(0, 1, n + 1))[:, None]
-    return {
-        "flat": PhaseGuess(flat_s, flat, flat * 0, flat * 0),
-        "toe": PhaseGuess(toe_s, toe, toe * 0, toe * 0),
-        "flight": PhaseGuess(t_f, np.full_like(theta, rho), theta * 0, theta * 0, theta, constants),
-    }
-
-
-def reach_of(robot: Robot, *, keep: bool = False) -> Reach:
-    """What the robot can do, see :func:`jumplab.robot.reach.reach`: from the file shipped with it, else sampled.
-
-    With ``keep``, what was sampled is left for later processes.
+    """Start values that know only the target: the stance, which leans over, then a flight with its
+    inertia, steadily turning.
     """
-    if (known := shipped_reach(robot)) is not None or not keep:
-        return known or reach(robot)
-    return Reach.from_json(remembered("reach", robot.hash, lambda: reach(robot).to_json()))
+    n_flat, n_toe, n = settings.intervals
+    _, length, _, radius = envelope.start
+    flight_s = task.flight_time(min(task.platform_m, 0.9 * task.height_m))
+    vel_x = 0.8 * task.distance_m / flight_s
+    lean = 0.45 * np.tanh(vel_x)  # [rad] at take-off, and as far back at touchdown
+    spin = (task.rotation_rad - 2 * lean) / flight_s
+    rho = envelope.mass * radius**2
+    constants = dict(
+        L=rho * spin,
+        com_x=length * np.sin(lean),
+        com_z=0.9 * length,
+        vel_x=vel_x,
+        vel_z=task.takeoff_speed,
+        leg=0.94 * length,
+    )
+
+    def leaning(duration: float, first: float, last: float, intervals: int) -> PhaseGuess:
+        q = np.tile(envelope.start, (intervals + 1, 1))
+        q[:, 0] += lean * np.linspace(first, last, intervals + 1) ** 2
+        return PhaseGuess(duration, q, 0 * q, 0 * q)
+
+    theta = lean + spin * flight_s * np.linspace(0.0, 1.0, n + 1)[:, None]
+    inertia = np.full_like(theta, rho), 0 * theta, 0 * theta
+    return {
+        "flat": leaning(0.5, 0.0, 0.8, n_flat),
+        "toe": leaning(0.12, 0.8, 1.0, n_toe),
+        "flight": PhaseGuess(flight_s, *inertia, theta, constants),
+    }
 
 
 class SrmpPlanner:
     """Stage 1 for one robot: built once, solved for any target.
 
-    ``keep`` keeps what was built for later processes; ``changes`` are own terms, other weights, and terms left out.
+    ``keep`` keeps what was built for later processes; ``changes`` are own terms, other weights, and
+    terms left out.
     """
 
     def __init__(
@@ -166,8 +172,10 @@ class SrmpPlanner:
         keep: bool = False,
         changes: StageChanges = StageChanges(),
     ):
-        self.robot, self.settings, self.changes = robot, settings, changes
-        self.reach = reach_of(robot, keep=keep)
+        self.robot = robot
+        self.settings = settings
+        self.changes = changes
+        self.reach = reach(robot)
         key = f"{robot.hash} {settings}" if keep else None
         self.nlp = Nlp(changes.applied(build_problem(robot, settings, self.reach)), OPTIONS, key)
         self._warm = self.nlp.with_options(WARM | OPTIONS)
@@ -176,50 +184,61 @@ class SrmpPlanner:
         self,
         task: JumpTask,
         *,
-        guess: dict[str, PhaseGuess] | None = None,
-        weights: Mapping[str, float] | None = None,
-        off: tuple[str, ...] = SYMMETRY_OFF,
+        weights: Mapping[str, float] = MappingProxyType({}),
         near: SrmpPlan | None = None,
         start: np.ndarray | None = None,
     ) -> SrmpPlan:
         """Solve for a target; ``near`` is a plan for one close by to begin with, if that works.
 
-        ``start`` is the rod (4,) that the jump begins with, at rest, see :func:`jumplab.robot.reach.rod_of`; that of
-        the stance if None.
+        ``start`` is the rod (4,) that the jump begins with, at rest, see
+        :func:`jumplab.robot.reach.rod_of`; that of the stance if None.
 
         Raises
         ------
-        InfeasibleError
-            Before solving, if closed forms already say that the robot cannot do it.
         SolverError
             If there is no solution; names the violated terms.
         """
-        check_reachable(task, self.reach, self.robot, self.settings)
+        data = parameters(task, self.reach, start)
+        weights = self.changes.spread(self.nlp.problem, weights)
         if near is not None:
+            known = near.solution
             try:
-                return self._solve(task, near.solution.guess(), weights, off, False, near.solution.multipliers, start)
+                solution = self._warm.solve(
+                    data,
+                    known.guess(),
+                    weights=weights,
+                    explain=False,
+                    multipliers=known.multipliers,
+                )
+                return sample_plan(task, solution, self.reach)
             except SolverError:
                 pass  # as if there had been none
-        return self._solve(task, guess, weights, off, start=start)
-
-    def _solve(self, task: JumpTask, guess, weights, off, explain=True, multipliers=None, start=None) -> SrmpPlan:
-        guess = guess or naive_guess(task, self.reach, self.settings)
-        weights, off = self.changes.spread(self.nlp.problem, weights), self.changes.still_there(self.nlp.problem, off)
-        nlp, data = self.nlp if multipliers is None else self._warm, parameters(task, self.reach, start)
-        solution = nlp.solve(data, guess, weights=weights, off=off, explain=explain, multipliers=multipliers)
-        return sample_plan(task, solution, self.reach, self.robot.sagittal.total_mass)
+        guess = naive_guess(task, self.reach, self.settings)
+        return sample_plan(task, self.nlp.solve(data, guess, weights=weights), self.reach)
 
 
 # samples ------------------------------------------------------------------------------------------
-def sample_plan(task: JumpTask, solution: Solution, envelope: Reach, mass: float) -> SrmpPlan:
-    """Sample a stage-1 solution on grids that include both ends of both parts."""
+def sample_plan(
+    task: JumpTask,
+    solution: Solution,
+    envelope: Reach,
+    launch_t: np.ndarray | None = None,
+    flight_t: np.ndarray | None = None,
+) -> SrmpPlan:
+    """Sample a stage-1 solution at times (n,) since launch and flight began [s], by default on
+    grids that include both ends.
+    """
     flat, toe, flight = (solution.phases[k] for k in ("flat", "toe", "flight"))
-    t = grid(flat.duration + toe.duration)
+    t = grid(flat.duration + toe.duration) if launch_t is None else launch_t
     first = t < flat.duration
     later = np.minimum(t[~first] - flat.duration, toe.duration)
-    q, v, a = (np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True))
-    launch = SrmpStance(*on_ground(mass, task.gravity, t, q, v, a))
-    return SrmpPlan(task, launch, _sample_flight(flight, toe.q[-1, 1], task.gravity), solution, envelope)
+    motion = (
+        np.concatenate(pair) for pair in zip(flat.sample(t[first]), toe.sample(later), strict=True)
+    )
+    launch = SrmpStance(*on_ground(envelope.mass, task.gravity, t, *motion))
+    t = grid(flight.duration) if flight_t is None else flight_t
+    flown = _sample_flight(flight, toe.q[-1, 1], task.gravity, t)
+    return SrmpPlan(task, launch, flown, solution, envelope)
 
 
 def grid(duration: float) -> np.ndarray:
@@ -231,12 +250,14 @@ def grid(duration: float) -> np.ndarray:
 def _pendulum(mass: float, gravity: float) -> ca.Function:
     q, v, a = (ca.SX.sym(n, 4) for n in "qva")
     s = SrmpState(mass, q, v, a, gravity)
-    out = [s.com, s.com_velocity, s.com_acceleration, s.angular_momentum, s.angular_momentum_rate]
+    out = [s.com, s.com_velocity, s.com_acceleration, s.L, s.L_rate]
     out += [s.inertia, s.inertia_rate, s.inertia_accel, s.ground_force, s.pivot_torque]
     return ca.Function("srmp", [q, v, a], out)
 
 
-def on_ground(mass: float, gravity: float, t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple:
+def on_ground(
+    mass: float, gravity: float, t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray
+) -> tuple:
     """Columns of a :class:`SrmpStance` from times (n,) and coordinates with their rates (n, 4)."""
     out = [x.full().T.squeeze() for x in _pendulum(mass, gravity).map(len(t))(q.T, v.T, a.T)]
     com, com_v, com_a, momentum, rate, rho, rho_v, rho_a, force, torque = out
@@ -247,38 +268,25 @@ def on_ground(mass: float, gravity: float, t: np.ndarray, q: np.ndarray, v: np.n
     return *motion, rate, *force.T, cop, q[:, 0] + q[:, 2], q
 
 
-def _sample_flight(flight: PhaseSolution, takeoff_length: float, gravity: float) -> SrmpFlight:
-    t = grid(flight.duration)
+def _sample_flight(
+    flight: PhaseSolution, takeoff_length: float, gravity: float, t: np.ndarray
+) -> SrmpFlight:
+    from scipy.interpolate import BPoly, CubicHermiteSpline  # slow to import
+
     rho, rho_v, rho_a = (x[:, 0] for x in flight.sample(t))
-    c, ones = flight.constants, np.ones_like(t)
+    c = flight.constants
     # theta between nodes: the cubic through the node values with the exact rates L / rho
-    theta = _cubic(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0], t)
-    rate, accel = c["L"] / rho, -c["L"] * rho_v / rho**2
-    leg, leg1, leg2 = _leg_between(takeoff_length, c["leg"], t)
+    theta = CubicHermiteSpline(flight.t, flight.z[:, 0], c["L"] / flight.q[:, 0])(t)
+    # only the ends of the leg's length matter, the rod has no mass
+    ends = [takeoff_length, 0.0, 0.0], [c["leg"], 0.0, 0.0]
+    leg = BPoly.from_derivatives([0.0, flight.duration], ends)
     along = -np.stack([np.sin(theta), np.cos(theta)], -1)
     across = np.stack([along[:, 1], -along[:, 0]], -1)
-    foot = leg[:, None] * along
-    foot_v = leg1[:, None] * along + (leg * rate)[:, None] * across
-    foot_a = (leg2 - leg * rate**2)[:, None] * along + (leg * accel + 2 * leg1 * rate)[:, None] * across
-    com = np.stack([c["com_x"] + c["vel_x"] * t, c["com_z"] + c["vel_z"] * t - gravity * t**2 / 2], -1)
-    com_v = np.stack([c["vel_x"] * ones, c["vel_z"] - gravity * t], -1)
-    com_a = np.stack([0 * ones, -gravity * ones], -1)
-    return SrmpFlight(t, com, com_v, com_a, c["L"] * ones, rho, rho_v, rho_a, theta, foot, foot_v, foot_a)
-
-
-def _leg_between(first: float, last: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Leg length from take-off to touchdown with two derivatives: smooth, only the ends matter, the rod has no mass."""
-    s, d = t / t[-1], last - first
-    leg = first + d * (10 * s**3 - 15 * s**4 + 6 * s**5)
-    leg1 = d * ((30 * s**2 - 60 * s**3 + 30 * s**4) / t[-1])
-    return leg, leg1, d * ((60 * s - 180 * s**2 + 120 * s**3) / t[-1] ** 2)
-
-
-def _cubic(nodes: np.ndarray, values: np.ndarray, rates: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The cubic pieces through values and rates at nodes, at times ``t``."""
-    k = np.clip(np.searchsorted(nodes, t, side="right") - 1, 0, len(nodes) - 2)
-    h = nodes[k + 1] - nodes[k]
-    s = (t - nodes[k]) / h
-    rise = values[k + 1] - values[k]
-    first, last = h * rates[k], h * rates[k + 1]
-    return values[k] + s * (first + s * (3 * rise - 2 * first - last + s * (first + last - 2 * rise)))
+    length, speed, turning = (x[:, None] for x in (leg(t), leg.derivative()(t), c["L"] / rho))
+    fall = np.array([0.0, -gravity])
+    velocity = np.array([c["vel_x"], c["vel_z"]])
+    time = t[:, None]
+    com = np.array([c["com_x"], c["com_z"]]) + velocity * time + fall * time**2 / 2
+    motion = com, velocity + fall * time, np.broadcast_to(fall, com.shape), np.full_like(t, c["L"])
+    foot = length * along, speed * along + length * turning * across
+    return SrmpFlight(t, *motion, rho, rho_v, rho_a, theta, *foot)

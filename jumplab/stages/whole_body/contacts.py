@@ -1,18 +1,23 @@
-"""What is on the ground, when and where: a contact schedule as a value, with the usual ones by name."""
+"""What is on the ground, when and where: a contact schedule as a value, with the usual ones by
+name.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
+from jumplab.stages.whole_body.settings import Limits, Mesh
 
 SIDES = ("left", "right")
+HOLD = ("x", "y", "z", "yaw")  # of the middle of the toe edge of a foot that carries
 FLIGHT = "-"
-# natural times of phases [sqrt(leg / g)] by what carries: bounds of the duration, and where a solve begins
+# natural times of phases [sqrt(leg / g)] by what carries: bounds of the duration, and where a solve
+# begins
 TIMES = {
     "two feet": (1.1, 2.9, 2.1),
     "one foot": (0.4, 2.9, 1.5),
@@ -28,13 +33,20 @@ def sole_length(robot: Robot) -> float:
     return robot.foot.toe - robot.foot.heel
 
 
+def modes_of(feet: str) -> dict[int, str]:
+    """Side (0 left, 1 right) -> "flat" or "toe", of ``feet`` as of :class:`ContactPhase`."""
+    sides = sorted(("LR".index(c.upper()), c) for c in feet if c != FLIGHT)
+    return {side: "flat" if c.isupper() else "toe" for side, c in sides}
+
+
 @dataclass(frozen=True)
 class ContactPhase:
     """One phase: the feet that carry, and for how long.
 
     Attributes
     ----------
-    feet : "L", "R" for a flat left or right foot, "l", "r" for one on its toes, "-" for flight: "LR", "Lr", "l".
+    feet : "L", "R" for a flat left or right foot, "l", "r" for one on its toes, "-" for flight:
+        "LR", "Lr", "l".
     time_s : (low, high) bounds of the duration [s], which is an unknown.
     guess_s : duration with which a solve begins [s].
     intervals : number of equal steps.
@@ -49,9 +61,8 @@ class ContactPhase:
 
     @property
     def modes(self) -> dict[int, str]:
-        """Side (0 left, 1 right) -> "flat" or "toe", of the feet that carry."""
-        pairs = [(c, SIDES.index("left" if c in "Ll" else "right")) for c in self.feet if c != FLIGHT]
-        return {side: "flat" if c.isupper() else "toe" for c, side in sorted(pairs, key=lambda pair: pair[1])}
+        """Side -> "flat" or "toe", of the feet that carry."""
+        return modes_of(self.feet)
 
     @property
     def flying(self) -> bool:
@@ -59,19 +70,13 @@ class ContactPhase:
         return self.feet == FLIGHT
 
     @classmethod
-    def usual(cls, feet: str, robot: Robot, time_s: tuple[float, float] | None = None) -> ContactPhase:
-        """A phase with times and intervals that suit the robot's legs; ``time_s`` instead of its bounds [s]."""
-        carried = feet.replace(FLIGHT, "")
-        kind = (
-            FLIGHT if not carried else "toes" if carried.islower() else "one foot" if len(carried) == 1 else "two feet"
-        )
-        if len(carried) == 2 and carried != carried.upper():
-            kind = "toes"
+    def usual(cls, feet: str, robot: Robot) -> ContactPhase:
+        """A phase with times [s] and intervals that suit the robot's legs; ``feet`` as above."""
+        kind = "toes"
+        if feet == feet.upper():
+            kind = FLIGHT if feet == FLIGHT else "one foot" if len(feet) == 1 else "two feet"
         unit = math.sqrt(leg_length(robot) / robot.gravity)
         low, high, guess = (x * unit for x in TIMES[kind])
-        if time_s is not None:
-            low, high = time_s
-            guess = min(max(guess, low), high)
         return cls(feet, (low, high), guess, INTERVALS[kind])
 
 
@@ -99,14 +104,15 @@ class Place:
 class Contacts:
     """A contact schedule.
 
-    A foot that is on the ground in consecutive phases stays where it is, flat or on its toes; each time it comes down
-    again, without speed, it has a new :class:`Place`.
+    A foot that is on the ground in consecutive phases stays where it is, flat or on its toes; each
+    time it comes down again, without speed, it has a new :class:`Place`.
 
     Attributes
     ----------
     phases : one after the other; the first begins at rest in the stance.
     places : of all contacts after the first ones, in the order of the phases, left before right.
-    ends : "rest" (the robot stands still) or "touchdown" (in flight, both flat soles about to meet the ground).
+    ends : "rest" (the robot stands still) or "touchdown" (in flight, both flat soles about to meet
+        the ground).
 
     Raises
     ------
@@ -117,172 +123,204 @@ class Contacts:
     phases: tuple[ContactPhase, ...]
     places: tuple[Place, ...] = ()
     ends: str = "rest"
-    landings: tuple[tuple[int, int], ...] = field(init=False)  # (phase, side) of each contact, the first ones included
+    # (phase, side) of each contact, the first ones included
+    landings: tuple[tuple[int, int], ...] = field(init=False)
 
     def __post_init__(self):
-        named = [replace(p, name=p.name or f"{k} {p.feet}") for k, p in enumerate(self._phases(), start=1)]
-        object.__setattr__(self, "phases", tuple(named))
-        object.__setattr__(self, "places", tuple(self.places))
-        self._check_phases()
-        landings = [
-            (k, side) for k, p in enumerate(named) for side in p.modes if k == 0 or side not in named[k - 1].modes
-        ]
-        object.__setattr__(self, "landings", tuple(landings))
-        self._check_places()
-        _ = self.surface
-
-    def _phases(self) -> Iterable[ContactPhase]:
         for p in self.phases:
             require_type(p, ContactPhase, "a phase of the schedule")
-        if not self.phases:
-            raise InputError("a contact schedule needs at least one phase")
-        return self.phases
+        named = [replace(p, name=p.name or f"{k} {p.feet}") for k, p in enumerate(self.phases, 1)]
+        object.__setattr__(self, "phases", tuple(named))
+        object.__setattr__(self, "places", tuple(self.places))
+        for fault in self._faults():
+            raise InputError(fault)
+        _ = self.surface
 
-    def _check_phases(self) -> None:
-        for k, p in enumerate(self.phases):
-            where = f"phase {p.name!r}"
-            letters = p.feet.lower() if isinstance(p.feet, str) else ""
-            if letters not in ("l", "r", "lr", FLIGHT):
-                raise InputError(
-                    f"{where}: feet = {quoted(p.feet)}; write L and R for flat feet, l and r for toes, left before "
-                    f"right, or '-' for flight"
+    def _faults(self) -> Iterator[str]:
+        """What cannot be; finds where feet land on the way."""
+        phases = self.phases
+        if not phases:
+            yield "a contact schedule needs at least one phase"
+        for k, p in enumerate(phases):
+            if fault := _fault_of(p):
+                yield f"phase {p.name!r}: {fault}"
+            if k and p.feet == phases[k - 1].feet:
+                yield (
+                    f"phase {p.name!r}: the same feet carry as in the phase before; make one phase "
+                    f"of them"
                 )
-            if not (isinstance(p.time_s, tuple) and len(p.time_s) == 2 and 0 < p.guess_s < math.inf):
-                raise InputError(f"{where}: time_s must be (low, high) and guess_s a number, both in seconds")
-            low, high = p.time_s
-            if not 0 < low <= high < math.inf:
-                raise InputError(f"{where}: its time of {low:g} to {high:g} s must be positive, and in order")
-            if not isinstance(p.intervals, int) or isinstance(p.intervals, bool) or p.intervals < 2:
-                raise InputError(f"{where}: intervals = {quoted(p.intervals)} must be a whole number of 2 or more")
-            if k and p.feet == self.phases[k - 1].feet:
-                raise InputError(f"{where}: the same feet carry as in the phase before; make one phase of them")
-        first, last = self.phases[0], self.phases[-1]
+        first = phases[0]
+        last = phases[-1]
         if not first.feet.isupper():
-            raise InputError(
-                f"phase {first.name!r}: a schedule begins on flat feet, at rest; there is no support to wait on"
+            yield (
+                f"phase {first.name!r}: a schedule begins on flat feet, at rest; there is no "
+                f"support to wait on"
             )
-        names = [p.name for p in self.phases]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise InputError(f"two phases are called {twice[0]!r}; names must be unique in a schedule")
+        names = [p.name for p in phases]
+        if twice := sorted({n for n in names if names.count(n) > 1}):
+            yield f"two phases are called {twice[0]!r}; names must be unique in a schedule"
         if self.ends not in ("rest", "touchdown"):
-            raise InputError(f"ends = {quoted(self.ends)}: choose 'rest' or 'touchdown'")
+            yield f"ends = {quoted(self.ends)}: choose 'rest' or 'touchdown'"
         if last.flying != (self.ends == "touchdown"):
-            need = "end in flight" if self.ends == "touchdown" else "end on the ground"
-            raise InputError(f"phase {last.name!r}: a schedule that ends with {self.ends!r} has to {need}")
-
-    def _check_places(self) -> None:
-        first = len(self.phases[0].modes)
-        later = self.landings[first:]
-        if first == 1:
-            (side,) = self.phases[0].modes
-            other = SIDES[1 - side]
-            raise InputError(
-                f"phase {self.phases[0].name!r}: the schedule begins on one foot; where the {other} one waits "
-                f"nobody says; begin with 'LR'"
+            need = "end on the ground" if last.flying else "end in flight"
+            yield f"phase {last.name!r}: a schedule that ends with {self.ends!r} has to {need}"
+        if len(first.modes) == 1:
+            (side,) = first.modes
+            yield (
+                f"phase {first.name!r}: the schedule begins on one foot; where the "
+                f"{SIDES[1 - side]} one waits nobody says; begin with 'LR'"
             )
+        before = [{}, *(p.modes for p in phases)]
+        pairs = enumerate(zip(before, phases, strict=False))
+        landings = [(k, side) for k, (old, p) in pairs for side in p.modes if side not in old]
+        object.__setattr__(self, "landings", tuple(landings))
+        later = landings[len(first.modes) :]
         if len(self.places) != len(later):
-            came = ", ".join(f"{SIDES[side]} in phase {self.phases[k].name!r}" for k, side in later) or "none"
-            raise InputError(
-                f"places: {len(self.places)} given, but feet come down {len(later)} times ({came}); a foot lands only "
-                f"after it has left the ground"
+            came = [f"{SIDES[side]} in phase {phases[k].name!r}" for k, side in later]
+            yield (
+                f"places: {len(self.places)} given, but feet come down {len(later)} times "
+                f"({', '.join(came) or 'none'}); a foot lands only after it has left the ground"
             )
 
     @property
     def even(self) -> bool:
-        """Whether left and right do the same: both carry in the same way, or none, and places are mirror images."""
-        if any(p.modes and (len(p.modes) == 1 or len(set(p.modes.values())) > 1) for p in self.phases):
+        """Whether left and right do the same: both carry in the same way, or none, and places are
+        mirror images.
+        """
+        if any(p.feet not in ("LR", "lr", FLIGHT) for p in self.phases):
             return False
         pairs = zip(self.places[::2], self.places[1::2], strict=True)
         return all(a == replace(b, left_m=-b.left_m, turn_rad=-b.turn_rad) for a, b in pairs)
 
     @property
     def surface(self) -> tuple[float, int]:
-        """Height of the ground on which the schedule ends [m], and the number of the first place on it.
+        """Height of the ground on which the schedule ends [m], and the number of the first place on
+        it.
 
         Raises :class:`InputError` if places lie on more than one height besides the first.
         """
         heights = [p.up_m for p in self.places]
         height = heights[-1] if heights else 0.0
         first = next((i for i, up in enumerate(heights) if up == height), len(heights))
-        if any(up != 0 for up in heights[:first]) or any(up != height for up in heights[first:]):
-            told = ", ".join(f"{up:g}" for up in heights)
+        if any(heights[:first]) or set(heights[first:]) - {height}:
+            listed = ", ".join(f"{up:g}" for up in heights)
             raise InputError(
-                f"places at the heights {told} m: the ground has one step up or down; "
+                f"places at the heights {listed} m: the ground has one step up or down; "
                 f"give all places after it the same up_m, and all before it none"
             )
         return height, first
 
     def contact_of(self, phase: int, side: int) -> int:
-        """Index into :attr:`landings` of the contact that a foot has in a phase."""
+        """Index into :attr:`landings` of the contact of a foot (0 left, 1 right) in a phase."""
         return max(i for i, (k, s) in enumerate(self.landings) if k <= phase and s == side)
 
-    # the usual ones --------------------------------------------------------------------------------------------
+    # the usual ones, with steps of usual length where none is given [m]
+    # ------------------------------------------------------------------------------------------
     @classmethod
-    def of(cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest") -> Contacts:
-        """A schedule from words such as "LR L l - LR", with times that suit the robot's legs."""
+    def of(
+        cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest"
+    ) -> Contacts:
+        """A schedule from words such as "LR L l - LR", with times [s] that suit the robot's legs.
+
+        Raises :class:`InputError` as the class does, as all below.
+        """
         return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends)
 
     @classmethod
-    def hop(cls, robot: Robot, ahead_m: float | None = None, *, foot: str = "left", same: bool = False) -> Contacts:
-        """Off one foot, and down on both, or with ``same`` on the same one, the other following."""
+    def hop(
+        cls, robot: Robot, ahead_m: float | None = None, *, foot: str = "left", same: bool = False
+    ) -> Contacts:
+        """Off one foot, and down on both ``ahead_m`` [m] further, or with ``same`` on the same one,
+        the other following.
+        """
         if foot not in SIDES:
             raise InputError(f"foot = {quoted(foot)}: choose {' or '.join(SIDES)}")
-        d = STEP_SHARE * leg_length(robot) if ahead_m is None else ahead_m
-        up, other = ("L", "R") if foot == "left" else ("R", "L")
-        land = f"{up} LR" if same else "LR"
-        order = (up, other) if same else ("L", "R")
-        return cls.of(f"LR {up} {up.lower()} - {land}", robot, [Place(d) for _ in order])
+        place = Place(_step(robot, ahead_m))
+        up = "LR"[SIDES.index(foot)]
+        return cls.of(f"LR {up} {up.lower()} - {f'{up} ' * same}LR", robot, [place, place])
 
     @classmethod
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
-        """One or more steps, then off one foot, and down on both."""
-        d = STEP_SHARE * leg_length(robot) if step_m is None else step_m
-        words, places, ahead, last = ["LR"], [], 0.0, "L"
-        words.append(last)
+        """One or more steps of ``step_m`` [m], then off one foot, and down on both."""
+        d = _step(robot, step_m)
+        words = ["LR", "L"]
+        ahead = [d * (1 + 0.9 * k) for k in range(steps)]
         for k in range(steps):
-            following = "R" if last == "L" else "L"
-            ahead += d if k == 0 else 0.9 * d
-            pair = f"{last.lower()}{following}" if last == "L" else f"{following}{last.lower()}"
-            words += [pair, following]
-            places.append(Place(ahead))
-            last = following
-        words += [last.lower(), FLIGHT, "LR"]
-        places += [Place(ahead + 1.6 * d), Place(ahead + 1.6 * d)]
-        return cls.of(" ".join(words), robot, places)
+            words += ["Lr", "L"] if k % 2 else ["lR", "R"]
+        words += [words[-1].lower(), FLIGHT, "LR"]
+        jump = (ahead or [0.0])[-1] + 1.6 * d
+        return cls.of(" ".join(words), robot, [Place(x) for x in (*ahead, jump, jump)])
 
     @classmethod
-    def leap(cls, robot: Robot, step_m: float | None = None) -> Contacts:
-        """A step, then off the right foot, and down on the left one, the right one following."""
-        d = STEP_SHARE * leg_length(robot) if step_m is None else step_m
-        return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(2.4 * d), Place(2.4 * d)])
+    def leap(cls, robot: Robot, step_m: float | None = None, *, share: float = 2.4) -> Contacts:
+        """A step of ``step_m`` [m], then off the right foot, and down on the left one, the other
+        following; ``share`` is how many steps ahead they land.
+        """
+        d = _step(robot, step_m)
+        return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(share * d), Place(share * d)])
+
+    @classmethod
+    def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
+        """A leap that goes farther, ``step_m`` [m] as there."""
+        return cls.leap(robot, step_m, share=2.8)
 
     @classmethod
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
-        """Jumps off both feet and down on both, one after the other."""
-        d = STEP_SHARE * leg_length(robot) if jump_m is None else jump_m
-        words = ["LR"] + ["lr", FLIGHT, "LR"] * jumps
-        return cls.of(" ".join(words), robot, [Place((1 + k // 2) * d) for k in range(2 * jumps)])
+        """Jumps of ``jump_m`` [m] off both feet and down on both, in a row."""
+        d = _step(robot, jump_m)
+        places = [Place((1 + k // 2) * d) for k in range(2 * jumps)]
+        return cls.of("LR" + " lr - LR" * jumps, robot, places)
 
     @classmethod
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
-        """Off an edge with one foot first, in flight, and down on both, ``drop_m`` lower."""
-        d = STEP_SHARE * leg_length(robot) + sole_length(robot) if ahead_m is None else ahead_m
-        low = Place(d, up_m=-drop_m)
+        """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
+        low = Place(_off(robot, ahead_m), up_m=-drop_m)
         return cls.of("LR L l - LR", robot, [low, low])
 
     @classmethod
     def drop_jump(
         cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None
     ) -> Contacts:
-        """Off an edge, down on both feet, and up again at once."""
-        d = STEP_SHARE * leg_length(robot) + sole_length(robot) if ahead_m is None else ahead_m
-        j = STEP_SHARE * leg_length(robot) if jump_m is None else jump_m
-        low, far = Place(d, up_m=-drop_m), Place(d + j, up_m=-drop_m)
+        """Off an edge ``drop_m`` [m] down onto both feet, and at once on by ``jump_m`` [m]."""
+        low = Place(_off(robot, ahead_m), up_m=-drop_m)
+        far = replace(low, ahead_m=low.ahead_m + _step(robot, jump_m))
         return cls.of("LR L l - LR lr - LR", robot, [low, low, far, far])
 
-    @classmethod
-    def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
-        """A step, then off the right foot far ahead onto the left, and on to a stand."""
-        d = STEP_SHARE * leg_length(robot) if step_m is None else step_m
-        return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(2.8 * d), Place(2.8 * d)])
+
+def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:
+    """The schedule of a standing jump, which ends at touchdown; durations [s] by ``limits``,
+    intervals by ``mesh``.
+    """
+    phases = (
+        ContactPhase("LR", limits.flat_s, 0.6, mesh.flat, "flat"),
+        ContactPhase("lr", limits.toe_s, 0.1, mesh.toe, "toe"),
+        ContactPhase("-", limits.flight_s, 0.5, mesh.flight, "flight"),
+    )
+    return Contacts(phases, ends="touchdown")
+
+
+def _step(robot: Robot, given_m: float | None) -> float:
+    return STEP_SHARE * leg_length(robot) if given_m is None else given_m
+
+
+def _off(robot: Robot, given_m: float | None) -> float:
+    """The way off an edge [m]: a step, and the sole."""
+    return _step(robot, None) + sole_length(robot) if given_m is None else given_m
+
+
+def _fault_of(p: ContactPhase) -> str:
+    """What is wrong with a phase by itself, or nothing."""
+    letters = p.feet.lower() if isinstance(p.feet, str) else ""
+    if letters not in ("l", "r", "lr", FLIGHT):
+        return (
+            f"feet = {quoted(p.feet)}; write L and R for flat feet, l and r for toes, left before "
+            f"right, or '-' for flight"
+        )
+    if not (isinstance(p.time_s, tuple) and len(p.time_s) == 2 and 0 < p.guess_s < math.inf):
+        return "time_s must be (low, high) and guess_s a number, both in seconds"
+    low, high = p.time_s
+    if not 0 < low <= high < math.inf:
+        return f"its time of {low:g} to {high:g} s must be positive, and in order"
+    if not isinstance(p.intervals, int) or isinstance(p.intervals, bool) or p.intervals < 2:
+        return f"intervals = {quoted(p.intervals)} must be a whole number of 2 or more"
+    return ""

@@ -18,54 +18,69 @@ class Limits:
 
     torque_share: float = 0.85  # of the peak torque: margin for model error and for feedback
     speed_share: float = 0.90  # of the speed limit
-    friction: float = 0.42  # below the lowest friction that trials have (0.5), so that it holds between the nodes too
+    # below the lowest friction that trials have (0.5), so that it holds between the nodes too
+    friction: float = 0.42
     range_margin_rad: float = 0.03  # to the joint stops
-    cop_margin_m: float = 0.01  # ahead of the heel; at the toe none, it ends there before the heel rises
-    # of the sole, kept from both its ends besides until the last of the flat-foot phase: launches are open loop
+    # ahead of the heel; at the toe none, it ends there before the heel rises
+    cop_margin_m: float = 0.01
+    # of the sole, kept from both its ends besides until the last of the flat-foot phase: launches
+    # are open loop
     cop_reserve_share: float = 0.125
     least_push: float = 0.0  # share of the weight that both flat feet carry at least
     heel_up_rad: float = 0.9  # foot pitch at most during toe-off
     straight_knee_rad: float = 0.15  # flexion at least while a foot carries: a leg
     # nearly straight has hardly a rate for what its foot has to do, and tapes have jumps there
     flat_s: tuple[float, float] = (0.25, 0.90)  # duration of the flat-foot phase
-    toe_s: tuple[float, float] = (0.06, 0.12)  # duration of the toe phase, in which perturbed robots fall forward
-    flight_s: tuple[float, float] = (0.05, 1.5)  # duration of the flight, from a hop to a rise of two metres
-    clearance_m: float = 0.037  # of the soles over the ground in mid-flight: 2 cm, beside platforms too, between nodes
+    # duration of the toe phase, in which perturbed robots fall forward
+    toe_s: tuple[float, float] = (0.06, 0.12)
+    # duration of the flight, from a hop to a rise of two metres
+    flight_s: tuple[float, float] = (0.05, 1.5)
+    # of the soles over the ground in mid-flight: 2 cm, beside platforms too, between nodes
+    clearance_m: float = 0.037
     body_clearance_m: float = 0.05  # of knees and hands over the ground
     edge_clearance_m: float = 0.07  # by which a platform's edge counts as nearer to them
     shank_clearance_m: float = 0.015  # of the faces of the shanks from a platform's edge
     edge_smoothing_m: float = 0.015  # a platform's edge is a step smoothed over about twice this
     edge_before_heel_m: float = 0.05  # a platform begins this far before the landing soles
-    edge_step_m: float = 0.08  # and for clearance its upper surface counts as reaching this much further
-    ankle_margin_m: float = 0.005  # of the ankle of a foot in the air, over its height in the stance
+    # and for clearance its upper surface counts as reaching this much further
+    edge_step_m: float = 0.08
+    # of the ankle of a foot in the air, over its height in the stance
+    ankle_margin_m: float = 0.005
     # touchdown
     touchdown_joint_rate: float = 2.0  # [rad/s] each: the landing starts from near rest
     touchdown_trunk_rate: float = 1.0  # [rad/s]
     touchdown_foot_rate: float = 0.3  # [rad/s] a foot that turns lands on an edge
-    touchdown_knee: tuple[float, float] = (0.95, 1.4)  # [rad] the impact turns a straighter one too fast
+    # [rad] the impact turns a straighter one too fast
+    touchdown_knee: tuple[float, float] = (0.95, 1.4)
     touchdown_pitch: tuple[float, float] = (0.0, 0.30)  # [rad] of the base
-    touchdown_ankle_stroke: float | None = None  # [rad] if set, least way left to the stop that the shank leans into
-    capture_offset_m: float = 0.02  # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
+    # [rad] if set, least way left to the stop that the shank leans into
+    touchdown_ankle_stroke: float | None = None
+    # sole centre ahead of the CoM at touchdown: offset + slope * velocity (measured)
+    capture_offset_m: float = 0.02
     capture_slope_s: float = 0.13
     capture_window_m: float = 0.02
-    # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l), l the leg's length
+    # if set, not the window but L about the soles' middle, either way, in shares of m l sqrt(g l),
+    # l the leg's length
     capture_moment: float | None = None
-    # in the plane instead: that L of a flip forward; and of one backward the capture point + slope * take-off speed,
-    # ahead of the toes, in shares of l and of sqrt(l / g) (measured)
+    # in the plane instead: that L of a flip forward; and of one backward the capture point + slope
+    # * take-off speed, ahead of the toes, in shares of l and of sqrt(l / g) (measured)
     capture_forward: tuple[float, float] = (0.070, 0.116)
     capture_backward: tuple[float, float] = (0.12, 0.16)
     capture_backward_slope: float = 0.18
-    opening_speed_share: float = 1.0  # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
+    # of the speed limit, in the last :data:`LATE_SHARE` of the flight, if it is less
+    opening_speed_share: float = 1.0
     # where left and right move differently
     side_margin_m: float = 0.02  # CoP inside the sole's sides
     torsion_arm_m: float = 0.045  # on which friction resists the spin of a foot that carries alone
     foot_share: float = 0.15  # of the weight, on each flat foot at least
     knee_rad: float = 2.2  # flexion at most: deeper squats end on one leg
     roll_rad: float = 1.0  # of the base, far from the chart's end at a quarter turn
-    sides_share: float = 0.45  # of the stance's distance between left and right leg, seen from the trunk
+    # of the stance's distance between left and right leg, seen from the trunk
+    sides_share: float = 0.45
     hands_inward_m: float = 0.05  # by which hands may be further in than in the stance
     link_distance_m: float = 0.003  # between links that came too close without it
-    touchdown_slope: float = 0.42  # a sole's speed along the ground over that towards it: above the friction it slides
+    # a sole's speed along the ground over that towards it: above the friction it slides
+    touchdown_slope: float = 0.42
     touchdown_turning: float = (
         4.0  # [rad/s] of trunk and feet about the vertical besides, per half turn after the first
     )
@@ -76,7 +91,9 @@ class Limits:
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
     def of_flip(self) -> Limits:
-        """The same for a jump that turns over: time to wind up, a trunk that arrives turning, caught by momentum."""
+        """The same for a jump that turns over: time to wind up, a trunk that arrives turning,
+        caught by momentum.
+        """
         return replace(
             self,
             flat_s=(0.25, 1.3),
@@ -86,7 +103,8 @@ class Limits:
             momentum_share=0.15,  # stage 1's rod turns with other inertia than the body
             touchdown_trunk_rate=5.0,  # the trunk cannot stop while L stays what the turn needed
             touchdown_foot_rate=8.0,
-            touchdown_ankle_stroke=0.12,  # an ankle at its stop cannot keep a tilted robot's soles flat
+            # an ankle at its stop cannot keep a tilted robot's soles flat
+            touchdown_ankle_stroke=0.12,
             capture_moment=0.047,
         )
 
@@ -102,17 +120,24 @@ class Weights:
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
     track_velocity: float = 20.0  # [1] / [m/s]^2 / [s]
     # inertia in shares of the stance's, so that weights mean the same for robots of any size
-    track_inertia: float = 6800.0  # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
-    track_inertia_rate: float = 23.0  # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
-    track_flight_inertia_rate: float = 136.0  # the same in flight; less, and arms swing the other way and miss by 6 %
+    # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
+    track_inertia: float = 6800.0
+    # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
+    track_inertia_rate: float = 23.0
+    # the same in flight; less, and arms swing the other way and miss by 6 %
+    track_flight_inertia_rate: float = 136.0
     track_momentum: float = 2.0  # [1] / [kg m^2/s]^2 / [s]
     heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
     ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
     track_duration: float = 50.0  # [1] / [s]^2
 
     def of_flip(self) -> Weights:
-        """The same for a jump that turns over: stage 1's inertia, of a rod that turns as one, is only a hint."""
-        return replace(self, track_inertia=45.4, track_inertia_rate=0.454, track_flight_inertia_rate=0.454)
+        """The same for a jump that turns over: stage 1's inertia, of a rod that turns as one, is
+        only a hint.
+        """
+        return replace(
+            self, track_inertia=45.4, track_inertia_rate=0.454, track_flight_inertia_rate=0.454
+        )
 
 
 @dataclass(frozen=True)
@@ -126,7 +151,9 @@ class Mesh:
     def __post_init__(self):
         for name, n in self.intervals().items():
             if isinstance(n, bool) or not isinstance(n, int) or n < 2:
-                raise InputError(f"mesh: {name} = {quoted(n)} intervals, must be a whole number of 2 or more")
+                raise InputError(
+                    f"mesh: {name} = {quoted(n)} intervals, must be a whole number of 2 or more"
+                )
 
     def of_flip(self) -> Mesh:
         """The same for a jump that turns over: it winds up longer, and turns faster."""

@@ -1,23 +1,22 @@
-"""Which links can meet, found from the robot's shapes, and how far apart a face of one keeps the other."""
+"""Boxes around the links, and how far apart a face of one keeps another."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 
 from jumplab.models.spatial import SpatialModel, SpatialState
-from jumplab.robot import Robot
 
-ROUNDED_M = 1e-3  # by which the corner of a box gives way, so that the distance has a slope everywhere
+# by which the corner of a box gives way, so that the distance has a slope everywhere
+ROUNDED_M = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Box:
-    """A link's collision shape, or the box around it, in the frame of its body."""
+    """The box around a link's collision shape, in the frame of its body."""
 
     name: str
     body: int
@@ -28,13 +27,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two boxes that a face of the first keeps apart: ``way`` (3,) points out of it, at ``reach`` from its centre."""
+    """Two boxes that a ``face`` of the first keeps apart: 2 i is where its axis i begins, 2 i + 1
+    where it ends.
+    """
 
     first: Box
     second: Box
-    way: np.ndarray  # in the frame of the first one's body
-    reach: float
-    face: int  # which of the first one's six
+    face: int
 
     @property
     def name(self) -> str:
@@ -48,49 +47,39 @@ class Pair:
 
     def gap(self, s: SpatialState) -> ca.SX:
         """Distance of the second box from the plane of that face [m]; negative behind it."""
-        a, b = self.first, self.second
-        way = s.rotation(a.body) @ ca.DM(self.way)
+        a = self.first
+        b = self.second
+        axis = self.face // 2
+        out = a.axes[:, axis] * (1 if self.face % 2 else -1)
+        way = s.rotation(a.body) @ ca.DM(out)
         middle = s.point(b.body, b.centre) - s.point(a.body, a.centre)
         along = s.rotation(b.body) @ ca.DM(b.axes * b.half)
         spread = sum(ca.sqrt(ca.dot(way, along[:, i]) ** 2 + ROUNDED_M**2) for i in range(3))
-        return ca.dot(way, middle) - self.reach - spread
+        return ca.dot(way, middle) - float(a.half[axis]) - spread
 
 
-def boxes(robot: Robot, model: SpatialModel) -> tuple[list[Box], pin.GeometryModel]:
-    """The boxes of all links, in the order of the robot's collision shapes, and these."""
-    tree, out = model.model, []
-    geometry = pin.buildGeomFromUrdfString(tree, robot.urdf, pin.GeometryType.COLLISION)
+@dataclass(frozen=True)
+class Apart:
+    """Two links that a face keeps apart, at nodes ``first`` to ``last`` of one phase, by ``more_m``
+    than usual.
+    """
+
+    phase: int
+    first: int
+    last: int
+    pair: Pair
+    more_m: float = 0.0
+
+
+def boxes(geometry: pin.GeometryModel, model: SpatialModel) -> list[Box]:
+    """The boxes of all links [m], in the order of their collision shapes."""
+    out = []
     for shape in geometry.geometryObjects:
         shape.geometry.computeLocalAABB()
-        low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
-        own, place = model.bodies[shape.parentJoint - 1].own, shape.placement
-        centre = model.local(shape.parentJoint, place.act((low + high) / 2))
-        out.append(Box(shape.name, shape.parentJoint - 1, centre, own.T @ place.rotation, (high - low) / 2))
-    return out, geometry
-
-
-def candidates(robot: Robot, model: SpatialModel, found: list[Box]) -> list[tuple[int, int]]:
-    """Pairs of links (indices of their boxes) that are no neighbours."""
-    above = [b.parent for b in model.bodies]
-    out = []
-    for i, k in combinations(range(len(found)), 2):
-        a, b = found[i].body, found[k].body
-        if not (a == b or (b and above[b] == a) or (a and above[a] == b)):
-            out.append((i, k))
+        low = shape.geometry.aabb_local.min_
+        high = shape.geometry.aabb_local.max_
+        body = shape.parentJoint - 1
+        centre = model.local(shape.parentJoint, shape.placement.act((low + high) / 2))
+        axes = model.bodies[body].own.T @ shape.placement.rotation
+        out.append(Box(shape.name, body, centre, axes, (high - low) / 2))
     return out
-
-
-def faces(a: Box, b: Box) -> list[Pair]:
-    """What each face of the first box makes of the pair."""
-    ways = [(i, sign) for i in range(3) for sign in (-1.0, 1.0)]
-    return [Pair(a, b, sign * a.axes[:, i], a.half[i], n) for n, (i, sign) in enumerate(ways)]
-
-
-def gaps(pair: Pair, turns: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """:meth:`Pair.gap` in postures (n, bodies, 3, 3), (n, bodies, 3), with sharp corners (n,)."""
-    a, b = pair.first, pair.second
-    way = turns[:, a.body] @ pair.way
-    middle = places[:, b.body] + turns[:, b.body] @ b.centre - places[:, a.body] - turns[:, a.body] @ a.centre
-    along = turns[:, b.body] @ (b.axes * b.half)
-    spread = np.abs(np.einsum("ni,nij->nj", way, along)).sum(1)
-    return np.einsum("ni,ni->n", way, middle) - pair.reach - spread

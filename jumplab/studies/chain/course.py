@@ -1,31 +1,35 @@
-"""What a chain of jumps shall achieve: how far each time, how high, onto what; and the ground that belongs to it."""
+"""What a chain of jumps shall achieve: how far each time, how high, onto what; and the ground that
+belongs to it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from jumplab.errors import InputError, RobotError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.stance import check_stance
-from jumplab.sim.scene import REACH_M, Block, Scene
+from jumplab.sim.scene import Scene
 from jumplab.stages.whole_body import Limits
-from jumplab.stages.whole_body.planner import platform_edge_m
+from jumplab.stages.whole_body.ground import platform_edge_m
 from jumplab.task import JumpTask
 
-CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}  # half-way to the bottom of a landing: soon reached, quick to launch
+# half-way to the bottom of a landing: soon reached, quick to launch
+CROUCH = {"knee_rad": 1.0, "trunk_pitch_rad": 0.2}
 MOST_JUMPS = 50  # two minutes of simulated time; more is surely a typo
 
 
 def crouched(robot: Robot) -> Robot:
     """The robot whose standing posture is a crouch; itself if its joints do not allow that one.
 
-    Planners begin there, landings end there, and the standing controller holds it: all of them ask the robot.
+    Planners begin there, landings end there, and the standing controller holds it: all of them ask
+    the robot.
     """
     other = robot.with_stance(**CROUCH)
     try:
@@ -36,26 +40,29 @@ def crouched(robot: Robot) -> Robot:
 
 
 def placed(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Where a ``step`` (3,) leads from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as seen from there."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
+    """Where a ``step`` (3,) leads from a ``pose`` (3,): x, y [m] and heading [rad]; the step is as
+    seen from there.
+    """
+    return pose + pin.rpy.rpyToMatrix(0.0, 0.0, pose[2]) @ step
+
+
+def step_of(task: JumpTask) -> np.ndarray:
+    """(3,) way ahead and to the left [m], and turn [rad], of a jump."""
+    return np.array([task.distance_m, task.side_m, task.yaw_rad])
 
 
 def seen_from(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The step (3,) that leads from a ``pose`` to an ``other``."""
-    c, s, (x, y, turn) = np.cos(pose[2]), np.sin(pose[2]), other - pose
-    return np.array([c * x + s * y, c * y - s * x, turn])
+    """The step (3,) that leads from a ``pose`` (3,) to an ``other``."""
+    return pin.rpy.rpyToMatrix(0.0, 0.0, -pose[2]) @ (other - pose)
 
 
 @dataclass(frozen=True)
 class Course:
-    """Targets of a chain; make one with :meth:`of`, which reads and checks numbers."""
+    """Targets of a chain, each from where the one before it ends; :meth:`of` reads and checks
+    numbers.
+    """
 
-    distances_m: tuple[float, ...]  # travel of the feet in each jump, toe to toe
-    heights_m: tuple[float, ...]  # rise of the CoM in each flight
-    platforms_m: tuple[float, ...]  # height of each landing surface above the ground that the chain begins on
-    sides_m: tuple[float, ...] = ()  # travel of the feet to the left, in the heading in which each jump begins
-    turns_rad: tuple[float, ...] = ()  # about the vertical, to the left
+    tasks: tuple[JumpTask, ...]
 
     @classmethod
     def of(
@@ -66,109 +73,138 @@ class Course:
         sides_m: Iterable[Any] | None = None,
         turns_rad: Iterable[Any] | None = None,
     ) -> Course:
-        """A course from what somebody typed: one height for all jumps or one per jump; level ground without platforms,
-        straight ahead without sides and turns.
+        """A course from what somebody typed, (K,) each [m, rad]: one height for all jumps or one
+        per jump; platforms above the first ground, else level; straight ahead without sides and
+        turns.
 
-        Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number cannot be meant.
+        Raises :class:`InputError` if there is no jump, if lists differ in length, or if a number
+        cannot be meant.
         """
         distances = _numbers("distances", distances_m)
         count = len(distances)
         if not 1 <= count <= MOST_JUMPS:
-            raise InputError(f"a chain has 1 ... {MOST_JUMPS} jumps, this one has {count}; give one distance per jump")
+            raise InputError(
+                f"a chain has 1 ... {MOST_JUMPS} jumps, this one has {count}; "
+                f"give one distance per jump"
+            )
         heights = _numbers("heights", [height_m] if np.ndim(height_m) == 0 else height_m)
-        heights = heights * count if len(heights) == 1 else heights
-        platforms = (0.0,) * count if platforms_m is None else _numbers("platforms", platforms_m)
-        away = [() if x is None else _numbers(n, x) for n, x in (("sides", sides_m), ("turns", turns_rad))]
-        rows = ("heights", heights), ("platforms", platforms), *zip(("sides", "turns"), away, strict=True)
-        for name, values in rows:
-            if len(values) not in ((count,) if name in ("heights", "platforms") else (0, count)):
+        rows = {"heights": heights * count if len(heights) == 1 else heights}
+        given = {"platforms": platforms_m, "sides": sides_m, "turns": turns_rad}
+        for name, values in given.items():
+            rows[name] = [0.0] * count if values is None else _numbers(name, values)
+        for name, values in rows.items():
+            if len(values) != count:
                 raise InputError(f"{len(values)} {name} for {count} distances: give one per jump")
-        if any(map(any, away)) and any(platforms):
-            raise InputError("platforms lie on a straight way: leave them away, or ask for neither sides nor turns")
-        course = cls(distances, heights, platforms, *away)
-        for k in range(count):
+        if any(rows["platforms"]) and any(rows["sides"] + rows["turns"]):
+            raise InputError(
+                "platforms lie on a straight way: leave them away, "
+                "or ask for neither sides nor turns"
+            )
+        # above the surface that each jump starts from
+        rows["platforms"] = np.diff(rows["platforms"], prepend=0.0).round(9).tolist()
+        tasks = []
+        for k, (*numbers, side, turn) in enumerate(zip(distances, *rows.values(), strict=True), 1):
             try:
-                course.task(k)
+                tasks.append(JumpTask(*numbers, side_m=side, yaw_rad=turn))
             except InputError as e:
-                raise InputError(f"jump {k + 1} of {count}: {e}") from e
-        return course
+                raise InputError(f"jump {k} of {count}: {e}") from e
+        return cls(tuple(tasks))
 
     @property
     def count(self) -> int:
         """Number of jumps."""
-        return len(self.distances_m)
+        return len(self.tasks)
 
     @property
     def in_plane(self) -> bool:
-        """Whether it goes straight ahead or back; then places are those of the toes, else of the soles' middle."""
-        return not (any(self.sides_m) or any(self.turns_rad))
+        """Whether it goes straight ahead or back; then places are those of the toes, else of the
+        soles' middle.
+        """
+        return all(task.in_plane for task in self.tasks)
 
-    def step(self, k: int) -> np.ndarray:
-        """(3,) way ahead and to the left [m], and turn [rad], of jump ``k``."""
-        return np.array([self.distances_m[k], *(x[k] if x else 0.0 for x in (self.sides_m, self.turns_rad))])
+    @property
+    def platforms_m(self) -> list[float]:
+        """(K,) height of each landing surface above the ground that the chain begins on [m]."""
+        return np.cumsum([task.platform_m for task in self.tasks]).round(9).tolist()
 
     @cached_property
     def goals(self) -> np.ndarray:
-        """(K, 3) x, y [m] and heading [rad] of the feet after each jump as wanted, from where they stand at first."""
+        """(K, 3) x, y [m] and heading [rad] of the feet after each jump as wanted, from where they
+        stand at first.
+        """
         poses = [np.zeros(3)]
-        for k in range(self.count):
-            poses.append(placed(poses[-1], self.step(k)))
+        for task in self.tasks:
+            poses.append(placed(poses[-1], step_of(task)))
         return np.array(poses[1:])
 
-    @cached_property
-    def goals_m(self) -> tuple[float, ...]:
-        """How far ahead the feet should be after each jump, from where they stand at first [m]."""
-        return tuple(self.goals[:, 0].tolist())
+    @property
+    def goals_m(self) -> list[float]:
+        """(K,) how far ahead the feet should be after each jump, from where they stand at first
+        [m].
+        """
+        return self.goals[:, 0].tolist()
 
-    def task(self, k: int, step: np.ndarray | None = None) -> JumpTask:
-        """Target of jump ``k`` (counted from 0), with another step (3,) if given."""
-        ahead, side, turn = self.step(k) if step is None else step
-        rise = self.platforms_m[k] - (0.0, *self.platforms_m)[k]  # above the surface that it starts from
-        return JumpTask(ahead, self.heights_m[k], round(rise, 9), side_m=side, yaw_rad=turn)
+    def to_json(self) -> dict[str, list[float]]:
+        """Plain data, a number per jump [m, rad]."""
+        return {
+            "distances_m": [task.distance_m for task in self.tasks],
+            "heights_m": [task.height_m for task in self.tasks],
+            "platforms_m": self.platforms_m,
+            "sides_m": [task.side_m for task in self.tasks],
+            "turns_rad": [task.yaw_rad for task in self.tasks],
+        }
 
-    def edges(self, robot: Robot) -> tuple[tuple[float, float], ...]:
+    def edges(self, robot: Robot) -> list[tuple[float, float]]:
         """(x, height) where the ground changes its height, x from the toes' first place [m]."""
-        jumps = zip(map(self.task, range(self.count)), (0.0, *self.goals_m), self.platforms_m, strict=False)
-        return tuple((x + platform_edge_m(task, robot), top) for task, x, top in jumps if task.platform_m)
+        places = zip(self.tasks, (0.0, *self.goals_m), self.platforms_m, strict=False)
+        return [
+            (start + platform_edge_m(task, robot), top)
+            for task, start, top in places
+            if task.platform_m
+        ]
 
     def check(self, robot: Robot) -> None:
-        """Raise :class:`InputError` if a platform overlaps with a place where the robot stands.
+        """Raise :class:`InputError` if a platform overlaps with a place (see :attr:`goals`) where
+        the robot stands.
 
-        Between two places of different height both soles need room beside the edge; see :func:`platform_edge_m`.
+        Between two places of different height both soles need room beside the edge; see
+        :func:`platform_edge_m`.
         """
-        if any(self.platforms_m) and min(self.distances_m) < 0:
-            k = int(np.argmin(self.distances_m))
-            raise InputError(
-                f"jump {k + 1} of {self.count}: {self.distances_m[k]:g} m goes back over the platforms; "
-                f"chains with platforms go forward, backward jumps stay on the level"
-            )
+        if not any(self.platforms_m):
+            return
         least = 2 * Limits().edge_before_heel_m - robot.sagittal.heel[0]
-        for k in range(self.count):
-            rise, distance = self.task(k).platform_m, self.distances_m[k]
-            if rise and distance < least:
-                what = f"{self.platforms_m[k]:g} m high" if rise > 0 else f"down at {self.platforms_m[k]:g} m"
+        for k, (task, top) in enumerate(zip(self.tasks, self.platforms_m, strict=True), 1):
+            number = f"jump {k} of {self.count}"
+            distance = task.distance_m
+            rise = task.platform_m
+            if distance < 0:
                 raise InputError(
-                    f"jump {k + 1} of {self.count}: the surface {what} would begin under the sole that stands "
+                    f"{number}: {distance:g} m goes back over the platforms; "
+                    f"chains with platforms go forward, backward jumps stay on the level"
+                )
+            if rise and distance < least:
+                what = f"{top:g} m high" if rise > 0 else f"down at {top:g} m"
+                raise InputError(
+                    f"{number}: the surface {what} would begin under the sole that stands "
                     f"{distance:g} m before it; place them {least:.2f} m apart or more, toe to toe"
                 )
 
     def scene(self, robot: Robot) -> Scene:
-        """The ground: level, or blocks that meet at the edges."""
-        edges = self.edges(robot)
-        if not edges:
-            return Scene.flat()
+        """The ground: level, or blocks that meet at the :meth:`edges` (x [m], height [m])."""
         zero = robot.foot.toe - float(robot.foot.center[0])  # soles' middle at x = 0
-        ends = [(-REACH_M, 0.0), *((zero + x, top) for x, top in edges), (REACH_M, 0.0)]
-        return Scene("platforms", tuple(Block(a, b, top) for (a, top), (b, _) in pairwise(ends)))
+        tops = {zero + x: top for x, top in self.edges(robot)}
+        return Scene.level("platforms", tops) if tops else Scene.flat()
 
 
-def _numbers(name: str, values: Any) -> tuple[float, ...]:
+def _numbers(name: str, values: Any) -> list[float]:
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise InputError(f"the {name} of a chain must be a list of numbers, got {quoted(values)}")
-    out = []
+    numbers = []
     for k, value in enumerate(values, 1):
         try:
-            out.append(float("" if isinstance(value, bool) else value))
+            numbers.append(float("" if isinstance(value, bool) else value))
         except (TypeError, ValueError, OverflowError):
-            raise InputError(f"the {name} of a chain must be numbers in m; number {k} is {quoted(value)}") from None
-    return tuple(out)
+            raise InputError(
+                f"the {name} of a chain must be numbers in m; number {k} is {quoted(value)}"
+            ) from None
+    return numbers

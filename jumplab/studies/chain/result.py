@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from jumplab.auditing import AuditReport, write_audit
+from jumplab.control.kinematics import Gauge
 from jumplab.io import folder as store
-from jumplab.io.folder import transaction
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S
-from jumplab.sim.kinematics import Gauge
 from jumplab.sim.result import LEVEL_TOLERANCE_M, SimulationResult
 from jumplab.sim.scene import Scene
 from jumplab.studies.chain.course import Course
-from jumplab.studies.chain.pilot import Ahead
+from jumplab.studies.chain.foresight import Ahead
+from jumplab.studies.study import Plain
 
 SCHEMA = "jumplab-chain-1"
-REPORT, LOG, JUMPS = "chain.json", "chain.npz", "jumps"
+REPORT = "chain.json"
+LOG = "chain.npz"
+JUMPS = "jumps"
 PLAN_NAMES = "looked_s air foretold_m place_m bias_m solve_s cpu_s ready_s needed_s began_s".split()
 
 
@@ -31,10 +33,12 @@ class ChainedJump:
     """One jump of a chain."""
 
     number: int  # from 0
-    start_s: float  # time of the chain at which the log begins; the stand before the first jump belongs to it
+    # time of the chain at which the log begins; the stand before the first jump belongs to it
+    start_s: float
     ahead: Ahead | None  # the plan with which it began; None if it did not
     plans: tuple[Ahead, ...]  # all that were made for it
-    simulation: SimulationResult  # log up to the beginning of the next jump, its time counted from zero
+    # log up to the beginning of the next jump, its time counted from zero
+    simulation: SimulationResult
 
     @property
     def air_s(self) -> float | None:
@@ -43,28 +47,11 @@ class ChainedJump:
         return None if m.touchdown_s is None or m.liftoff_s is None else m.touchdown_s - m.liftoff_s
 
     def on_feet(self, robot: Robot) -> bool:
-        """Whether it came down, and nothing but the feet touched the ground from its start to the next jump."""
+        """Whether it came down, and nothing but the feet (of ``robot``) touched the ground from its
+        start to the next jump.
+        """
         feet = np.isin(self.simulation.link_names, robot.foot.frames)
         return self.air_s is not None and not self.simulation.touching[:, ~feet].any()
-
-    def row(
-        self, course: Course, robot: Robot, travel_m: float, error_m: float, heading_error_rad: float
-    ) -> dict[str, Any]:
-        """Distances, errors, and when the plan was made, ready, needed and begun, as plain data."""
-        a, first, run = self.ahead, self.plans[0] if self.plans else None, self.simulation
-        row = dict(
-            jump=self.number + 1,
-            asked_m=float(np.hypot(*course.step(self.number)[:2])),
-            travel_m=travel_m,
-            error_m=error_m,
-        )
-        row |= dict(rise_m=run.metrics.com_rise_m, air_s=self.air_s, planned_m=a and a.plan.task.distance_m)
-        row |= {name: a and getattr(a, name) for name in PLAN_NAMES}
-        row |= dict(first_solve_s=first and first.solve_s, first_ready_s=first and first.ready_s)
-        row["in_time"] = a.in_time if self.number and a else None
-        row |= dict(on_feet=self.on_feet(robot), honest=run.checks_passed, heading_error_rad=heading_error_rad)
-        row["plans"] = [{n: getattr(p, n) for n in ("failure", *PLAN_NAMES)} for p in self.plans]
-        return row
 
 
 def _joined(name: str, doc: str) -> property:
@@ -88,43 +75,47 @@ class ChainResult:
     settings: dict  # how it was run
 
     @cached_property
-    def places_m(self) -> np.ndarray:
-        """(K + 1, 3) middle between the toes at first, and at the end of each jump's log, from the first [m].
-
-        On a course with sides and turns the middle between the soles.
+    def feet(self) -> np.ndarray:
+        """(K + 1, 4) x, y, z [m] and heading [rad] of the feet, at first and where each jump's log
+        ends, from the first; of the toes, or on a course with sides and turns of the soles' middle.
         """
         gauge = Gauge(self.robot)
         where = gauge.toe if self.course.in_plane else gauge.soles
-        first = where(self.jumps[0].simulation.q[0])
-        return np.array([np.zeros(3), *(where(j.simulation.q[-1]) - first for j in self.jumps)])
+        ends = [self.jumps[0].simulation.q[0], *(j.simulation.q[-1] for j in self.jumps)]
+        poses = np.array([[*where(q), gauge.heading(q)] for q in ends])
+        return poses - poses[0]
+
+    @property
+    def places_m(self) -> np.ndarray:
+        """(K + 1, 3) places of the :attr:`feet` [m]."""
+        return self.feet[:, :3]
 
     @property
     def travels_m(self) -> np.ndarray:
         """(K,) travel of the feet in each jump [m]; with sides and turns the length of the way."""
-        if not self.course.in_plane:
-            return np.linalg.norm(np.diff(self.places_m[:, :2], axis=0), axis=1)
-        return np.diff(self.places_m[:, 0])
+        return self._along(np.diff(self.feet, axis=0))
 
     @property
     def errors_m(self) -> np.ndarray:
-        """(K,) where the feet stand after each jump less where the course wants them [m]; with sides and turns how far
-        off they are."""
-        goals = self.course.goals[: len(self.jumps)]
-        if not self.course.in_plane:
-            return np.linalg.norm(self.places_m[1:, :2] - goals[:, :2], axis=1)
-        return self.places_m[1:, 0] - goals[:, 0]
+        """(K,) where the feet stand after each jump less where the course wants them [m]; with
+        sides and turns how far off they are.
+        """
+        return self._along(self.feet[1:, :2] - self.course.goals[: len(self.jumps), :2])
+
+    def _along(self, ways: np.ndarray) -> np.ndarray:
+        return ways[:, 0] if self.course.in_plane else np.linalg.norm(ways[:, :2], axis=1)
 
     @property
     def heading_errors_rad(self) -> np.ndarray:
         """(K,) where the feet point after each jump less where the course wants them to [rad]."""
-        gauge = Gauge(self.robot)
-        found = [gauge.heading(j.simulation.q[-1]) for j in self.jumps]
-        off = np.array(found) - gauge.heading(self.jumps[0].simulation.q[0]) - self.course.goals[: len(found), 2]
-        return np.arctan2(np.sin(off), np.cos(off))
+        errors = self.feet[1:, 3] - self.course.goals[: len(self.jumps), 2]
+        return np.arctan2(np.sin(errors), np.cos(errors))
 
     @property
     def stood(self) -> bool:
-        """Whether every jump was jumped, on the feet alone, and the robot stood for 3 s after the last one."""
+        """Whether every jump was jumped, on the feet alone, and the robot stood for 3 s after the
+        last one.
+        """
         return not self.reason
 
     @property
@@ -134,21 +125,28 @@ class ChainResult:
             return self.interrupted
         if len(self.jumps) < self.course.count:
             return f"only {len(self.jumps)} of {self.course.count} jumps began"
-        for j, height in zip(self.jumps, self.places_m[1:, 2], strict=True):
-            if not j.on_feet(self.robot):
-                return f"jump {j.number + 1}: {j.simulation.reason}"
-            miss = height - self.course.platforms_m[j.number]
-            if abs(miss) > LEVEL_TOLERANCE_M:
-                return f"jump {j.number + 1}: stands {miss:+.2f} m from the height it was meant to land on"
-            if not j.simulation.checks_passed:
-                failed = "; ".join(str(f) for f in j.simulation.checks if not f.passed)
-                return f"jump {j.number + 1}: not honest: {failed}"
-        last = self.jumps[-1].simulation
-        return "" if last.landed else f"jump {len(self.jumps)}: {last.reason}"
+        for jump, top in zip(self.jumps, self.course.platforms_m, strict=True):
+            run = jump.simulation
+            miss = self.feet[jump.number + 1, 2] - top
+            reason = ""
+            if not jump.on_feet(self.robot):
+                reason = run.reason
+            elif abs(miss) > LEVEL_TOLERANCE_M:
+                reason = f"stands {miss:+.2f} m from the height it was meant to land on"
+            elif not run.checks_passed:
+                checks = "; ".join(str(f) for f in run.checks if not f.passed)
+                reason = f"failed checks of the run: {checks}"
+            elif jump is self.jumps[-1] and not run.landed:
+                reason = run.reason
+            if reason:
+                return f"jump {jump.number + 1}: {reason}"
+        return ""
 
     @property
     def replans(self) -> tuple[Ahead, ...]:
-        """Plans made on the way, in the air and on the ground: all but the first jump's, for which nothing waits."""
+        """Plans made on the way, in the air and on the ground: all but the first jump's, for which
+        nothing waits.
+        """
         return tuple(p for j in self.jumps[1:] for p in j.plans)
 
     @property
@@ -158,8 +156,11 @@ class ChainResult:
 
     @property
     def waits_s(self) -> tuple[float, ...]:
-        """How long the robot, still enough, waited for a plan before each jump but the first [s]."""
-        return tuple(j.ahead.began_s - j.ahead.needed_s for j in self.jumps[1:] if j.ahead is not None)
+        """How long the robot, still enough, waited for a plan before each jump but the first
+        [s].
+        """
+        begun = (j.ahead for j in self.jumps[1:] if j.ahead)
+        return tuple(ahead.began_s - ahead.needed_s for ahead in begun)
 
     @property
     def t(self) -> np.ndarray:
@@ -176,41 +177,81 @@ class ChainResult:
         """The log under the names of ``chain.npz``."""
         logs = {name: getattr(self, name) for name in ("t", "q", "v", "tau", "phase", "com")}
         logs["jump"] = np.concatenate([np.full(len(j.simulation.t), j.number) for j in self.jumps])
-        return {"schema": np.array(SCHEMA), **logs, "joint_names": np.asarray(self.robot.joint_names)}
+        return logs | {"schema": np.array(SCHEMA), "joint_names": np.array(self.robot.joint_names)}
 
-    def rows(self) -> list[dict[str, Any]]:
-        """One row per jump, see :meth:`ChainedJump.row`."""
-        told = zip(
-            self.jumps, *(x.tolist() for x in (self.travels_m, self.errors_m, self.heading_errors_rad)), strict=True
-        )
-        return [jump.row(self.course, self.robot, *row) for jump, *row in told]
+    def rows(self) -> list[Plain]:
+        """One row per jump: distances [m], errors, and when the plan was made, ready, needed and
+        begun [s].
+        """
+        rows = []
+        for jump in self.jumps:
+            ahead = jump.ahead
+            first = jump.plans[0] if jump.plans else None
+            task = self.course.tasks[jump.number]
+            row = {
+                "jump": jump.number + 1,
+                "asked_m": math.hypot(task.distance_m, task.side_m),
+                "travel_m": float(self.travels_m[jump.number]),
+                "error_m": float(self.errors_m[jump.number]),
+                "heading_error_rad": float(self.heading_errors_rad[jump.number]),
+                "rise_m": jump.simulation.metrics.com_rise_m,
+                "air_s": jump.air_s,
+                "planned_m": ahead and ahead.plan.task.distance_m,
+                **{name: ahead and getattr(ahead, name) for name in PLAN_NAMES},
+                "first_solve_s": first and first.solve_s,
+                "first_ready_s": first and first.ready_s,
+                "in_time": ahead.in_time if jump.number and ahead else None,
+                "on_feet": jump.on_feet(self.robot),
+                "checks_passed": jump.simulation.checks_passed,
+                "plans": [{n: getattr(p, n) for n in ("failure", *PLAN_NAMES)} for p in jump.plans],
+            }
+            rows.append(row)
+        return rows
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Plain:
         """The content of ``chain.json``."""
-        robot = dict(name=self.robot.name, hash=self.robot.hash)
-        said = dict(schema=SCHEMA, target=asdict(self.course), robot=robot, stood=self.stood, reason=self.reason)
-        said |= dict(replans=len(self.replans), in_time=self.in_time, waits_s=self.waits_s, settings=self.settings)
-        return said | {"jumps": self.rows()}
+        return {
+            "schema": SCHEMA,
+            "target": self.course.to_json(),
+            "robot": {"name": self.robot.name, "hash": self.robot.hash},
+            "stood": self.stood,
+            "reason": self.reason,
+            "replans": len(self.replans),
+            "in_time": self.in_time,
+            "waits_s": self.waits_s,
+            "settings": self.settings,
+            "jumps": self.rows(),
+        }
 
 
 def write_chain(
-    folder: str | Path, result: ChainResult, further: Mapping[str, str] | None = None, *, series: Mapping | None = None
+    folder: str | Path,
+    result: ChainResult,
+    further: Mapping[str, str] | None = None,
+    *,
+    series: Mapping | None = None,
 ) -> tuple[AuditReport, ...]:
-    """Write a chain, whole or not at all, in the place of an older one; returns the audits of its plans.
+    """Write a chain, whole or not at all, in the place of an older one; returns the audits of its
+    plans.
 
-    ``jumps/1`` and so on are folders of plans like any other. ``further`` are names and texts of further files (the 3-D
-    page); ``series``, a report on many robots, becomes an entry of ``chain.json``.
+    ``jumps/1`` and so on are folders of plans like any other. ``further`` are names and texts of
+    further files (the 3-D page); ``series``, a report on many robots, becomes an entry of
+    ``chain.json``.
     """
     audits = []
-    with transaction(folder) as staging:
+    with store.transaction(folder) as staging:
         (staging / JUMPS).mkdir()
         for jump in result.jumps:
-            if jump.ahead is not None and jump.ahead.plan is not None:
-                plan, place = jump.ahead.plan, staging / JUMPS / str(jump.number + 1)
-                audits.append(store.write_plan(place, plan.tape, plan.robot, plan.summary, complete=write_audit))
+            if jump.ahead is not None:
+                plan = jump.ahead.plan
+                place = staging / JUMPS / str(jump.number + 1)
+                given = place, plan.tape, plan.robot, plan.summary
+                audits.append(store.write_plan(*given, complete=write_audit))
         np.savez_compressed(staging / LOG, **result.arrays())
         for name, text in (further or {}).items():
             (staging / name).write_text(text, encoding="utf-8")
-        report = {**result.to_json(), "versions": store.versions(), **({} if series is None else {"series": series})}
+        report = result.to_json() | {"versions": store.versions()}
+        if series is not None:
+            report["series"] = series
         (staging / REPORT).write_text(store.to_json(report), encoding="utf-8")
     return tuple(audits)

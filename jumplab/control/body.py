@@ -1,0 +1,147 @@
+"""The whole body at one state: what follows from joint accelerations and foot wrenches, and the
+rows that any choice of them has to obey.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.ocp.qp import Qp, QpSolver
+from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet, point_motion, wrench_rows
+
+PERIOD_STEPS = 2  # 500 Hz
+WRENCH_SCALE = 100.0  # [N] unit of the wrench variables, so that all unknowns are of order 1 to 10
+# [kg m^2] pitch inertia of the landed robot, turns a momentum rate into rad/s^2
+NOMINAL_INERTIA = 5.0
+AXES = np.arange(3)
+SPIN_FRICTION = 0.04  # [m] friction coefficient times the mean lever of the sole, about 0.07 m
+SPIN_HALF_WIDTH_M = 0.05  # of that sole: narrow ones turn on their edges under less
+TOLERANCE = 1e-6  # of residuals in N m, N and (r)m/s^2, far below what a motor can resolve
+MAX_ITERATIONS = 300  # ten times what the hardest recorded QP took
+SURELY_NONE = 1e-4  # ProxQP's own; residuals of programs that have no answer
+
+
+class WholeBody:
+    """Quantities at one state (:meth:`update`); unknowns are x = (accelerations (nv), wrench left,
+    wrench right).
+
+    Wrenches act at a point of each foot, the middle of the sole unless told, world axes, force then
+    moment, in units of :data:`WRENCH_SCALE`.
+
+    Attributes
+    ----------
+    unknowns : (nx, nx), rows of the unknowns themselves.
+    com, com_velocity : (3,) [m, m/s];  momentum : (3,) angular momentum about the CoM [kg m^2/s].
+    trunk : (3, 3) attitude of the base.
+    soles : (2, 3) the feet's points;  attitudes : (2, 3, 3);  twists : (2, 6).
+    sole_rows, sole_drift : (2, 6, nx) and (2, 6), acceleration of the point = rows @ x + drift.
+    force_rows : (3, nx), CoM acceleration = rows @ x + gravity.
+    momentum_rows : (3, nx), rate of ``momentum``.
+    """
+
+    def __init__(self, robot: Robot):
+        self._robot = robot
+        self._model = robot.model
+        self._data = self._model.createData()
+        self._middles = on_feet(robot, robot.foot.center)
+        self.motors = robot.limits
+        self.nv = self._model.nv
+        self.nx = self.nv + 12
+        self.mass = robot.total_mass
+        self.gravity = self._model.gravity.linear.copy()
+        self.unknowns = np.eye(self.nx)
+        self.sole_rows = np.zeros((2, 6, self.nx))
+        self.force_rows = np.zeros((3, self.nx))
+        self.momentum_rows = np.zeros((3, self.nx))
+        self._dynamics = np.zeros((self.nv, self.nx))
+
+    def update(self, q: np.ndarray, v: np.ndarray, anchors: list | None = None) -> None:
+        """Evaluate everything at ``q`` (nq,) and ``v`` (nv,), before :meth:`set_contact`; with the
+        wrenches at other ``anchors`` of both feet than the soles' middles.
+        """
+        model = self._model
+        data = self._data
+        pin.computeAllTerms(model, data, q, v)
+        pin.forwardKinematics(model, data, q, v, np.zeros(self.nv))
+        self.com = data.com[0].copy()
+        self.com_velocity = data.vcom[0].copy()
+        self.momentum = data.hg.angular.copy()
+        self.trunk = data.oMi[1].rotation.copy()
+        self._dynamics[:, : self.nv] = data.M
+        self._offset = data.nle.copy()
+        feet = [point_motion(model, data, anchor) for anchor in anchors or self._middles]
+        self.soles = np.array([foot.place for foot in feet])
+        self.attitudes = np.array([foot.turn for foot in feet])
+        self.twists = np.array([foot.velocity for foot in feet])
+        self.sole_drift = np.array([foot.drift for foot in feet])
+        self.sole_rows[:, :, : self.nv] = [foot.jacobian for foot in feet]
+
+    def set_contact(self, contact: np.ndarray) -> None:
+        """Let only the feet flagged in ``contact`` (2,) transmit wrenches."""
+        for side in (0, 1):
+            at = self.nv + 6 * side
+            unit = WRENCH_SCALE * float(contact[side])
+            self._dynamics[:, at : at + 6] = -unit * self.sole_rows[side, :, : self.nv].T
+            self.force_rows[AXES, at + AXES] = unit / self.mass
+            self.momentum_rows[:, at : at + 3] = unit * pin.skew(self.soles[side] - self.com)
+            self.momentum_rows[AXES, at + 3 + AXES] = unit
+
+    def program(self, v: np.ndarray, corners: np.ndarray, moment: np.ndarray | None = None) -> Qp:
+        """A QP without wishes: the base's dynamics, the motors at the rates of ``v`` (nv,), and the
+        ground's ``corners``, see :func:`corner_rows`.
+
+        ``moment`` (3,) about the CoM is needed besides, by a load that the model lacks [N m].
+        """
+        offset = self._offset.copy()
+        if moment is not None:
+            offset[3:6] += self.trunk.T @ moment
+        qp = Qp(self.nx)
+        qp.equality("base", self._dynamics[:6], -offset[:6])
+        low, high = self.motors.range(v[6:])
+        qp.limit("motors", self._dynamics[6:], low - offset[6:], high - offset[6:])
+        qp.limit("ground", corners, 0.0)
+        return qp
+
+    def balance(
+        self, qp: Qp, com: np.ndarray, momentum: np.ndarray, weights: tuple[np.ndarray, float]
+    ) -> None:
+        """Wish for an acceleration of the CoM (3,) [m/s^2] and a rate of the angular momentum (3,)
+        [N m]; the latter's weight is of that over a nominal inertia.
+        """
+        qp.cost("CoM", self.force_rows, com - self.gravity, weights[0])
+        rows = self.momentum_rows / NOMINAL_INERTIA
+        qp.cost("momentum", rows, momentum / NOMINAL_INERTIA, weights[1])
+
+    def torque(self, x: np.ndarray) -> np.ndarray:
+        """Joint torques (nv - 6,) that go with the unknowns ``x`` (nx,) [N m]."""
+        return self._dynamics[6:] @ x + self._offset[6:]
+
+    def gravity_torque(self, contact: np.ndarray) -> np.ndarray:
+        """Joint torques (nv - 6,) that hold the weight on the feet flagged in ``contact`` (2,) if
+        nothing moves [N m].
+        """
+        x = np.zeros(self.nx)
+        share = self.mass * -self.gravity[2] / WRENCH_SCALE / max(1, int(np.sum(contact)))
+        x[self.nv + 2 :: 6] = share * np.asarray(contact)
+        return self.torque(x)
+
+
+def solver() -> QpSolver:
+    """A solver for programs of one controller."""
+    return QpSolver(TOLERANCE, MAX_ITERATIONS, SURELY_NONE)
+
+
+def corner_rows(robot: Robot, friction: float, length: float, width: float) -> np.ndarray:
+    """Rows r (k, nx) with r @ x >= 0: friction [1], CoP within these shares of the sole's length
+    and width [1], and turning friction of both wrenches.
+    """
+    foot = robot.foot
+    half = length * (foot.toe - foot.heel) / 2
+    spin = SPIN_FRICTION
+    if not robot.planar:
+        spin *= foot.half_width / SPIN_HALF_WIDTH_M
+    inside = friction / np.sqrt(2)  # a pyramid within the cone
+    one = np.array([*wrench_rows(inside, half, half, width * foot.half_width, spin).values()])
+    return np.hstack([np.zeros((2 * len(one), robot.model.nv)), np.kron(np.eye(2), one)])

@@ -1,0 +1,254 @@
+"""One jump's controller: the tape until touchdown, a landing planned on the way down, the landing
+controller after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.control import STEP_S
+from jumplab.control.body import PERIOD_STEPS
+from jumplab.control.estimator import SURE
+from jumplab.control.kinematics import Gauge, Motion, State, headed, turned_wrench, yaw_of
+from jumplab.control.landing import LandingController
+from jumplab.control.launch import LaunchFeedback, check_mode
+from jumplab.control.playback import Command, Playback
+from jumplab.control.reaim import Reaim
+from jumplab.control.reference import LEAD_S, Forecast, LandingAhead
+from jumplab.control.servo import Drive, servo_of
+from jumplab.control.tuck import FROM_SHARE, Tuck, is_flip
+from jumplab.errors import InputError, quoted
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+
+LANDINGS = ("planned", "spring")
+# how long the robot may hang in the air after the tape's end before the run is given up
+WAIT_S = 0.5
+TOUCHDOWN_FORCE_N = 30.0  # sum of both feet; 7 % of the weight, ten times the sensor noise
+HEADING_DIGITS = 9  # of headings [nrad]
+# share of the planned flight before which a graze of the ground is no landing
+EARLIEST_TOUCHDOWN = 0.5
+SETTLING_S = 0.5  # after touchdown; 40 robots shoved after it stand as often with a QP each ...
+CALM_STEPS = 10  # ... 10 ms as with one each 2 ms
+# so long before the ground is due (a flip's legs still have to be stopped then) ...
+YIELD_S = 0.03
+FLIP_YIELD_S = 0.008
+# ... servos of mode "whole-body" get this share of the torque: enough for the posture, too little
+# to fight the impact
+YIELD_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What a controller knows of the drives, sensors and time steps that it works with."""
+
+    # torques are known to arrive so late; until touchdown, they are sent ahead
+    delay_s: float = 0.0
+    force_noise_n: float = 0.0  # standard deviation of the feet's forces
+    substeps: int = 1  # in which a simulator takes one step, see :class:`.servo.Servo`
+
+
+def level(x: float) -> float:
+    """Height of flat ground [m], wherever."""
+    return 0.0
+
+
+class Controller:
+    """Joint torques of one jump, from measured states; it knows no simulator.
+
+    Parameters
+    ----------
+    mode : "position", "pd" or "whole-body", the servo that plays the tape until touchdown, see
+        :mod:`.servo`; after it, a landing in torque mode.
+    reaim : put the legs in the air to where they can catch the robot, see :class:`.reaim.Reaim`.
+    step : allow one recovery step after touchdown, see :class:`.step.RecoveryStep`.
+    feedback : let the joints leave the tape in launch, so that the body as a whole launches as
+        planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd".
+    landing : "planned" follows stage 1's landing, planned in flight from the measured state;
+        "spring" leads to the stance by spring-dampers alone, and so does "planned" where stage 1
+        finds no landing.
+    ground : its height [m] at a place [m] along the heading of the landing.
+    hardware : what is known of drives and sensors.
+    start_rad : heading in which the robot stands at the start, where the tape begins with zero.
+    at_rest : the robot stands still at the start, and a wrong posture is led back to the plan.
+
+    Attributes
+    ----------
+    looks_rad : heading in which the robot shall land, or has landed if its legs are re-aimed; all
+        that looks ahead sees it along that one.
+    touchdown : step of the first contact after the flight, None until then.
+    ahead : what the landing controller follows, and why.
+    last_step : at which a robot that is still in the air is given up.
+
+    Raises :class:`InputError` if mode or landing make no sense, the tape is another robot's, or
+    ``feedback`` is asked in mode "pd".
+    """
+
+    def __init__(
+        self,
+        tape: Tape,
+        robot: Robot,
+        *,
+        mode: str = "position",
+        reaim: bool = False,
+        step: bool = False,
+        feedback: bool = False,
+        landing: str = "planned",
+        ground: Callable[[float], float] = level,
+        hardware: Hardware = Hardware(),
+        start_rad: float = 0.0,
+        at_rest: bool = True,
+    ):
+        if not isinstance(landing, str) or landing not in LANDINGS:
+            raise InputError(f"landing {quoted(landing)}: must be one of {', '.join(LANDINGS)}")
+        self.goal = tape.q[-1]
+        self._gauge = Gauge(robot)
+        # without the rounding of a plan that goes straight on: states need not be turned then
+        heading = round(self._gauge.heading(tape.q[-1]), HEADING_DIGITS)
+        self.looks_rad = start_rad + heading
+        tape = replace(tape, q=headed(tape.q, heading), f=turned_wrench(tape.f, heading))
+        self._none = np.zeros(len(robot.joint_names))
+        self._tau = self._none
+        self._at_rest = at_rest
+        self.touchdown: int | None = None
+        self.mode = mode
+        self.playback = Playback(tape, robot, hardware.delay_s)
+        kind = servo_of(mode)
+        self._servo = kind(robot, late_s=hardware.delay_s, substeps=hardware.substeps)
+        if feedback:
+            check_mode(mode)
+        self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None
+        self.forecast = Forecast(robot, tape, ground)
+        self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
+        flip = is_flip(tape)
+        # other jumps land flat, within a centimetre or two of what was planned for them
+        self.ahead = LandingAhead(robot, landing, again=flip)
+        self._reaim = Reaim(robot, tape, ground) if reaim else None
+        self._tuck = Tuck(robot, tape) if reaim and flip else None
+        self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + hardware.delay_s
+        self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * hardware.force_noise_n)
+        flight = tape.takeoff_time, tape.t[-1]
+        shares = EARLIEST_TOUCHDOWN, FROM_SHARE if self._tuck else EARLIEST_TOUCHDOWN
+        steps = np.interp(shares, (0.0, 1.0), flight) / STEP_S
+        self._earliest, self._looks_from = map(round, steps.tolist())
+        self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
+
+    @property
+    def solves(self) -> tuple[int, int]:
+        """QPs posed by the landing controller, and how many of them failed."""
+        return self.landing.solver.solves, self.landing.solver.failures
+
+    @property
+    def stepped_s(self) -> float | None:
+        """When a recovery step began, since the touchdown [s]; None if none did."""
+        return self.landing.step.began_s
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        feedback = self.feedback and self.feedback.to_json()
+        return dict(feedback=feedback, landing=self.ahead.to_json())
+
+    def torque(self, t: float, state: State) -> np.ndarray:
+        """Joint torques (nv - 6,) [N m] at ``t`` since the tape began [s], from the measured
+        ``state``: what drives make of :meth:`drive` that have the same encoders and get it at once.
+        """
+        return self.drive(t, state).torque(state.q[7:], state.v[6:])
+
+    def drive(self, t: float, state: State) -> Drive:
+        """What the joints' drives are sent at ``t`` since the tape began [s], from the measured
+        ``state``; to be called once in each :data:`~jumplab.control.STEP_S`.
+        """
+        command = self.command(round(t / STEP_S), state.along(self.looks_rad))
+        return self._servo.drive(command, *(command.state or state[:2]))
+
+    def command(self, step: int, state: State) -> Command:
+        """What the joints shall do at ``step``, from the state as it is seen along the heading of
+        the landing.
+        """
+        if step == 0 and self._at_rest:
+            self.playback.approach(state.q)
+            if self.feedback is not None:
+                self.feedback.begin(state.q)
+        if self.touchdown is None:
+            if step < self._looks_from:
+                return self._play(step, state)
+            if step < self._earliest or state.wrench[:, 2].sum() <= self._touches_n:
+                return self._fly(step, *state[:2])
+            state = self._touch(step, state)
+        return self._land(step - self.touchdown, state)
+
+    def _play(self, step: int, state: State) -> Command:
+        """In launch, and early in flight."""
+        command = self.playback.command(step, *state[:2], self._none)
+        return command if self.feedback is None else self.feedback(step, command, state)
+
+    def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
+        now = self._gauge.motion(q, v)
+        left = self.forecast.time_left(now)
+        shift = (0.0, 0.0) if self._tuck is None else self._tuck.shift(step, now, left)
+        if left <= LEAD_S:
+            self._look_ahead(step, now, v, left)
+        aimed = self._none
+        if self._reaim is not None:
+            turn = self._turn(step, now, left)
+            aimed = self._reaim.correction(now, turn, left, self._tuck is not None)
+        command = self.playback.command(step, q, v, aimed, *shift)
+        return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
+
+    def _land(self, since: int, state: State) -> Command:
+        """The landing controller's torque, ``since`` touchdown in steps."""
+        landing = self.landing
+        q, v, wrench = state
+        time = since * STEP_S
+        if self.ahead.again and self.ahead.followed == "planned" and self.stepped_s is None:
+            landing.reference = self.ahead.follow(time, q, v, landing.reference)
+        every = PERIOD_STEPS if time < SETTLING_S else CALM_STEPS
+        if since % every == 0:
+            self._tau = landing.torque(time, q, v, wrench[:, 2])
+        return Command(tau=self._tau)
+
+    def _look_ahead(self, step: int, now: Motion, v: np.ndarray, left: float) -> None:
+        """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
+        if self.ahead.source != "planned" or self.ahead.followed is not None:
+            return
+        there = now.q, v
+        if left > 0:
+            turn = self._turn(step, now, left)
+            correction = 0.0
+            if self._reaim is not None:
+                correction, turn = self._reaim.touchdown(now, turn)
+            there = self.forecast.state(now, turn, correction)
+        self.landing.reference = self.ahead.plan(*there, step * STEP_S, left)
+
+    def _turn(self, step: int, now: Motion, left: float) -> np.ndarray:
+        """How far (3, 3) the trunk will be off its planned attitude at touchdown, in ``left``
+        seconds.
+
+        Without re-aim only the pitch is told, as it is now.
+        """
+        if self._tuck is not None:
+            return self._tuck.turn_ahead(step, now, left)
+        error = self.playback.attitude_error(step, now.q)
+        if self._reaim is None:
+            return pin.rpy.rpyToMatrix(0.0, float(error[1]), 0.0)
+        turn = pin.exp3(error)
+        return self._reaim.turn_ahead(now, turn, left) if 0 < left < np.inf else turn
+
+    def _touch(self, step: int, state: State) -> State:
+        """Begin the landing; the state comes back as it is seen from now on.
+
+        Re-aimed soles point where the trunk does, and along that heading the robot has to be
+        caught.
+        """
+        self.touchdown = step
+        if self._reaim is not None:
+            yaw = yaw_of(self._turn(step, self._gauge.motion(*state[:2]), 0.0))
+            self.looks_rad += yaw
+            state = state.along(yaw)
+        now = self._gauge.motion(*state[:2])
+        self._look_ahead(step, now, state.v, 0.0)  # the ground came early
+        return state

@@ -1,0 +1,236 @@
+"""Landing controller: a whole-body QP in torque mode, entered at touchdown.
+
+The paper lands with the controller of an earlier paper of its authors (Sec. VI-A) and does not
+repeat it. Here, every 2 ms, joint accelerations and foot wrenches are chosen that obey the base
+dynamics, friction, the soles' edges and the motors' torques, and come closest to a list of wishes:
+CoM, angular momentum, trunk, feet flat and still, posture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.control.body import WholeBody, corner_rows, solver
+from jumplab.control.kinematics import Gauge
+from jumplab.control.step import RecoveryStep
+from jumplab.ocp.qp import Qp
+from jumplab.robot import Robot
+from jumplab.robot.stance import stance_configuration
+from jumplab.stages.srmp.landing import LandingPlan
+
+CONTACT_FORCE_N = 10.0  # a foot stands if it carries more than 2.5 % of the weight ...
+LIKELY = 3.0  # [1] ... and so many standard deviations of a poor sensor ...
+# ... and for so long after it last did; flicker of the flag makes robots fall
+CONTACT_HOLD_S = 0.008
+NEAR_GROUND_M = 0.02  # a foot that bounced less than this is pressed down again, not swung
+# of the sole's length and width for the wished CoP; more width lets robots roll onto an edge
+SOLE_SHARE = 0.95, 0.5
+PLANNED_FRICTION = 0.45  # below the lowest floor friction of the perturbed trials, 0.5
+STOP_MARGIN_RAD = 0.05  # a stop is respected this far before it
+STOP_HORIZON_S = 0.05  # a joint that would reach it within this time is turned back ...
+STOP_LEAVE = 10.0  # [rad/s^2] ... and if it is wished elsewhere, at least so much
+# [m/s^2], [rad/s^2] an impact must not make wishes that drown all others
+MAX_SHIFT = 60.0
+MAX_TURN = 300.0
+MOST = np.repeat([MAX_SHIFT, MAX_TURN], 3)
+MAX_STEP = 150.0  # [m/s^2] of a foot that steps: 0.5 m in 0.24 s begin with 50
+# [0.1 mN m] ProxQP's last digits depend on where its memory lies; rounded, runs are the same
+TORQUE_DIGITS = 4
+FALLBACK_DAMPING = 3.0  # [N m s/rad] stable at 500 Hz on the lightest joint
+
+
+@dataclass(frozen=True)
+class LandingGains:
+    """Natural frequencies [rad/s] of critically damped wishes, and their weights; the paper prints
+    none.
+
+    Weights are [1 / (m/s^2)^2] or [1 / (rad/s^2)^2], found by landing from states around the plan's
+    touchdown.
+    """
+
+    com_rate_xy: float = 4.0  # the pendulum's own sqrt(g/z) = 4: faster would ask for a longer sole
+    com_rate_z: float = 6.0  # stops 2 m/s within 0.12 m
+    momentum_rate: float = 8.0
+    trunk_rate: float = 7.0
+    foot_rate: float = 25.0
+    posture_rate: float = 8.0
+    # z: a late push meets the end of the knee's stroke
+    com_weight: tuple[float, float, float] = (30.0, 10.0, 30.0)
+    momentum_weight: float = 0.5  # of L-rate over a nominal inertia, hence also rad/s^2
+    trunk_weight: float = 0.5
+    foot_weight: tuple[float, float] = (20.0, 0.5)  # displacement, turning
+    swing_weight: tuple[float, float] = (1.0, 0.05)
+    step_weight: tuple[float, float] = (20.0, 0.5)  # of a foot in a recovery step
+    arm_posture_weight: float = 0.02
+    leg_posture_weight: float = 0.002  # pitch joints; feet, CoM and trunk decide them already
+    lateral_posture_weight: float = 0.2  # yaw and roll joints
+    stop_weight: float = 1.0
+    uneven_weight: float = 0.02  # [1 / (100 N)^2] of the difference between both wrenches
+    wrench_weight: float = 1e-3  # [1 / (100 N)^2]
+    acceleration_weight: float = 1e-4
+
+
+GAINS = LandingGains()
+
+
+class LandingController:
+    """Torques that catch and hold the robot; see the module's docstring.
+
+    ``robot`` is as planned: the controller knows no perturbation. Without a
+    ``reference``, spring-dampers lead to the middle of the feet at standing height. ``solver``
+    counts the QPs posed and those without a solution. With ``may_step`` it takes one ``step`` where
+    its feet alone cannot catch the robot; what was planned ends there. Forces of the feet err by
+    ``force_noise_n`` [N] each.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        reference: LandingPlan | None = None,
+        may_step: bool = False,
+        force_noise_n: float = 0.0,
+    ):
+        self._may_step = may_step
+        self.step = RecoveryStep(robot, SOLE_SHARE, force_noise_n)
+        self.solver = solver()
+        self._loaded_n = max(CONTACT_FORCE_N, LIKELY * force_noise_n)
+        self.body = WholeBody(robot)
+        weights = {
+            name: GAINS.leg_posture_weight for pair in robot.joints.values() for name in pair
+        }
+        weights |= dict.fromkeys(robot.joints["shoulder_pitch"], GAINS.arm_posture_weight)
+        side = GAINS.lateral_posture_weight
+        self._posture_weight = np.array([weights.get(name, side) for name in robot.joint_names])
+        self._corners = corner_rows(robot, PLANNED_FRICTION, *SOLE_SHARE)
+        self._last_contact = np.full(2, -np.inf)
+        # accelerations, wrenches, and what these differ by
+        nv = self.body.nv
+        wrenches = self.body.unknowns[nv:]
+        self._effort_rows = np.vstack([self.body.unknowns, wrenches[:6] - wrenches[6:]])
+        weights = (GAINS.acceleration_weight, GAINS.wrench_weight, GAINS.uneven_weight)
+        self._effort_weight = np.repeat(weights, [nv, 12, 6])
+        rest = stance_configuration(robot)
+        self._rest = rest[7:].copy()
+        self._rest_pitch = float(robot.stance["trunk_pitch_rad"])
+        self._height = float(Gauge(robot).com(rest)[2])  # above the soles
+        self.reference = reference
+
+    def torque(
+        self, time: float, q: np.ndarray, v: np.ndarray, foot_force: np.ndarray
+    ) -> np.ndarray:
+        """Joint torques (nv - 6,) [N m], ``time`` after touchdown [s], from measured ``q`` (nq,),
+        ``v`` (nv,) and vertical foot forces (2,) [N].
+        """
+        body = self.body
+        body.update(q, v)
+        if self._may_step:
+            self.step.look(time, body, foot_force)
+        if self.step.began_s is not None:
+            self.reference = None
+        contact = self.standing(time, foot_force)
+        body.set_contact(contact)
+        answer = self.solver.solve(self._program(time, q, v, contact))
+        if answer.solved:
+            tau = body.torque(answer.x)
+        else:
+            tau = body.gravity_torque(contact) - FALLBACK_DAMPING * v[6:]
+        return np.clip(np.round(tau, TORQUE_DIGITS), *body.motors.range(v[6:]))
+
+    def standing(self, time: float, foot_force: np.ndarray) -> np.ndarray:
+        """Which feet (2,) may carry weight: those whose ``foot_force`` (2,) [N] did a moment before
+        ``time`` [s], and any that hovers just beside one.
+        """
+        self._last_contact[foot_force > self._loaded_n] = time
+        if self.step.side is not None:
+            return np.arange(2) != self.step.side
+        loaded = time - self._last_contact <= CONTACT_HOLD_S
+        if not loaded.any():
+            return loaded
+        height = self.body.soles[:, 2]
+        return loaded | (height - height[loaded].min() < NEAR_GROUND_M)
+
+    def _program(self, time: float, q: np.ndarray, v: np.ndarray, contact: np.ndarray) -> Qp:
+        """The QP of one moment."""
+        g = GAINS
+        body = self.body
+        qp = body.program(v, self._corners)
+        ground = body.soles[contact] if contact.any() else body.soles
+        com_wish, momentum_wish = self._balance(time, ground.mean(axis=0))
+        if self.step.side is not None:
+            com_wish[:2] = self.step.com_acceleration(body)
+        on = float(contact.any())  # in the air neither CoM nor momentum can be asked for
+        weights = on * np.array(g.com_weight), on * g.momentum_weight
+        body.balance(qp, com_wish, momentum_wish, weights)
+        qp.cost("trunk", body.unknowns[3:6], self._trunk_wish(v), g.trunk_weight)
+        for side in (0, 1):
+            wish = self._foot_wish(side, contact[side], ground[:, 2].min())
+            weight = g.foot_weight if contact[side] else g.swing_weight
+            if side == self.step.side:
+                wish[:3] = np.clip(self.step.foot_acceleration(time, body), -MAX_STEP, MAX_STEP)
+                weight = g.step_weight
+            target = wish - body.sole_drift[side]
+            qp.cost(f"foot {side}", body.sole_rows[side], target, np.repeat(weight, 3))
+        qp.cost("posture", body.unknowns[6 : body.nv], *self.posture_wish(q, v))
+        qp.cost("effort", self._effort_rows, 0.0, self._effort_weight)
+        return qp
+
+    def _balance(self, time: float, foot_middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wished CoM acceleration (3,) and rate of angular momentum (3,)."""
+        body = self.body
+        rate = np.array([GAINS.com_rate_xy, GAINS.com_rate_xy, GAINS.com_rate_z])
+        goal = foot_middle + np.array([0.0, 0.0, self._height])
+        speed, momentum, push, twist = np.zeros((4, 3))
+        if self.reference is not None:
+            com, speed[[0, 2]], momentum[1] = self.reference.at(time)
+            goal[[0, 2]] = foot_middle[[0, 2]] + com
+            push[[0, 2]], twist[1] = self.reference.feed_forward(time)
+        wish = push + rate**2 * (goal - body.com) + 2 * rate * (speed - body.com_velocity)
+        return wish, twist + GAINS.momentum_rate * (momentum - body.momentum)
+
+    def _trunk_wish(self, v: np.ndarray) -> np.ndarray:
+        """Angular acceleration (3,) of the trunk in its own axes: upright in roll and pitch, yaw
+        only damped.
+        """
+        rate = GAINS.trunk_rate
+        trunk = self.body.trunk
+        goal = pin.rpy.rpyToMatrix(0.0, self._rest_pitch, np.arctan2(trunk[1, 0], trunk[0, 0]))
+        return rate**2 * pin.log3(trunk.T @ goal) - 2 * rate * v[3:6]
+
+    def _foot_wish(self, side: int, standing: bool, ground_height: float) -> np.ndarray:
+        """Acceleration (6,) of a sole: flat and still; a foot in the air is also led down to the
+        ground.
+        """
+        rate = GAINS.foot_rate
+        body = self.body
+        attitude = body.attitudes[side]
+        wish = -2 * rate * body.twists[side]
+        goal = pin.rpy.rpyToMatrix(0.0, 0.0, np.arctan2(attitude[1, 0], attitude[0, 0]))
+        wish[3:] += rate**2 * pin.log3(goal @ attitude.T)
+        if not standing:
+            wish[:2] += 2 * rate * body.com_velocity[:2]
+            wish[2] += rate**2 * (ground_height - body.soles[side, 2])
+        return np.clip(wish, -MOST, MOST)
+
+    def posture_wish(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wished joint accelerations (nv - 6,) [rad/s^2] and their weights at q (nq,), v (nv,);
+        near a stop the wish is to turn back in time.
+        """
+        rate = GAINS.posture_rate
+        motors = self.body.motors
+        wish = rate**2 * (self._rest - q[7:]) - 2 * rate * v[6:]
+        weight = self._posture_weight.copy()
+        ahead = q[7:] + v[6:] * STOP_HORIZON_S
+        for stop, way in ((motors.lower, 1.0), (motors.upper, -1.0)):
+            needed = 2 * (way * (stop - ahead) + STOP_MARGIN_RAD) / STOP_HORIZON_S**2
+            near = needed > 0
+            if not near.any():
+                continue
+            # or a joint that is to go back would rest just there
+            away = np.clip(way * wish, 0.0, STOP_LEAVE)
+            wish[near] = way * np.clip(np.maximum(needed, away), 0.0, MAX_TURN)[near]
+            weight[near] = GAINS.stop_weight
+        return wish, weight

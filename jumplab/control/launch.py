@@ -1,0 +1,247 @@
+"""Launch feedback: joints leave the tape a little, so that the body as a whole launches as planned.
+
+A tape that is followed joint by joint moves a robot unlike its plan, or one that is shoved or sinks
+in, with another momentum and over another place: its feet tip, and on its toes it falls on like a
+pendulum. Here, every 2 ms, joint accelerations and foot wrenches are chosen that obey the base
+dynamics, friction, the soles' edges and the motors' torques, and come closest to the planned CoM,
+its velocity, the angular momentum and the planned joints, with the feet still. What the joints'
+accelerations differ by from the tape's is integrated and added to it, and so are the torques that
+go with them.
+
+Feet that stand flat tell where the CoM really is: a load that the trunk carries besides pushes them
+by its mass times the acceleration of the trunk, and turns them by that push about where it is. Its
+mass and place are filtered from the wrenches, and the real CoM is led along the planned one's way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.control import STEP_S
+from jumplab.control.body import PERIOD_STEPS, WholeBody, corner_rows, solver
+from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
+from jumplab.control.playback import AIR, FLAT, TOE, Command, Playback, resampled
+from jumplab.errors import InputError
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
+
+FRICTION = 0.6  # more than plans use, less than most floors have
+LENGTH_SHARE = 0.95  # of the sole for the CoP
+LEAST_LOAD = 0.5  # [1] of the weight; with less on the feet nothing is changed any more
+FELT_LOAD = 0.7  # [1] of the weight, with which feet tell where the CoM is ...
+STILL_RAD = 0.01  # ... unless they are tilted by so much
+ROLLING_S = 0.1  # before the heels rise: the CoP is on its way to the toes, and soles begin to tip
+MOST_OFF_M = 0.025  # that the CoM is believed to be off
+# of the flight, in which what was changed fades; natural times of that, to 4 %
+FADE_SHARE = 0.4
+FADED = 5.0
+# weights of base accelerations and of wrenches / 100 N, so that the answer is one
+LEAST = 1e-8
+LEAST_WRENCH = 1e-4
+TORQUE_DIGITS = 4  # [0.1 mN m]
+DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory lies
+
+
+# natural frequencies [rad/s] of critically damped wishes
+COM_RATE = 8.0  # twice the pendulum's own: the launch is over within a second
+MOMENTUM_RATE = 10.0
+POSTURE_RATE = 4.0  # back to the tape, where nothing else is asked
+# back to the tape in the air, or faster in a short flight: before legs are re-aimed
+FADE_RATE = 20.0
+# weights [1 / (m/s^2)^2] or [1 / (rad/s^2)^2]
+COM_WEIGHT = 1.0, 1.0, 3.0
+MOMENTUM_WEIGHT = 1.0  # of L-rate over a nominal inertia
+FOOT_WEIGHT = 1e4
+POSTURE_WEIGHT = 0.02
+MOST = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
+# standard deviations. Of the load on the trunk before anything is felt, in shares of the robot's
+# mass: its mass, and that times how far it is ahead of and above the base [m]
+PRIOR = 0.1, 0.02, 0.03
+# of one reading, in which all that moves unlike the model errs too, in shares of the push: push
+# up, and moment [m]
+READING = 0.07, 0.03
+
+
+def check_mode(mode: str) -> None:
+    """Refuse (:class:`InputError`) a mode of playback in which the launch cannot be corrected."""
+    if mode == "pd":
+        raise InputError(
+            "feedback answers to all that is measured, and mode 'pd' would do so twice; "
+            "choose mode 'position' or 'whole-body'"
+        )
+
+
+class LaunchFeedback:
+    """Changes the commands of one launch; see the module's docstring.
+
+    Not for servos of mode "pd": feet begin to rock by what sensors err by. ``solver`` counts the
+    QPs posed and those without a solution, where the joints go back to the tape. ``off_m`` is how
+    far the CoM is believed to be ahead of where the robot's model has it [m].
+    """
+
+    def __init__(self, robot: Robot, tape: Tape, playback: Playback):
+        self._robot = robot
+        self.playback = playback
+        self._body = WholeBody(robot)
+        self._gauge = Gauge(robot)
+        self.solver = solver()
+        self.off_m = 0.0
+        fade_s = FADE_SHARE * float(tape.t[-1] - tape.takeoff_time)
+        self._fade_rate = max(FADE_RATE, FADED / fade_s)
+        # of the joints, off the tape
+        self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
+        self._none = np.zeros(len(robot.joint_names))
+        self._torque = self._none  # besides the tape's
+        self._farthest = 0.0  # [rad]
+        # mass on the trunk [kg], and that times its place ahead of and above the base [kg m]
+        self._load = np.zeros(3)
+        self._spread = np.diag(np.square(PRIOR)) * robot.total_mass**2
+        self._forward, self._left = about_vertical(self._gauge.heading(tape.q[0])).T[:2]
+        self._first = tape.q[0]
+        self.rows = self._planned(tape)
+        self._spin = self.rows[0, 4]  # rate of L that the last command takes
+        stands = {FLAT: (robot.foot.center, LENGTH_SHARE), TOE: (robot.foot.tip, 0.0)}
+        self._stands = {
+            stand: (on_feet(robot, point), corner_rows(robot, FRICTION, share, 1.0))
+            for stand, (point, share) in stands.items()
+        }
+
+    def _planned(self, tape: Tape) -> np.ndarray:
+        """CoM, its velocity and acceleration, L, its rate, and the base's acceleration (steps, 6,
+        3) of the launch.
+        """
+        last = tape.takeoff_index
+        mass = self._robot.total_mass
+        gravity = self._robot.model.gravity.linear
+        rows = []
+        for q, v, a, f in zip(tape.q[:last], tape.v[:last], tape.a[:last], tape.f, strict=False):
+            base = rotation(q[3:7]) @ (a[:3] + np.cross(v[3:6], v[:3]))
+            now = self._gauge.motion(q, v)
+            push = f[:, :3].sum(axis=0) / mass + gravity
+            moment = self._moment(q, now.com, f)
+            rows.append([now.com, now.velocity, push, now.momentum, moment, base])
+        grid = np.arange(self.playback.takeoff) * STEP_S
+        return resampled(grid, tape.t[:last], np.array(rows))
+
+    def _moment(self, q: np.ndarray, com: np.ndarray, wrench: np.ndarray) -> np.ndarray:
+        """Moment (3,) about ``com`` of wrenches (2, 6) at the origins of the foot links."""
+        arms = np.array([foot.translation for foot in self._gauge.places(q)]) - com
+        return (wrench[:, 3:] + np.cross(arms, wrench[:, :3])).sum(axis=0)
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        return {
+            "solves": self.solver.solves,
+            "failures": self.solver.failures,
+            "farthest_rad": self._farthest,
+            "com_ahead_m": self.off_m,
+        }
+
+    def begin(self, q: np.ndarray) -> None:
+        """Start from ``q`` (nq,), whose CoM is led back to the plan as :meth:`Playback.approach`
+        leads wrong joints.
+        """
+        model = self._gauge.model
+        way = pin.difference(model, self._first, q)
+        moved = pin.computeCentroidalMap(model, self._gauge.data, self._first) @ way
+        com = moved[:3] / self._robot.total_mass
+        turned = moved[3:]
+        left, rate, acceleration = self.playback.way_back()
+        ways = (left, com), (rate, com), (acceleration, com), (rate, turned), (acceleration, turned)
+        for column, (share, off) in enumerate(ways):
+            self.rows[: len(share), column] += share[:, None] * off
+
+    def __call__(self, step: int, command: Command, state: State) -> Command:
+        """``command`` of the tape at ``step``, changed; from the measured state, in the tape's
+        axes.
+        """
+        due = step + self.playback.lead
+        stand = self.playback.stands(due)
+        if stand == AIR or due >= len(self.rows):
+            self.changes = self._back(self._fade_rate)
+            self._torque = self._none
+        elif step % PERIOD_STEPS == 0:
+            if self.playback.stands(step + round(ROLLING_S / STEP_S)) == FLAT:
+                self._feel(state, self.rows[step])
+            if self.rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
+                self.changes = -2 * POSTURE_RATE * self._rates
+            else:
+                self.changes, tau = self._solve(due, stand, *(command.state or state[:2]))
+                self._torque = self._none if tau is None else tau - command.tau
+        self._rates = self._rates + STEP_S * self.changes
+        self.angles = self.angles + STEP_S * self._rates
+        self._farthest = max(self._farthest, float(np.abs(self.angles).max()))
+        moves = dict(q=command.q + self.angles, rate=command.rate + self._rates)
+        moves |= dict(acceleration=command.acceleration + self.changes)
+        return replace(command, **moves, tau=command.tau + self._torque)
+
+    def _feel(self, state: State, planned: np.ndarray) -> None:
+        """Learn from the feet's wrenches where the CoM is, unless they carry little or are tilted.
+
+        ``planned`` (6, 3) is the row of what is followed now. A load of mass m at p pushes by F = m
+        (a - g), with a the base's acceleration, and turns by p x F: linear in m and m p, of which a
+        Kalman filter keeps the mean.
+        """
+        mass = self._robot.total_mass
+        gravity = self._robot.gravity
+        push = state.wrench[:, 2].sum()
+        tilt = max(abs(foot.rotation[2, 0]) for foot in self._gauge.places(state.q))
+        if push < FELT_LOAD * mass * gravity or tilt > STILL_RAD:
+            return
+        com = self._gauge.com(state.q)
+        axes = rotation(state.q[3:7])
+        felt = self._moment(state.q, com, state.wrench) - self._spin
+        pull = planned[5] + [0.0, 0.0, gravity]
+        arms = np.array([state.q[:3] - com, axes[:, 0], axes[:, 2]])
+        sense = np.array([[pull[2], 0.0, 0.0], np.cross(arms, pull) @ self._left])
+        readings = np.array([push - mass * (planned[2, 2] + gravity), felt @ self._left])
+        noise = np.diag(np.square(np.multiply(READING, push)))
+        gain = np.linalg.solve(sense @ self._spread @ sense.T + noise, sense @ self._spread).T
+        self._load = self._load + gain @ (readings - sense @ self._load)
+        self._spread = self._spread - gain @ sense @ self._spread
+        ahead = float(self._forward @ arms.T @ self._load) / (mass + float(self._load[0]))
+        self.off_m = float(np.clip(ahead, -MOST_OFF_M, MOST_OFF_M))
+
+    def _solve(
+        self, due: int, stand: str, q: np.ndarray, v: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step
+        ``due``, and the motors' torques (nv - 6,) with that [N m], None without a solution.
+        """
+        body = self._body
+        anchors, corners = self._stands[stand]
+        body.update(q, v, anchors)
+        body.set_contact(np.ones(2, bool))
+        com, speed, push, momentum, spin, _ = self.rows[due]
+        ahead = self.off_m * self._forward
+        # that the real CoM takes besides
+        moment = np.cross(ahead, body.mass * (push - body.gravity))
+        shift = COM_RATE**2 * (com - ahead - body.com)
+        shift = shift + 2 * COM_RATE * (speed - body.com_velocity)
+        turn = spin + moment + MOMENTUM_RATE * (momentum - body.momentum)
+        tape = self.playback.acceleration(due)
+        back = self._back(POSTURE_RATE)
+        qp = body.program(v, corners, moment)
+        body.balance(qp, push + shift, turn, (COM_WEIGHT, MOMENTUM_WEIGHT))
+        still = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(stand == FLAT), 1.0])
+        for side in (0, 1):
+            qp.cost(f"foot {side}", body.sole_rows[side], -body.sole_drift[side], still)
+        qp.cost("posture", body.unknowns[6 : body.nv], tape + back, POSTURE_WEIGHT)
+        qp.cost("base", body.unknowns[:6], 0.0, LEAST)
+        qp.cost("wrenches", body.unknowns[body.nv :], 0.0, LEAST_WRENCH)
+        answer = self.solver.solve(qp)
+        if not answer.solved:
+            self._spin = spin
+            return back, None
+        self._spin = body.momentum_rows @ answer.x - moment
+        change = np.round(answer.x[6 : body.nv], DIGITS) - tape
+        tau = np.round(body.torque(answer.x), TORQUE_DIGITS) + body.motors.lost(v[6:])
+        return np.clip(change, -MOST, MOST), tau
+
+    def _back(self, rate: float) -> np.ndarray:
+        """Accelerations (nv - 6,) that lead the joints back to the tape, critically damped."""
+        return -(rate**2) * self.angles - 2 * rate * self._rates

@@ -1,0 +1,175 @@
+"""Launch and flight: the tape, step by step, as commands that the servos of :mod:`.servo` turn into
+what joints are sent. The paper plays it in position mode (Sec. VI-B).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.polynomial import Polynomial
+from scipy.interpolate import PPoly
+
+from jumplab.control import STEP_S
+from jumplab.control.kinematics import Gauge, rotation
+from jumplab.errors import InputError
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+
+# how both feet stand
+FLAT = "flat"
+TOE = "toe"
+AIR = "air"
+HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
+ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
+# a start farther off than sensors err is led back until the heels rise; sooner, the robot tips
+WRONG_RAD = 0.02
+WAY_BACK = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])  # of time, smooth at 0 and at 1
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the joints shall do in one step: move, as the servo sees to, or just give a torque."""
+
+    q: np.ndarray | None = None  # (nv - 6,) [rad]
+    rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
+    acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
+    tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
+    change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
+    feet: str = AIR  # how they stand by the plan
+    # (2, 6) of the plan on them, as on a tape; None: both carry alike
+    wrench: np.ndarray | None = None
+    share: float = 1.0  # of the torque limit, for the servo
+    # (q, v) that it is expected to arrive in; as measured if None
+    state: tuple[np.ndarray, np.ndarray] | None = None
+
+
+class Playback:
+    """The tape on the 1 ms grid of control, as commands. After its end the last posture is held.
+
+    Of a jump whose feet carry unlike loads, commands say what each of them carries. Raises
+    :class:`InputError` if the tape is another robot's.
+
+    Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot
+    is expected to be as far off the tape then as it is measured to be now: the plan is sent ahead,
+    errors are met late.
+    """
+
+    def __init__(self, tape: Tape, robot: Robot, lead_s: float = 0.0):
+        names = tuple(str(n) for n in tape.joint_names)
+        if names != robot.joint_names:
+            raise InputError(
+                f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}"
+            )
+        self.steps = round(float(tape.t[-1]) / STEP_S)
+        self.takeoff = round(tape.takeoff_time / STEP_S)
+        self.lead = round(lead_s / STEP_S)
+        self._gauge = Gauge(robot)
+        self._grid = np.arange(self.steps + 1) * STEP_S
+        q, self._v, self.tau, wrench = (
+            resampled(self._grid, tape.t, x) for x in (tape.q, tape.v, tape.tau, tape.f)
+        )
+        self._q = q[:, 7:]
+        self._attitude = q[:, 3:7]
+        self._rate = self._v[:, 6:]
+        self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
+        self._change[self.takeoff - 1] = 0.0  # what the ground held ends there at once
+        left, right = tape.f[: tape.takeoff_index, :, 2].T
+        self._wrench = wrench if np.abs(left - right).max() > ALIKE_N else None
+        tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
+        tilted = (t for t, x in zip(tape.t, tilts, strict=True) if abs(x) > HEEL_RAD)
+        self._heel_off = round(float(next(tilted, tape.t[-1])) / STEP_S)
+
+    def stands(self, step: float) -> str:
+        """How the feet stand by the plan."""
+        return AIR if step >= self.takeoff else TOE if step >= self._heel_off else FLAT
+
+    def command(
+        self,
+        step: int,
+        q: np.ndarray,
+        v: np.ndarray,
+        correction: np.ndarray,
+        shift_s: float = 0.0,
+        pace: float = 0.0,
+    ) -> Command:
+        """Command to send at one step, from the measured ``q`` (nq,) and ``v`` (nv,).
+
+        ``correction`` (nv - 6,) is added to the angles [rad]. The tape is read ``shift_s`` beyond
+        the step, and ``1 + pace`` times as fast.
+        """
+        due = step + self.lead + shift_s / STEP_S
+        q, v = self._arriving(due, q, v)
+        at = min(max(due, 0.0), float(self.steps))
+        angles = between(self._q, at) + correction
+        rate = between(self._rate, at)
+        acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
+        rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
+        on_ground = at < self.takeoff and self._wrench is not None
+        moves = dict(q=angles, rate=rate, acceleration=acceleration)
+        moves |= dict(tau=between(self.tau, at), change=between(self._change, at))
+        wrench = between(self._wrench, at) if on_ground else None
+        return Command(**moves, feet=self.stands(at), wrench=wrench, state=(q, v))
+
+    def approach(self, q: np.ndarray) -> None:
+        """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the
+        plan smoothly.
+        """
+        error = q[7:] - self._q[0]
+        if np.abs(error).max() > WRONG_RAD:
+            for rows, share in zip((self._q, self._rate), self.way_back(), strict=False):
+                rows[: len(share)] += share[:, None] * error
+
+    def add(self, way: PPoly) -> None:
+        """Add joint angles (nv - 6,) over time [s], with their rates, to the tape's as long as the
+        ``way`` lasts.
+        """
+        rows = self._grid < way.x[-1]
+        self._q[rows] += way(self._grid[rows])
+        self._rate[rows] += way(self._grid[rows], 1)
+
+    def way_back(self) -> list[np.ndarray]:
+        """Share (k,) of an error at the start that is left while the feet stand flat, and its first
+        two derivatives [1, 1/s, 1/s^2].
+        """
+        steps = min(self._heel_off, self.takeoff)
+        share = np.arange(steps) / max(steps, 1)
+        lasts_s = max(steps, 1) * STEP_S
+        return [WAY_BACK.deriv(k)(share) / lasts_s**k for k in range(3)]
+
+    def acceleration(self, step: int) -> np.ndarray:
+        """Joint accelerations (nv - 6,) of the tape [rad/s^2]."""
+        now = min(step, self.steps - 1)
+        return (self._rate[now + 1] - self._rate[now]) / STEP_S
+
+    def _arriving(self, at: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """State (q, v) in which a command of the tape's step ``at`` arrives, as far off the tape as
+        now.
+        """
+        if self.lead == 0:
+            return q, v
+        due, now = (min(max(x, 0.0), self.steps) for x in (at, at - self.lead))
+        moved = between(self._q, due) - between(self._q, now)
+        gained = between(self._v, due) - between(self._v, now)
+        base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
+        return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
+
+    def attitude_error(self, step: int, q: np.ndarray) -> np.ndarray:
+        """How far the trunk is turned away from the plan: rotation vector (3,) in the axes of ``q``
+        (nq,) and tape [rad].
+        """
+        planned = self._attitude[min(step, self.steps)]
+        return pin.log3(rotation(q[3:7]) @ rotation(planned / np.linalg.norm(planned)).T)
+
+
+def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows (n, ...) at times ``grid`` (n,) [s] of ``rows`` (N, ...) at times ``t`` (N,) [s]."""
+    columns = [np.interp(grid, t, column) for column in rows.reshape(len(t), -1).T]
+    return np.stack(columns, axis=1).reshape(len(grid), *rows.shape[1:])
+
+
+def between(rows: np.ndarray, at: float) -> np.ndarray:
+    """The row (...) of ``rows`` (N, ...) at a place between two."""
+    low = min(int(at), len(rows) - 2)
+    return rows[low] + min(at - low, 1.0) * (rows[low + 1] - rows[low])

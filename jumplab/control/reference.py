@@ -1,0 +1,180 @@
+"""The landing to follow: planned in flight for the touchdown that is forecast, and in a flip again
+while it goes on.
+
+The impact of a flip leaves the robot elsewhere than its plan expected. From the measured state the
+rest is planned as the landing was; that takes its time too, so the robot follows the older plan
+until the newer one is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from time import thread_time
+
+import numpy as np
+
+from jumplab.control import STEP_S
+from jumplab.control.kinematics import Gauge, Motion, about_vertical, rotation, turned, yaw_of
+from jumplab.errors import JumplabError
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
+
+# before touchdown a landing is planned: three times what the solve takes on one core of a laptop
+LEAD_S = 0.15
+# after touchdown it is planned again; before, the soles of flips are tilted, and a plan knows flat
+# ones
+FIRST_S = 0.15
+EVERY_S = 0.10  # twice what a solve takes
+UNTIL_S = 1.2  # the longest landing that is planned; afterwards the controller leads to the stance
+LATENCY_S = 0.05  # before a new plan is followed, about what its solve takes
+OFF_M = 0.03  # of the capture point; less is what the controller's own feedback mends
+LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot is still told
+
+
+@lru_cache(maxsize=4)  # robots of one session; a planner holds a few megabytes
+def _planner_of(urdf: str, config_text: str, gravity: float) -> LandingPlanner:
+    return LandingPlanner(Robot.from_text(urdf, config_text).under_gravity(gravity))
+
+
+def landing_planner(robot: Robot) -> LandingPlanner:
+    """The landing planner of ``robot``, built once (0.3 s)."""
+    return _planner_of(robot.urdf, robot.config_text, robot.gravity)
+
+
+class Forecast:
+    """The touchdown that a measured flight leads to; the last row of the planned ``tape`` is the
+    posture to land in. ``ground`` is the height [m] at a place [m] along the heading in which all
+    this is seen.
+    """
+
+    def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
+        self._gauge = Gauge(robot)
+        self._gravity = robot.gravity
+        self._ground = ground
+        self._q = tape.q[-1].copy()
+        self._v = tape.v[-1].copy()
+        self._ahead, _, self._below = self._gauge.soles(self._q) - self._gauge.com(self._q)
+
+    def time_left(self, now: Motion) -> float:
+        """Time until the soles meet the ground [s] in a flight that is measured ``now``; inf if
+        they never do.
+        """
+        x, _, z = now.com
+        vx, _, vz = now.velocity
+        left = 0.0
+        for _ in range(2):  # the ground's height depends on where, and so on when
+            drop = z + self._below - self._ground(x + vx * left + self._ahead)
+            root = vz**2 + 2 * self._gravity * drop
+            if root < 0:
+                return np.inf
+            left = (vz + np.sqrt(root)) / self._gravity
+        return float(left)
+
+    def state(
+        self, now: Motion, turn: np.ndarray, correction: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured flight.
+
+        The trunk will be off its planned attitude by ``turn`` (3, 3), and ``correction`` (nv - 6,)
+        will have been added to the tape by then. The forecast is seen along the heading that the
+        robot will have.
+        """
+        back = about_vertical(-yaw_of(turn))
+        end = turned(self._q, back @ turn)
+        end[7:] += correction
+        rates = self._v.copy()
+        # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM
+        # flies on
+        attitude = rotation(end[3:7])
+        tape = self._gauge.motion(end, rates)
+        missing = (back @ now.momentum - tape.momentum)[1] / tape.inertia[1, 1]
+        rates[3:6] += missing * attitude[1]
+        speed = back @ now.velocity - [0.0, 0.0, self._gravity * self.time_left(now)]
+        rates[:3] += attitude.T @ (speed - self._gauge.motion(end, rates).velocity)
+        return end, rates
+
+
+class LandingAhead:
+    """The landing to follow, and what became of it: planned in flight by stage 1 (``source``
+    "planned"), or none, where spring-dampers lead to the stance ("spring").
+
+    ``followed`` is which of both really is, once decided; with ``again`` the rest is planned anew
+    after the touchdown.
+    """
+
+    def __init__(self, robot: Robot, source: str, again: bool = False):
+        self._robot = robot
+        self.source = source
+        self.followed: str | None = None
+        self._planned: dict[str, float | None] = {}
+        self._reason: str | None = None
+        self._due = FIRST_S
+        self._next: LandingPlan | None = None
+        # plans made after the touchdown, states from which stage 1 found none, the longest solve
+        self.again = dict(made=0, refused=0, slowest_s=0.0) if again else None
+        if source == "planned":
+            try:  # now, so that the solve in flight is all that is left to do
+                landing_planner(robot)
+            except JumplabError as e:  # a robot for which stage 1 has no landing
+                self.followed = "spring"
+                self._reason = str(e)
+
+    def plan(self, q: np.ndarray, v: np.ndarray, time: float, left: float) -> LandingPlan | None:
+        """Stage 1's landing from the forecast touchdown ``q`` (nq,), ``v`` (nv,), None if there is
+        none; planned at ``time`` of the jump, ``left`` before that [s].
+        """
+        plan, self._reason, solve_s = self._solve(touchdown_of_state(self._robot, q, v))
+        in_time = solve_s <= max(0.0, left)
+        self._planned = dict(planned_at_s=time, time_left_s=left, solve_s=solve_s, in_time=in_time)
+        self.followed = "spring" if plan is None else "planned"
+        return plan
+
+    def _solve(self, touchdown: Touchdown) -> tuple[LandingPlan | None, str | None, float]:
+        """Stage 1's landing, or None and the reason why there is none; and its solve's time [s]."""
+        planner = landing_planner(self._robot)
+        began = thread_time()
+        plan = None
+        reason = None
+        try:
+            plan = planner.plan(touchdown)
+        except JumplabError as e:
+            reason = str(e)
+        return plan, reason, thread_time() - began
+
+    def follow(
+        self, time: float, q: np.ndarray, v: np.ndarray, reference: LandingPlan
+    ) -> LandingPlan:
+        """What to follow at ``time`` since touchdown [s] from the measured ``q`` (nq,) and ``v``
+        (nv,); ``reference`` is followed so far.
+        """
+        if self._next is not None and time >= self._next.t[0] + LATENCY_S - STEP_S / 2:
+            reference = self._next
+            self._next = None
+        if self._due - STEP_S / 2 <= time <= UNTIL_S:
+            self._due += EVERY_S
+            now = touchdown_of_state(self._robot, q, v, impact=False)
+            com, velocity, _ = reference.at(time)
+            # the capture point is x + v_x / rate
+            rate = np.sqrt(self._robot.gravity / max(now.com[1], LEAST_HEIGHT_M))
+            if abs(now.com[0] - com[0] + (now.com_velocity[0] - velocity[0]) / rate) > OFF_M:
+                plan, _, spent_s = self._solve(now)
+                # from here stage 1 may know no landing; the older one is the best there is then
+                self._next = plan and replace(plan, t=plan.t + time)  # since touchdown
+                self.again["made" if plan else "refused"] += 1
+                self.again["slowest_s"] = max(self.again["slowest_s"], spent_s)
+        return reference
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        planned = dict.fromkeys(("planned_at_s", "time_left_s", "solve_s", "in_time"))
+        return {
+            "asked": self.source,
+            "followed": self.followed or self.source,
+            **planned,
+            **self._planned,
+            "reason": self._reason,
+            "again": self.again,
+        }

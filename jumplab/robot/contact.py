@@ -1,0 +1,117 @@
+"""What the ground can do to a foot, and how a foot's points move: numbers that hold for NumPy and
+for CasADi alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+if TYPE_CHECKING:
+    from jumplab.robot.description import Robot
+
+WAYS = (("+x", 0, 1.0), ("-x", 0, -1.0), ("+y", 1, 1.0), ("-y", 1, -1.0))
+WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+def pyramid(friction: float) -> np.ndarray:
+    """Edges (4, 3) of the friction pyramid, each with a vertical force of one: a force is inside if
+    it is a sum of them with factors that are not negative.
+    """
+    edges = np.array([[0.0, 0.0, 1.0]] * len(WAYS))
+    for edge, (_, axis, sign) in zip(edges, WAYS, strict=True):
+        edge[axis] = sign * friction
+    return edges
+
+
+def wrench_rows(
+    friction: float | None = None,
+    ahead: float | None = None,
+    behind: float | None = None,
+    half_width: float | None = None,
+    spin: float | None = None,
+) -> dict[str, np.ndarray]:
+    """Rows r (6,) by name, with r @ [force, moment] >= 0 while a foot sticks and does not tip.
+
+    The wrench is about a point of the sole, in axes that are turned about the vertical as the foot
+    is. The CoP is at (-m_y, m_x) / f_z from that point. What is None has no rows.
+
+    Parameters
+    ----------
+    friction : the largest force along x, and along y, over that down [1].
+    ahead, behind, half_width : how far the CoP may be from the point, along the foot and across it
+        [m].
+    spin : the largest moment about the vertical over the force down [m].
+    """
+    rows = {"F_z >= 0": np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])}
+
+    def limit(name: str, share: float | None, column: int, sign: float) -> None:
+        if share is not None:
+            rows[name] = np.zeros(6)
+            rows[name][2] = share
+            rows[name][column] = -sign
+
+    for way, axis, sign in WAYS:
+        limit(f"friction {way}", friction, axis, sign)
+    limit("CoP behind toe", ahead, 4, -1.0)
+    limit("CoP ahead of heel", behind, 4, 1.0)
+    limit("CoP left of right edge", half_width, 3, -1.0)
+    limit("CoP right of left edge", half_width, 3, 1.0)
+    limit("torsion +", spin, 5, 1.0)
+    limit("torsion -", spin, 5, -1.0)
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """A point of a link: Pinocchio's joint that carries it, and its placement in its frame."""
+
+    joint: int
+    placement: pin.SE3
+
+
+def on_feet(robot: Robot, point: np.ndarray) -> list[Anchor]:
+    """A ``point`` (3,) of the foot links' frames [m], of the left and of the right foot."""
+    frames = [
+        robot.model.frames[robot.model.getFrameId(name, pin.BODY)] for name in robot.foot.frames
+    ]
+    move = pin.SE3(np.eye(3), np.array(point, float))
+    return [Anchor(frame.parentJoint, frame.placement * move) for frame in frames]
+
+
+@dataclass(frozen=True, eq=False)
+class PointMotion:
+    """How a point of a link moves, in world axes.
+
+    Attributes
+    ----------
+    place : (3,) [m].  turn : (3, 3) attitude of the link's frame.
+    velocity : (6,) of the point, then angular of the link [m/s, rad/s].
+    jacobian : (6, nv), velocity = jacobian @ v.
+    drift : (6,), acceleration = jacobian @ v' + drift [m/s^2, rad/s^2].
+    """
+
+    place: np.ndarray
+    turn: np.ndarray
+    velocity: np.ndarray
+    jacobian: np.ndarray
+    drift: np.ndarray
+
+
+def moving(model: pin.Model, data: pin.Data, q: np.ndarray, v: np.ndarray) -> None:
+    """Makes ``data`` ready for :func:`point_motion` at ``q`` (nq,) and ``v`` (nv,)."""
+    pin.computeJointJacobians(model, data, q)
+    pin.forwardKinematics(model, data, q, v, np.zeros(model.nv))
+
+
+def point_motion(model: pin.Model, data: pin.Data, anchor: Anchor) -> PointMotion:
+    """How an anchor moves [m, rad, s] in the state that ``data`` is :func:`moving` in."""
+    at = anchor.joint, anchor.placement
+    place = data.oMi[anchor.joint] * anchor.placement
+    jacobian = pin.getFrameJacobian(model, data, *at, WORLD)
+    velocity = pin.getFrameVelocity(model, data, *at, WORLD).vector
+    drift = pin.getFrameClassicalAcceleration(model, data, *at, WORLD).vector
+    return PointMotion(place.translation, place.rotation, velocity, jacobian, drift)

@@ -1,0 +1,154 @@
+"""The two files of a robot: which ones there are, their texts, and the entries of the TOML
+file, each refused in one sentence.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jumplab.errors import RobotError, quoted
+
+HERE = Path(__file__).parent
+SHIPPED = {
+    path.stem: path
+    for path in (HERE / "bhr" / "bhr.toml", *sorted((HERE / "published").glob("*.toml")))
+}
+ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
+LEG = ROLES[:3]
+MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
+_REQUIRED = object()
+
+
+def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
+    """A robot's URDF as its TOML file names it, the folder that it is named from, and the TOML's
+    text; None for a bare URDF.
+
+    Raises :class:`RobotError` if there is neither.
+    """
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise RobotError(
+            f"a robot must be a name or the path of a TOML file, got {quoted(name_or_path)}"
+        )
+    name = str(name_or_path)
+    path = SHIPPED.get(name) or Path(name)
+    if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
+        return path.name, path.parent, None
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as e:
+        raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
+    except (OSError, ValueError) as e:
+        known = ", ".join(SHIPPED)
+        short = name if len(name) < 80 else name[:77] + "..."
+        raise RobotError(
+            f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file"
+        ) from e
+    urdf = read_toml(text, str(path)).get("urdf")
+    if not isinstance(urdf, str):
+        raise RobotError(
+            f"{path}: the entry 'urdf' must name the URDF file beside it, got {urdf!r}"
+        )
+    return urdf, path.parent, text
+
+
+def read_text(path: Path) -> str:
+    """The text of a URDF file. Raises :class:`RobotError` if it cannot be one."""
+    try:
+        if path.is_dir():
+            raise RobotError(f"{path}: is a folder; name the URDF file inside it")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
+            raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
+        return decode(path.read_bytes(), str(path))
+    except FileNotFoundError:
+        raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
+    except (OSError, ValueError) as e:
+        raise RobotError(
+            f"{path}: cannot be read ({type(e).__name__}); give the path of a readable URDF"
+        ) from e
+
+
+def decode(raw: bytes, where: str) -> str:
+    """Bytes as the text of a URDF (UTF-8); :class:`RobotError` for anything else."""
+    if not raw.strip():
+        raise RobotError(
+            f"{where}: the file is empty (0 of {len(raw)} bytes are text); copy or download it "
+            f"again"
+        )
+    if raw[:2] in (b"\x1f\x8b", b"PK"):
+        raise RobotError(f"{where}: is a compressed archive, not a URDF; unpack it first")
+    try:
+        text = raw.decode("utf-8-sig")
+        at = raw.find(b"\0")
+    except UnicodeDecodeError as e:
+        at = e.start
+    if at >= 0:
+        raise RobotError(f"{where}: is binary (byte {at} is no UTF-8 text); a URDF is an XML text")
+    if text.startswith("version https://git-lfs.github.com/spec"):
+        raise RobotError(
+            f"{where}: is a Git LFS pointer of {len(raw)} bytes, not the file itself; run 'git "
+            f"lfs pull'"
+        )
+    return text
+
+
+# entries of the TOML file
+# -------------------------------------------------------------------------------------------
+def read_toml(text: str, where: str) -> dict:
+    """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
+        raise RobotError(f"{where}: not a TOML file: {e}") from e
+
+
+def entry(
+    config: dict, *path: str, kind: type = float, count: int | None = None, default: Any = _REQUIRED
+) -> Any:
+    """One checked entry of the configuration: a finite number or a text, or ``count`` of them (a
+    list).
+
+    Raises :class:`RobotError` if it is of another kind, or missing without a ``default``.
+    """
+    where = ".".join(path)
+    value = config
+    for key in path:
+        if not isinstance(value, dict) or key not in value:
+            if default is not _REQUIRED:
+                return default
+            raise RobotError(f"robot configuration: the entry {where!r} is missing")
+        value = value[key]
+    items = value if count else [value]
+    numbers = kind is float
+    good = isinstance(items, list) and len(items) == (count or 1)
+    good = good and all(
+        isinstance(x, (int, float) if numbers else str) and not isinstance(x, bool) for x in items
+    )
+    if not good or (numbers and not np.all(np.isfinite(items))):
+        many = f"{count} of " if count else ""
+        wanted = "a finite number" if numbers else "a text"
+        raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
+    clean = [kind(x) for x in items]
+    return clean if count else clean[0]
+
+
+def table(config: dict, name: str) -> dict:
+    """A table of the configuration, {} where it is missing; :class:`RobotError` if it is none."""
+    value = config.get(name, {})
+    if not isinstance(value, dict):
+        raise RobotError(f"robot configuration: {name!r} = {value!r} must be a table [{name}]")
+    return value
+
+
+def roles_table(config: dict) -> dict[str, tuple[str, ...]]:
+    """role -> (left, right) joint names; () for a shoulder whose list is empty: held arms."""
+    joints = {}
+    for role in ROLES:
+        held = role == "shoulder_pitch" and table(config, "joints").get(role) == []
+        joints[role] = () if held else tuple(entry(config, "joints", role, kind=str, count=2))
+    return joints

@@ -1,0 +1,111 @@
+"""Inverse kinematics of the legs: the joints that bring the feet to their places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.robot.contact import Anchor, on_feet
+from jumplab.robot.stance import stance_configuration
+
+if TYPE_CHECKING:
+    from jumplab.robot.description import Robot
+
+LOCAL = pin.ReferenceFrame.LOCAL
+BASE = 6  # columns of the base
+
+
+def leg_columns(robot: Robot) -> list[np.ndarray]:
+    """Columns of the rates that move each foot alone, of the left and of the right leg; of longer
+    legs the six that move it best in the stance.
+
+    A waist above both hips, where the base is the trunk, belongs to neither.
+    """
+    from scipy.linalg import qr  # slow to import
+
+    model = robot.model
+    data = model.createData()
+    feet = [anchor.joint for anchor in on_feet(robot, np.zeros(3))]
+    pin.computeJointJacobians(model, data, stance_configuration(robot))
+    out = []
+    for foot, other in zip(feet, feet[::-1], strict=True):
+        chain = sorted(set(model.supports[foot]) - set(model.supports[other]))
+        columns = np.array([model.idx_vs[joint] for joint in chain])
+        slope = pin.getJointJacobian(model, data, foot, LOCAL)[:, columns]
+        out.append(np.sort(columns[qr(slope, pivoting=True)[2][:6]]))
+    return out
+
+
+def give_of(robot: Robot, base: float = 0.0) -> np.ndarray:
+    """How readily each column (nv,) moves: joints of legs 1, of the base ``base`` [1], others 0."""
+    give = np.zeros(robot.model.nv)
+    give[:BASE] = base
+    give[np.concatenate(leg_columns(robot))] = 1.0
+    return give
+
+
+def bring_feet(
+    model: pin.Model,
+    data: pin.Data,
+    q: np.ndarray,
+    goals: Mapping[Anchor, pin.SE3],
+    give: np.ndarray,
+    *,
+    limits: tuple[np.ndarray, np.ndarray] | None = None,
+    damping: float = 0.0,
+    most_rad: float = np.inf,
+    steps: int = 10,
+    near: float = 1e-10,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The configuration (nq,) near ``q`` (nq,) whose feet are at ``goals``, and what they miss.
+
+    Newton's method, each step the least motion in shares of what columns give.
+
+    Parameters
+    ----------
+    goals : placement in the world, by anchor.
+    give : (nv,) how readily each column moves [1]; 0 stays where it is.
+    limits : least and largest joint angles (nq - 7,) [rad].
+    damping : of the steps [m^2, rad^2], where legs are nearly straight.  most_rad : most of a step.
+    steps : at most.  near : what feet may miss [m, rad].
+
+    Returns the configuration, and (anchors, 6) of each foot's way left, in its axes [m, rad].
+    """
+    q = q.copy()
+    for left in range(steps, -1, -1):
+        pin.computeJointJacobians(model, data, q)
+        missed, rows = _missed(model, data, goals)
+        if not left or np.abs(missed).max() < near:
+            break
+        step = least_motion(rows, missed, give, damping)
+        q = pin.integrate(model, q, np.clip(step, -most_rad, most_rad))
+        if limits is not None:
+            q[7:] = np.clip(q[7:], *limits)
+    return q, missed.reshape(-1, 6)
+
+
+def _missed(
+    model: pin.Model, data: pin.Data, goals: Mapping[Anchor, pin.SE3]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is missed of all goals (6 k,), and the slope of what is reached (6 k, nv)."""
+    missed = []
+    rows = []
+    for anchor, goal in goals.items():
+        place = data.oMi[anchor.joint] * anchor.placement
+        missed.append(pin.log6(place.actInv(goal)).vector)
+        rows.append(pin.getFrameJacobian(model, data, anchor.joint, anchor.placement, LOCAL))
+    return np.concatenate(missed), np.concatenate(rows)
+
+
+def least_motion(
+    rows: np.ndarray, missed: np.ndarray, give: np.ndarray, damping: float = 0.0
+) -> np.ndarray:
+    """The least x (nv,), in shares of what columns ``give`` (nv,), with rows (k, nv) @ x = missed
+    (k,), or as near as can be; ``damping`` as of :func:`bring_feet`.
+    """
+    slope = rows * give
+    inner = slope @ slope.T + damping * np.eye(len(missed))
+    return give * (slope.T @ np.linalg.lstsq(inner, missed, rcond=None)[0])

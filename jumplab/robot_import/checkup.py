@@ -1,0 +1,111 @@
+"""What ``jumplab robot check`` finds out about a URDF, as one result; above all, whether five links
+describe it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pinocchio as pin
+
+from jumplab.errors import RobotError
+from jumplab.robot.description import Robot
+from jumplab.robot.files import files_of, read_toml
+from jumplab.robot.stance import check_stance, stance_configuration
+from jumplab.robot_import import checks as urdf_checks
+from jumplab.robot_import.jumper import REPAIRS, Jumper, make_jumper
+from jumplab.robot_import.roles import Draft, draft
+from jumplab.robot_import.urdf import MOVING, locate, parse, read_urdf
+
+
+@dataclass(frozen=True)
+class Checkup:
+    """A robot that can be planned with, and how it came about."""
+
+    robot: Robot
+    jumper: Jumper  # its lumped bodies and the URDF as it was
+
+    def rows(self) -> list[dict]:
+        """One row per role: joints, direction of their axes, range, torque and speed."""
+        s = self.robot.sagittal
+        out = []
+        for i, (role, pair) in enumerate(self.robot.joints.items()):
+            row = dict.fromkeys(("role", "left", "right", "axes", "range", "N m", "rad/s"), "")
+            row |= {"role": role.replace("_", " "), "left": "held", "right": "held"}
+            if pair:
+                row["left"], row["right"] = pair
+                row["axes"] = " ".join("+y" if x > 0 else "-y" for x in s.signs[i])
+                row["range"] = f"{s.lower[i]:+.2f} ... {s.upper[i]:+.2f}"
+                row["N m"] = f"{s.effort[i] / 2:.4g}"
+                row["rad/s"] = f"{s.speed[i]:.4g}"
+            out.append(row)
+        return out
+
+    def lines(self) -> list[str]:
+        """What else is worth knowing, a line each."""
+        r = self.robot
+        tree = self.jumper.tree
+        moving = len(r.joint_names)
+        foot = r.foot
+        com = pin.centerOfMass(r.model, r.model.createData(), stance_configuration(r))
+        movable = sum(joint.kind in MOVING for joint in tree.joints.values())
+        out = [
+            f"robot {r.name}: {r.total_mass:.3f} kg ({tree.mass:.3f} kg in the XML), {moving} of "
+            f"{movable} joints move, {len(self.jumper.lumped.held)} are held off zero",
+            f"sole: {1e3 * foot.heel:.0f} ... {1e3 * foot.toe:.0f} mm from the last leg joint, "
+            f"{2e3 * foot.half_width:.0f} mm wide, {-1e3 * foot.sole_z:.0f} mm below it",
+            f"standing: CoM {com[2]:.3f} m up, knee {r.stance['knee_rad']:.2f} rad, "
+            f"trunk {r.stance['trunk_pitch_rad']:.2f} rad",
+            "five links describe it"
+            if r.planar
+            else "no five links describe it: jumps are planned directly, not in three steps",
+        ]
+        return out + [
+            f"changed: {what}: {x:.3g} {unit}"
+            for what, (x, unit) in self.jumper.lumped.changed.items()
+        ]
+
+
+def first_look(path: str | Path, repair: tuple[str, ...] = ()) -> tuple[Draft | None, list[str]]:
+    """A first description of a URDF, and every fault of the file, else of the limits of the joints
+    with a role.
+
+    With faults of the file the roles are those that it has once all repairs are allowed; None if
+    not even then. Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
+    """
+    path = Path(path)
+    if not (faults := urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair)):
+        first = draft(path, repair)
+        return first, list(first.faults)
+    try:
+        return draft(path, REPAIRS), faults
+    except RobotError:
+        return None, faults
+
+
+def check(path: str | Path, config_text: str) -> Checkup:
+    """The robot of a URDF and a configuration with [source]; raises :class:`RobotError`."""
+    path = Path(path)
+    config = read_toml(config_text, "robot configuration")
+    if "source" not in config:
+        missing = "the table [source] is missing: it names trunk, forward, up and repair"
+        raise RobotError(f"robot configuration: {missing}")
+    jumper = make_jumper(read_urdf(path), config, path.name, path)
+    robot = Robot(jumper.urdf, jumper.config_text)
+    check_stance(robot)
+    return Checkup(robot, jumper)
+
+
+def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
+    """The checkup of a name or a path; roles are found where no table [source] tells them."""
+    urdf, folder, config = files_of(robot)
+    path = locate(urdf, folder)
+    if config is None or "source" not in read_toml(config, "robot configuration"):
+        config = draft(path, repair).text
+    return check(path, config)
+
+
+def load(name_or_path: str | Path, repair: tuple[str, ...] = ()) -> Robot:
+    """The robot of a bare URDF or MJCF, or of a TOML file with a table [source]: (name or path)."""
+    return examine(name_or_path, repair).robot

@@ -1,0 +1,96 @@
+"""What is written: elements of a URDF, numbers with twelve digits, and TOML files from the
+templates of this folder.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+
+HERE = pin.SE3.Identity()
+
+
+def add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
+    """An element below ``parent``; attributes are texts, numbers, or arrays (n,)."""
+    for key, value in values.items():
+        if not isinstance(value, str):
+            values[key] = " ".join(f"{x:.12g}" for x in 0.0 + np.atleast_1d(value))
+    return ET.SubElement(parent, tag, values)
+
+
+def add_origin(parent: ET.Element, place: pin.SE3) -> None:
+    """Where an element is [m, rad]."""
+    add(parent, "origin", xyz=place.translation, rpy=pin.rpy.matrixToRpy(place.rotation))
+
+
+def add_joint(
+    robot: ET.Element,
+    name: str,
+    kind: str,
+    ends: tuple[str, str],
+    place: pin.SE3 | None = None,
+    axis: np.ndarray | None = None,
+    limits: Mapping[str, float] | None = None,
+) -> None:
+    """A joint between two links, ``place`` of the child in the parent; if it moves, its
+    ``axis`` (3,) and limits [rad, N m, rad/s].
+    """
+    joint = add(robot, "joint", name=name, type=kind)
+    add(joint, "parent", link=ends[0])
+    add(joint, "child", link=ends[1])
+    if place is not None:
+        add_origin(joint, place)
+    if axis is not None:
+        add(joint, "axis", xyz=axis)
+        add(joint, "limit", **limits)
+
+
+def add_link(robot: ET.Element, name: str, inertia: pin.Inertia) -> ET.Element:
+    """A link with its inertia, in its own frame [kg, m, kg m^2]."""
+    link = add(robot, "link", name=name)
+    inertial = add(link, "inertial")
+    add_origin(inertial, pin.SE3(np.eye(3), inertia.lever))
+    add(inertial, "mass", value=inertia.mass)
+    m = np.where(np.abs(inertia.inertia) < 1e-15, 0.0, inertia.inertia)
+    ends = zip(*np.triu_indices(3), strict=True)
+    add(inertial, "inertia", **{f"i{'xyz'[i]}{'xyz'[k]}": m[i, k] for i, k in ends})
+    return link
+
+
+def add_boxes(
+    link: ET.Element,
+    kind: str,
+    boxes: Iterable[tuple[np.ndarray, np.ndarray]],
+    axes: pin.SE3 = HERE,
+) -> None:
+    """Boxes (centre, size) [m] along ``axes`` in the link; ``kind`` is "visual" or "collision"."""
+    for centre, size in boxes:
+        shape = add(link, kind)
+        add_origin(shape, axes * pin.SE3(np.eye(3), np.array(centre, float)))
+        add(add(shape, "geometry"), "box", size=size)
+
+
+def filled(template: str, **values: Any) -> str:
+    """A template of this folder with its fields filled in (as :meth:`str.format` does)."""
+    return Path(__file__).with_name(template).read_text(encoding="utf-8").format(**values)
+
+
+def quote(value: Any) -> str:
+    """A text or an array of texts, the same in TOML as in JSON."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def rows(values: Mapping[str, float]) -> str:
+    """Lines of a table, name = number."""
+    return "\n".join(f"{quote(name)} = {value:.12g}" for name, value in values.items())
+
+
+def titled(title: str, values: Mapping[str, float]) -> str:
+    """A table below others; nothing if it is empty (name -> number)."""
+    return f"\n\n[{title}]\n{rows(values)}" if values else ""

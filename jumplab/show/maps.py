@@ -1,0 +1,144 @@
+"""Pictures of many jumps: the map of those that a robot can do, and how much a plan bears."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+
+from jumplab.errors import InputError
+from jumplab.show.style import (
+    COLUMN_IN,
+    FLIGHT,
+    INK,
+    LANDING,
+    LAUNCH,
+    PAGE_IN,
+    new_figure,
+    styled,
+    tint,
+)
+from jumplab.studies.envelope import BEYOND, OPEN, Envelope
+
+if TYPE_CHECKING:  # pictures need no simulator
+    from jumplab.studies.margins import MarginReport
+
+REFUSED = {
+    OPEN: ("#9A9A9A", "no plan found"),
+    BEYOND: ("#F0F0F0", "not tried"),
+}
+MOST_TICKS = 14  # more would touch
+COLUMNS = 4  # of maps side by side
+AXIS_WORDS = {
+    "distance_m": "distance [m]",
+    "height_m": "rise of the CoM [m]",
+    "side_m": "to the left [m]",
+    "yaw_rad": "turn [rad]",
+}
+RADAR_COLORS = LAUNCH, FLIGHT, INK, LANDING
+RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
+
+
+@styled
+def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
+    """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much
+    of it.
+
+    Maps of ``others`` over the same two numbers stand beside it, four in a row, under one legend.
+    """
+    maps = envelope, *others
+    across, up = (AXIS_WORDS[name] for name in envelope.axes)
+    cells = [cell for each in maps for cell in each.cells]
+    limiting = {cell.limiting for cell in cells}
+    palette = matplotlib.color_sequences["okabe_ito"]
+    colors = {
+        name: palette[(i + 1) % len(palette)]
+        for i, name in enumerate(sorted({cell.limiting for cell in cells if cell.solved}))
+    }
+    entries = [(color, name) for name, color in colors.items()]
+    entries += [look for kind, look in REFUSED.items() if kind in limiting]
+    handles = [Patch(color=color, label=label) for color, label in entries]
+    if others:
+        rows = -(-len(maps) // COLUMNS)
+        fig = new_figure(PAGE_IN, 0.9 + 1.75 * rows)
+        axes = fig.subplots(rows, COLUMNS, squeeze=False).ravel()
+        for ax in axes[len(maps) :]:
+            ax.set_axis_off()
+        fig.supxlabel(across, fontsize=8)
+        fig.supylabel(up, fontsize=8)
+        fig.legend(handles=handles, loc="outside upper center", ncols=4)
+    else:
+        fig = new_figure(1.6 * COLUMN_IN, 3.2)
+        axes = [fig.subplots()]
+        axes[0].set(xlabel=across, ylabel=up)
+        axes[0].legend(handles=handles, loc="center left", bbox_to_anchor=(1.01, 0.5))
+    for ax, each in zip(axes, maps, strict=False):
+        _draw_cells(ax, each, colors, "{:.2g}" if others else "{:g}")
+        ax.set_title(each.robot if others else f"{each.robot}: limit used most, in %")
+    return fig
+
+
+def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: str) -> None:
+    centres = envelope.distances, envelope.heights
+    size = np.array([np.min(np.diff(values)) if len(values) > 1 else 0.1 for values in centres])
+    for cell in envelope.cells:
+        place = np.array([getattr(cell, name) for name in envelope.axes])
+        face = REFUSED.get(cell.limiting, ("", ""))[0]
+        if cell.solved:
+            face = tint(colors[cell.limiting], 0.25 + 0.75 * float(np.clip(cell.share, 0, 1)))
+            look = dict(ha="center", va="center", fontsize=5.5)
+            look["color"] = "black" if np.mean(face) > 0.3 else "white"
+            ax.text(*place, f"{100 * cell.share:.0f}", **look)
+        look = dict(facecolor=face, edgecolor="white", linewidth=0.6)
+        ax.add_patch(Rectangle(place - size / 2, *size, **look))
+    ax.autoscale_view()
+    ax.margins(0)
+    if max(map(len, centres)) <= MOST_TICKS:
+        ax.set_xticks(envelope.distances, map(tick.format, envelope.distances))
+        ax.set_yticks(envelope.heights, map(tick.format, envelope.heights))
+    ax.grid(False)
+
+
+@styled
+def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
+    """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and
+    re-aimed.
+
+    Of several reports, by the names that the legend shall have, only the disturbances that two or
+    more of them have. Raises :class:`InputError` for more reports than colours, or if nothing is
+    left to show.
+    """
+    several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
+    counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
+    names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
+    if not names or len(several) > len(RADAR_COLORS):
+        given = f"{len(several)} reports with {len(names)} disturbances that two of them tell"
+        most = f"up to {len(RADAR_COLORS)} reports and what two of them tell"
+        raise InputError(f"the radar shows {most}, got {given}")
+    fig = new_figure(PAGE_IN, 3.8)
+    angles = np.linspace(0, 2 * np.pi, len(names) + 1)  # the first again, so that lines close
+    words = [name.replace("+", " +\n").replace("shove_", "shove_\n") for name in names]
+    panels = fig.subplots(1, 2, subplot_kw={"projection": "polar"})
+    for ax, reaim in zip(panels, (False, True), strict=True):
+        lines = zip(several.items(), RADAR_COLORS, RADAR_WIDTHS, strict=False)
+        for (title, report), color, width in lines:
+            shares = {m.names: 100 * m.share for m in report.margins if m.reaim == reaim}
+            values = [shares.get(name, np.nan) for name in (*names, names[0])]
+            look = dict(color=color, linewidth=width, marker="o", markersize=2 + width)
+            ax.plot(angles, values, label=title, **look)
+        ax.set(ylim=(0, 105), theta_offset=np.pi / 2, theta_direction=-1)
+        ax.set_title("re-aimed" if reaim else "plain", fontsize=8, pad=14)
+        ax.set_xticks(angles[:-1], words, fontsize=6)
+        ax.set_yticks([25, 50, 75, 100], ["25 %", "50 %", "75 %", "100 %"], fontsize=6, zorder=5)
+        ax.set_rlabel_position(-180 / len(names))  # between the last and the first
+        ax.tick_params(axis="x", pad=11)  # clear of the circle
+    if "" not in several:
+        handles = ax.get_legend_handles_labels()
+        fig.legend(*handles, loc="outside lower center", ncols=len(several))
+    return fig

@@ -1,0 +1,108 @@
+"""What the robot's sensors tell of the true state, and what its controllers make of that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.control.estimator import Estimator, Reading, SensorNoise
+from jumplab.control.kinematics import State, rotation, turned
+from jumplab.robot import Robot
+from jumplab.sim import STEP_S
+from jumplab.task import GRAVITY
+
+LEVER_M = 0.05  # a moment of a foot's sensor is wrong by as much as a force at this distance
+
+
+class Sensors:
+    """Readings of the true state, exact if every deviation in ``noise`` is zero.
+
+    Biases are drawn once. Foot forces are those of the contact itself, as if the sensor's reading
+    were corrected for the foot's own weight and inertia; the accelerometer has no end of its range.
+    """
+
+    def __init__(self, noise: SensorNoise, seed: int, gravity: float = GRAVITY):
+        # a stream of its own beside the robot's draw
+        self.noise = noise
+        self._rng = np.random.default_rng([seed, 1])
+        self._other = np.random.default_rng([seed, 3])
+        self._gyro_bias = noise.gyro_bias * self._rng.standard_normal(3)
+        self._accel_bias = noise.accel_bias * self._rng.standard_normal(3)
+        self._last_velocity: np.ndarray | None = None
+        self._gravity = np.array([0.0, 0.0, -gravity])
+
+    def initial(self, q: np.ndarray) -> np.ndarray:
+        """Configuration (nq,) as it is believed to be before the jump: a little tilted."""
+        error = self.noise.tilt_rad * self._rng.standard_normal(2)
+        return turned(q, pin.exp3(np.array([*error, 0.0])))
+
+    def read(self, q: np.ndarray, v: np.ndarray, wrench: np.ndarray) -> Reading:
+        """Measure the true state (q, v) and the true wrenches (2, 6) under the feet; call it once
+        per step.
+        """
+        n = self.noise
+        draw = self._rng.standard_normal
+        attitude = rotation(q[3:7])
+        velocity = attitude @ v[:3]
+        gained = np.zeros(3) if self._last_velocity is None else velocity - self._last_velocity
+        self._last_velocity = velocity
+        force = attitude.T @ (gained / STEP_S - self._gravity)
+        joints = q[7:] + n.joint_rad * draw(len(q) - 7)
+        if n.encoder_step_rad:
+            joints = n.encoder_step_rad * np.round(joints / n.encoder_step_rad)
+        return Reading(
+            joints,
+            v[6:] + n.joint_rate * draw(len(v) - 6),
+            v[3:6] + self._gyro_bias + n.gyro * draw(3),
+            force + self._accel_bias + n.accel * draw(3),
+            self._felt(wrench, draw(2)),
+        )
+
+    def _felt(self, wrench: np.ndarray, vertical: np.ndarray) -> np.ndarray:
+        """Foot wrenches (2, 6) as measured; ``vertical`` (2,) is drawn for the forces up."""
+        error = self._other.standard_normal((2, 6)) * np.repeat([1.0, LEVER_M], 3)
+        error[:, 2] = vertical
+        return wrench + self.noise.force * error
+
+
+class Perception:
+    """What the controllers are told: the truth if no sensor errs, otherwise the estimate, see
+    :class:`Estimator`.
+    """
+
+    def __init__(self, robot: Robot, q: np.ndarray, v: np.ndarray, noise: SensorNoise, seed: int):
+        self._sensors = Sensors(noise, seed, robot.gravity)
+        self._tilt = 0.0
+        self._speed = 0.0
+        exact = noise == SensorNoise()  # then the true state stands for its estimate
+        self._estimator = None if exact else Estimator(robot, self._sensors.initial(q), v, noise)
+
+    def __call__(self, state: State) -> State:
+        """The true ``state`` as far as the robot knows it."""
+        if self._estimator is None:
+            return state
+        reading = self._sensors.read(*state)
+        q, v = self._estimator.update(reading)
+        errors = estimation_error(*state[:2], q, v)
+        self._tilt, self._speed = np.maximum((self._tilt, self._speed), errors).tolist()
+        return State(q, v, reading.foot_wrench)
+
+    def to_json(self) -> dict:
+        """What the settings of a result say."""
+        if self._estimator is None:
+            return {"state": "true"}
+        return {
+            "state": "estimated",
+            "worst_tilt_error_rad": self._tilt,
+            "worst_velocity_error": self._speed,
+        }
+
+
+def estimation_error(
+    q: np.ndarray, v: np.ndarray, believed_q: np.ndarray, believed_v: np.ndarray
+) -> tuple[float, float]:
+    """Error of roll and pitch together [rad], and of the base's velocity in the world [m/s]."""
+    true, believed = (rotation(x[3:7]) for x in (q, believed_q))
+    # between the two ideas of up, in the trunk's axes
+    tilt = np.arccos(np.clip(true[2] @ believed[2], -1.0, 1.0))
+    return float(tilt), float(np.linalg.norm(believed @ believed_v[:3] - true @ v[:3]))

@@ -1,0 +1,100 @@
+"""What a tape uses of the limits, also between the nodes of the plan that it was made from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+from jumplab.stages.whole_body.ground import Surface
+from jumplab.stages.whole_body.tape import FLAT, SHORTEST_S, feet_of
+from jumplab.stages.whole_body.terms import SOLE_SHARES
+
+# the audit's limits
+FRICTION = 0.5  # of each foot
+LOADED_N = 10.0  # the ratio is taken to this force at least
+RATE_GAP = 0.01  # [rad/s] of angles over one step, against the mean of the rates at its ends
+ACCELERATION_GAP = 4.0  # [rad/s^2] the same of rates against accelerations
+RANGE_GAP = 1e-3  # [rad] beyond a stop
+PRESSURE_GAP = 2e-3  # [m] of the CoP beyond the sole
+PRESSED_N = 50.0  # on a foot, from which on its CoP is looked at
+CLEAR_M = 0.02  # of the soles over the ground in mid-flight
+MIDDLE = (0.3, 0.7)  # the shares of a flight between which that is
+SUNK_M = 1e-3  # of a sole in the ground or in a platform
+
+
+def used_between(tape: Tape, robot: Robot, surface: Surface = Surface()) -> float:
+    """Largest share [1] that the tape uses of the limits of motors, stops, ground, and of gaps
+    between angles, rates and accelerations.
+
+    The limits are those of the audit; up to 1 the tape holds them, also between the nodes. Soles
+    that in the middle of a flight are as low as they may be use all of their height, on the surface
+    twice of it.
+    """
+    motors = robot.limits
+    angles = tape.q[:, 7:]
+    rates = tape.v[:, 6:]
+    least, most = motors.range(rates)
+    origin, turn = feet_of(robot, tape.q)
+    along = np.linalg.norm(tape.f[..., :2], axis=-1)
+    shares = [
+        1 + np.maximum(tape.tau - most, least - tape.tau) / motors.effort,
+        np.abs(rates) / motors.speed,
+        np.maximum(motors.lower - angles, angles - motors.upper) / RANGE_GAP,
+        along / (FRICTION * np.maximum(tape.f[..., 2], LOADED_N)),
+        _pressed_outside(tape, robot, turn) / PRESSURE_GAP,
+        _gap(tape.t, angles, rates) / RATE_GAP,
+        _gap(tape.t, rates, tape.a[:, 6:]) / ACCELERATION_GAP,
+        _low(tape, robot, surface, origin, turn),
+    ]
+    return float(max(x.max() for x in shares))
+
+
+def _gap(t: np.ndarray, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """By how much differences of ``values`` (n, k) miss the mean of the ``rates`` (n, k)."""
+    step = np.diff(t)[:, None]
+    moves = step[:, 0] > SHORTEST_S  # the instant of take-off is there twice
+    missed = np.diff(values, axis=0)[moves] / step[moves] - (rates[1:] + rates[:-1])[moves] / 2
+    return np.abs(missed)
+
+
+def _pressed_outside(tape: Tape, robot: Robot, turn: np.ndarray) -> np.ndarray:
+    """How far the CoP of each foot that carries is outside its sole, on its toes beside their edge
+    (n, 2) [m].
+
+    ``turn`` (n, 2, 3, 3) are attitudes of the feet.
+    """
+    foot = robot.foot
+    force = tape.f[..., :3]
+    load = np.where(force[..., 2] > PRESSED_N, force[..., 2], np.nan)
+    moment = tape.f[..., 3:] - np.cross(turn @ foot.tip, force)
+    x = -moment[..., 1] / load  # from the middle of the toe edge
+    y = moment[..., 0] / load
+    ahead = turn[..., :2, 0] / np.linalg.norm(turn[..., :2, 0], axis=-1, keepdims=True)
+    along = ahead[..., 0] * x + ahead[..., 1] * y
+    across = ahead[..., 0] * y - ahead[..., 1] * x
+    length = np.where(tape.extra["contacts"] == FLAT, foot.toe - foot.heel, 0.0)
+    outside = np.max([along, -along - length, np.abs(across) - foot.half_width], axis=0)
+    return np.where(np.isnan(load), -np.inf, outside)
+
+
+def _low(
+    tape: Tape, robot: Robot, surface: Surface, origin: np.ndarray, turn: np.ndarray
+) -> np.ndarray:
+    """Share (n, 2) of what the soles may be too low in flight, in its middle under :data:`CLEAR_M`.
+
+    ``origin`` (n, 2, 3) [m] and ``turn`` (n, 2, 3, 3) are places and attitudes of the feet.
+    """
+    heels, toes = np.split(robot.foot.corners, 2)
+    sole = np.concatenate([heels + share * (toes - heels) for share in SOLE_SHARES])
+    points = origin[:, :, None] + np.einsum("nkij,pj->nkpi", turn, sole)
+    height = (points[..., 2] - surface.below(points)).min(axis=2)
+    shares = np.full(height.shape, -np.inf)
+    flying = np.flatnonzero(~tape.extra["contacts"].any(axis=1))
+    for rows in np.split(flying, np.flatnonzero(np.diff(flying) > 1) + 1):
+        if not len(rows):
+            continue
+        t = tape.t[rows] - tape.t[rows[0]]
+        middle = (t >= MIDDLE[0] * t[-1]) & (t <= MIDDLE[1] * t[-1])
+        shares[rows] = np.where(middle[:, None], 2 - height[rows] / CLEAR_M, -height[rows] / SUNK_M)
+    return shares

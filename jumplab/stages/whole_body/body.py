@@ -1,0 +1,175 @@
+"""A robot as the whole-body program sees it: the same numbers in every phase."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.models.spatial import SpatialModel
+from jumplab.robot import Robot
+from jumplab.robot.contact import on_feet
+from jumplab.robot.legs import leg_columns
+from jumplab.robot.reduction import even_masses
+from jumplab.robot.stance import knees, leg_length, stance_configuration
+from jumplab.stages.whole_body.coordinates import BASE
+from jumplab.stages.whole_body.shapes import Box, boxes
+from jumplab.task import GRAVITY
+
+# of half the length of a shank's box, where a platform's edge may meet it
+SHANK_SHARES = -0.8, -0.4, 0.0, 0.4, 0.8
+Spot = tuple[int, np.ndarray]  # a body, and a place in its frame (3,) [m]
+
+
+class Body:
+    """Tree, soles, knees, motors and shapes of a robot.
+
+    The world's origin lies in the middle of the soles in their first place, x forward, z up.
+
+    Attributes
+    ----------
+    model : the tree.  mg : weight on Earth [N].  stance : chart (6 + joints,) in which the robot
+        waits.
+    feet : bodies of the left and the right foot.  axes : (3, 3) of the soles in them.
+    tips, middles : (3,) middle of the toe edge and of the sole, in them [m].
+    corners : (2, 4, 3) of the soles, in them: toe left, toe right, heel left, heel right.
+    places : (2, 3) middles of the toe edges in the stance [m].
+    legs : columns of the chart that follow from a foot that stands, see :func:`leg_columns`.
+    ankle_m : height of the feet's joints in the stance [m].  half_m : half a sole's length [m].
+    """
+
+    def __init__(self, robot: Robot):
+        foot = robot.foot
+        self.robot = robot
+        self.made: dict[tuple, Any] = {}  # what others make of it, once
+        self.model = SpatialModel(robot.model)
+        self.mg = self.model.mass * GRAVITY
+        self.half_m = (foot.toe - foot.heel) / 2
+        tips = on_feet(robot, foot.tip)
+        self.feet = [x.joint - 1 for x in tips]
+        self.axes = [self.model.bodies[x.joint - 1].own.T @ x.placement.rotation for x in tips]
+        self.tips = self._on_feet(foot.tip)
+        self.middles = self._on_feet(foot.center)
+        corners = [self._on_feet(x) for x in foot.corners[::-1]]
+        self.corners = np.array(corners).transpose(1, 0, 2)
+        self.knees = knees(robot)
+        self.legs = [columns.tolist() for columns in leg_columns(robot)]
+        self.motors = robot.limits
+        configuration = stance_configuration(robot)
+        self.stance = self.model.of_pinocchio(configuration[None])[0]
+        data = robot.model.createData()
+        pin.forwardKinematics(robot.model, data, configuration)
+        self.places = np.array([(data.oMi[x.joint] * x.placement).translation for x in tips])
+        self.ankle_m = float(data.oMi[tips[0].joint].translation[2])
+
+    def _on_feet(self, point: np.ndarray) -> list[np.ndarray]:
+        """A point of the foot links' frames (3,), in the bodies of both feet."""
+        anchors = on_feet(self.robot, point)
+        return [self.model.local(x.joint, x.placement.translation) for x in anchors]
+
+    @cached_property
+    def leg_m(self) -> float:
+        """Length l of the legs in the stance [m]."""
+        return leg_length(self.robot)
+
+    @property
+    def spin_size(self) -> float:
+        """Natural size of angular momenta m l sqrt(g l) [kg m^2/s]."""
+        return float(self.model.mass * self.leg_m * np.sqrt(GRAVITY * self.leg_m))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.model.names[BASE:]
+
+    def chain(self, body: int) -> list[int]:
+        """Bodies from one up to the base (which is left out)."""
+        return [joint - 1 for joint in self.robot.model.supports[body + 1] if joint > 1][::-1]
+
+    @cached_property
+    def shoulders(self) -> list[tuple[int, float]]:
+        """Columns of the chart of the joints that swing the arms, with the sign that makes backward
+        positive.
+        """
+        names = self.robot.joints["shoulder_pitch"]
+        signs = self.robot.sagittal.signs[3]
+        return [
+            (BASE + self.joint_names.index(name), float(sign))
+            for name, sign in zip(names, signs, strict=False)
+        ]
+
+    @property
+    def short(self) -> bool:
+        """Whether a leg has fewer than six joints: both feet on the ground then hold yaw and roll
+        of the base.
+        """
+        return min(len(x) for x in self.legs) < 6
+
+    @cached_property
+    def mirrored(self) -> bool:
+        """Whether left and right are built alike, and every joint has its mirror image."""
+        pairs = self.model.pairs
+        all_paired = len({i for pair in pairs for i in pair[:2]}) == self.model.joints
+        return all_paired and even_masses(self.robot.model, pairs)
+
+    @cached_property
+    def geometry(self) -> pin.GeometryModel:
+        """Collision shapes of the links; its pairs are the :attr:`candidates`."""
+        kind = pin.GeometryType.COLLISION
+        geometry = pin.buildGeomFromUrdfString(self.robot.model, self.robot.urdf, kind)
+        bodies = [shape.parentJoint - 1 for shape in geometry.geometryObjects]
+        above = [b.parent for b in self.model.bodies]
+        for i, k in combinations(range(len(bodies)), 2):
+            a = bodies[i]
+            b = bodies[k]
+            if a not in (b, above[b]) and b != above[a]:
+                geometry.addCollisionPair(pin.CollisionPair(i, k))
+        return geometry
+
+    @property
+    def candidates(self) -> list[tuple[int, int]]:
+        """Pairs of links that are no neighbours, as indices of :attr:`shapes`."""
+        return [(pair.first, pair.second) for pair in self.geometry.collisionPairs]
+
+    @cached_property
+    def shapes(self) -> list[Box]:
+        """Boxes around the collision shapes, in the same order."""
+        return boxes(self.geometry, self.model)
+
+    def _shapes_of(self, bodies: set[int]) -> list[tuple[Box, np.ndarray]]:
+        """Boxes of some bodies, each with the way from its middle to its far end (3,) [m]."""
+        return [
+            (x, x.axes[:, np.argmax(x.half)] * x.half.max())
+            for x in self.shapes
+            if x.body in bodies
+        ]
+
+    @cached_property
+    def _shanks(self) -> list[tuple[Box, np.ndarray]]:
+        return self._shapes_of({1 + k for k, _, _ in self.knees})
+
+    @cached_property
+    def shank_m(self) -> float:
+        """Half the thickness of the shank [m]: with a level shank its face is that much lower than
+        the knee.
+        """
+        return float(max((min(box.half) for box, _ in self._shanks), default=0.0))
+
+    @cached_property
+    def shank_points(self) -> list[Spot]:
+        """Places along the middle of the boxes of the shanks."""
+        return [
+            (x.body, x.centre + share * way) for x, way in self._shanks for share in SHANK_SHARES
+        ]
+
+    @cached_property
+    def limb_points(self) -> list[Spot]:
+        """Knees, and the far ends of the bodies that end a limb but are no feet."""
+        points = [(1 + k, np.zeros(3)) for k, _, _ in self.knees]
+        ends = set(range(len(self.model.bodies))) - {b.parent for b in self.model.bodies}
+        for box, way in self._shapes_of(ends - set(self.feet)):
+            points.append((box.body, box.centre + (way if way @ box.centre > 0 else -way)))
+        return points

@@ -1,0 +1,120 @@
+"""Where the ground steps up or down: at a platform, or between the places of a schedule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jumplab.errors import InfeasibleError
+from jumplab.robot import Robot
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.contacts import Contacts
+from jumplab.stages.whole_body.settings import Limits
+from jumplab.task import JumpTask
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Ground that steps up or down.
+
+    Attributes
+    ----------
+    height_m : of the part beyond the edge.
+    edge_m : where the edge is, ahead of the world's origin.
+    along_rad : the way in which it is ahead.
+    room_m : by how much the upper part could reach further before it met a sole.
+    """
+
+    height_m: float = 0.0
+    edge_m: float = 0.0
+    along_rad: float = 0.0
+    room_m: float = 0.0
+
+    @classmethod
+    def between(
+        cls, leaving: float, arriving: float, height: float, limits: Limits, along_rad: float = 0.0
+    ) -> Surface:
+        """The one between toes that leave and heels that arrive, so far ahead of the origin [m];
+        the part beyond is ``height`` [m] above the other.
+
+        It steps up a little before the heels, or down a little ahead of the toes.
+        """
+        gap = limits.edge_before_heel_m
+        edge = leaving + gap if height < 0 else arriving - gap
+        return cls(height, edge, along_rad, max(0.0, arriving - leaving - gap))
+
+    def below(self, points: np.ndarray) -> np.ndarray:
+        """Height of the ground below points (..., 3) [m]."""
+        return np.where(points[..., :2] @ self.along > self.edge_m, self.height_m, 0.0)
+
+    @property
+    def along(self) -> np.ndarray:
+        """Unit vector (2,) of the way in which the edge is ahead."""
+        return np.array([np.cos(self.along_rad), np.sin(self.along_rad)])
+
+    def reaching(self, more_m: float) -> float:
+        """Where the edge would be [m] if the upper part reached further, by ``more_m`` at most."""
+        return float(self.edge_m - np.sign(self.height_m) * min(more_m, self.room_m))
+
+
+def platform_edge_m(task: JumpTask, robot: Robot, limits: Limits = Limits()) -> float:
+    """Where the ground steps up or down in a jump straight ahead, from the toes' first place [m].
+
+    A platform begins a little before the landing heel; when the robot jumps down, the launching
+    surface ends a little ahead of its toe.
+    """
+    heel = task.distance_m - (robot.foot.toe - robot.foot.heel)
+    return Surface.between(0.0, heel, task.platform_m, limits).edge_m
+
+
+def surface_of_jump(body: Body, limits: Limits, task: JumpTask) -> Surface:
+    """The ground of a jump to a target, with the soles in their places of the stance [m].
+
+    Raises :class:`InfeasibleError` for a platform so near that a sole would stand across its edge.
+    """
+    foot = body.robot.foot
+    c = np.cos(task.yaw_rad)
+    s = np.sin(task.yaw_rad)
+    along = np.array([np.cos(task.along_rad), np.sin(task.along_rad)])
+    corners = (body.places[:, None] + foot.corners - foot.tip).reshape(-1, 3)[:, :2]
+    landed = [task.distance_m, task.side_m] + corners @ np.array([[c, s], [-s, c]])
+    leaving = float((corners @ along).max())
+    arriving = float((landed @ along).min())
+    apart = arriving - leaving - limits.edge_before_heel_m
+    if task.platform_m and apart < -1e-9:  # rounding
+        way = float(np.hypot(task.distance_m, task.side_m))
+        least = float(np.ceil(100 * (way - apart) - 1e-6) / 100)
+        raise InfeasibleError(
+            f"platform = {task.platform_m:g} m at a distance of {way:g} m: the two surfaces would "
+            f"meet under a sole of {body.robot.name}; that takes a distance of at least "
+            f"{least:.2f} m",
+            number="distance_m",
+            bound=least,
+        )
+    return Surface.between(leaving, arriving, task.platform_m, limits, task.along_rad)
+
+
+def surface_of_schedule(body: Body, limits: Limits, contacts: Contacts) -> Surface:
+    """The ground of a schedule, between its places on either height [m].
+
+    Raises :class:`InfeasibleError` if they leave no room for the edge.
+    """
+    height, first = contacts.surface
+    if height == 0:
+        return Surface()
+    length = 2 * body.half_m
+    toes = float(body.places[:, 0].mean())
+    leaving = max([toes, *(toes + p.ahead_m for p in contacts.places[:first])])
+    arriving = min(toes + p.ahead_m for p in contacts.places[first:]) - length
+    room = 2 * limits.edge_before_heel_m
+    if arriving - leaving < room:
+        bound = leaving + room + length - toes
+        raise InfeasibleError(
+            f"places on a surface {height:g} m higher: it would begin {arriving - leaving:.2f} m "
+            f"ahead of the toes that leave, which takes {room:.2f} m; put the places {bound:.2f} m "
+            f"ahead",
+            number="ahead_m",
+            bound=bound,
+        )
+    return Surface.between(leaving, arriving, height, limits)

@@ -1,0 +1,77 @@
+"""What the whole-body program ends in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jumplab.errors import Shown
+from jumplab.io.tape import Tape
+from jumplab.ocp.solution import PhaseSolution, Solution
+from jumplab.stages.whole_body.between import used_between
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.program import Program, Solved
+from jumplab.stages.whole_body.settings import Limits
+from jumplab.stages.whole_body.starts import Attempt
+from jumplab.stages.whole_body.tape import make_tape
+from jumplab.task import JumpTask
+
+
+@dataclass(frozen=True, repr=False)
+class WholeBodyPlan(Shown):
+    """Result of the whole-body program.
+
+    Attributes
+    ----------
+    solution : in the coordinates of the program.
+    phases : the same with every coordinate of the robot, as one of ``schedule.whole``.
+    edge_m : where the ground steps up or down, ahead of the toes' first place [m].
+    limits : that it was made with.
+    tape : the 1 kHz tape of the motion.
+    used : largest share of the limits that the tape uses, also between the nodes [1].
+    start : name of the start that led here.
+    attempts : all that were made for the target.
+    """
+
+    task: JumpTask
+    solution: Solution
+    phases: Mapping[str, PhaseSolution]
+    schedule: Schedule
+    edge_m: float
+    limits: Limits
+    tape: Tape
+    used: float
+    start: str
+    attempts: tuple[Attempt, ...] = ()
+
+    @classmethod
+    def of(cls, program: Program, task: JumpTask, solved: Solved, start: str) -> WholeBodyPlan:
+        """The plan that a solution is, with its tape (1 kHz); ``start`` led to it."""
+        robot = program.robot
+        surface = program.surface(task)
+        phases = solved.phases
+        tape = make_tape(solved.schedule.whole, phases, task.gravity)
+        return cls(
+            task,
+            solved.solution,
+            phases,
+            solved.schedule,
+            surface.edge_m - robot.foot.toe + float(robot.foot.center[0]),
+            program.limits,
+            tape,
+            used_between(tape, robot, surface),
+            start,
+        )
+
+    @property
+    def launch_s(self) -> float:
+        """Time until the feet first leave the ground [s]."""
+        durations = [p.duration for p in self.solution.phases.values()]
+        flying = [*(p.flying for p in self.schedule.contacts.phases), True]
+        return float(sum(durations[: flying.index(True)]))
+
+    @property
+    def flight_s(self) -> float:
+        """Duration of the first flight [s]; 0 if there is none."""
+        pairs = zip(self.solution.phases.values(), self.schedule.contacts.phases, strict=True)
+        return next((x.duration for x, p in pairs if p.flying), 0.0)

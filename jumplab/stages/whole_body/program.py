@@ -1,0 +1,277 @@
+"""The whole-body program of one robot, one contact schedule and one set of coordinates: built once,
+solved for any target.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jumplab.errors import Shown, SolverError
+from jumplab.ocp.nlp import Nlp, Solution
+from jumplab.ocp.solution import PhaseSolution
+from jumplab.robot import Robot
+from jumplab.stages.changes import StageChanges
+from jumplab.stages.srmp import SrmpPlan
+from jumplab.stages.whole_body.apart import merged, too_close
+from jumplab.stages.whole_body.body import Body
+from jumplab.stages.whole_body.contacts import SIDES, Contacts
+from jumplab.stages.whole_body.coordinates import Coordinates
+from jumplab.stages.whole_body.ground import Surface, surface_of_jump, surface_of_schedule
+from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.settings import Limits, Weights
+from jumplab.stages.whole_body.shapes import Apart
+from jumplab.stages.whole_body.starts import APART, Asked, Beginning, Start, from_solved
+from jumplab.task import JumpTask
+
+# beyond, the cost moves by less than one in a million
+IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4, "max_iter": 250}
+# joints that lie at a stop for many nodes have multipliers that settle last: where all rows are
+# met, and the cost moves by less than 0.2 % twice in a row, the motion stands
+IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
+IPOPT |= {
+    "acceptable_constr_viol_tol": 5e-5,
+    "acceptable_obj_change_tol": 2e-3,
+    "acceptable_iter": 2,
+}
+# where the Hessian is indefinite, what is added to it should be close to what the last step needed
+IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturbation": 0.05}
+# added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
+HOLD = 0.1
+FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
+# variables, up to which the patience of a start is what it says; larger programs have more
+USUAL_SIZE = 4500
+ROUNDS = 4  # of rows for links that met
+BUILT = 8  # programs with such rows that are kept
+
+
+@dataclass(frozen=True, repr=False)
+class Solved(Shown):
+    """A solution of the program."""
+
+    schedule: Schedule
+    solution: Solution  # in the coordinates of the program
+
+    @cached_property
+    def phases(self) -> dict[str, PhaseSolution]:
+        """The solution with every coordinate of the robot, as one of ``schedule.whole``."""
+        return self.schedule.spread(self.solution.phases)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Program(Shown):
+    """The program, with its numbers for a target.
+
+    Attributes
+    ----------
+    free : the coordinates that move.
+    tracking : whether a jump follows stage 1.
+    changes : own terms, weights and switches.
+    options : of ipopt besides :data:`IPOPT`.
+    keep : whether what was built is kept for later processes.
+    """
+
+    body: Body
+    contacts: Contacts
+    limits: Limits
+    weights: Weights
+    free: Coordinates
+    tracking: bool = False
+    changes: StageChanges = StageChanges()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    keep: bool = False
+    _built: dict[tuple, Nlp] = field(default_factory=dict, init=False)
+
+    @property
+    def robot(self) -> Robot:
+        """Who moves."""
+        return self.body.robot
+
+    def schedule(self, apart: tuple[Apart, ...] = ()) -> Schedule:
+        """Its schedule, with rows for links that met (none by default)."""
+        given = self.body, self.contacts, self.limits, self.weights
+        return Schedule(*given, apart, self.free, self.tracking)
+
+    @property
+    def nlp(self) -> Nlp:
+        """The problem without rows for links that met."""
+        return self._nlp(())
+
+    def _nlp(self, apart: tuple[Apart, ...]) -> Nlp:
+        key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
+        if key not in self._built:
+            if len(self._built) > BUILT:
+                usual = self._built[()]
+                self._built.clear()
+                self._built[()] = usual
+            words = (
+                f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking}"
+            )
+            problem = self.changes.applied(self.schedule(apart).problem())
+            self._built[key] = Nlp(problem, {}, words if self.keep else None)
+        return self._built[key]
+
+    @cached_property
+    def finer(self) -> Program:
+        """The same on half as many nodes again."""
+        phases = tuple(
+            replace(p, intervals=math.ceil(FINER * p.intervals)) for p in self.contacts.phases
+        )
+        return replace(self, contacts=replace(self.contacts, phases=phases))
+
+    def patience_s(self, usual_s: float) -> float:
+        """Processor time [s] that a program of this size may take where one of usual size takes
+        ``usual_s``.
+        """
+        return usual_s * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+
+    def solve(
+        self, asked: Asked, start: Start, begin: Beginning | None = None, *, explain: bool = False
+    ) -> Solved:
+        """One solve, from where the ``start`` begins if ``begin`` says nothing else; what came of
+        it, and its processor time [s], is added to the attempts. Raises :class:`SolverError`, whose
+        sentence names the terms in conflict where it shall ``explain``.
+        """
+        begin = begin or start.begin(self, asked)
+        limit = {"max_cpu_time": self.patience_s(start.patience_s)}
+        options = {**IPOPT, **start.options, **limit, **self.options}
+        nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
+        began = time.process_time()
+        try:
+            solution = nlp.solve(
+                self.parameters(asked.task, asked.stance, asked.srmp),
+                begin.guess,
+                references=self.references(asked.srmp),
+                weights=self.changes.spread(self.nlp.problem, asked.weights),
+                multipliers=begin.multipliers,
+                explain=explain,
+            )
+        except SolverError as e:
+            asked.note(start, e.iterations, e.status, time.process_time() - began)
+            raise
+        done = solution.statistics
+        asked.note(start, done.iterations, done.status, time.process_time() - began)
+        return Solved(self.schedule(begin.apart), solution)
+
+    def solve_apart(self, asked: Asked, start: Start) -> Solved:
+        """The same, solved on with rows for whatever links meet in it (at most :data:`ROUNDS`
+        times).
+        """
+        solved = self.solve(asked, start)
+        for _ in range(ROUNDS):
+            begin = from_solved(self, solved)
+            rows = merged(begin.apart, self._met(solved))
+            if rows == begin.apart:
+                break
+            begin = replace(begin, apart=rows)
+            try:
+                solved = self.solve(asked, APART[not start.held], begin)
+            except SolverError:
+                if not start.held:
+                    raise
+                solved = self.solve(asked, APART[-1], begin)
+        return solved
+
+    def _met(self, solved: Solved) -> list[Apart]:
+        """Rows for links that meet; in an even motion without those of mirror images."""
+        met = too_close(self.body, list(solved.phases.values()))
+        if not self.free.even:
+            return met
+        model = self.body.model
+        left = {k for k in model.left_half if model.across[k] is None}
+        return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
+
+    # numbers of a target
+    # ------------------------------------------------------------------------------------------
+    def surface(self, task: JumpTask) -> Surface:
+        """The ground on which a target is planned [m].
+
+        Raises :class:`InfeasibleError` if a sole would stand across its edge.
+        """
+        if self.contacts.ends == "rest":
+            return surface_of_schedule(self.body, self.limits, self.contacts)
+        return surface_of_jump(self.body, self.limits, task)
+
+    def parameters(
+        self, task: JumpTask, stance: np.ndarray | None = None, srmp: SrmpPlan | None = None
+    ) -> dict[str, Any]:
+        """Parameter values of the problem for a target: name -> number or column [SI].
+
+        ``stance`` as in :class:`Asked`; with tracking, ``srmp`` is stage 1's plan for the target.
+        Raises :class:`InfeasibleError` for an impossible platform.
+        """
+        surface = self.surface(task)
+        values = {
+            "stance": self.free.taken(self.body.stance if stance is None else stance),
+            "distance": task.distance_m,
+            "side": task.side_m,
+            "yaw": task.yaw_rad,
+            "platform": surface.height_m,
+            # for clearance, also between the nodes, the upper part counts as reaching further
+            "edge": surface.reaching(self.limits.edge_step_m),
+            "along": surface.along,
+            "takeoff_speed": task.takeoff_speed,
+            "rotation": task.rotation_rad,
+            "gravity": task.gravity,
+            "straight": float(task.in_plane and self.contacts.ends == "touchdown"),
+        }
+        if self.tracking:
+            flat_s = srmp.launch_s - srmp.toe_s
+            values |= {"momentum": srmp.launch.L[-1], "launch_s": [flat_s, srmp.toe_s]}
+        return values
+
+    def references(self, srmp: SrmpPlan | None = None) -> dict[str, dict[str, np.ndarray]]:
+        """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and
+        foot; with tracking also stage 1's trajectories, by share of each phase.
+        """
+        phases = self.contacts.phases
+        values = {p.name: {} for p in phases}
+        for side in self.free.sides:
+            for run in _runs([side not in p.modes for p in phases]):
+                ends = np.cumsum([0, *(phases[k].intervals for k in run)])
+                for k, first, last in zip(run, ends, ends[1:], strict=False):
+                    bump = _bump(np.arange(first, last + 1) / ends[-1])
+                    # in a jump the soles come down steeply, in a step they hardly leave the ground
+                    height = bump**3 if run[-1] == len(phases) - 1 else bump
+                    if phases[k].flying:
+                        flown = _bump(np.linspace(0, 1, len(bump)))
+                        height = np.maximum(height, flown**3)
+                    name = f"{SIDES[side]}_clearance"
+                    values[phases[k].name][name] = self.limits.clearance_m * height[None]
+        if self.tracking:
+            for p in phases:
+                values[p.name] |= _followed(srmp, p.name, p.intervals)
+        return values
+
+
+def _followed(srmp: SrmpPlan, name: str, intervals: int) -> dict[str, np.ndarray]:
+    """Stage 1's trajectories at the nodes of a phase, each (size, N + 1)."""
+    flat_s = srmp.launch_s - srmp.toe_s
+    spans = {"flat": (0.0, flat_s), "toe": (flat_s, srmp.launch_s), "flight": (0.0, srmp.flight_s)}
+    columns = {"rho": "rho", "rho_rate": "rho_rate"}
+    if name != "flight":
+        columns |= {"L": "L", "velocity": "com_velocity"}
+    part = srmp.flight if name == "flight" else srmp.launch
+    t = np.linspace(*spans[name], intervals + 1)
+    return {
+        key: np.array([np.interp(t, part.t, x) for x in np.atleast_2d(getattr(part, column).T)])
+        for key, column in columns.items()
+    }
+
+
+def _bump(u: np.ndarray) -> np.ndarray:
+    """From 0 at 0 over 1 to 0 at 1."""
+    return 4 * u * (1 - u)
+
+
+def _runs(flags: list[bool]) -> Iterator[np.ndarray]:
+    """Runs of consecutive indices whose flag is set."""
+    chosen = np.flatnonzero(flags)
+    parts = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+    return (part for part in parts if len(part))

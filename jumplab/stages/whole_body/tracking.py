@@ -1,0 +1,61 @@
+"""Terms of a whole-body program that follows stage 1."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from jumplab.ocp.problem import Term
+from jumplab.robot.reach import rod_of
+from jumplab.robot.stance import stance_angles
+from jumplab.stages.whole_body.mode import Mode
+
+
+def tracking(m: Mode) -> list[Term]:
+    """Stage 1's trajectories as references, at the same share of each phase (WL-J1, WL-J3, WF-J1,
+    WF-J2).
+
+    Heel up, the heel stays quiet besides, and L at take-off is stage 1's (WL-D1).
+    """
+    w = m.weights
+    lim = m.limits
+    origin = "WF-J1" if m.flying else "WL-J1"
+    # [kg m^2] of the stance
+    size = m.model.mass * rod_of(m.robot, stance_angles(m.robot))[3] ** 2
+    rates = w.track_flight_inertia_rate if m.flying else w.track_inertia_rate
+
+    def follow(name, equation, unit, of, weight):
+        return Term(name, equation, unit, "node", of, float(weight))
+
+    def inertia(p):
+        return p.rho - p.ref.rho
+
+    def inertia_rate(p):
+        return p.rho_rate - p.ref.rho_rate
+
+    def velocity(p):
+        return p.com_velocity[[0, 2]] - p.ref.velocity
+
+    def momentum_kept(p):
+        slack = ca.fmax(lim.momentum_share * ca.fabs(p.p.momentum), lim.momentum_slack)
+        difference = p.L[1] - p.p.momentum
+        return ca.vertcat(slack - difference, slack + difference)
+
+    rows = [
+        follow("track inertia", origin, "kg m^2", inertia, w.track_inertia / size**2),
+        follow("track inertia rate", origin, "kg m^2/s", inertia_rate, rates / size**2),
+    ]
+    if m.flying:
+        ankle = "ankle rate", "WF-J2", "rad/s", lambda p: p.joint_rates.ankle[0]
+        return [*rows, follow(*ankle, w.ankle_rate)]
+    spin = "WL-D1, as a cost on L"
+    rows += [
+        follow("track velocity", origin, "m/s", velocity, w.track_velocity),
+        follow("track momentum", spin, "kg m^2/s", lambda p: p.L[1] - p.ref.L, w.track_momentum),
+    ]
+    if m.raised:
+        words = "L at take-off", "WL-D1", "kg m^2/s", "end"
+        heel = "m/s", lambda p: p.point_velocity("left_heel")[2]
+        rows.append(follow("heel velocity", "WL-J3", *heel, w.heel_velocity))
+        rows.append(Term(*words, momentum_kept, upper=np.inf))
+    return rows

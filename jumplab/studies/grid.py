@@ -1,0 +1,138 @@
+"""Plans of a grid: what sweeps, maps and atlases ask of each target, and in which order.
+
+A cell is planned from nothing, or with an atlas: its plan depends on the target alone, not on what
+else the grid holds or on what was planned before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import joblib
+
+from jumplab.auditing.audit import audit
+from jumplab.auditing.report import AuditReport
+from jumplab.errors import InfeasibleError, JumplabError
+from jumplab.robot import Robot
+from jumplab.stages.plan import JumpPlan
+from jumplab.stages.planner import Planner
+from jumplab.studies.study import Plain, key_of, open_study
+from jumplab.task import JumpTask
+
+CELLS = "cells.jsonl"
+MAX_CELLS = 2500  # an hour or two of work
+GIVE_UP = 2  # so many cells in a row without a plan, and the farther ones of the row are not tried
+# checks of the audit
+USES = {"torque at speed": "torque", "joint speed": "speed", "friction used": "friction"}
+COLUMNS = (
+    "planned",
+    "clean",
+    "failed_checks",
+    "limiting",
+    "share",
+    "planned_distance_m",
+    "planned_rise_m",
+    "launch_s",
+    "flight_s",
+    "cost",
+    "iterations",
+    "cpu_s",
+    "wall_s",
+    "infeasible",
+    "reason",
+)
+
+
+def most_used(report: AuditReport, robot: Robot) -> tuple[str, float]:
+    """What a plan uses most of what its robot has, torque at its speed, speed or friction, and the
+    share of it [1].
+
+    A joint with a role is named by it.
+    """
+    shares = []
+    roles = {joint: role for role, pair in robot.joints.items() for joint in pair}
+    for check in report.checks:
+        if what := USES.get(check.name):
+            worst = check.note.rpartition("; worst: ")[2]
+            joint = roles.get(worst, worst).removeprefix("left_").removeprefix("right_")
+            name = what if what == "friction" else f"{joint} {what}"
+            shares.append((check.value / check.limit, name))
+    share, name = max(shares)
+    return name.replace("_", " "), float(share)
+
+
+def plan_cell(
+    planner: Planner,
+    task: JumpTask,
+    method: str = "direct",
+    weights: Mapping[str, float] | None = None,
+) -> tuple[Plain, JumpPlan | None]:
+    """Plan and audit a target: a row of :data:`COLUMNS`, and the plan.
+
+    A target without a plan is a row too, with the reason, and whether that is an
+    :class:`InfeasibleError` (``infeasible``). Times [s] are those of the plan, without its audit.
+    """
+    row = dict.fromkeys(COLUMNS) | dict(planned=False, clean=False, infeasible=False)
+    plan = None
+    cpu = time.process_time()
+    wall = time.perf_counter()
+    try:
+        plan = planner.plan(task, method, weights=weights)
+    except JumplabError as e:
+        row |= {"reason": str(e), "infeasible": isinstance(e, InfeasibleError)}
+    row |= {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
+    if plan is None:
+        return row, None
+    report = audit(plan.tape, plan.robot, task, edge_m=plan.summary["platform_edge_m"])
+    limiting, share = most_used(report, plan.robot)
+    failed = ", ".join(check.name for check in report.failed)
+    row |= {
+        "planned": True,
+        "clean": report.passed,
+        "failed_checks": failed,
+        "limiting": limiting,
+        "share": share,
+        "planned_distance_m": plan.planned_distance_m,
+        "planned_rise_m": plan.planned_rise_m,
+        "launch_s": plan.whole_body.launch_s,
+        "flight_s": plan.whole_body.flight_s,
+        "cost": plan.whole_body.solution.statistics.objective,
+        "iterations": sum(stage.iterations for stage in plan.statistics),
+        "reason": f"outside the limits of the audit: {failed}" if failed else None,
+    }
+    return row, plan
+
+
+def plan_rows(
+    tasks: Sequence[Sequence[JumpTask]],
+    work: Callable[[JumpTask], Plain],
+    known: Sequence[Any],
+    good: str,
+    folder: str | Path | None,
+    command: str,
+    **options: Any,
+) -> list[list[Plain]]:
+    """Results of rows of targets, each from near to far, rows side by side.
+
+    ``work`` gives the row of a target, decided by that and by what is ``known`` of it (plain data).
+    A row ends after :data:`GIVE_UP` results that are not ``good`` (a column). Results are kept in
+    ``folder``; ``command`` and ``options`` are those of :func:`.study.open_study`.
+    """
+    rows: list[list[Plain]] = [[] for _ in tasks]
+    path = None if folder is None else Path(folder) / CELLS
+    with open_study(path, command, total=sum(map(len, tasks)), **options) as study:
+        for column in zip(*tasks, strict=True):
+            alive = [
+                k
+                for k, row in enumerate(rows)
+                if len(row) < GIVE_UP or any(x[good] for x in row[-GIVE_UP:])
+            ]
+            cells = [column[k] for k in alive]
+            now = {key_of(*known, asdict(task)): joblib.delayed(work)(task) for task in cells}
+            for k, result in zip(alive, study.results(now), strict=True):
+                rows[k].append(result)
+    return rows

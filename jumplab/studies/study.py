@@ -1,0 +1,210 @@
+"""One study: cases by their keys; those on file are not done again, the others in parallel, and
+each is kept at once.
+
+A case is decided by its key alone, see :func:`key_of`. A study that was stopped therefore goes on
+where it was, and gives what it would have given undisturbed; several studies may share a log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import joblib
+from tqdm import tqdm
+
+from jumplab.errors import InputError
+from jumplab.io import folder as store
+from jumplab.io.files import Log, made, open_log
+from jumplab.io.progress import tell
+
+LOOK_S = 0.5  # how often a worker looks whether its parent still lives
+PACKAGE = Path(__file__).parent.parent
+# whose versions decide a result
+DECIDING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet", "mujoco")
+SHOWING = ("show", "cli", "api.py", "__main__.py", "notebooks")  # what decides no result
+_CLUSTER: list[str] = []  # that does the work, see on_cluster
+Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
+
+
+Plain = dict[str, Any]  # data as JSON has them, of one case for example
+
+
+# keys ------------------------------------------------------------------------------------------
+def short_hash(data: Any) -> str:
+    """64 bits of a hash of JSON data, enough to tell cases apart."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@cache
+def code(root: Path = PACKAGE) -> str:
+    """Short hash of the sources that decide results."""
+    files = sorted(f for f in root.rglob("*.py") if f.relative_to(root).parts[0] not in SHOWING)
+    return short_hash(
+        [[str(f.relative_to(root)), hashlib.sha256(f.read_bytes()).hexdigest()] for f in files]
+    )
+
+
+def key_of(*decisive: Any) -> str:
+    """Name of a case: a short hash of all ``decisive`` plain data (target, robot's hash, settings),
+    of the code and of the packages that it runs on.
+    """
+    versions = store.versions()
+    return short_hash([decisive, code(), [versions[name] for name in DECIDING]])
+
+
+def check_numbers(n: int, seed: int, jobs: int | None) -> None:
+    """Raise :class:`InputError` unless these numbers (cases, seed, processes) can be meant."""
+    for name, value, least in (("n", n, 1), ("seed", seed, 0), ("jobs", jobs or 1, 1)):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise InputError(f"{name} must be a whole number, got {value!r}")
+        if value < least:
+            raise InputError(f"{name} = {value} is too small; it must be at least {least}")
+
+
+# the study -------------------------------------------------------------------------------------
+class Study:
+    """A study at work; made by :func:`open_study`."""
+
+    def __init__(self, log: Log | None, bar: tqdm, kind: type | None, jobs: int | None):
+        self._log = log
+        self._bar = bar
+        self._kind = kind
+        self._jobs = jobs
+        self._count = 0
+        self.done: dict[str, Any] = {} if log is None else log.done  # by key
+        self.resumed = 0  # cases that an earlier run had done
+
+    def results(self, work: Mapping[str, Task]) -> list[Any]:
+        """Do what the log does not have of ``work`` (tasks by key); all results, in its order."""
+        missing = [
+            joblib.delayed(_named)(k, task) for k, task in work.items() if k not in self.done
+        ]
+        self.resumed += len(work) - len(missing)
+        self._advance(len(work) - len(missing))
+        for name, result in in_parallel(missing, self._jobs):
+            row = result if self._kind is None else result.to_json()
+            row = json.loads(json.dumps(row))  # the very one that a resumed run reads
+            if self._log is not None:
+                self._log.add({"key": name, "row": row})
+            self.done[name] = row if self._kind is None else self._kind.from_json(row)
+            self._advance(1)
+        return [self.done[name] for name in work]
+
+    def _advance(self, cases: int) -> None:
+        self._count += cases
+        self._bar.update(cases)
+        self._bar.refresh()
+        if self._bar.total:
+            tell("done", self._count, self._bar.total)
+
+
+@contextmanager
+def open_study(
+    path: Path | None,
+    command: str,
+    kind: type | None = None,
+    *,
+    total: int | None = None,
+    jobs: int | None = None,
+    progress: bool | None = None,
+) -> Iterator[Study]:
+    """A study, whose finished cases (a line each) are kept until the block ends and after it.
+
+    Parameters
+    ----------
+    path : of the log; a study without keeps nothing.
+    command : of jumplab that this is.
+    kind : of the results, with ``to_json`` and ``from_json``; others' lines are read around. If
+        None, results are plain rows, and a log that has no line of such studies is refused.
+    total : number of cases, where it is known beforehand.
+    jobs : processes, by default one per core.
+    progress : whether there is a bar; by default on a terminal only.
+
+    Raises
+    ------
+    InputError
+        If the log cannot be written, another process writes it, or it is something else's.
+    """
+
+    def entry(line: Any) -> tuple[str, Any]:
+        row = line["row"]
+        return line["key"], row if kind is None else kind.from_json(row)
+
+    with ExitStack() as stack:
+        log = None
+        if path is not None:
+            stack.enter_context(made(path.parent))
+            log = stack.enter_context(open_log(path, command, entry))
+            if kind is None and not (log.empty or log.done):
+                raise InputError(
+                    f"{str(path)!r} is no log of this version's 'jumplab {command}'; "
+                    f"choose another folder"
+                )
+        hidden = None if progress is None else not progress
+        bar = tqdm(total=total, unit="case", disable=hidden, dynamic_ncols=True)
+        yield Study(log, stack.enter_context(bar), kind, jobs)
+
+
+def _named(name: str, task: Task) -> tuple[str, Any]:
+    work, arguments, options = task
+    return name, work(*arguments, **options)
+
+
+# processes -------------------------------------------------------------------------------------
+def in_parallel(
+    work: Sequence[Task], jobs: int | None = None, order: str = "generator_unordered"
+) -> Iterator[Any]:
+    """Results of ``work`` (n tasks), as they come unless ``order`` is "generator".
+
+    In ``jobs`` processes, one per core if None; or where :func:`on_cluster` has it done.
+    """
+    if _CLUSTER:
+        return joblib.Parallel(return_as=order)(work)
+    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
+    options = {"initializer": _serve, "initargs": (os.getpid(),)} if jobs > 1 else {}
+    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+
+
+@contextmanager
+def on_cluster(address: str) -> Iterator[None]:
+    """Within the block, work is done by the Dask scheduler at ``address``, "tcp://host:8786";
+    raises :class:`InputError` if none answers.
+    """
+    try:
+        from distributed import Client
+
+        client = Client(address, timeout="10s")
+    except ImportError:
+        raise InputError("a cluster needs Dask: install jumplab[cluster]") from None
+    except (OSError, ValueError, TimeoutError) as e:
+        raise InputError(f"no Dask scheduler answers at {address!r} ({type(e).__name__})") from None
+    _CLUSTER.append(address)
+    try:
+        with joblib.parallel_config("dask", client=client):
+            yield
+    finally:
+        _CLUSTER.remove(address)
+
+
+def _serve(parent: int) -> None:
+    """A worker's habits: Ctrl-C is its parent's affair, and without the parent there is nothing
+    left to do.
+    """
+
+    def leave_with_it() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK_S)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=leave_with_it, daemon=True).start()
