@@ -317,7 +317,28 @@ def test_events_from_forces():
         (((100, 400), (300, 0)), (100, None)),
         (((100, 400),), (None, None)),
     ):
-        assert events(np.concatenate([np.full(n, f, float) for n, f in parts])) == rows
+        force = np.concatenate([np.full(n, f, float) for n, f in parts])
+        assert events(force, lambda row: np.array([2e-3 * row, 0, 0])) == rows
+
+
+def test_a_crouch_that_unloads_the_feet_is_no_flight():
+    force = np.concatenate([np.full(n, f, float) for n, f in ((100, 9), (200, 0), (80, 90), (300, 0), (9, 90))])
+    assert events(force, lambda row: np.array([0, 0, 1e-3 * max(row - 380, 0)])) == (380, 680)
+    assert events(force, lambda row: np.zeros(3)) == (None, None)
+
+
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_a_jump_on_the_moon_is_measured_from_its_take_off(bhr, engine):
+    """The crouch falls as fast as the ground could push, so the feet carry nothing for 0.2 s."""
+    task = JumpTask(1.0, 0.5, gravity=1.62)
+    plan = Planner(bhr).plan(task, "direct")
+    run = simulate(plan.tape, bhr.under_gravity(1.62), engine=engine, stand_s=SHORT_S)
+    unloaded = run.foot_wrench[:, :, 2].sum(axis=1)[: plan.tape.takeoff_index] == 0
+    assert unloaded.sum() > 50
+    assert run.metrics.liftoff_s == pytest.approx(plan.tape.takeoff_time, abs=0.01)
+    assert run.metrics.touchdown_s == pytest.approx(float(plan.tape.t[-1]), abs=0.01)
+    assert run.metrics.com_rise_m == pytest.approx(0.5, abs=2e-3)
+    assert run.metrics.foot_distance_touchdown_m == pytest.approx(1.0, abs=0.01)
 
 
 def test_an_exploded_engine_is_an_error(bhr, tape):

@@ -291,7 +291,7 @@ def test_a_plan_that_passes_limits_between_the_nodes_is_settled_and_then_solved_
 
 def test_where_the_patience_is_spent_nothing_more_is_tried(doubted, monkeypatch):
     last, known, said = doubted
-    monkeypatch.setattr(planning, "PATIENCE_S", 0.0)
+    monkeypatch.setattr("jumplab.stages.whole_body.program.PATIENCE_S", 0.0)
     said(1.2)
     assert [x.start for x in last(AHEAD, near=known).attempts] == ["neighbour"]
 
@@ -454,7 +454,7 @@ def test_all_starts_are_tried_and_a_refusal_is_explained_to_who_reads_it(near, r
 def test_a_start_that_leads_nowhere_is_followed_by_the_next(monkeypatch):
     """Each attempt is a row of the plan's statistics, those that failed too."""
     first, *others = COLD
-    hasty = replace(first, options={"max_iter": 3})
+    hasty = replace(first, patience=3)
     monkeypatch.setattr(planning, "ASIDE", (hasty, *others))
     plan = planner().plan(SIDE, "direct")
     attempts = plan.whole_body.attempts

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ SMOOTHING_S = 0.02
 SATURATED = 0.999  # share of the available torque that counts as "at the limit"
 # a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
 MIN_FLIGHT_S = 0.05
+FLOWN_M = 0.01  # way of the toe until the middle of a flight; feet that only carry nothing stay
 REPORT_NAME = "simulation.json"
 XZ = tuple[float, float]
 ByJoint = dict[str, float]
@@ -264,11 +265,12 @@ def record(
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
     wrench = np.array([c.wrench for c in contacts])
-    times = liftoff, touchdown = events(wrench[:, :, 2].sum(axis=1))
+    gauge = Gauge(robot)
+    times = events(wrench[:, :, 2].sum(axis=1), lambda row: gauge.toe(q[row]))
+    liftoff, touchdown = times
     phase = np.full(len(q), "launch", dtype="<U7")
     for row, name in zip(times, ("flight", "landing"), strict=True):
         phase[len(q) if row is None else row :] = name
-    gauge = Gauge(robot)
     motions = [gauge.motion(*row) for row in zip(q, v, strict=True)]
     log = dict(
         t=np.arange(len(q)) * STEP_S,
@@ -443,17 +445,18 @@ def motors_spent(motors: MotorLimits, tau: np.ndarray, rates: np.ndarray) -> np.
     return (np.abs(tau) >= SATURATED * np.where(tau > 0, high, -low)) & (tau != 0)
 
 
-def events(force: np.ndarray) -> tuple[int | None, int | None]:
+def events(force: np.ndarray, toe: Callable[[int], np.ndarray]) -> tuple[int | None, int | None]:
     """Rows of lift-off and touchdown: the ends of the first long time without vertical ``force``
-    (N,) [N].
+    (N,) [N] in which the ``toe`` moves, (3,) [m] at each row. Where gravity is small, a crouch
+    leaves no force either, but the feet stay.
     """
     edges = np.concatenate([[-1], np.flatnonzero(force > CONTACT_FORCE_N), [len(force)]])
-    flights = np.flatnonzero((np.diff(edges) - 1) * STEP_S >= MIN_FLIGHT_S)
-    if not len(flights):
-        return None, None
-    liftoff = int(edges[flights[0]]) + 1
-    touchdown = int(edges[flights[0] + 1])
-    return liftoff, touchdown if touchdown < len(force) else None
+    for k in np.flatnonzero((np.diff(edges) - 1) * STEP_S >= MIN_FLIGHT_S):
+        liftoff, touchdown = int(edges[k]) + 1, int(edges[k + 1])
+        middle = (liftoff + touchdown) // 2
+        if np.linalg.norm(toe(middle) - toe(liftoff)) > FLOWN_M:
+            return liftoff, touchdown if touchdown < len(force) else None
+    return None, None
 
 
 def _xz(vector: np.ndarray) -> XZ:

@@ -26,6 +26,8 @@ from jumplab.stages.srmp import SrmpPlan
 CORRECTIONS = (1.0, 0.5, 0.0)
 # [m/s, rad/s] by which a rate may be mispredicted before the step is solved again
 PREDICTED_RATE = 0.4
+# ... and beyond which a step that is solved again is none: it follows the solver's last digits
+LOST_RATE = 2.0
 LONGEST_STEP_S = 0.02  # the feedback (damping 40 1/s) would ring with longer steps
 SHORTEST_STEP_S = 0.0005  # half the control cycle; shorter steps are a typing error
 
@@ -191,6 +193,15 @@ class JointMapper:
             if np.abs(a - predicted).max() * h / 2 < PREDICTED_RATE:
                 break
             state = state._replace(a=predicted + share * (a - predicted))
+        missed = np.abs(a - predicted).max() * h / 2
+        if missed > LOST_RATE:
+            raise SolverError(
+                f"stage 2: at t = {qp.t[k]:.3f} s of the {qp.phase.name} rates change within one "
+                f"step of {h:.3f} s by {missed:.1f} m/s or rad/s more than its program foresees, "
+                f"at most {LOST_RATE:g} can be mended; take shorter steps or a slower motion",
+                stage="joint_map",
+                status="step not settled",
+            )
         f = np.zeros(12)
         f[: qp.first] = answer.x[: qp.first]
         tau = (middle.M @ a + middle.H - middle.J.T @ f)[6:]

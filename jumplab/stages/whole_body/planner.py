@@ -40,10 +40,7 @@ from jumplab.stages.whole_body.starts import (
 )
 from jumplab.task import JumpTask
 
-# of all attempts for one target: beyond, no other start and no finer mesh is tried; on a busy core
-# a hop, which has to be solved on a finer mesh with its links apart, takes 20 to 40 s
-PATIENCE_S = 60.0
-EXPLAINING_S = 1.0  # processor time of the search before its failure is explained
+EXPLAINING = 30  # iterations of the search before its failure is explained
 BROKEN = 1.5  # times a limit between the nodes, beyond which a motion is none
 # with more than that to turn only the exact Hessian settles, so it is tried first
 HELD_TURN_RAD = np.radians(100)
@@ -177,7 +174,7 @@ class WholeBodyPlanner:
             patient = explain and program is programs[-1]
             usual = self._starts(program, asked, patient) if starts is None else starts
             for start in usual:
-                if asked.spent_s > program.patience_s(PATIENCE_S):
+                if asked.spent_s > program.patience_s:
                     break
                 try:
                     plans.append(self._refined(program, asked, start))
@@ -224,7 +221,7 @@ class WholeBodyPlanner:
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         for further in REFINED:
-            if best.used <= 1 or asked.spent_s > program.patience_s(PATIENCE_S):
+            if best.used <= 1 or asked.spent_s > program.patience_s:
                 break
             program = program if further is SETTLED else program.finer
             try:
@@ -237,7 +234,7 @@ class WholeBodyPlanner:
 
     def _explained(self, program: Program, asked: Asked) -> SolverError | None:
         """Why there is no plan: the terms in conflict, by a short search."""
-        start = replace(COLD[1], patience_s=EXPLAINING_S)
+        start = replace(COLD[1], patience=EXPLAINING)
         try:
             program.solve(replace(asked, attempts=[]), start, explain=True)
         except SolverError as e:

@@ -31,7 +31,7 @@ from jumplab.stages.whole_body.starts import APART, Asked, Beginning, Start, fro
 from jumplab.task import JumpTask
 
 # beyond, the cost moves by less than one in a million
-IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4, "max_iter": 250}
+IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4}
 # joints that lie at a stop for many nodes have multipliers that settle last: where all rows are
 # met, and the cost moves by less than 0.2 % twice in a row, the motion stands
 IPOPT |= {"acceptable_tol": 1e8, "acceptable_dual_inf_tol": 1e10, "acceptable_compl_inf_tol": 1e-2}
@@ -45,8 +45,12 @@ IPOPT |= {"perturb_dec_fact": 0.6, "perturb_inc_fact": 4.0, "min_hessian_perturb
 # added to the Gauss-Newton Hessian of the scaled variables: it leads there in half the time
 HOLD = 0.1
 FINER = 1.5  # times as many intervals, where a motion passes limits between the nodes
-# variables, up to which the patience of a start is what it says; larger programs have more
-USUAL_SIZE = 4500
+# of all attempts for one target, in processor time: beyond, no other start and no finer mesh is
+# tried; on a busy core a hop, which has to be solved on a finer mesh with its links apart, takes 20
+# to 40 s
+PATIENCE_S = 60.0
+USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have more time
+LEAST_S = 1.0  # for a solve that begins as the time ends
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -125,11 +129,10 @@ class Program(Shown):
         )
         return replace(self, contacts=replace(self.contacts, phases=phases))
 
-    def patience_s(self, usual_s: float) -> float:
-        """Processor time [s] that a program of this size may take where one of usual size takes
-        ``usual_s``.
-        """
-        return usual_s * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+    @property
+    def patience_s(self) -> float:
+        """Processor time [s] after which no other start of a program of this size is tried."""
+        return PATIENCE_S * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
 
     def solve(
         self, asked: Asked, start: Start, begin: Beginning | None = None, *, explain: bool = False
@@ -139,7 +142,8 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        limit = {"max_cpu_time": self.patience_s(start.patience_s)}
+        left_s = max(LEAST_S, self.patience_s - asked.spent_s)
+        limit = {"max_iter": start.patience, "max_cpu_time": left_s}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
         began = time.process_time()

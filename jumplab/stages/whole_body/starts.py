@@ -88,14 +88,15 @@ class Start:
     name : of what it begins with.
     begin : what that is, in a program and for what is asked.
     held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
-    patience_s : processor time after which it is given up [s].
+    patience : iterations after which it is given up, in whatever time: a busy machine finds the
+        same plan.
     options : of ipopt besides the usual ones.
     """
 
     name: str
     begin: Callable[[Program, Asked], Beginning]
     held: bool
-    patience_s: float
+    patience: int
     options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -168,36 +169,36 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
 NEIGHBOUR = "neighbour"
 STANCE = "stance"
 MENDED = "given motion, feet in place"
-STRAIGHT = Start("straight ahead", from_schedule, True, 3.0, {"max_iter": 80, "acceptable_iter": 1})
+STRAIGHT = Start("straight ahead", from_schedule, True, 80, {"acceptable_iter": 1})
 COLD = (
-    Start("schedule", from_schedule, True, 9.0, {"max_iter": 150}),
-    Start("schedule", from_schedule, False, 8.0),
-    Start(STANCE, from_stance, False, 3.0),
+    Start("schedule", from_schedule, True, 150),
+    Start("schedule", from_schedule, False, 150),
+    Start(STANCE, from_stance, False, 80),
 )
-ASIDE = (Start("ramp", from_straight, True, 9.0, {"max_iter": 150}), *COLD)
+ASIDE = (Start("ramp", from_straight, True, 150), *COLD)
 # in the plane a step costs a few milliseconds: where the held Hessian wanders, the exact one is
 # tried soon
 IN_PLANE = (
-    Start("schedule", from_schedule, True, 2.0, {"max_iter": 50}),
-    Start("schedule", from_schedule, False, 4.0),
-    Start(STANCE, from_stance, False, 2.0),
+    Start("schedule", from_schedule, True, 50),
+    Start("schedule", from_schedule, False, 150),
+    Start(STANCE, from_stance, False, 80),
 )
 GIVEN = (
-    Start("given motion", from_motion, True, 3.0, {"max_iter": 60}),
-    Start("given motion", from_motion, False, 5.0),
-    Start(MENDED, from_mended, True, 3.0, {"max_iter": 60}),
-    Start(MENDED, from_mended, False, 5.0),
+    Start("given motion", from_motion, True, 60),
+    Start("given motion", from_motion, False, 150),
+    Start(MENDED, from_mended, True, 60),
+    Start(MENDED, from_mended, False, 150),
 )
 FROM_NEIGHBOUR = (
-    Start(NEIGHBOUR, from_neighbour, True, 4.0, NEAR),
-    Start(NEIGHBOUR, from_neighbour, False, 6.0, WARM | {"acceptable_iter": 1}),
+    Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
+    Start(NEIGHBOUR, from_neighbour, False, 150, WARM | {"acceptable_iter": 1}),
 )
 # from a solution: with rows for links that met, to the end, on finer meshes
-MET = WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80}
+MET = WARM | {"acceptable_iter": 1, "mu_init": 1e-3}
 APART = (
-    Start("links apart", from_neighbour, True, 5.0, MET),
-    Start("links apart", from_neighbour, False, 5.0, MET),
+    Start("links apart", from_neighbour, True, 80, MET),
+    Start("links apart", from_neighbour, False, 80, MET),
 )
-SETTLED = Start("settled", from_neighbour, False, 8.0, WARM | PATIENT)
-FINER = Start("finer mesh", from_neighbour, False, 10.0, WARM | {"acceptable_iter": 1})
+SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
+FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
 REFINED = (SETTLED, FINER, FINER)
