@@ -1,6 +1,7 @@
 """Results show themselves: one line where they are printed, a card in a notebook, columns by the names of joints."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,21 @@ def test_a_plan_and_its_stages_are_a_line_each(plan):
 def test_a_notebook_shows_a_small_table_and_a_picture(plan, of):
     page = of(plan)._repr_html_()
     assert page.count("<table>") == 1 and page.count('src="data:image/png;base64,') == 1 and len(page) < 150_000
+
+
+def test_a_plans_card_says_whether_its_audit_passed(plan):
+    assert ">audit</td>" in plan._repr_html_() and "all 51 checks passed" in plan._repr_html_()
+    other = replace(plan, task=replace(plan.task, distance_m=0.9))
+    assert "of 51 checks failed: distance" in other._repr_html_()
+
+
+def test_the_rise_counts_from_take_off_and_the_apex_from_the_stance(plan):
+    height = plan.tape.extra["com"][:, 2]
+    assert plan.planned_apex_m == pytest.approx(height.max() - height[0], abs=1e-12)
+    assert plan.planned_rise_m - plan.planned_apex_m == pytest.approx(
+        height[0] - height[plan.tape.takeoff_index], abs=1e-12
+    )
+    assert 0.3 < plan.planned_apex_m < 0.4 < plan.planned_rise_m
 
 
 def test_what_has_no_card_shows_its_line(plan):

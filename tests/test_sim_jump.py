@@ -62,6 +62,7 @@ def test_reaches_the_target_and_stands(jump):
     assert m.foot_distance_m == pytest.approx(DISTANCE, abs=0.02)
     assert m.foot_distance_touchdown_m == pytest.approx(m.foot_distance_m, abs=0.01)
     assert m.com_rise_m == pytest.approx(HEIGHT, abs=0.01)
+    assert m.com_apex_m == pytest.approx(jump.com[:, 2].max() - jump.com[0, 2], abs=1e-12)
     assert m.standing_s >= 3
     assert m.self_collision_s == 0 and m.stray_contacts == () and m.qp_failures == 0
     assert m.qp_solves == pytest.approx(250 + 100 * (m.standing_s - 0.5), abs=2)  # rarely, once it is calm

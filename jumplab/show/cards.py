@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from jumplab.auditing import audit
 from jumplab.errors import InputError, Shown
 from jumplab.show.bodies import robot_sheet
 from jumplab.show.jumps import inertia_and_momentum, joint_trajectories, jump_strobe, margins
@@ -60,11 +61,14 @@ def _of_plan(plan: JumpPlan) -> Card:
     planned = {
         "travel [m]": plan.planned_distance_m,
         "rise of the CoM [m]": plan.planned_rise_m,
+        "its apex above the stance [m]": plan.planned_apex_m,
         "time in the air [s]": float(plan.tape.t[-1] - plan.tape.takeoff_time),
         f"largest torque [N m], {joint}": peaks[joint],
         "solving [s]": sum(row.solve_s for row in plan.statistics),
     }
     rows = [{"": name, "asked": asked.get(name), "planned": x} for name, x in planned.items()]
+    report = audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+    rows.append({"": "audit", "planned": report.line()})
     return table(rows), jump_strobe(plan.tape, plan.robot)
 
 
@@ -73,6 +77,7 @@ def _of_run(run: SimulationResult) -> Card:
     simulated = {
         "travel [m]": m.foot_distance_m,
         "rise of the CoM [m]": m.com_rise_m,
+        "its apex above the stance [m]": m.com_apex_m,
         "on its feet [s]": m.standing_s,
         "largest share of a torque limit": m.max_torque_ratio,
         "verdict": run.reason,

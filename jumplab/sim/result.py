@@ -81,6 +81,7 @@ class Metrics:
     yaw_rad: Maybe = None  # turn of the feet about the vertical, whole turns counted
     # apex minus CoM at lift-off, the last contact force above a few newtons
     com_rise_m: Maybe = None
+    com_apex_m: Maybe = None  # apex minus CoM at the start, where the robot stands and waits
     takeoff_velocity: XZ | None = None  # of the CoM at lift-off [m/s]
     takeoff_momentum: Maybe = None  # L_y at lift-off [kg m^2/s]
     # from touchdown to the end, or until anything but the feet touched the ground
@@ -338,9 +339,11 @@ class _Jump:
         )
         if off is None:
             return out
+        apex = float(run.com[off : self.touchdown, 2].max())
         return out | dict(
             liftoff_s=float(run.t[off]),
-            com_rise_m=float(run.com[off : self.touchdown, 2].max() - run.com[off, 2]),
+            com_rise_m=apex - float(run.com[off, 2]),
+            com_apex_m=apex - float(run.com[0, 2]),
             takeoff_velocity=_xz(run.com_velocity[off]),
             takeoff_momentum=float(run.L[off]),
         )

@@ -156,6 +156,13 @@ class JumpPlan(Shown, Named):
         return self.summary["planned_rise_m"]
 
     @property
+    def planned_apex_m(self) -> float | None:
+        """CoM apex minus CoM of the robot that stands and waits [m]: less than the rise, since legs
+        are bent at take-off. None in folders of earlier versions.
+        """
+        return self.summary.get("planned_apex_m")
+
+    @property
     def weights(self) -> dict[str, dict[str, float]]:
         """Cost weights of the stages, as solved: stage -> "phase/term" -> weight."""
         return self.summary["manifest"]["weights"]
@@ -204,14 +211,19 @@ def make_tape(body: WholeBodyPlan, srmp: SrmpPlan | None = None) -> Tape:
 def planned(tape: Tape) -> dict[str, float]:
     """Where the motion of a tape goes; to the side only if it is not one in the plane."""
     extra = tape.extra
-    rise = extra["com"][tape.takeoff_index :, 2]
+    height = extra["com"][:, 2]
+    apex = float(height[tape.takeoff_index :].max())
     ahead, left, _ = extra["soles_travel"].tolist()
     aside = {"planned_side_m": left, "planned_yaw_rad": float(extra["feet_turn"])}
     if "planar_toe" in extra:
         toe = extra["planar_toe"]
         ahead = float(toe[-1, 0] - toe[0, 0])
         aside = {}
-    return {"planned_distance_m": ahead, "planned_rise_m": float(rise.max() - rise[0]), **aside}
+    rise = {
+        "planned_rise_m": apex - float(height[tape.takeoff_index]),
+        "planned_apex_m": apex - float(height[0]),
+    }
+    return {"planned_distance_m": ahead, **rise, **aside}
 
 
 def _summary(
