@@ -7,6 +7,7 @@ can carry them.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +23,9 @@ from jumplab.errors import RobotError
 from jumplab.robot.description import STANCE
 from jumplab.robot.files import LEG, entry, roles_table, table
 from jumplab.robot_import.checks import read_tree
-from jumplab.robot_import.lump import CORNER, NO_LOAD, OWN, Body, Lumped, RoleJoints, lump
+from jumplab.robot_import.lump import CORNER, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
-from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
+from jumplab.robot_import.urdf import LIMITS, MOVING, OWN, Tree
 from jumplab.robot_import.write import (
     HERE,
     add_boxes,
@@ -68,6 +69,7 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the
     URDF in messages, and meshes are looked for near its ``path``.
     """
+    config = _facing(config)
     source = _source(config)
     tree = read_tree(urdf, where, path, source["repair"])
     roles = roles_table(config)
@@ -103,6 +105,36 @@ def _source(config: dict) -> dict:
                 f"robot configuration: 'source.repair' knows {', '.join(REPAIRS)}, got {word!r}"
             )
     return out | {"repair": tuple(repair)}
+
+
+def _facing(config: dict) -> dict:
+    """The configuration of a robot that faces as [source] says: where that is opposite to what was
+    found, its pairs, soles and assumed ranges turned about.
+    """
+    facing = entry(config, "source", "facing", kind=str, default="")
+    forward = entry(config, "source", "forward", kind=str, default="+x")
+    if facing in ("", forward):
+        return config
+    if facing not in AXES or facing[1] != forward[1]:
+        other = forward.translate(str.maketrans("+-", "-+"))
+        raise RobotError(
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, along "
+            f"the way that was found"
+        )
+    new = copy.deepcopy(config)
+    new["source"]["forward"] = facing
+    for role, pair in roles_table(config).items():
+        new["joints"][role] = list(pair[::-1])
+    feet = new["feet"]
+    feet["links"] = entry(config, "feet", "links", kind=str, count=2)[::-1]
+    for side in ("sole_x_m", "sole_y_m"):
+        low, high = entry(config, "feet", side, count=2)
+        feet[side] = [-high, -low]
+    new["stance"]["shoulder_rad"] = -entry(config, "stance", "shoulder_rad")
+    for limits in table(new, "assumed").values():
+        if {"lower", "upper"} <= set(limits):
+            limits |= {"lower": -limits["upper"], "upper": -limits["lower"]}
+    return new
 
 
 def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
