@@ -186,7 +186,7 @@ class Robot(Shown):
                         f"moves, and at least {least:g}"
                     )
         for name in self.foot.frames:
-            if not self._model.existFrame(name):
+            if not self._model.existFrame(name, pin.FrameType.BODY):
                 raise self.error(f"the foot link {name!r} is not in the URDF")
 
     def _check_numbers(self) -> None:
