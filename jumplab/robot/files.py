@@ -7,6 +7,8 @@ from __future__ import annotations
 import os
 import re
 import tomllib
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,24 @@ SHIPPED = {
 }
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 LEG = ROLES[:3]
+# what the TOML file of a robot holds: its tables and their entries; () for names of the robot
+TABLES = {
+    "name": None,
+    "urdf": None,
+    "joints": ROLES,
+    "feet": ("links", "sole_x_m", "sole_y_m", "sole_z_m"),
+    "stance": ("knee_rad", "trunk_pitch_rad", "shoulder_rad"),
+    "rest": (),
+    "actuators": (
+        "corner_speed_ratio",
+        "corner_speed_ratios",
+        "no_load_ratios",
+        "armature",
+        "friction",
+        "damping",
+    ),
+    "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
+}
 MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
 _REQUIRED = object()
 
@@ -97,7 +117,9 @@ def _encoding(raw: bytes) -> str:
     marks = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be"}
     if (marked := marks.get(raw[:2])) is not None:
         return marked
-    declared = re.match(rb"(?:\s|<!--.*?-->)*<\?xml[^>]*encoding\s*=\s*[\"']([\w.:-]+)", raw, re.DOTALL)
+    declared = re.match(
+        rb"(?:\s|<!--.*?-->)*<\?xml[^>]*encoding\s*=\s*[\"']([\w.:-]+)", raw, re.DOTALL
+    )
     name = declared[1].decode() if declared else "utf-8"
     return "utf-8-sig" if name.lower() in ("utf-8", "utf8") else name
 
@@ -177,6 +199,26 @@ def entry(
         raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
     clean = [kind(x) for x in items]
     return clean if count else clean[0]
+
+
+def check_entries(config: dict, known: Mapping[str, tuple[str, ...] | None]) -> None:
+    """Refuse (:class:`RobotError`) tables and entries that nothing reads, such as misspelt ones.
+
+    ``known`` are the entries of each table, as :data:`TABLES` has them.
+    """
+    for title, values in config.items():
+        _check_name(title, known, "", "[{}]" if isinstance(values, dict) else "{!r}")
+        for name in table(config, title) if known[title] else ():
+            _check_name(name, known[title], f"[{title}] ", "{!r}")
+
+
+def _check_name(name: str, known: Collection[str], where: str, shown: str) -> None:
+    if name not in known:
+        near = get_close_matches(name, known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"it may hold {', '.join(known)}"
+        raise RobotError(
+            f"robot configuration: {where}{shown.format(name)} is nothing that is read; {hint}"
+        )
 
 
 def table(config: dict, name: str) -> dict:

@@ -31,6 +31,7 @@ from jumplab.robot_import.urdf import (
     tensor_of,
     unsolid,
 )
+from jumplab.robot_import.write import listed
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 # what a humanoid can have; the paper prints none of these numbers
@@ -43,9 +44,9 @@ MOST_RAD_S = 60.0
 MOST_RAD = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
 # why a joint of an MJCF has none
 IN_MJCF = {
-    "lower": "it has no range",
-    "upper": "add one",
-    "effort": "no actuator on it has a forcerange or a ctrlrange in N m",
+    "lower": "has no range",
+    "upper": "has no range",
+    "effort": "no actuator on it has a forcerange, or a motor's ctrlrange",
     "velocity": "MJCF has no speed limits",
 }
 
@@ -111,20 +112,26 @@ def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
     for joint in root.findall("joint/limit[@effort]/.."):
         if joint.get("type") in MOVING and numbers(joint.find("limit").get("effort"), 1) == 0:
             yield f"joint {joint.get('name')!r} has no motor (effort = 0): held"
-    used = []
+    yield from _losses(root)
+
+
+def _losses(root: ET.Element) -> Iterator[str]:
+    """Which of armature, friction and damping the file has, and which cannot be."""
+    used = {key: 0 for key in OWN}
+    wrong = {}  # (key, text) -> joints
     for joint in root.findall("joint/dynamics/.."):
-        for key in OWN:
-            value = numbers(joint.find("dynamics").get(key, "0"), 1)
+        for key in OWN if joint.get("type") in MOVING else ():
+            text = joint.find("dynamics").get(key, "0")
+            value = numbers(text, 1)
             if value is None or value[0] < 0:
-                text = joint.find("dynamics").get(key)
-                yield (
-                    f"joint {joint.get('name')!r}: {key} = {text!r} is no loss of a motor, it must "
-                    f"be a number from 0 on: not used"
-                )
-            elif value[0] > 0 and key not in used:
-                used.append(key)
-    if used:
-        yield f"the joints' own {' and '.join(used)} are those of the file"
+                wrong.setdefault((key, text), []).append(repr(joint.get("name")))
+            elif value[0] > 0:
+                used[key] += 1
+    for (key, text), joints in wrong.items():
+        yield f"{key} = {text!r} of {listed(joints)} must be a number from 0 on: not used"
+    if any(used.values()):
+        counts = ", ".join(f"{key} of {count} joints" for key, count in used.items() if count)
+        yield f"the file has losses of the motors: {counts}"
 
 
 def _triples(element: ET.Element | None, at: str, *keys: str) -> Iterator[str]:
@@ -215,9 +222,10 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
             f"without a parent"
         )
     elif len(roots) > 1:
+        named = listed(map(repr, roots))
         yield (
-            f"{where}: {len(roots)} links have no parent ({_quoted(roots)}), Pinocchio keeps one "
-            f"tree and drops the rest; connect them"
+            f"{where}: {len(roots)} links have no parent ({named}), Pinocchio keeps one tree and "
+            f"drops the rest; connect them"
         )
     else:
         below = list(roots)
@@ -226,13 +234,8 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
                 child for child, above in zip(children, parents, strict=True) if above == link
             ]
         if lost := sorted(names - set(below)):
-            yield (
-                f"{where}: the links {_quoted(lost)} form a cycle apart from the root {roots[0]!r}"
-            )
-
-
-def _quoted(names: list[str]) -> str:
-    return ", ".join(map(repr, names[:4]))
+            named = listed(map(repr, lost))
+            yield f"{where}: the links {named} form a cycle apart from the root {roots[0]!r}"
 
 
 # inertials
@@ -295,7 +298,7 @@ def _massless_bodies(tree: Tree) -> Iterator[str]:
     """Joints that move no mass themselves, though what hangs on them has some; but for those of a
     body with several.
     """
-    remedy = "or let it have a gram: --repair massless, or [source] repair = [\"massless\"]"
+    remedy = 'or let it have a gram: --repair massless, or [source] repair = ["massless"]'
     for joint in tree.joints.values():
         link = joint.child
         at = f"{tree.where}: link {link!r}"
@@ -373,34 +376,49 @@ def limit_faults(
 ) -> Iterator[str]:
     """The faults of the limits of one joint that the jump uses, in one sentence, if there are any.
 
-    ``given`` values [rad, N m, rad/s] go before those of the file, of the format ``form``; the
-    sentence advises the ``table`` of the configuration that can tell them.
+    ``given`` and ``form`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the
+    configuration that can tell them.
+    """
+    if wrong := wrong_limits(joint, given, form):
+        keys = ", ".join(keys_of(wrong))
+        advice = f", or tell {keys} in [{table}] of the configuration" if table else ""
+        advice = advice.replace(", or", ";") if form == "MJCF" else advice
+        yield f"{where}: joint {joint.get('name')!r}: {'; '.join(wrong.values())}{advice}"
+
+
+def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
+    """The limits that complaints are about, in the order of :data:`LIMITS`."""
+    return [key for key in LIMITS if any(key in group for group in wrong)]
+
+
+def wrong_limits(
+    joint: ET.Element, given: dict[str, float] | None = None, form: str = "URDF"
+) -> dict[tuple[str, ...], str]:
+    """Limits of a joint that cannot be meant, or are missing, and what is wrong with them.
+
+    ``given`` values [rad, N m, rad/s] go before those of the file, of the format ``form``.
     """
     limit = joint.find("limit")
     values = dict(given or {})
     missing = [key for key in LIMITS if key not in values]
     texts = {key: None if limit is None else limit.get(key) for key in missing}
-    wrong = {}  # keys that it is about -> complaint
     absent = tuple(key for key, text in texts.items() if text is None)
-    if limit is None and missing:
+    wrong = {}
+    if absent and form == "MJCF":
+        wrong[absent] = "; ".join(dict.fromkeys(IN_MJCF[key] for key in absent))
+    elif limit is None and missing:
         wrong[absent] = f"has no <limit>; add {', '.join(missing)}"
     elif absent:
-        named = ", ".join(absent)
         them = "it" if len(absent) == 1 else "them"
-        wrong[absent] = f"<limit> has no {named}, which Pinocchio reads as 0; add {them}"
-        if form == "MJCF":
-            wrong[absent] = f"no {named}: {'; '.join(IN_MJCF[key] for key in absent)}"
+        which = f"{', '.join(absent)}, which Pinocchio reads as 0; add {them}"
+        wrong[absent] = f"<limit> has no {which}"
     for key in missing:
         if (text := texts[key]) is not None:
             if (value := numbers(text, 1)) is None:
                 wrong[key,] = f"{key} = {text!r} must be a finite number"
             else:
                 values[key] = float(value[0])
-    wrong |= _range_faults(values) | _motor_faults(values)
-    if wrong:
-        keys = ", ".join(key for key in LIMITS if any(key in group for group in wrong))
-        advice = f", or tell {keys} in [{table}] of the configuration" if table else ""
-        yield f"{where}: joint {joint.get('name')!r}: {'; '.join(wrong.values())}{advice}"
+    return wrong | _range_faults(values) | _motor_faults(values)
 
 
 def _range_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
@@ -410,7 +428,9 @@ def _range_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
     low, high = values["lower"], values["upper"]
     span = f"range {low:g} ... {high:g} rad is"
     if max(abs(low), abs(high)) > MOST_RAD:
-        wrong = f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+        wrong = (
+            f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+        )
     elif low > high:
         wrong = f"lower = {low:g} rad is above upper = {high:g} rad; swap them"
     elif low == high:

@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot.description import STANCE
-from jumplab.robot.files import LEG, entry, roles_table, table
+from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, table
 from jumplab.robot_import.checks import read_tree
 from jumplab.robot_import.lump import CORNER, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
@@ -37,12 +37,21 @@ from jumplab.robot_import.write import (
     titled,
 )
 
-REPAIRS = ("inertia", "massless")
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
 # shares of the leg's length from hip to ankle: the trunk's rear, front, half width, bottom and top,
 # from the middle between the hips.
 TRUNK_BOX = (-0.115, 0.115, 0.2, 0.14, 1.0)
 THICKNESS = {"thigh": 0.125, "shank": 0.10, "arm": 0.10, "foot": 0.04}
+REPAIRS = ("inertia", "massless")
+# what a configuration with [source] may hold beside what every robot's has
+SOURCE_TABLES = TABLES | {
+    "source": ("trunk", "forward", "up", "facing", "repair"),
+    "joints": (*TABLES["joints"], "free"),
+    "locked": (),
+    "limits": (),
+    "assumed": (),
+    "shapes": ("trunk_m", *(f"{part}_thickness_m" for part in THICKNESS)),
+}
 GAP = 0.14  # share of each limb's length, kept free at both ends
 ARM_REACH = 1.86  # length of an arm's box, in distances from the shoulder to the arm's CoM
 DIAGONAL = 1e-9  # [kg m^2] below, a product of inertia is rounding
@@ -69,6 +78,7 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the
     URDF in messages, and meshes are looked for near its ``path``.
     """
+    check_entries(config, SOURCE_TABLES)
     config = _facing(config)
     source = _source(config)
     tree = read_tree(urdf, where, path, source["repair"])
@@ -118,8 +128,8 @@ def _facing(config: dict) -> dict:
     if facing not in AXES or facing[1] != forward[1]:
         other = forward.translate(str.maketrans("+-", "-+"))
         raise RobotError(
-            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, along "
-            f"the way that was found"
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, one "
+            f"of both ways along which it can walk"
         )
     new = copy.deepcopy(config)
     new["source"]["forward"] = facing

@@ -109,8 +109,8 @@ def lump(
     if hips[0][1] <= hips[1][1]:
         left, right = roles["hip_pitch"]
         raise tree.error(
-            f"joint {left!r} is named as the left one, and is on the right of {right!r} for a robot "
-            f"that faces {source['forward']}; give [source] facing, which turns all pairs, or "
+            f"joint {left!r} is named as the left one, and is on the right of {right!r} where the "
+            f"trunk faces {source['forward']}; give [source] facing, which turns all pairs, or "
             f"correct [joints]"
         )
     middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
@@ -213,7 +213,8 @@ def _limits(
             told = {part: entry(config, title, name, part) for part in values if part != SOURCE}
             given[name] = given.get(name, {}) | told
             entry(config, title, name, SOURCE, kind=str, default="")
-    role = next((r for r, pair in roles.items() if joint in pair), "")
+    # a joint that is called like a role goes before it
+    role = next((r for r, pair in roles.items() if joint in pair and r not in tree.joints), "")
     values = given.get(role, {}) | given.get(joint, {})
     element = tree.joints[joint].element
     where = f"limits.{key(role or joint)}"

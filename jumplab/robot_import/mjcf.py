@@ -19,8 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin
-
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
 
 
 def _numbers(kinds: Any) -> SimpleNamespace:
@@ -42,7 +41,6 @@ UNNAMED = "MuJoCo Model"
 # names of files that say nothing of the robot in them
 GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
 POINTER = b"version https://git-lfs"
-MOST_NAMES = 6  # of things that a note lists
 
 
 def as_description(path: Path, text: str) -> str:
@@ -104,7 +102,9 @@ def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
     """The robot's name: of the model, of a file that it includes, else of file or folder."""
     inner = [spec.modelname if spec.modelname != UNNAMED else ""]
     for _, content in _included(path.parent, text):
-        inner += re.findall(r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", content.decode("utf-8", "replace"))
+        inner += re.findall(
+            r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", content.decode("utf-8", "replace")
+        )
     names = (GENERIC.sub("", name) for name in (*inner, path.stem, path.resolve().parent.name))
     return next((name for name in names if name.strip(" _-")), path.stem)
 
@@ -117,7 +117,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     files = sorted({x.file for x in (*spec.textures, *spec.hfields) if x.file})
     absent = [f for f in files if not any((path.parent / x / f).is_file() for x in folders)]
     if absent:
-        notes.append(f"the pictures {_listed([*map(repr, absent)])} are not there: left out")
+        notes.append(f"the pictures {listed([*map(repr, absent)])} are not there: left out")
     pictures = [*spec.textures, *spec.materials, *spec.skins, *spec.sensors, *spec.keys]
     terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
     for part in [*pictures, *terrain, *spec.hfields]:
@@ -154,9 +154,7 @@ def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
     """Whether MuJoCo complains of the file of a mesh."""
     opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
     reading = re.search(r"decoder|\b(STL|OBJ|MSH) file", sentence)
-    return bool(mesh.file) and (
-        opening or bool(reading and Path(mesh.file).name in sentence)
-    )
+    return bool(mesh.file) and (opening or bool(reading and Path(mesh.file).name in sentence))
 
 
 def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: list[str]) -> None:
@@ -178,7 +176,7 @@ def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: lis
     bodies = sorted({repr(g.parent.name) for g in geoms})
     for part in [*pairs, *geoms, mesh]:
         spec.delete(part)
-    where = f" of {_listed(bodies)}" if bodies else ""
+    where = f" of {listed(bodies)}" if bodies else ""
     notes.append(f"the mesh {mesh.file!r}{where} is not there or cannot be read: left out")
 
 
@@ -191,7 +189,7 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
             hinges[model.body_rootid[body]] += 1
     most = max(hinges.values(), default=0)
     robots = [top for top in tops if hinges[top] == most]
-    names = _listed([repr(model.body(top).name) for top in robots])
+    names = listed([repr(model.body(top).name) for top in robots])
     if not most:
         raise RobotError(f"{where}: no body hangs on another by a hinge; a robot needs legs")
     if len(robots) > 1:
@@ -201,7 +199,7 @@ def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
         )
     others = [repr(model.body(top).name or f"body_{top}") for top in tops if top not in robots]
     if others:
-        notes.append(f"other bodies of the scene are left out: {_listed(others)}")
+        notes.append(f"other bodies of the scene are left out: {listed(others)}")
     return robots[0]
 
 
@@ -344,7 +342,9 @@ class _Writer:
             if not ball and (start := model.qpos0[model.jnt_qposadr[k]]):  # of <joint ref>
                 slide = kind == JOINT.mjJNT_SLIDE
                 back = -start * axes[n]
-                place = place * (pin.SE3(np.eye(3), back) if slide else pin.SE3(pin.exp3(back), 0 * back))
+                place = place * (
+                    pin.SE3(np.eye(3), back) if slide else pin.SE3(pin.exp3(back), 0 * back)
+                )
             moving = "prismatic" if kind == JOINT.mjJNT_SLIDE else "revolute"
             limits, losses = self._limits(k, n)
             element = add_joint(self.xml, joint, moving, (above, child), place, axes[n], limits)
@@ -407,7 +407,7 @@ class _Writer:
     # ----------------------------------------------------------------------------------------------
     def _joints(self, numbers: Iterable[int]) -> str:
         names = [repr(self.model.joint(int(k)).name or f"joint_{k}") for k in numbers]
-        return _listed(names)
+        return listed(names)
 
     def add_equalities(self) -> None:
         """Joints that follow others, as mimics; loops are named."""
@@ -480,13 +480,7 @@ class _Writer:
             self.notes.append(f"the springs of the joints {self._joints(springs)} are left out")
         tendons = [repr(model.tendon(t).name or t) for t in range(model.ntendon)]
         if tendons:
-            self.notes.append(f"the tendons {_listed(tendons)} are left out")
+            self.notes.append(f"the tendons {listed(tendons)} are left out")
         if self.motors.others:
-            names = _listed([repr(name) for name in self.motors.others])
+            names = listed([repr(name) for name in self.motors.others])
             self.notes.append(f"the actuators {names} act on no joint: their torque is not counted")
-
-
-def _listed(names: list[str]) -> str:
-    """Names for a sentence, the first of many."""
-    more = len(names) - MOST_NAMES
-    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

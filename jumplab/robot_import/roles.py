@@ -19,9 +19,9 @@ import pinocchio as pin
 
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.checks import MOST_RAD, MOST_RAD_S
+from jumplab.robot_import.checks import MOST_RAD, MOST_RAD_S, keys_of, wrong_limits
 from jumplab.robot_import.urdf import MOVING, ROUND, Joint, Tree, read_urdf
-from jumplab.robot_import.write import filled, key, quote
+from jumplab.robot_import.write import filled, key, listed, quote
 
 # None of these numbers is printed by the paper.
 SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
@@ -300,6 +300,12 @@ def find_roles(tree: Tree) -> Roles:
         for role, pair in zip(ROLES, pairs, strict=True)
     }
     feet = tuple(finder.foot(*leg) for leg in finder.legs)[order]
+    toes = [j.name for foot in feet for j in tree.joints.values() if j.driven and tree.on(j, foot)]
+    if toes:
+        named = listed(map(repr, toes))
+        notes.append(
+            f"the joints {named} beyond the ankles are held, their links belong to the sole"
+        )
     if (reach := finder.ahead(forward)) < -BACKWARD_M:
         notes.append(
             f"the feet point backwards ({reach:.3f} m) for a robot whose knees bend backwards; "
@@ -470,7 +476,7 @@ def starter(
     tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()
 ) -> tuple[str, Roles, Sole]:
     """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are
-    written into it.
+    written into it; numbers that it lacks are asked for in comments.
 
     ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person
     allows to be repaired. Raises :class:`RobotError` if the URDF has no two legs.
@@ -485,6 +491,13 @@ def starter(
         f"\n[assumed.{key(joint)}]  # holds where [limits] has no number\n"
         + "".join(f"{part} = {x:g}\n" for part, x in limits.items())
         for joint, limits in roles.assumed.items()
+    )
+    asked = "".join(
+        f"# [limits.{key(joint)}]\n" + "".join(f"# {part} =\n" for part in keys_of(wrong))
+        for joint in jumping_joints(tree, roles)
+        if (
+            wrong := wrong_limits(tree.joints[joint].element, roles.assumed.get(joint), tree.format)
+        )
     )
     text = filled(
         "starter.toml.in",
@@ -501,9 +514,17 @@ def starter(
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
         assumed=assumed,
+        asked=asked
+        and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
     return text, roles, sole
+
+
+def jumping_joints(tree: Tree, roles: Roles) -> list[str]:
+    """Names of the joints that jump: with a role, and the others of the legs."""
+    names = [name for pair in roles.joints.values() for name in pair]
+    return list(dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)))
 
 
 def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
@@ -541,11 +562,9 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
     text, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
     found = (*urdf_checks.notes(tree.xml, repair), *tree.notes)
     roles = replace(roles, notes=(*found, *roles.notes))
-    names = [name for pair in roles.joints.values() for name in pair]
-    names += leg_joints(tree, roles.trunk, roles.feet)
     wrong = [
         sentence
-        for name in dict.fromkeys(names)
+        for name in jumping_joints(tree, roles)
         for sentence in urdf_checks.limit_faults(
             tree.joints[name].element,
             path.name,

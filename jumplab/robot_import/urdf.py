@@ -423,6 +423,10 @@ class Tree:
         hanging = [c for c in self.bodies if c == carrier or carrier in self.model.supports[c]]
         return [part for c in hanging for part in self.bodies[c]]
 
+    def on(self, joint: Joint, link: str) -> bool:
+        """Whether a joint hangs on a link, or on what that carries."""
+        return joint.parent in self.below(link)
+
     def sole(self, foot: str, turn: np.ndarray, thick_m: float) -> tuple[np.ndarray, np.ndarray]:
         """Points of a foot and its toes at most ``thick_m`` [m] above the lowest, (n, 3) from its
         origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around

@@ -14,6 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
+MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
 
 
@@ -86,6 +87,13 @@ def filled(template: str, **values: Any) -> str:
 def quote(value: Any) -> str:
     """A text or an array of texts, the same in TOML as in JSON."""
     return json.dumps(value, ensure_ascii=False)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a sentence, the first of many."""
+    names = list(names)
+    more = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def key(name: str) -> str:
