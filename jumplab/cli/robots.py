@@ -58,7 +58,9 @@ def check(args: Namespace) -> None:
             raise InputError(f"--config {args.config}: {words}") from e
         result = checkup.check(urdf, text)
     elif not shipped:
-        result = checkup.check(urdf, _draft(urdf, tuple(args.repair), args.out, args.force))
+        whole = urdfs.read_urdf(urdf)
+        config = _draft(urdf, whole, tuple(args.repair), args.out, args.force)
+        result = checkup.check(urdf, config, whole)
     elif "[source]" in shipped.read_text(encoding="utf-8"):
         result = checkup.examine(urdf)
     else:
@@ -81,13 +83,13 @@ def robot(args: Namespace) -> None:
     raise InputError(f"jumplab robot: {words}")
 
 
-def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
-    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an
-    ``out``.
+def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
+    """The starter configuration of a URDF (path, text) without faults; written as OUT/NAME.toml if
+    there is an ``out``.
 
     Faults of limits alone do not hinder the writing: they are mended there.
     """
-    draft, faults = checkup.first_look(urdf, repair)
+    draft, faults = checkup.first_look(urdf, repair, text)
     path = None
     if draft:
         for note in draft.roles.notes:

@@ -154,6 +154,13 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     y = np.array(entry(config, "feet", "sole_y_m", count=2)) + left
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
+    if z < 0 and half > 0 and x[0] < x[1] and (x[0] >= 0 or x[1] <= 0):
+        end = "toes" if x[0] >= 0 else "heels"
+        raise RobotError(
+            f"{where}: with all joints at 0 only the {end} touch the ground, from {x[0]:.3f} to "
+            f"{x[1]:.3f} m ahead of the ankle: the feet are not level; tell the sole, as it is "
+            f"along the level axes, in [feet]"
+        )
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
         raise RobotError(
             f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "

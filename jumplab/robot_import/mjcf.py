@@ -120,6 +120,8 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
         notes.append(f"the pictures {listed([*map(repr, absent)])} are not there: left out")
     pictures = [*spec.textures, *spec.materials, *spec.skins, *spec.sensors, *spec.keys]
     terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
+    for part in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
+        part.material = ""
     for part in [*pictures, *terrain, *spec.hfields]:
         spec.delete(part)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False

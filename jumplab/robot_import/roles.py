@@ -37,6 +37,7 @@ FRAME_VOTE = 0.5  # of the root's x, which is ahead by custom; a range has 1, th
 SAME_WAY = 0.95  # of a wheel: cosine of its axis, and of its radius what belongs to the rim
 SECTORS = 12  # of the rim, all of which a wheel has
 SHORTEST_LEG = 0.15  # share of the robot's height: shorter ones are fingers
+TOES = 0.25  # of a shank: joints farther beyond the ankle are of the toes
 FOOT_LIKE = 0.6  # a pitch joint this near the one before it, in shanks, is of the toes
 SAME_M = 0.02  # how far from mirror images two limbs may stand
 # ranges of joints that turn without stops, or whose stops nobody told: a person's, nearly
@@ -199,8 +200,14 @@ class _Finder:
 
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
-        beyond = chain[chain.index(three[2]) + 1 :]
-        still = takewhile(lambda joint: self.turning(joint) < SWINGS, beyond)
+        _, knee, ankle = (self.at[joint.name] for joint in three)
+        near = TOES * np.linalg.norm(ankle - knee)
+
+        def of_ankle(joint: Joint) -> bool:
+            close = np.linalg.norm(self.at[joint.name] - ankle) < near
+            return close and self.turning(joint) < SWINGS
+
+        still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
         return [three[2], *still][-1].child
 
     def ahead(self, forward: np.ndarray) -> float:
@@ -453,6 +460,12 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
     if max(np.ptp(touching[:, :2], axis=0)) < least:
+        _, whole = tree.sole(foot, turn, np.inf)
+        if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
+            raise tree.error(
+                f"with all joints at 0 the foot {foot!r} touches level ground in a point, it leans; "
+                f"give it a shape whose lower side is level in that pose, such as a box"
+            )
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
             f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
@@ -553,13 +566,17 @@ class Draft:
     faults: tuple[str, ...]
 
 
-def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
-    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`."""
+def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
+    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`.
+
+    ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
+    """
     path = Path(path)
-    tree = urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
+    text = read_urdf(path) if text is None else text
+    tree = urdf_checks.read_tree(text, path.name, path, repair)
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
-    text, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
+    config, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
     found = (*urdf_checks.notes(tree.xml, repair), *tree.notes)
     roles = replace(roles, notes=(*found, *roles.notes))
     wrong = [
@@ -573,4 +590,4 @@ def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
             table=f"limits.{key(name)}",
         )
     ]
-    return Draft(text, roles, sole, tuple(wrong))
+    return Draft(config, roles, sole, tuple(wrong))

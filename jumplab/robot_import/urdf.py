@@ -12,6 +12,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from importlib import import_module, metadata
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -361,11 +362,15 @@ class Tree:
         """Inertia of a link and all fixed to it, in their joint's frame [kg, m, kg m^2]."""
         return self.model.inertias[self.carrier[link]]
 
-    def carried(self, link: str) -> float:
-        """Mass of the body of a link and of all that hangs on it [kg]."""
+    @cached_property
+    def _carried(self) -> list[float]:
         data = self.model.createData()
         pin.computeSubtreeMasses(self.model, data)
-        return data.mass[self.carrier[link]]
+        return list(data.mass)
+
+    def carried(self, link: str) -> float:
+        """Mass of the body of a link and of all that hangs on it [kg]."""
+        return self._carried[self.carrier[link]]
 
     def holding(self, held: Mapping[str, float], moving: Collection[str]) -> pin.Model:
         """Pinocchio's model whose other joints do not move: they are ``held`` [rad, m], else at 0.
