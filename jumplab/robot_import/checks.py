@@ -78,7 +78,8 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
         return out
     tree = Tree(root, where, repair_inertia=True)
     most = np.inf if "inertia" in repair else slight(root)
-    longest = min(GYRATION_M, max(length_of(tree), SIZES_M[0]))
+    low, high = SIZES_M  # beyond them, the lengths are wrong, which is found below
+    longest = min(GYRATION_M, size) if low <= (size := length_of(tree)) <= high else GYRATION_M
     out += [sentence for link, at in links for sentence in _tensor_faults(link, at, most, longest)]
     if "massless" not in repair:
         out += _massless_bodies(tree)

@@ -155,11 +155,11 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
     if z < 0 and half > 0 and x[0] < x[1] and (x[0] >= 0 or x[1] <= 0):
-        end = "toes" if x[0] >= 0 else "heels"
+        side, end = ("ahead of", "toes") if x[0] >= 0 else ("behind", "heel")
         raise RobotError(
-            f"{where}: with all joints at 0 only the {end} touch the ground, from {x[0]:.3f} to "
-            f"{x[1]:.3f} m ahead of the ankle: the feet are not level; tell the sole, as it is "
-            f"along the level axes, in [feet]"
+            f"{where}: the sole, {x[0]:.3f} ... {x[1]:.3f} m from the ankle, lies {side} it: the "
+            f"foot stands on its {end} with all joints at 0, or [feet] is wrong; tell there the "
+            f"sole along the level axes"
         )
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
         raise RobotError(

@@ -135,7 +135,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
             mesh = next((m for m in spec.meshes if _blamed(m, sentence)), None)
             if mesh is None:
                 raise RobotError(
-                    f"{path.name}: MuJoCo cannot compile this MJCF file: {sentence}"
+                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
                 ) from e
             _leave_out(spec, mesh, path, notes)
 

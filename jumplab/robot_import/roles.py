@@ -257,14 +257,17 @@ class _Finder:
             "the arms' range": -self.middle(arms, left),
             "the root's x axis": FRAME_VOTE * round(float(ahead @ AXES["+x"])),
         }
-        left = left if sum(votes.values()) > 0 else -left
-        if abs(votes["the feet"]) < 1:
-            by = " and ".join(name for name, vote in votes.items() if vote) or "nothing"
+        total = sum(votes.values())
+        against = [name for name, vote in votes.items() if vote * total < 0]
+        if not feet or against:
+            by = " and ".join(name for name, vote in votes.items() if vote * total > 0)
+            even = "the feet reach as far ahead as behind"
             notes.append(
-                f"where it faces is a guess, by {by}: the knees bend both ways and the feet reach "
-                f"as far ahead as behind; if it faces the other way, give [source] facing"
+                f"where it faces is a guess, by {by or 'nothing'}: the knees bend both ways, and "
+                f"{', '.join(against) + ' speak against it' if against else even}; if it faces the "
+                f"other way, give [source] facing"
             )
-        return left
+        return left if total > 0 else -left
 
     def arms(self) -> tuple[Chain, ...]:
         """The heaviest mirrored pair of limbs that are no legs, on the side of the lateral axis
@@ -407,7 +410,7 @@ def _explain(tree: Tree) -> NoReturn:
             if not joint.driven:
                 kind = f"is of type {joint.kind!r}"
                 if joint.limits.get("effort") == 0:
-                    kind = "has effort = 0 N m"
+                    kind = "has effort = 0 N m" if tree.format == "URDF" else "has no actuator"
                 elif joint.mimic:
                     kind = f"mimics {joint.mimic[0]!r}"
                 raise tree.error(
@@ -463,8 +466,8 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
         _, whole = tree.sole(foot, turn, np.inf)
         if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
             raise tree.error(
-                f"with all joints at 0 the foot {foot!r} touches level ground in a point, it leans; "
-                f"give it a shape whose lower side is level in that pose, such as a box"
+                f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
+                f"point; give it a shape whose lower side is level in that pose, such as a box"
             )
         wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
         raise tree.error(
