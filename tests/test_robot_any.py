@@ -230,7 +230,7 @@ REFUSED = [
      "my.urdf: joint 'left_knee': corner = 20 rad/s must lie between 0 and the speed limit, 20 rad/s; correct "
      "[limits.knee]"),
     (GOOD, config("x") + "[limits.knee]\neffort = -1.0\n",
-     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell it in "
+     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell effort in "
      "[limits.knee] of the configuration"),
     (GOOD, config("x") + "[shapes]\ntrunk_m = [[1.0, 0.0, 0.1, 0.0, 1.0]]\n",
      "robot configuration: 'shapes.trunk_m' = [[1.0, 0.0, 0.1, 0.0, 1.0]] must be a list of [rear, front, half width, "

@@ -385,7 +385,7 @@ def _opposite(left: Body, right: Body) -> Body:
     """
     gap = left.place - MIRROR * right.place
     along = float(gap @ left.axis)
-    if abs(along) < ALIKE:
+    if abs(along) <= CAD_M:  # which is evened out
         return right
     if left.joint == right.joint:
         place = right.place - along / 2 * right.axis
