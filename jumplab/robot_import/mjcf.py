@@ -7,6 +7,7 @@ named in its ``<note>`` elements.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -66,13 +67,10 @@ def as_description(path: Path, text: str) -> str:
 
 # reading
 # --------------------------------------------------------------------------------------------------
-def _silence(text: str) -> None:
-    """MuJoCo would write its warnings into a file of the working folder."""
-
-
 def _spec(path: Path, text: str) -> mujoco.MjSpec:
     """MuJoCo's own reading of a file, whatever it is called."""
-    mujoco.set_mju_user_warning(_silence)
+    # MuJoCo would write its warnings into a file of the working folder
+    mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
     try:
         # MuJoCo reads only files that are called so
         if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
@@ -341,12 +339,6 @@ class _Writer:
         for n, joint in enumerate(self.joints[k]):
             end = last and n == len(axes) - 1 and not np.any(model.jnt_pos[k])
             child = body if end else self._between(f"{body}_{joint}")
-            if not ball and (start := model.qpos0[model.jnt_qposadr[k]]):  # of <joint ref>
-                slide = kind == JOINT.mjJNT_SLIDE
-                back = -start * axes[n]
-                place = place * (
-                    pin.SE3(np.eye(3), back) if slide else pin.SE3(pin.exp3(back), 0 * back)
-                )
             moving = "prismatic" if kind == JOINT.mjJNT_SLIDE else "revolute"
             limits, losses = self._limits(k, n)
             element = add_joint(self.xml, joint, moving, (above, child), place, axes[n], limits)
@@ -354,6 +346,11 @@ class _Writer:
             above = child
             place = HERE
         return above, anchor.inverse()
+
+    def _ref(self, k: int) -> float:
+        """Where a joint counts from [rad, m]: there bodies are as the file places them."""
+        hinge = self.model.jnt_type[k] in (JOINT.mjJNT_HINGE, JOINT.mjJNT_SLIDE)
+        return float(self.model.qpos0[self.model.jnt_qposadr[k]]) if hinge else 0.0
 
     def _between(self, name: str) -> str:
         """A link without mass, of a name that no body has; its name."""
@@ -369,8 +366,8 @@ class _Writer:
         limits = {}
         if model.jnt_limited[k]:
             low, high = model.jnt_range[k]
-            limits |= {"lower": -high if model.jnt_type[k] == JOINT.mjJNT_BALL else low}
-            limits |= {"upper": high}
+            ball = model.jnt_type[k] == JOINT.mjJNT_BALL
+            limits = {"lower": -high if ball else low - self._ref(k), "upper": high - self._ref(k)}
         if (effort := self.motors.effort(dof)) is not None:
             limits["effort"] = effort
         losses = {
@@ -454,9 +451,7 @@ class _Writer:
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""
         model = self.model
-        start, led = (model.qpos0[model.jnt_qposadr[k]] if k >= 0 else 0.0 for k in (one, other))
-        factor = curve[1]
-        offset = start + curve[0] - factor * led
+        offset, factor = curve[:2]  # from where both joints count
         named = self._joints(k for k in (one, other) if k >= 0)
         if np.any(curve[2:]) or (other >= 0 and not factor):
             self.notes.append(f"{name} couples the joints {named} along a curve: left out")
@@ -477,6 +472,8 @@ class _Writer:
     def note_what_is_left_out(self) -> None:
         """Springs, tendons, and actuators that act on no joint."""
         model = self.model
+        if counted := [k for k in self.joints if self._ref(k)]:
+            self.notes.append(f"the joints {self._joints(counted)} count from their ref, as 0")
         springs = [k for k in self.joints if model.jnt_stiffness[k]]
         if springs:
             self.notes.append(f"the springs of the joints {self._joints(springs)} are left out")

@@ -410,13 +410,25 @@ def _explain(tree: Tree) -> NoReturn:
             if not joint.driven:
                 kind = f"is of type {joint.kind!r}"
                 if joint.limits.get("effort") == 0:
-                    kind = "has effort = 0 N m" if tree.format == "URDF" else "has no actuator"
+                    kind = (
+                        "has effort = 0 N m"
+                        if tree.format == "URDF"
+                        else "has no actuator both ways"
+                    )
                 elif joint.mimic:
                     kind = f"mimics {joint.mimic[0]!r}"
                 raise tree.error(
                     f"joint {joint.name!r} {kind}, but has the place of a "
                     f"{role.replace('_', ' ')}, which must be revolute with a range and a motor "
                     f"of its own"
+                )
+    for pair in zip(*(chain for _, chain in legs), strict=True) if legs else ():
+        for still, moving in (pair, pair[::-1]):
+            if moving.driven and not still.driven:
+                kind = f"follows {still.mimic[0]!r}" if still.mimic else "has no motor of its own"
+                raise tree.error(
+                    f"joint {still.name!r} {kind}, while its counterpart {moving.name!r} moves: "
+                    f"both legs must have the same joints"
                 )
     finder = _Finder(tree, GUESSES[0])
     hanging = {chain[-1].name for chain in finder.tips if finder.along(finder.triple(chain))}
@@ -455,7 +467,10 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     touching, around = tree.sole(foot, turn, thickness(leg_m))
     if not len(around):
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
+        files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
+        lost = listed(sorted({repr(file) for file in files if file}))
         source = "GUESSED from the leg's length: the foot has no shape that is at hand"
+        source += f", the mesh {lost} is not there" if lost else ""
         return Sole(x, y, leg_m * GUESS_Z, source)
     parts = tree.below(foot)
     drawn = "visual" if not any(len(tree.points(part)) for part in parts) else "collision"

@@ -187,6 +187,10 @@ def parse(text: str, where: str) -> ET.Element:
         raise RobotError(
             f"{where}: the root element is <{tag}>, {ROOTS.get(tag, 'a URDF begins with <robot>')}"
         )
+    for element in root.iter():  # of a default namespace
+        element.tag = (
+            str(element.tag).rpartition("}")[2] if "xacro" not in str(element.tag) else element.tag
+        )
     if late:
         words = "the XML declaration stands behind a comment or a space, and is passed over"
         ET.SubElement(root, "note", text=words)
