@@ -269,9 +269,9 @@ def test_toes_are_held_and_belong_to_the_sole(put, shank):
         toe += 'ixz="0" iyz="0"/></inertial><collision><origin xyz=".03 0 -.01"/><geometry><box size=".06 .08 .03"/>'
         toe += f'</geometry></collision></link><joint name="{side}_toe" type="revolute"><child link="{side}_toe"/>'
         toe += (
-            f'<parent link="{side}_ankle_roll_link"/><origin xyz=".13 0 -.04"/><axis xyz="0 1 0"/><limit lower="-.5" '
+            f'<parent link="{side}_ankle_roll_link"/><origin xyz=".13 0 -.04"/><axis xyz="0 1 0"/><limit '
         )
-        text = text.replace("</robot>", toe + 'upper=".5" effort="9" velocity="9"/></joint></robot>')
+        text = text.replace("</robot>", toe + 'lower="-.5" upper=".5" effort="9" velocity="9"/></joint></robot>')
         ankle = f'<child link="{side}_ankle_pitch_link"/><origin xyz="0 0 '
         text = changed(text, (f"{ankle}-0.31", f"{ankle}{shank}"))
     found = examine(put(text)).robot
