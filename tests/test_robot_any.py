@@ -139,7 +139,7 @@ def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
     assert refused(lambda: Robot.load(str(tmp_path / "s.toml"))) == (
         "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
-        "start there: change [stance] in its configuration"
+        "start there; with shoulder_rad = 0 in [stance] it can"
     )
 
 
