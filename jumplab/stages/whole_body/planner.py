@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
-from jumplab.ocp.nlp import EXPLAINED, Nlp
+from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding
@@ -177,7 +177,7 @@ class WholeBodyPlanner:
             patient = explain and program is programs[-1]
             usual = self._starts(program, asked, patient) if starts is None else starts
             for start in usual:
-                if asked.spent_s > program.patience_s(PATIENCE_S):
+                if _spent(program, asked):
                     break
                 try:
                     plans.append(self._refined(program, asked, start))
@@ -224,7 +224,7 @@ class WholeBodyPlanner:
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         for further in REFINED:
-            if best.used <= 1 or asked.spent_s > program.patience_s(PATIENCE_S):
+            if best.used <= 1 or _spent(program, asked):
                 break
             program = program if further is SETTLED else program.finer
             try:
@@ -262,3 +262,10 @@ class WholeBodyPlanner:
                 f"of {effort:.3g}; if these are motors' efforts before their gears, give those of "
                 f"the joints in [limits]"
             )
+
+
+def _spent(program: Program, asked: Asked) -> bool:
+    """Whether no further start is tried: after some attempts, if the search has taken too long."""
+    return bool(asked.attempts) and (
+        left_s() <= 0 or asked.spent_s > program.patience_s(PATIENCE_S)
+    )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import Shown, SolverError
-from jumplab.ocp.nlp import Nlp, Solution
+from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
@@ -139,7 +139,8 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        limit = {"max_cpu_time": self.patience_s(start.patience_s)}
+        most = min(self.patience_s(start.patience_s), max(left_s(), LEAST_S))
+        limit = {"max_cpu_time": most}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
         began = time.process_time()
