@@ -76,8 +76,8 @@ def test_where_nothing_helps_it_says_so(monkeypatch):
     planner = Fake()
     planner.plan = lambda task, method: (_ for _ in ()).throw(SolverError("no", stage="SRMP"))
     sentence = str(refused(JumpTask(0.2, 0.3), monkeypatch, planner))
-    begin = "no; none of the easier targets that were tried has a plan either: a distance of 0.12 m; a distance of 0.12 m"
-    assert sentence.startswith(f"{begin} and a height of 0.18 m; ") and sentence.count("; ") > 5
+    begin = "no; none of the easier targets that were tried has a plan either: a distance of 0.12 m; a distance of "
+    assert sentence.startswith(f"{begin}0.12 m and a height of 0.18 m; ") and sentence.count("; ") > 5
 
 
 def test_patience_is_a_number_of_seconds(monkeypatch):

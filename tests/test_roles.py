@@ -11,7 +11,8 @@ from fixtures_robots import VARIANTS, joint, link, one_axis_ankle, refused, root
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.checkup import check
-from jumplab.robot_import.roles import draft, find_roles, find_sole, starter
+from jumplab.robot_import.feet import find_sole
+from jumplab.robot_import.roles import draft, find_roles, starter
 from jumplab.robot_import.urdf import Tree, parse, read_urdf, repaired
 
 SIDES = (("left", 0.1), ("right", -0.1))

@@ -12,15 +12,14 @@ from dataclasses import dataclass, replace
 from itertools import combinations, takewhile
 from pathlib import Path
 from typing import NoReturn
-from xml.etree import ElementTree as ET
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.checks import MOST_RAD, MOST_RAD_S, keys_of, wrong_limits
-from jumplab.robot_import.urdf import MOVING, ROUND, Joint, Tree, read_urdf
+from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
+from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
 from jumplab.robot_import.write import filled, key, listed, quote
 
 # None of these numbers is printed by the paper.
@@ -34,8 +33,6 @@ EVEN_RAD = 0.3
 # nor do feet that reach less farther ahead than behind, as a share of the leg's length
 EVEN_FEET = 0.02
 FRAME_VOTE = 0.5  # of the root's x, which is ahead by custom; a range has 1, the feet up to 2
-SAME_WAY = 0.95  # of a wheel: cosine of its axis, and of its radius what belongs to the rim
-SECTORS = 12  # of the rim, all of which a wheel has
 SHORTEST_LEG = 0.15  # share of the robot's height: shorter ones are fingers
 TOES = 0.25  # of a shank: joints farther beyond the ankle are of the toes
 FOOT_LIKE = 0.6  # a pitch joint this near the one before it, in shanks, is of the toes
@@ -50,16 +47,6 @@ ASSUMED_RAD = {
 }
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
-# shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
-# so little above the lowest point belongs to the sole, at most SOLE_M
-SMALLEST = 0.04
-SOLE_SHARE = 0.02
-SOLE_M = 0.012
-# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to
-# ankle
-GUESS_X = (-0.143, 0.2)
-GUESS_Y = (-0.071, 0.071)
-GUESS_Z = -0.107
 STANCE_KNEE_RAD = 0.5  # as the default robot stands
 STANCE_TRUNK_RAD = 0.05
 STANCE_ROOM_RAD = 0.15  # from the joint stops
@@ -218,7 +205,7 @@ class _Finder:
         for three, chain in self.legs:
             foot = self.foot(three, chain)
             axes = np.stack([forward, np.cross(self.up, forward), self.up])
-            _, around = self.tree.sole(foot, axes, thickness(self.leg_m()))
+            _, around = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
             x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
@@ -299,7 +286,7 @@ def find_roles(tree: Tree) -> Roles:
     finders = (_Finder(tree, guess) for guess in GUESSES)
     finder = next((finder for finder in finders if finder.legs), None) or _explain(tree)
     for three, _ in finder.legs:
-        _refuse_wheel(tree, finder, three[2])
+        refuse_wheel(tree, three[2])
     notes = []
     left = finder.leftward(notes)
     forward = np.cross(left, finder.up)
@@ -335,44 +322,6 @@ def find_roles(tree: Tree) -> Roles:
             f"correct [limits.{key(name)}]"
         )
     return Roles(trunk, ahead, above, joints, feet, assumed, tuple(notes))
-
-
-def _refuse_wheel(tree: Tree, finder: _Finder, ankle: Joint) -> None:
-    """Raise if a leg ends in a wheel: a joint without stops whose body is round about it."""
-    stops = [ankle.limits.get(end, np.inf) for end in ("lower", "upper")]
-    if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
-        return
-    place = finder.tree.pose[ankle.child]
-    for part in tree.bodies[tree.carrier[ankle.child]]:
-        for kind in ("collision", "visual"):
-            for at, shape in tree.shapes(part, kind):
-                to_joint = place.inverse() * tree.pose[part] * at
-                if _round(tree, shape, to_joint, ankle.axis):
-                    raise tree.error(
-                        f"the legs end in wheels: joint {ankle.name!r} turns without stops, and "
-                        f"its body {part!r} is round about it; jumps are planned for feet with "
-                        f"soles"
-                    )
-
-
-def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> bool:
-    """Whether a shape, at its ``place`` in the frame of a joint, is round about the joint's axis
-    (3,).
-    """
-    if shape.tag in ROUND:
-        centre = place.translation - (place.translation @ axis) * axis
-        radius = float(shape.get("radius"))
-        along = shape.tag == "sphere" or abs(place.rotation[:, 2] @ axis) > SAME_WAY
-        return along and np.linalg.norm(centre) < radius / 2
-    if shape.tag != "mesh":
-        return False
-    points = tree.corners(shape) @ place.rotation.T + place.translation
-    across = points - np.outer(points @ axis, axis)
-    far = np.linalg.norm(across, axis=1)
-    rim = across[far > SAME_WAY * far.max(initial=0.0)]
-    side = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
-    sectors = np.floor((np.arctan2(*(rim @ side.T).T) + np.pi) / (2 * np.pi) * SECTORS)
-    return len(set(sectors[sectors < SECTORS])) == SECTORS
 
 
 def _assumed(
@@ -447,62 +396,6 @@ def _explain(tree: Tree) -> NoReturn:
 
 # the first description
 # ------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class Sole:
-    """Rectangle along the robot's axes, from the foot link's origin [m], and its source."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    z: float
-    source: str
-
-
-def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
-    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that
-    are at hand.
-
-    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
-    to ankle, a sole is guessed if the link ``foot`` has no shape.
-    """
-    touching, around = tree.sole(foot, turn, thickness(leg_m))
-    if not len(around):
-        x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
-        files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
-        lost = listed(sorted({repr(file) for file in files if file}))
-        source = "GUESSED from the leg's length: the foot has no shape that is at hand"
-        source += f", the mesh {lost} is not there" if lost else ""
-        return Sole(x, y, leg_m * GUESS_Z, source)
-    parts = tree.below(foot)
-    drawn = "visual" if not any(len(tree.points(part)) for part in parts) else "collision"
-    kinds = {shape.tag for part in parts for _, shape in tree.shapes(part, drawn)}
-    source = f"from its {' and '.join(sorted(kinds))}"
-    least = SMALLEST * leg_m
-    if max(np.ptp(touching[:, :2], axis=0)) < least:
-        _, whole = tree.sole(foot, turn, np.inf)
-        if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
-            raise tree.error(
-                f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
-                f"point; give it a shape whose lower side is level in that pose, such as a box"
-            )
-        wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
-        raise tree.error(
-            f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
-            f"has no sole, and jumps are planned for feet that stand flat; give the foot a shape "
-            f"with a level lower side"
-        )
-    ends = []
-    for axis in range(2):
-        points = touching if np.ptp(touching[:, axis]) >= least else around
-        ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
-        source += ", whose round side counts as level" if points is around else ""
-    return Sole(*ends, float(touching[:, 2].min()), source)
-
-
-def thickness(leg_m: float) -> float:
-    """How far above the lowest point of a foot [m] its sole ends."""
-    return min(SOLE_M, SOLE_SHARE * leg_m)
-
-
 def starter(
     tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()
 ) -> tuple[str, Roles, Sole]:

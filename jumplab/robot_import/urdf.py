@@ -63,7 +63,6 @@ TRIANGLE = 1e-3
 # radius of gyration of the whole robot: a link's tensor that is wrong by less is mended with a note
 LEFTOVER_M = 0.01
 ROUND = ("sphere", "capsule", "cylinder")
-STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
 MOST_MESH_M = 5.0  # no link is longer: a larger mesh is in millimetres
 # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 THINNEST = 1e-3
@@ -218,7 +217,8 @@ def _place(element: ET.Element) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
 
 
-def _placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
+def placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of a frame at ``place``, where that is."""
     return points @ place.rotation.T + place.translation
 
 
@@ -414,7 +414,7 @@ class Tree:
     def points(self, link: str, kind: str = "collision") -> np.ndarray:
         """(n, 3) points of a link, in its frame, whose hull holds its shapes of a kind."""
         out = [np.zeros((0, 3))]
-        out += [_placed(place, self.corners(shape)) for place, shape in self.shapes(link, kind)]
+        out += [placed(place, self.corners(shape)) for place, shape in self.shapes(link, kind)]
         return np.concatenate(out)
 
     def corners(self, shape: ET.Element) -> np.ndarray:
@@ -436,44 +436,6 @@ class Tree:
         """Whether a joint hangs on a link, or on what that carries."""
         return joint.parent in self.below(link)
 
-    def sole(self, foot: str, turn: np.ndarray, thick_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Points of a foot and its toes at most ``thick_m`` [m] above the lowest, (n, 3) from its
-        origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
-        its shapes, which are farther out where these are round.
-
-        What is drawn counts where nothing collides.
-        """
-        axes = pin.SE3(turn, -turn @ self.pose[foot].translation)
-        parts = self.below(foot)
-        touching = np.zeros((0, 3))
-        around = touching
-        for kind in ("collision", "visual"):
-            for part in parts if not len(around) else ():
-                for place, shape in self.shapes(part, kind):
-                    placed = axes * self.pose[part] * place
-                    around = np.concatenate([around, _placed(placed, self.corners(shape))])
-                    touching = np.concatenate([touching, self._lowest(shape, placed)])
-        level = touching[:, 2].min(initial=np.inf) + thick_m
-        return touching[touching[:, 2] < level], around[around[:, 2] < level]
-
-    def _lowest(self, shape: ET.Element, place: pin.SE3) -> np.ndarray:
-        """(n, 3) points of a placed shape that may touch level ground: one of a sphere, two of a
-        capsule or of a cylinder that lies, else its corners.
-        """
-        if shape.tag not in ROUND:
-            return _placed(place, self.corners(shape))
-        radius = numbers(shape.get("radius"), 1)[0]
-        length = 0.0 if shape.tag == "sphere" else numbers(shape.get("length"), 1)[0]
-        along = place.rotation[:, 2]
-        down = np.array([0.0, 0.0, -1.0])
-        if shape.tag == "cylinder":
-            down = down - (down @ along) * along
-            if np.linalg.norm(down) < STANDS:
-                return _placed(place, self.corners(shape))
-            down = down / np.linalg.norm(down)
-        ends = np.array([-0.5, 0.5]) if length else np.zeros(1)
-        return place.translation + np.outer(ends * length, along) + radius * down
-
     def meshes(self, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
         """Points (n, 3) in a link's frame, triangles (m, 3) of the meshes that are found."""
         out = []
@@ -482,7 +444,7 @@ class Tree:
             if mesh and mesh.num_tris:
                 corners = map(mesh.tri_indices, range(mesh.num_tris))
                 triangles = np.array([[corner[i] for i in range(3)] for corner in corners])
-                out.append((_placed(place, np.array(mesh.vertices())), triangles))
+                out.append((placed(place, np.array(mesh.vertices())), triangles))
         return out
 
     def _mesh(self, shape: ET.Element) -> coal.BVHModelBase | None:
