@@ -4,6 +4,7 @@ them all.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,6 +36,7 @@ def plan(
     contacts: Contacts | None = None,
     method: str = USUAL,
     robust: Ranges | None = None,
+    patience_s: float = math.inf,
     **changes: Any,
 ) -> JumpPlan:
     """Plan one jump, by one optimisation or by the paper's three (Sec. III to V), then the 1 kHz
@@ -52,6 +54,8 @@ def plan(
         where stages 1 or 2, or stage 3's tracking, are changed.
     robust : how far robots differ that the plan shall allow for, such as ``jumplab.sim.Ranges()``,
         see :mod:`jumplab.studies.robust`.
+    patience_s : processor time after which planning of a target ends, with the best that was
+        found or a refusal [s].
     changes : own ``terms``, ``weights``, terms that are ``off``, ``limits``, ``settings`` and
         ``mesh``, as of :class:`jumplab.Planner`, which plans many targets with them.
 
@@ -79,7 +83,7 @@ def plan(
         from jumplab.studies.robust import robust_changes
 
         changes = robust_changes(task, robot, robust, changes)
-    return plan_or_advise(Planner(robot, keep=True, **changes), task, method)
+    return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
 
 
 def audit(plan: JumpPlan) -> AuditReport:

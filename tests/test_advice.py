@@ -11,7 +11,8 @@ from functools import cache
 import pytest
 
 import jumplab as jl
-from jumplab.errors import InfeasibleError, JumplabError, SolverError
+from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
+from jumplab.ocp.nlp import patience
 from jumplab.robot_import.urdf import have_published
 from jumplab.studies import advice
 from jumplab.task import JumpTask
@@ -74,9 +75,27 @@ def test_what_was_known_of_the_refusal_stays_known(monkeypatch):
 def test_where_nothing_helps_it_says_so(monkeypatch):
     planner = Fake()
     planner.plan = lambda task, method: (_ for _ in ()).throw(SolverError("no", stage="SRMP"))
-    assert str(refused(JumpTask(0.2, 0.3), monkeypatch, planner)) == (
-        "no; none of the easier targets that were tried has a plan either"
-    )
+    sentence = str(refused(JumpTask(0.2, 0.3), monkeypatch, planner))
+    begin = "no; none of the easier targets that were tried has a plan either: a distance of 0.12 m; a distance of "
+    assert sentence.startswith(f"{begin}0.12 m and a height of 0.18 m; ") and sentence.count("; ") > 5
+
+
+def test_patience_is_a_number_of_seconds(monkeypatch):
+    """A search that has taken longer ends with the best that it has, and says so."""
+    planner = Fake()
+    planner.plan = lambda task, method: (_ for _ in ()).throw(SolverError("no"))
+    monkeypatch.setattr(advice, "_refused", lambda p, t, m: None)
+    with pytest.raises(SolverError) as e:
+        advice.plan_or_advise(planner, JumpTask(0.2, 0.3), patience_s=1e-9)
+    given_up = "no; planning was given up after 1e-09 s of processor time; ask for a distance of 0.12 m, "
+    assert str(e.value) == f"{given_up}which has a plan"
+    with pytest.raises(InputError, match="patience_s must be a positive number of seconds, got 0"):
+        jl.plan(JumpTask(0.2, 0.3), patience_s=0)
+
+
+def test_a_solve_ends_when_patience_is_spent(bhr):
+    with patience(1e-9), pytest.raises(SolverError, match="CpuTime"):
+        jl.Planner(bhr).plan(JumpTask(0.5, 0.3), "direct")
 
 
 def follow(task, text):
@@ -126,6 +145,6 @@ def test_refusals_of_five_robots_are_followed():
                 assert jl.audit(plan).passed, (name, task, found[1])
                 followed += 1
             else:
-                assert str(e).endswith("; none of the easier targets that were tried has a plan either")
+                assert "; none of the easier targets that were tried has a plan either: " in str(e)
     print(f"{followed} advices of {tried} targets followed")
     assert followed == REFUSALS

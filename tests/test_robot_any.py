@@ -139,7 +139,7 @@ def test_a_stance_at_the_end_of_a_range_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text(config("s").replace("shoulder_rad = 0.0", "shoulder_rad = 1.19"))
     assert refused(lambda: Robot.load(str(tmp_path / "s.toml"))) == (
         "robot s: standing, shoulder is at 1.190 rad, less than 0.04 from the end of its range -3 ... 1.2; no plan can "
-        "start there: change [stance] in its configuration"
+        "start there; with shoulder_rad = 0 in [stance] it can"
     )
 
 
@@ -230,7 +230,7 @@ REFUSED = [
      "my.urdf: joint 'left_knee': corner = 20 rad/s must lie between 0 and the speed limit, 20 rad/s; correct "
      "[limits.knee]"),
     (GOOD, config("x") + "[limits.knee]\neffort = -1.0\n",
-     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell it in "
+     "my.urdf: joint 'left_knee': effort = -1 N m must be positive; give the peak torque, or tell effort in "
      "[limits.knee] of the configuration"),
     (GOOD, config("x") + "[shapes]\ntrunk_m = [[1.0, 0.0, 0.1, 0.0, 1.0]]\n",
      "robot configuration: 'shapes.trunk_m' = [[1.0, 0.0, 0.1, 0.0, 1.0]] must be a list of [rear, front, half width, "
@@ -240,8 +240,8 @@ REFUSED = [
     (GOOD, config("x") + "[shapes]\nthigh_thickness_m = 0.0\n",
      "robot configuration: 'shapes.thigh_thickness_m' = 0 must be positive"),
     (GOOD, config("x", toe=-0.05),
-     "my.urdf: the sole [-0.1  -0.05] x [-0.05  0.05] m, -0.075 m from the ankle, must lie below it and reach to both "
-     "sides of it; correct [feet]"),
+     "my.urdf: the sole, -0.100 ... -0.050 m from the ankle, lies behind it: the foot stands on its heel with all "
+     "joints at 0, or [feet] is wrong; tell there the sole along the level axes"),
     (GOOD, config("x").replace('["left_knee", "right_knee"]', '["right_knee", "left_knee"]'),
      "my.urdf: the role joint 'right_knee' is not between 'trunk' and the foot 'left_foot'; correct [joints], [feet] "
      "links or their order left, right"),

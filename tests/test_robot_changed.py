@@ -164,7 +164,8 @@ def test_published_robots_take_the_same_changes(name):
 
 # refused --------------------------------------------------------------------------------------------------------
 NAMES = ", ".join(BHR.joint_names)
-STAND = "change [stance] in its configuration"
+NOWHERE = "nor can it with knees at 0.3 ... 1.2 and the trunk at 0 ... 0.3 rad in [stance]: correct its ranges or its "
+NOWHERE += "soles"
 REFUSED = [
     ("with_legs", {"factor": -1}, "the factor on the legs must be a positive number, got -1"),
     ("with_limits", {"effort": 0}, "the factor on effort must be a positive number, got 0"),
@@ -182,9 +183,10 @@ REFUSED = [
      "speed 20 rad/s; all must be finite, positive and in order"),
     ("with_limits", {"joints": {"left_knee": {"upper": 0.6}, "right_knee": {"lower": 0.7}}},
      "no standing posture with the knees at 0.5 rad and the trunk at 0.05 rad has flat feet below the CoM, 21 mm or "
-     f"mrad are missing; {STAND}"),
+     f"mrad are missing; {NOWHERE}"),
     ("with_limits", {"joints": {"knee": {"upper": 0.4}}},
-     f"standing with the knee at 0.5 rad needs knee at 0.500 rad, outside its range 0 ... 0.4; {STAND}"),
+     "standing with the knee at 0.5 rad needs knee at 0.500 rad, outside its range 0 ... 0.4; "
+     "with knee_rad = 0.3 and trunk_pitch_rad = 0 in [stance] it can"),
     ("with_mass", {"link": "trunk"}, "a mass is changed by mass_kg or by factor, give one of them"),
     ("with_mass", {"link": "trunk", "mass_kg": -1}, "mass_kg of 'trunk' must be a positive number, got -1"),
     ("with_mass", {"link": "trunk", "factor": np.inf},

@@ -157,9 +157,11 @@ TEXTS = [
     # inertials
     ("no inertial", without("<inertial>.*?</inertial>", SHANK),
      "link 'left_shank': has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, PyBullet 1 kg; "
-     "joint 'left_knee' needs a body of more than 0 kg"),
+     "joint 'left_knee' needs a body of more than 0 kg, or let it have a gram: --repair massless, or [source] repair = "
+     '["massless"]'),
     ("mass zero", changed('value="3"', 'value="0"', SHANK),
-     "link 'left_shank': mass = 0 kg, the body of joint 'left_knee' must weigh more than 0 kg"),
+     "link 'left_shank': mass = 0 kg, the body of joint 'left_knee' must weigh more than 0 kg, or let it have a "
+     'gram: --repair massless, or [source] repair = ["massless"]'),
     ("no mass", without("<mass [^>]*>", SHANK),
      "link 'left_shank': <inertial> has no <mass>, which Pinocchio reads as no inertial at all; add it"),
     ("mass NaN", changed('value="3"', 'value="nan"', SHANK),

@@ -92,7 +92,10 @@ def collisions(r: Replay) -> Iterator[Measure]:
         for (i, a), (k, b) in combinations(shapes, 2)
         if a != b and parents[a] != b and parents[b] != a
     ]
-    feet = {r.model.frames[r.model.getFrameId(str(n))].parentJoint for n in r.tape.contact_frames}
+    feet = {
+        r.model.frames[r.model.getFrameId(str(n), pin.FrameType.BODY)].parentJoint
+        for n in r.tape.contact_frames
+    }
     blocks = [geometry.addGeometryObject(block) for block in _surroundings(r)]
     outer = [(i, block) for block, (i, a) in product(blocks, shapes) if a not in feet]
     for pair in inner + outer:

@@ -232,13 +232,13 @@ def open_tape(tape: Tape, robot: Robot, task: JumpTask | None) -> tuple[pin.Mode
                 f"tape: {name} has shape {given}, the robot {robot.name!r} needs {shape}"
             )
     for name in frames:
-        if not model.existFrame(name):
+        if not model.existFrame(name, pin.FrameType.BODY):
             raise InputError(
                 f"tape: the contact frame {name!r} is not a link of the robot {robot.name!r}"
             )
     if not frames:
         raise InputError("tape: it names no contact frame; a jump needs at least one foot")
-    return model, [model.getFrameId(name) for name in frames]
+    return model, [model.getFrameId(name, pin.FrameType.BODY) for name in frames]
 
 
 def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None = None) -> Replay:

@@ -81,7 +81,14 @@ def plan(args: Namespace) -> None:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
-    plan = api.plan(task, robot, method=args.method, robust=ranges, atlas=atlas)
+    plan = api.plan(
+        task,
+        robot,
+        method=args.method,
+        robust=ranges,
+        atlas=atlas,
+        patience_s=args.patience,
+    )
     parts = (plan.tape, plan.robot, plan.summary)
     report = store.write_plan(args.out, *parts, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}

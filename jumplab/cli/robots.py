@@ -52,14 +52,16 @@ def check(args: Namespace) -> None:
         raise InputError(f"--repair is for a bare URDF; {words}")
     if args.config is not None:
         try:
-            text = Path(args.config).read_text()
+            text = files.toml_text(Path(args.config).read_bytes(), f"--config {args.config}")
         except (OSError, ValueError) as e:
             words = f"cannot be read as text ({type(e).__name__})"
             raise InputError(f"--config {args.config}: {words}") from e
         result = checkup.check(urdf, text)
     elif not shipped:
-        result = checkup.check(urdf, _draft(urdf, tuple(args.repair), args.out, args.force))
-    elif "[source]" in shipped.read_text():
+        whole = urdfs.read_urdf(urdf)
+        config = _draft(urdf, whole, tuple(args.repair), args.out, args.force)
+        result = checkup.check(urdf, config, whole)
+    elif "[source]" in shipped.read_text(encoding="utf-8"):
         result = checkup.examine(urdf)
     else:
         words = "is the default robot, described as jumplab wants it; there is nothing to check"
@@ -81,13 +83,14 @@ def robot(args: Namespace) -> None:
     raise InputError(f"jumplab robot: {words}")
 
 
-def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
-    """The starter configuration of a URDF without faults; written as OUT/NAME.toml if there is an
-    ``out``.
+def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
+    """The starter configuration of a URDF (path, text) without faults; written as OUT/NAME.toml if
+    there is an ``out``.
 
     Faults of limits alone do not hinder the writing: they are mended there.
     """
-    draft, faults = checkup.first_look(urdf, repair)
+    draft, faults = checkup.first_look(urdf, repair, text)
+    path = None
     if draft:
         for note in draft.roles.notes:
             print(f"note: {note}")
@@ -95,17 +98,19 @@ def _draft(urdf: str, repair: tuple[str, ...], out: str | None, force: bool) -> 
             print(f"{role.replace('_', ' ')}: {', '.join(pair) or 'held'}")
         print(f"sole: {draft.sole.source}")
         if out is not None and (not faults or draft.faults == tuple(faults)):
-            _write(Path(out), draft.text, force)
+            path = _write(Path(out), draft.text, force)
     if faults:
         first, *others = faults
         print("".join(f"{sentence}\n" for sentence in others), end="")
+        if path:
+            print(f"what is needed stands in comments in {path}; with --config {path} check again")
         above = f" ({len(others)} further faults are printed above)" if others else ""
         raise RobotError(first + above)
     return draft.text
 
 
-def _write(folder: Path, text: str, force: bool) -> None:
-    """Write a starter configuration, but not over one that somebody has edited."""
+def _write(folder: Path, text: str, force: bool) -> Path:
+    """Write a starter configuration, but not over one that somebody has edited; its path."""
     path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
     if path.exists() and not force and path.read_bytes() != _marked(path.read_bytes()):
         words = "has been edited; choose another --out, or overwrite it with --force"
@@ -116,6 +121,7 @@ def _write(folder: Path, text: str, force: bool) -> None:
         reason = getattr(e.__cause__, "strerror", e)
         raise InputError(f"{path}: cannot be written ({reason})") from e
     print(f"starter configuration: {path}")
+    return path
 
 
 def _marked(text: bytes) -> bytes:

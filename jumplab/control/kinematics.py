@@ -98,7 +98,9 @@ class Gauge:
         self.model = robot.model
         self.data = robot.model.createData()
         # names checked by Robot
-        self.frames = [robot.model.getFrameId(name) for name in robot.foot.frames]
+        self.frames = [
+            robot.model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames
+        ]
 
     def places(self, q: np.ndarray) -> list[pin.SE3]:
         """Placements of both feet in ``q`` (nq,)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import pickle
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -218,6 +219,8 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """
     import mujoco
 
+    # MuJoCo would write its warnings into a file of the working folder
+    mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
     spec = mujoco.MjSpec.from_string(whole.urdf)
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = True

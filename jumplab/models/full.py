@@ -144,7 +144,7 @@ class FullBody:
 
     def _check_feet(self) -> None:
         for name in self.robot.foot.frames:
-            turn = self.data.oMf[self.model.getFrameId(name)].rotation
+            turn = self.data.oMf[self.model.getFrameId(name, pin.FrameType.BODY)].rotation
             most = np.abs(turn - np.eye(3)).max()
             if most > PARALLEL_TOLERANCE:
                 raise RobotError(

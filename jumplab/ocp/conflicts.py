@@ -17,11 +17,11 @@ ELASTIC |= {"mu_strategy": "adaptive", "nlp_scaling_method": "none", "print_leve
 
 
 def reasons(
-    a: Assembled, posed: Posed, last: np.ndarray, explain: bool
+    a: Assembled, posed: Posed, last: np.ndarray, explain: bool, seconds: float = np.inf
 ) -> tuple[str, tuple[str, ...]]:
     """(end of a sentence, terms) about a solve that ended at ``last`` (n,) without a plan.
 
-    To ``explain`` a conflict costs about as much as a solve.
+    To ``explain`` a conflict costs about as much as a solve; ``seconds`` of processor time at most.
     """
     for where, x in {"initial guess": posed.x0, "last iterate": last}.items():
         lost = tuple(f"{name}{place}" for name, place in _without_number(a, x, posed.p).items())
@@ -34,7 +34,7 @@ def reasons(
             )
     if not explain:
         return "", ()
-    worst = _conflicts(a, posed)
+    worst = _conflicts(a, posed, seconds)
     if not worst:
         return (
             ": a motion that meets every constraint exists, but the search did not settle; try "
@@ -93,11 +93,11 @@ def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> dict[str, str
     return out
 
 
-def _conflicts(a: Assembled, posed: Posed) -> tuple[str, ...]:
+def _conflicts(a: Assembled, posed: Posed, seconds: float) -> tuple[str, ...]:
     """The terms that the least violating motion violates most, where and by how much, in their
     units.
     """
-    x = _least_violation(a, posed)
+    x = _least_violation(a, posed, seconds)
     beyond = np.nan_to_num(posed.beyond(a.nlp(x, posed.p)[1].full().ravel()), nan=np.inf)
     phases = unpack(a, x)
     worst = []
@@ -115,7 +115,7 @@ def _conflicts(a: Assembled, posed: Posed) -> tuple[str, ...]:
     return tuple(text for _, text in ranked[:NAMED])
 
 
-def _least_violation(a: Assembled, posed: Posed) -> np.ndarray:
+def _least_violation(a: Assembled, posed: Posed, seconds: float) -> np.ndarray:
     """The motion (n,) with the least sum of row violations plus a trace of the cost.
 
     Identities, which say only that the motion is one motion, stay hard.
@@ -149,4 +149,5 @@ def _least_violation(a: Assembled, posed: Posed) -> np.ndarray:
         "lbx": np.concatenate([posed.box[0], np.zeros(2 * m)]),
         "ubx": np.concatenate([posed.box[1], np.full(2 * m, np.inf)]),
     }
-    return ipopt(functions, ELASTIC)(**arguments)["x"].full().ravel()[:n]
+    options = ELASTIC | {"max_cpu_time": min(ELASTIC["max_cpu_time"], seconds)}
+    return ipopt(functions, options)(**arguments)["x"].full().ravel()[:n]

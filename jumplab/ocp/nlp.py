@@ -5,6 +5,7 @@ Where no plan comes out, :mod:`jumplab.ocp.conflicts` says why.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,6 +27,10 @@ from jumplab.ocp.solution import Multipliers, PhaseGuess, Solution, Statistics
 
 # off where nobody reads why there is no plan
 EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)
+# processor time of this process [s] at which a search ends with the best that it has
+DEADLINE: ContextVar[float] = ContextVar("deadline", default=math.inf)
+LEAST_S = 1.0  # that a solve gets all the same
+EXPLAINING_S = 2.5  # that an explanation gets
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # scaled row error above which a "solved" status is not believed
 IPOPT = {
@@ -61,6 +66,21 @@ def unexplained() -> Iterator[None]:
         yield
     finally:
         EXPLAINED.reset(outside)
+
+
+@contextmanager
+def patience(seconds: float) -> Iterator[None]:
+    """Inside, a search ends after so much processor time [s], with the best that it has."""
+    outside = DEADLINE.set(time.process_time() + seconds)
+    try:
+        yield
+    finally:
+        DEADLINE.reset(outside)
+
+
+def left_s() -> float:
+    """Processor time [s] that a search may still take."""
+    return DEADLINE.get() - time.process_time()
 
 
 class Nlp:
@@ -156,7 +176,8 @@ class Nlp:
         if np.all(np.isfinite(g)):
             residual = float(np.max(posed.beyond(g), initial=0.0))
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
-            because, violations = reasons(a, posed, x, explain and EXPLAINED.get())
+            asked = explain and EXPLAINED.get()
+            because, violations = reasons(a, posed, x, asked, max(left_s(), EXPLAINING_S))
             raise SolverError(
                 f"{self.problem.name}: no plan ({status} after {iterations} iterations){because}",
                 stage=self.problem.name,

@@ -17,7 +17,17 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes, foreign
-from jumplab.robot.files import ROLES, entry, files_of, read_text, read_toml, roles_table, table
+from jumplab.robot.files import (
+    ROLES,
+    TABLES,
+    check_entries,
+    entry,
+    files_of,
+    read_text,
+    read_toml,
+    roles_table,
+    table,
+)
 from jumplab.robot.motors import MotorLimits, read_only
 from jumplab.robot.reduction import in_plane
 from jumplab.robot.sagittal import SagittalModel, reduce
@@ -121,6 +131,7 @@ class Robot(Shown):
 
     def __post_init__(self) -> None:
         config = read_toml(self.config_text, "robot configuration")
+        check_entries(config, TABLES)
         get = partial(entry, config)
 
         def numbers(*path: str) -> Mapping[str, float]:
@@ -186,7 +197,7 @@ class Robot(Shown):
                         f"moves, and at least {least:g}"
                     )
         for name in self.foot.frames:
-            if not self._model.existFrame(name):
+            if not self._model.existFrame(name, pin.FrameType.BODY):
                 raise self.error(f"the foot link {name!r} is not in the URDF")
 
     def _check_numbers(self) -> None:

@@ -5,7 +5,10 @@ file, each refused in one sentence.
 from __future__ import annotations
 
 import os
+import re
 import tomllib
+from collections.abc import Collection, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +23,31 @@ SHIPPED = {
 }
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 LEG = ROLES[:3]
+# what the TOML file of a robot holds: its tables and their entries; () for names of the robot
+TABLES = {
+    "name": None,
+    "urdf": None,
+    "joints": ROLES,
+    "feet": ("links", "sole_x_m", "sole_y_m", "sole_z_m"),
+    "stance": ("knee_rad", "trunk_pitch_rad", "shoulder_rad"),
+    "rest": (),
+    "actuators": (
+        "corner_speed_ratio",
+        "corner_speed_ratios",
+        "no_load_ratios",
+        "armature",
+        "friction",
+        "damping",
+    ),
+    "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
+}
 MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
 _REQUIRED = object()
 
 
 def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
     """A robot's URDF as its TOML file names it, the folder that it is named from, and the TOML's
-    text; None for a bare URDF.
+    text; None for a bare URDF or MJCF, whatever it is called.
 
     Raises :class:`RobotError` if there is neither.
     """
@@ -39,15 +60,16 @@ def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return path.name, path.parent, None
     try:
-        text = path.read_text()
-    except UnicodeDecodeError as e:
-        raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
+        raw = path.read_bytes()
     except (OSError, ValueError) as e:
         known = ", ".join(SHIPPED)
         short = name if len(name) < 80 else name[:77] + "..."
         raise RobotError(
             f"robot {short!r}: neither a shipped robot ({known}) nor a readable TOML file"
         ) from e
+    if path.suffix.lower() != ".toml" and is_xml(raw):
+        return path.name, path.parent, None
+    text = toml_text(raw, str(path))
     urdf = read_toml(text, str(path)).get("urdf")
     if not isinstance(urdf, str):
         raise RobotError(
@@ -56,11 +78,28 @@ def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
     return urdf, path.parent, text
 
 
+def is_xml(raw: bytes) -> bool:
+    """Whether bytes begin as an XML text does, in any encoding."""
+    return raw[:256].replace(b"\0", b"").lstrip(b"\xef\xbb\xbf\xff\xfe \t\r\n").startswith(b"<")
+
+
+def toml_text(raw: bytes, where: str) -> str:
+    """Bytes as the text of a TOML file, which is UTF-8 on every machine."""
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise RobotError(
+            f"{where}: not a text file, byte {e.start} cannot be read as UTF-8; save it as UTF-8"
+        ) from e
+
+
 def read_text(path: Path) -> str:
     """The text of a URDF file. Raises :class:`RobotError` if it cannot be one."""
     try:
         if path.is_dir():
             raise RobotError(f"{path}: is a folder; name the URDF file inside it")
+        if path.exists() and not path.is_file():
+            raise RobotError(f"{path}: is a pipe or a device; save the robot to a file first")
         if (size := path.stat().st_size) > MAX_BYTES:
             most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
             raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
@@ -73,8 +112,22 @@ def read_text(path: Path) -> str:
         ) from e
 
 
+def _encoding(raw: bytes) -> str:
+    """The encoding of an XML text: by its first bytes, else as it declares, else UTF-8."""
+    marks = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be"}
+    if (marked := marks.get(raw[:2])) is not None:
+        return marked
+    declared = re.match(
+        rb"(?:\s|<!--.*?-->)*<\?xml[^>]*encoding\s*=\s*[\"']([\w.:-]+)", raw, re.DOTALL
+    )
+    name = declared[1].decode() if declared else "utf-8"
+    return "utf-8-sig" if name.lower() in ("utf-8", "utf8") else name
+
+
 def decode(raw: bytes, where: str) -> str:
-    """Bytes as the text of a URDF (UTF-8); :class:`RobotError` for anything else."""
+    """Bytes as the text of a URDF, in the encoding that it declares; :class:`RobotError` for
+    anything else.
+    """
     if not raw.strip():
         raise RobotError(
             f"{where}: the file is empty (0 of {len(raw)} bytes are text); copy or download it "
@@ -82,11 +135,22 @@ def decode(raw: bytes, where: str) -> str:
         )
     if raw[:2] in (b"\x1f\x8b", b"PK"):
         raise RobotError(f"{where}: is a compressed archive, not a URDF; unpack it first")
+    encoding = _encoding(raw)
     try:
-        text = raw.decode("utf-8-sig")
-        at = raw.find(b"\0")
+        text = raw.decode(encoding)
+        at = text.find("\0")
     except UnicodeDecodeError as e:
+        if is_xml(raw) and b"\0" not in raw:
+            name = encoding.removesuffix("-sig").upper()
+            raise RobotError(
+                f"{where}: byte {e.start} is no {name} text; save it as UTF-8, or declare its "
+                f'encoding in the first line, such as <?xml version="1.0" encoding="ISO-8859-1"?>'
+            ) from e
         at = e.start
+    except LookupError:
+        raise RobotError(
+            f"{where}: declares the encoding {encoding!r}, which is unknown; save it as UTF-8"
+        ) from None
     if at >= 0:
         raise RobotError(f"{where}: is binary (byte {at} is no UTF-8 text); a URDF is an XML text")
     if text.startswith("version https://git-lfs.github.com/spec"):
@@ -135,6 +199,26 @@ def entry(
         raise RobotError(f"robot configuration: {where!r} = {value!r}, must be {many}{wanted}")
     clean = [kind(x) for x in items]
     return clean if count else clean[0]
+
+
+def check_entries(config: dict, known: Mapping[str, tuple[str, ...] | None]) -> None:
+    """Refuse (:class:`RobotError`) tables and entries that nothing reads, such as misspelt ones.
+
+    ``known`` are the entries of each table, as :data:`TABLES` has them.
+    """
+    for title, values in config.items():
+        _check_name(title, known, "", "[{}]" if isinstance(values, dict) else "{!r}")
+        for name in table(config, title) if known[title] else ():
+            _check_name(name, known[title], f"[{title}] ", "{!r}")
+
+
+def _check_name(name: str, known: Collection[str], where: str, shown: str) -> None:
+    if name not in known:
+        near = get_close_matches(name, known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"it may hold {', '.join(known)}"
+        raise RobotError(
+            f"robot configuration: {where}{shown.format(name)} is nothing that is read; {hint}"
+        )
 
 
 def table(config: dict, name: str) -> dict:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from jumplab.errors import RobotError
 from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.files import LEG
 from jumplab.robot.sagittal import SAGITTAL_JOINTS, TO_COMPLEX, in_xz
@@ -19,6 +20,9 @@ SHANK_LEAN_RAD = (-0.6, 1.4)  # generous, both ways
 WIDTH_WEIGHT = 1e-3  # of the feet's distance in the neutral posture, which a robot keeps if it can
 # [m, rad] that a standing posture may miss: a leg of five joints whose sides differ
 STANDS_M = 1e-3
+CHANGE_STANCE = "change [stance] in its configuration"
+# [rad] knees and trunks of postures that are tried where the one that was told cannot stand
+OTHER_STANCES = ((0.3, 0.0), (0.3, 0.2), (0.8, 0.05), (0.8, 0.25), (1.2, 0.1), (1.2, 0.3))
 
 
 def com_from_toe(robot: Robot, angles: np.ndarray) -> np.ndarray:
@@ -46,7 +50,7 @@ def stance_angles(
         if within_limits and not low <= angle <= high:
             raise robot.error(
                 f"standing with the knee at {knee:g} rad needs {name} at {angle:.3f} rad, outside "
-                f"its range {low:g} ... {high:g}; change [stance] in its configuration"
+                f"its range {low:g} ... {high:g}; {CHANGE_STANCE}"
             )
     return angles
 
@@ -75,12 +79,39 @@ def _lean(robot: Robot, knee: float, trunk: float, arm: float) -> float:
         return inside[0]
     raise robot.error(
         f"with the knee at {knee:g} rad and the trunk at {trunk:g} rad no lean of the shank brings "
-        f"the CoM above the middle of the sole; change [stance] in its configuration"
+        f"the CoM above the middle of the sole; {CHANGE_STANCE}"
     )
 
 
 def check_stance(robot: Robot) -> np.ndarray:
-    """The standing posture (5,), refused with less than :data:`STANCE_ROOM_RAD` to a stop."""
+    """The standing posture (5,) or (nq,), refused with less than :data:`STANCE_ROOM_RAD` to a stop;
+    the sentence ends with another [stance] that can, if one was found.
+    """
+    try:
+        return _checked_stance(robot)
+    except RobotError as e:
+        raise RobotError(str(e).replace(CHANGE_STANCE, _other_stance(robot))) from None
+
+
+def _other_stance(robot: Robot) -> str:
+    """What of [stance] to change so that the robot can stand, or that nothing tried helps."""
+    others = [{"shoulder_rad": 0.0}]
+    others += [{"knee_rad": knee, "trunk_pitch_rad": trunk} for knee, trunk in OTHER_STANCES]
+    for other in others:
+        try:
+            _checked_stance(robot.with_stance(**other))
+        except RobotError:
+            continue
+        values = " and ".join(f"{key} = {angle:g}" for key, angle in other.items())
+        return f"with {values} in [stance] it can"
+    knees, trunks = zip(*OTHER_STANCES, strict=True)
+    return (
+        f"nor can it with knees at {min(knees):g} ... {max(knees):g} and the trunk at "
+        f"{min(trunks):g} ... {max(trunks):g} rad in [stance]: correct its ranges or its soles"
+    )
+
+
+def _checked_stance(robot: Robot) -> np.ndarray:
     if not robot.planar:
         return robot.standing
     angles = stance_angles(robot)
@@ -89,7 +120,7 @@ def check_stance(robot: Robot) -> np.ndarray:
             raise robot.error(
                 f"standing, {name} is at {angle:.3f} rad, less than "
                 f"{STANCE_ROOM_RAD:g} from the end of its range {low:.3g} ... {high:.3g}; no plan "
-                f"can start there: change [stance] in its configuration"
+                f"can start there; {CHANGE_STANCE}"
             )
     return angles
 
@@ -225,7 +256,7 @@ def standing(robot: Robot) -> np.ndarray:
         raise robot.error(
             f"no standing posture with the knees at {knee:g} rad and the trunk "
             f"at {trunk:g} rad has flat feet below the CoM, {1e3 * worst:.0f} mm or mrad are "
-            f"missing; change [stance] in its configuration"
+            f"missing; {CHANGE_STANCE}"
         )
     return q
 

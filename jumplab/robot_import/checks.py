@@ -20,15 +20,18 @@ from jumplab.robot_import.urdf import (
     FRAME_KG,
     LIMITS,
     MOVING,
+    OWN,
     SIZES,
     Tree,
     mass_of,
     numbers,
     parse,
+    repaired,
     slight,
     tensor_of,
     unsolid,
 )
+from jumplab.robot_import.write import listed
 
 TYPES = (*MOVING, "fixed", "floating", "planar")
 # what a humanoid can have; the paper prints none of these numbers
@@ -39,6 +42,13 @@ MOST_NM = 2000.0  # five times the strongest published electric humanoid joint
 # twice the fastest published humanoid pitch joint; above it, deg/s or a placeholder
 MOST_RAD_S = 60.0
 MOST_RAD = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
+# why a joint of an MJCF has none
+IN_MJCF = {
+    "lower": "has no range",
+    "upper": "has no range",
+    "effort": "no actuator on it has a forcerange, or a motor's ctrlrange",
+    "velocity": "MJCF has no speed limits",
+}
 
 
 def read_tree(
@@ -66,10 +76,11 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     out = out or [sentence for link, at in links for sentence in _inertial_faults(link, at)]
     if out:  # what follows reads what was refused
         return out
-    if "inertia" not in repair:
-        most = slight(root)
-        out += [sentence for link, at in links for sentence in _tensor_faults(link, at, most)]
     tree = Tree(root, where, repair_inertia=True)
+    most = np.inf if "inertia" in repair else slight(root)
+    low, high = SIZES_M  # beyond them, the lengths are wrong, which is found below
+    longest = min(GYRATION_M, size) if low <= (size := length_of(tree)) <= high else GYRATION_M
+    out += [sentence for link, at in links for sentence in _tensor_faults(link, at, most, longest)]
     if "massless" not in repair:
         out += _massless_bodies(tree)
     out += [sentence for link, at in links for sentence in _shape_faults(link, at)]
@@ -86,6 +97,7 @@ def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
                 f"the call "
                 f"<{element.tag.rpartition('}')[2]}> of a xacro macro is left over, and passed over"
             )
+    yield from (note.get("text") for note in root.findall("note"))
     most = np.inf if "inertia" in repair else slight(root)
     for link in root.findall("link"):
         name = link.get("name")
@@ -101,6 +113,26 @@ def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
     for joint in root.findall("joint/limit[@effort]/.."):
         if joint.get("type") in MOVING and numbers(joint.find("limit").get("effort"), 1) == 0:
             yield f"joint {joint.get('name')!r} has no motor (effort = 0): held"
+    yield from _losses(root)
+
+
+def _losses(root: ET.Element) -> Iterator[str]:
+    """Which of armature, friction and damping the file has, and which cannot be."""
+    used = {key: 0 for key in OWN}
+    wrong = {}  # (key, text) -> joints
+    for joint in root.findall("joint/dynamics/.."):
+        for key in OWN if joint.get("type") in MOVING else ():
+            text = joint.find("dynamics").get(key, "0")
+            value = numbers(text, 1)
+            if value is None or value[0] < 0:
+                wrong.setdefault((key, text), []).append(repr(joint.get("name")))
+            elif value[0] > 0:
+                used[key] += 1
+    for (key, text), joints in wrong.items():
+        yield f"{key} = {text!r} of {listed(joints)} must be a number from 0 on: not used"
+    if any(used.values()):
+        counts = ", ".join(f"{key} of {count} joints" for key, count in used.items() if count)
+        yield f"the file has losses of the motors: {counts}"
 
 
 def _triples(element: ET.Element | None, at: str, *keys: str) -> Iterator[str]:
@@ -191,9 +223,10 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
             f"without a parent"
         )
     elif len(roots) > 1:
+        named = listed(map(repr, roots))
         yield (
-            f"{where}: {len(roots)} links have no parent ({_quoted(roots)}), Pinocchio keeps one "
-            f"tree and drops the rest; connect them"
+            f"{where}: {len(roots)} links have no parent ({named}), Pinocchio keeps one tree and "
+            f"drops the rest; connect them"
         )
     else:
         below = list(roots)
@@ -202,13 +235,8 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
                 child for child, above in zip(children, parents, strict=True) if above == link
             ]
         if lost := sorted(names - set(below)):
-            yield (
-                f"{where}: the links {_quoted(lost)} form a cycle apart from the root {roots[0]!r}"
-            )
-
-
-def _quoted(names: list[str]) -> str:
-    return ", ".join(map(repr, names[:4]))
+            named = listed(map(repr, lost))
+            yield f"{where}: the links {named} form a cycle apart from the root {roots[0]!r}"
 
 
 # inertials
@@ -238,19 +266,21 @@ def _inertial_faults(link: ET.Element, at: str) -> Iterator[str]:
         yield f"{at}: {wrong} = {tensor.get(wrong)!r} must be a finite number of kg m^2"
 
 
-def _tensor_faults(link: ET.Element, at: str, most: float) -> Iterator[str]:
-    """Of an inertia farther than ``most`` [kg m^2] from a solid's, or too large."""
+def _tensor_faults(link: ET.Element, at: str, most: float, longest: float) -> Iterator[str]:
+    """Of an inertia farther than ``most`` [kg m^2] from a solid's, or too large: with a radius of
+    gyration above ``longest`` [m], which no repair mends.
+    """
     mass = mass_of(link)
     if mass < FRAME_KG:
         return
     matrix = tensor_of(link)
-    low, middle, high = np.linalg.eigvalsh(matrix)
+    gap = unsolid(matrix)
+    low, middle, high = np.linalg.eigvalsh(repaired(matrix) if 0 < gap <= most else matrix)
     remedy = (
         "correct <inertia>, or let it be repaired: --repair inertia, or [source] repair = "
         '["inertia"]'
     )
     gyration = np.sqrt(abs(high) / mass)
-    gap = unsolid(matrix)
     if low <= 0 and gap > most:
         yield f"{at}: principal moment of inertia {low:.3g} kg m^2 must be positive; {remedy}"
     elif gap > most:
@@ -258,28 +288,34 @@ def _tensor_faults(link: ET.Element, at: str, most: float) -> Iterator[str]:
             f"{at}: principal moments {low:.3g}, {middle:.3g}, {high:.3g} kg m^2: the largest must "
             f"not exceed the sum of the others, no solid has this; {remedy}"
         )
-    elif gyration > GYRATION_M:
+    elif gyration > longest:
         yield (
             f"{at}: moment of inertia {high:.3g} kg m^2 on {mass:g} kg is a radius of gyration of "
-            f"{gyration:.3g} m, at most {GYRATION_M:g} is likely; is it in g mm^2 or kg cm^2?"
+            f"{gyration:.3g} m, at most {longest:.3g} is likely; is it in g mm^2 or kg cm^2?"
         )
 
 
 def _massless_bodies(tree: Tree) -> Iterator[str]:
-    """Joints that move no mass themselves, though what hangs on them has some."""
+    """Joints that move no mass themselves, though what hangs on them has some; but for those of a
+    body with several.
+    """
+    remedy = 'or let it have a gram: --repair massless, or [source] repair = ["massless"]'
     for joint in tree.joints.values():
         link = joint.child
         at = f"{tree.where}: link {link!r}"
-        weighs = tree.body_of(link).mass > 0
+        weighs = tree.body_of(link).mass > 0 or tree.elements[link].get("between")
         if joint.kind == "fixed" or weighs or not tree.carried(link):
             continue
         if tree.elements[link].find("inertial") is None:
             yield (
                 f"{at}: has no <inertial>, and nothing fixed to it has: Pinocchio reads 0 kg, "
-                f"PyBullet 1 kg; joint {joint.name!r} needs a body of more than 0 kg"
+                f"PyBullet 1 kg; joint {joint.name!r} needs a body of more than 0 kg, {remedy}"
             )
         else:
-            yield f"{at}: mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg"
+            yield (
+                f"{at}: mass = 0 kg, the body of joint {joint.name!r} must weigh more than 0 kg, "
+                f"{remedy}"
+            )
 
 
 # units and shapes
@@ -294,8 +330,7 @@ def _unit_faults(tree: Tree) -> Iterator[str]:
             f"{tree.where}: weighs {mass:g} kg, a humanoid {low:g} to {high:g}; are the masses "
             f"in {guess}"
         )
-    chains = map(tree.chain, tree.elements)
-    size = max(sum(np.linalg.norm(j.place.translation) for j in chain) for chain in chains)
+    size = length_of(tree)
     low, high = SIZES_M
     if not low <= size <= high:
         guess = "kilometres, or are the origins missing?"
@@ -305,6 +340,12 @@ def _unit_faults(tree: Tree) -> Iterator[str]:
             f"{tree.where}: the longest chain of joints measures {size:g} m, a humanoid's {low:g} "
             f"to {high:g}; are the origins in {guess}"
         )
+
+
+def length_of(tree: Tree) -> float:
+    """The longest chain of joints [m]."""
+    chains = map(tree.chain, tree.elements)
+    return max(sum(np.linalg.norm(j.place.translation) for j in chain) for chain in chains)
 
 
 def _shape_faults(link: ET.Element, at: str) -> Iterator[str]:
@@ -318,7 +359,7 @@ def _shape_faults(link: ET.Element, at: str) -> Iterator[str]:
             if values is None or min(values) < least:
                 wanted = "three positive numbers" if count == 3 else "a positive number"
                 yield f"{at}: {shape.tag} {key} = {shape.get(key)!r} must be {wanted} of m"
-        if shape.tag == "mesh":
+        if shape.tag == "mesh" and not shape.get("vertex"):
             if not shape.get("filename"):
                 yield f"{at}: a collision mesh has no filename; add it, or remove the shape"
             yield from _triples(shape, f"{at}: mesh", "scale")
@@ -327,46 +368,95 @@ def _shape_faults(link: ET.Element, at: str) -> Iterator[str]:
 # limits
 # --------------------------------------------------------------------------------------------------
 def limit_faults(
-    joint: ET.Element, where: str, given: dict[str, float] | None = None
+    joint: ET.Element,
+    where: str,
+    given: dict[str, float] | None = None,
+    *,
+    form: str = "URDF",
+    table: str = "",
 ) -> Iterator[str]:
-    """Faults of the limits of one joint that the jump uses; ``given`` values [rad, N m, rad/s] go
-    before those of the file.
+    """The faults of the limits of one joint that the jump uses, in one sentence, if there are any.
+
+    ``given`` and ``form`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the
+    configuration that can tell them.
     """
-    at = f"{where}: joint {joint.get('name')!r}"
+    if wrong := wrong_limits(joint, given, form):
+        keys = ", ".join(keys_of(wrong))
+        advice = f", or tell {keys} in [{table}] of the configuration" if table else ""
+        advice = advice.replace(", or", ";") if form == "MJCF" else advice
+        yield f"{where}: joint {joint.get('name')!r}: {'; '.join(wrong.values())}{advice}"
+
+
+def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
+    """The limits that complaints are about, in the order of :data:`LIMITS`."""
+    return [key for key in LIMITS if any(key in group for group in wrong)]
+
+
+def wrong_limits(
+    joint: ET.Element, given: dict[str, float] | None = None, form: str = "URDF"
+) -> dict[tuple[str, ...], str]:
+    """Limits of a joint that cannot be meant, or are missing, and what is wrong with them.
+
+    ``given`` values [rad, N m, rad/s] go before those of the file, of the format ``form``.
+    """
     limit = joint.find("limit")
     values = dict(given or {})
     missing = [key for key in LIMITS if key not in values]
-    if limit is None and missing:
-        yield f"{at}: has no <limit>; add {', '.join(missing)}"
-        return
+    texts = {key: None if limit is None else limit.get(key) for key in missing}
+    absent = tuple(key for key, text in texts.items() if text is None)
+    wrong = {}
+    if absent and form == "MJCF":
+        wrong[absent] = "; ".join(dict.fromkeys(IN_MJCF[key] for key in absent))
+    elif limit is None and missing:
+        wrong[absent] = f"has no <limit>; add {', '.join(missing)}"
+    elif absent:
+        them = "it" if len(absent) == 1 else "them"
+        which = f"{', '.join(absent)}, which Pinocchio reads as 0; add {them}"
+        wrong[absent] = f"<limit> has no {which}"
     for key in missing:
-        text = limit.get(key)
-        if text is None:
-            yield f"{at}: <limit> has no {key}, which Pinocchio reads as 0; add it"
-            return
-        if (value := numbers(text, 1)) is None:
-            yield f"{at}: {key} = {text!r} must be a finite number"
-            return
-        values[key] = float(value[0])
-    low, high, effort, speed = (values[key] for key in LIMITS)
-    span = f"{at}: range {low:g} ... {high:g} rad is"
+        if (text := texts[key]) is not None:
+            if (value := numbers(text, 1)) is None:
+                wrong[key,] = f"{key} = {text!r} must be a finite number"
+            else:
+                values[key] = float(value[0])
+    return wrong | _range_faults(values) | _motor_faults(values)
+
+
+def _range_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
+    """What is wrong with a range [rad], if both of its ends are there."""
+    if not {"lower", "upper"} <= set(values):
+        return {}
+    low, high = values["lower"], values["upper"]
+    span = f"range {low:g} ... {high:g} rad is"
     if max(abs(low), abs(high)) > MOST_RAD:
-        yield f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+        wrong = (
+            f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+        )
     elif low > high:
-        yield f"{at}: lower = {low:g} rad is above upper = {high:g} rad; swap them"
+        wrong = f"lower = {low:g} rad is above upper = {high:g} rad; swap them"
     elif low == high:
-        yield f"{span} empty; give the real range"
+        wrong = f"{span} empty; give the real range"
+    else:
+        return {}
+    return {("lower", "upper"): wrong}
+
+
+def _motor_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
+    """What is wrong with a torque [N m] and a speed [rad/s], those that are there."""
+    out = {}
+    effort = values.get("effort", 1.0)
+    speed = values.get("velocity", 1.0)
     if effort <= 0:
-        yield f"{at}: effort = {effort:g} N m must be positive; give the peak torque"
+        out["effort",] = f"effort = {effort:g} N m must be positive; give the peak torque"
     elif effort > MOST_NM:
-        yield (
-            f"{at}: effort = {effort:g} N m is above {MOST_NM:g}: a placeholder; give the peak "
-            f"torque"
+        out["effort",] = (
+            f"effort = {effort:g} N m is above {MOST_NM:g}: a placeholder; give the peak torque"
         )
     if speed <= 0:
-        yield f"{at}: velocity = {speed:g} rad/s must be positive; give the speed limit"
+        out["velocity",] = f"velocity = {speed:g} rad/s must be positive; give the speed limit"
     elif speed > MOST_RAD_S:
-        yield (
-            f"{at}: velocity = {speed:g} rad/s is above {MOST_RAD_S:g}: deg/s or a placeholder; "
-            f"give the speed limit in rad/s"
+        out["velocity",] = (
+            f"velocity = {speed:g} rad/s is above {MOST_RAD_S:g}: deg/s or a placeholder; give the "
+            f"speed limit in rad/s"
         )
+    return out

@@ -67,31 +67,38 @@ class Checkup:
         ]
 
 
-def first_look(path: str | Path, repair: tuple[str, ...] = ()) -> tuple[Draft | None, list[str]]:
+def first_look(
+    path: str | Path, repair: tuple[str, ...] = (), text: str | None = None
+) -> tuple[Draft | None, list[str]]:
     """A first description of a URDF, and every fault of the file, else of the limits of the joints
     with a role.
 
     With faults of the file the roles are those that it has once all repairs are allowed; None if
-    not even then. Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
+    not even then. ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
+    Raises :class:`RobotError` if it is no URDF at all, or has no two legs.
     """
     path = Path(path)
-    if not (faults := urdf_checks.faults(parse(read_urdf(path), path.name), path.name, repair)):
-        first = draft(path, repair)
+    text = read_urdf(path) if text is None else text
+    if not (faults := urdf_checks.faults(parse(text, path.name), path.name, repair)):
+        first = draft(path, repair, text)
         return first, list(first.faults)
     try:
-        return draft(path, REPAIRS), faults
+        return draft(path, REPAIRS, text), faults
     except RobotError:
         return None, faults
 
 
-def check(path: str | Path, config_text: str) -> Checkup:
-    """The robot of a URDF and a configuration with [source]; raises :class:`RobotError`."""
+def check(path: str | Path, config_text: str, text: str | None = None) -> Checkup:
+    """The robot of a URDF and a configuration with [source]; raises :class:`RobotError`.
+
+    ``text`` as of :func:`first_look`.
+    """
     path = Path(path)
     config = read_toml(config_text, "robot configuration")
     if "source" not in config:
         missing = "the table [source] is missing: it names trunk, forward, up and repair"
         raise RobotError(f"robot configuration: {missing}")
-    jumper = make_jumper(read_urdf(path), config, path.name, path)
+    jumper = make_jumper(read_urdf(path) if text is None else text, config, path.name, path)
     robot = Robot(jumper.urdf, jumper.config_text)
     check_stance(robot)
     return Checkup(robot, jumper)
@@ -101,9 +108,10 @@ def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:
     """The checkup of a name or a path; roles are found where no table [source] tells them."""
     urdf, folder, config = files_of(robot)
     path = locate(urdf, folder)
+    text = read_urdf(path)
     if config is None or "source" not in read_toml(config, "robot configuration"):
-        config = draft(path, repair).text
-    return check(path, config)
+        config = draft(path, repair, text).text
+    return check(path, config, text)
 
 
 def load(name_or_path: str | Path, repair: tuple[str, ...] = ()) -> Robot:

@@ -7,6 +7,7 @@ can carry them.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,11 +21,11 @@ import pinocchio as pin
 
 from jumplab.errors import RobotError
 from jumplab.robot.description import STANCE
-from jumplab.robot.files import LEG, entry, roles_table, table
+from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, table
 from jumplab.robot_import.checks import read_tree
-from jumplab.robot_import.lump import CORNER, NO_LOAD, OWN, Body, Lumped, RoleJoints, lump
+from jumplab.robot_import.lump import CORNER, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
-from jumplab.robot_import.urdf import LIMITS, MOVING, Tree
+from jumplab.robot_import.urdf import LIMITS, MOVING, OWN, Tree
 from jumplab.robot_import.write import (
     HERE,
     add_boxes,
@@ -36,12 +37,21 @@ from jumplab.robot_import.write import (
     titled,
 )
 
-REPAIRS = ("inertia", "massless")
 # None of these numbers is printed by the paper. Boxes have the default robot's proportions, as
 # shares of the leg's length from hip to ankle: the trunk's rear, front, half width, bottom and top,
 # from the middle between the hips.
 TRUNK_BOX = (-0.115, 0.115, 0.2, 0.14, 1.0)
 THICKNESS = {"thigh": 0.125, "shank": 0.10, "arm": 0.10, "foot": 0.04}
+REPAIRS = ("inertia", "massless")
+# what a configuration with [source] may hold beside what every robot's has
+SOURCE_TABLES = TABLES | {
+    "source": ("trunk", "forward", "up", "facing", "repair"),
+    "joints": (*TABLES["joints"], "free"),
+    "locked": (),
+    "limits": (),
+    "assumed": (),
+    "shapes": ("trunk_m", *(f"{part}_thickness_m" for part in THICKNESS)),
+}
 GAP = 0.14  # share of each limb's length, kept free at both ends
 ARM_REACH = 1.86  # length of an arm's box, in distances from the shoulder to the arm's CoM
 DIAGONAL = 1e-9  # [kg m^2] below, a product of inertia is rounding
@@ -68,6 +78,8 @@ def make_jumper(urdf: str, config: dict, where: str, path: Path | None = None) -
     ``urdf`` is a text and ``config`` a configuration with a table [source]; ``where`` names the
     URDF in messages, and meshes are looked for near its ``path``.
     """
+    check_entries(config, SOURCE_TABLES)
+    config = _facing(config)
     source = _source(config)
     tree = read_tree(urdf, where, path, source["repair"])
     roles = roles_table(config)
@@ -105,6 +117,36 @@ def _source(config: dict) -> dict:
     return out | {"repair": tuple(repair)}
 
 
+def _facing(config: dict) -> dict:
+    """The configuration of a robot that faces as [source] says: where that is opposite to what was
+    found, its pairs, soles and assumed ranges turned about.
+    """
+    facing = entry(config, "source", "facing", kind=str, default="")
+    forward = entry(config, "source", "forward", kind=str, default="+x")
+    if facing in ("", forward):
+        return config
+    if facing not in AXES or facing[1] != forward[1]:
+        other = forward.translate(str.maketrans("+-", "-+"))
+        raise RobotError(
+            f"robot configuration: 'source.facing' = {facing!r} must be {forward} or {other}, one "
+            f"of both ways along which it can walk"
+        )
+    new = copy.deepcopy(config)
+    new["source"]["forward"] = facing
+    for role, pair in roles_table(config).items():
+        new["joints"][role] = list(pair[::-1])
+    feet = new["feet"]
+    feet["links"] = entry(config, "feet", "links", kind=str, count=2)[::-1]
+    for side in ("sole_x_m", "sole_y_m"):
+        low, high = entry(config, "feet", side, count=2)
+        feet[side] = [-high, -low]
+    new["stance"]["shoulder_rad"] = -entry(config, "stance", "shoulder_rad")
+    for limits in table(new, "assumed").values():
+        if {"lower", "upper"} <= set(limits):
+            limits |= {"lower": -limits["upper"], "upper": -limits["lower"]}
+    return new
+
+
 def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     """The sole in the frame of the foot body, whose link is ``offset`` (3,) [m] from it."""
     ahead, left, up = offset
@@ -112,6 +154,13 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     y = np.array(entry(config, "feet", "sole_y_m", count=2)) + left
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
+    if z < 0 and half > 0 and x[0] < x[1] and (x[0] >= 0 or x[1] <= 0):
+        side, end = ("ahead of", "toes") if x[0] >= 0 else ("behind", "heel")
+        raise RobotError(
+            f"{where}: the sole, {x[0]:.3f} ... {x[1]:.3f} m from the ankle, lies {side} it: the "
+            f"foot stands on its {end} with all joints at 0, or [feet] is wrong; tell there the "
+            f"sole along the level axes"
+        )
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
         raise RobotError(
             f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "

@@ -17,7 +17,8 @@ from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
 from jumplab.robot_import.roles import robot_axes
-from jumplab.robot_import.urdf import LIMITS, Tree, link_poses, links_of
+from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
+from jumplab.robot_import.write import key
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
@@ -27,8 +28,6 @@ DUMMY = pin.Inertia(1e-3, np.zeros(3), 1e-6 * np.eye(3))
 # [rad/s] up to which the whole effort is there, and from which none; not in URDFs
 CORNER = "corner"
 NO_LOAD = "no_load"
-# of a motor at its joint [kg m^2, N m, N m s/rad], as no URDF tells it
-OWN = ("armature", "friction", "damping")
 MOTOR = (CORNER, NO_LOAD, *OWN)
 SOURCE = "source"  # of a motor's numbers, in words
 MOST_ARMATURE = 10.0  # [kg m^2] a tenth of it is much, reflected by the gears of a humanoid's hip
@@ -99,22 +98,34 @@ def lump(
     trunk = source["trunk"]
     for link in (trunk, *feet):
         if link not in tree.elements:
-            raise tree.error(f"the configuration names the link {link!r}, which the URDF lacks")
+            what = f"the configuration names the link {link!r}, which the {tree.format} lacks"
+            raise tree.error(what)
     moving = _moving_joints(tree, config, roles, trunk, feet)
     held = _held_angles(tree, config, moving)
     model = tree.holding(held, moving)
     pose = link_poses(model)
     turn = robot_axes(pose[trunk].rotation, source["forward"], source["up"])
     hips = [turn @ pose[tree.joints[n].child].translation for n in roles["hip_pitch"]]
+    if hips[0][1] <= hips[1][1]:
+        left, right = roles["hip_pitch"]
+        raise tree.error(
+            f"joint {left!r} is named as the left one, and is on the right of {right!r} where the "
+            f"trunk faces {source['forward']}; give [source] facing, which turns all pairs, or "
+            f"correct [joints]"
+        )
     middle = np.array([0.0, (hips[0][1] + hips[1][1]) / 2, 0.0])
     model.jointPlacements[1] = pin.SE3(turn, -middle)
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
-    limits = {name: _limits(tree, config, roles, name) for name in moving}
-    bodies, links = _bodies(tree, model, placed, trunk, feet, limits, sum(edges) / 2)
     changed = {}
-    if "massless" in source["repair"]:
-        bodies = _with_mass(bodies, changed)
+    limits = {name: _limits(tree, config, roles, name, changed) for name in moving}
+    bodies, links = _bodies(tree, model, placed, trunk, feet, limits, sum(edges) / 2)
+    if bodies[0].inertia.mass < FRAME_KG:
+        raise tree.error(
+            f"the trunk {trunk!r} and all that is held on it weigh {bodies[0].inertia.mass:g} kg; "
+            f"give its link a mass, or name another [source] trunk"
+        )
+    bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
     return Lumped(tuple(bodies), changed, held, links, placed)
 
@@ -163,7 +174,7 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
     locked = table(config, "locked")
     out = {}
     for joint in tree.joints.values():
-        ends = [joint.limits[key] for key in ("lower", "upper") if key in joint.limits]
+        ends = [joint.limits[end] for end in ("lower", "upper") if end in joint.limits]
         if joint.kind in ("revolute", "prismatic") and len(ends) == 2:
             out[joint.name] = float(np.clip(0.0, *sorted(ends)))
     for name in locked:
@@ -177,27 +188,47 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
     return {name: angle for name, angle in out.items() if angle and name not in moving}
 
 
-def _limits(tree: Tree, config: dict, roles: RoleJoints, joint: str) -> dict[str, float]:
-    """The limits of a joint; those of [limits], by joint or role, come first."""
+def _limits(
+    tree: Tree, config: dict, roles: RoleJoints, joint: str, changed: dict
+) -> dict[str, float]:
+    """The limits of a joint; those of [limits], by joint or role, come first, those of [assumed]
+    next; its losses as the file has them, if its motor can bear them.
+    """
     given = {}
-    for name, values in table(config, "limits").items():
-        if name not in tree.joints and name not in roles:
-            raise tree.error(f"[limits.{name}] names neither a joint of the URDF nor a role")
-        may = (*LIMITS, *MOTOR, SOURCE)
-        if not isinstance(values, dict) or not set(values) <= set(may):
-            raise RobotError(
-                f"robot configuration: 'limits.{name}' may hold {', '.join(may)}, got {values!r}"
-            )
-        given[name] = {key: entry(config, "limits", name, key) for key in values if key != SOURCE}
-        entry(config, "limits", name, SOURCE, kind=str, default="")
-    role = next((r for r, pair in roles.items() if joint in pair), "")
+    may = (*LIMITS, *MOTOR, SOURCE)
+    for title in ("assumed", "limits"):
+        for name, values in table(config, title).items():
+            if name not in tree.joints and name not in roles:
+                dotted = next((j for j in tree.joints if j.startswith(f"{name}.")), None)
+                hint = f"; names with dots are quoted: [{title}.{key(dotted)}]" if dotted else ""
+                raise tree.error(
+                    f"[{title}.{key(name)}] names neither a joint of the {tree.format} nor a "
+                    f"role{hint}"
+                )
+            if not isinstance(values, dict) or not set(values) <= set(may):
+                raise RobotError(
+                    f"robot configuration: '{title}.{name}' may hold {', '.join(may)}, got "
+                    f"{values!r}"
+                )
+            told = {part: entry(config, title, name, part) for part in values if part != SOURCE}
+            given[name] = given.get(name, {}) | told
+            entry(config, title, name, SOURCE, kind=str, default="")
+    # a joint that is called like a role goes before it
+    role = next((r for r, pair in roles.items() if joint in pair and r not in tree.joints), "")
     values = given.get(role, {}) | given.get(joint, {})
-    for sentence in limit_faults(tree.joints[joint].element, tree.where, values):
-        raise RobotError(f"{sentence}, or tell it in [limits.{role or joint}] of the configuration")
-    limits = {key: values.get(key, tree.joints[joint].limits.get(key)) for key in LIMITS} | values
+    element = tree.joints[joint].element
+    where = f"limits.{key(role or joint)}"
+    for sentence in limit_faults(element, tree.where, values, form=tree.format, table=where):
+        raise RobotError(sentence)
+    limits = {part: values.get(part, tree.joints[joint].limits.get(part)) for part in LIMITS}
+    limits |= values
+    own = {part: x for part, x in tree.joints[joint].losses.items() if part not in limits}
+    if own and not _motor_fault(limits) and (sentence := _motor_fault(limits | own)):
+        changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (len(own), "numbers")
+        own = {}
     if sentence := _motor_fault(limits):
-        raise tree.error(f"joint {joint!r}: {sentence}; correct [limits.{role or joint}]")
-    return limits
+        raise tree.error(f"joint {joint!r}: {sentence}; correct [{where}]")
+    return limits | own
 
 
 def _motor_fault(limits: dict[str, float]) -> str:
@@ -206,7 +237,7 @@ def _motor_fault(limits: dict[str, float]) -> str:
     effort = limits["effort"]
     free = limits.get(NO_LOAD, speed)
     corner = limits.get(CORNER, free / 2)
-    armature, friction, damping = (limits.get(key, 0.0) for key in OWN)
+    armature, friction, damping = (limits.get(part, 0.0) for part in OWN)
     lost = friction + damping * speed
     if free < speed:
         return (
@@ -216,9 +247,9 @@ def _motor_fault(limits: dict[str, float]) -> str:
     if not 0 < corner < free:
         end = "no-load speed" if NO_LOAD in limits else "speed limit"
         return f"corner = {corner:g} rad/s must lie between 0 and the {end}, {free:g} rad/s"
-    for key in OWN:
-        if limits.get(key, 0.0) < 0:
-            return f"{key} = {limits[key]:g} must not be negative"
+    for part in OWN:
+        if limits.get(part, 0.0) < 0:
+            return f"{part} = {limits[part]:g} must not be negative"
     if armature > MOST_ARMATURE:
         return (
             f"armature = {armature:g} kg m^2 is more than {MOST_ARMATURE:g} kg m^2, that of no "
@@ -313,9 +344,13 @@ def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
 def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
     """Left and right as mirror images, their means, if they differ as a CAD export does."""
     out = {}
+    moved = {}
     gaps = []  # [m]
     shares = [0.0]  # [1]
     for left, right in _pairs(bodies):
+        right = _opposite(left, right)
+        left = right if left.joint == right.joint else left
+        moved[right.joint] = right
         gaps.append(left.place - MIRROR * right.place)
         place = (left.place + MIRROR * right.place) / 2
         inertias = left.inertia, right.inertia
@@ -341,7 +376,23 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
     if max(gap, share) > ALIKE:
         changed[f"left and right {done}, places"] = (1e3 * gap, "mm")
         changed[f"left and right {done}, masses"] = (100 * share, "%")
-    return [out.get(b.joint, b) for b in bodies] if even else bodies
+    return [(out if even else moved).get(b.joint, b) for b in bodies]
+
+
+def _opposite(left: Body, right: Body) -> Body:
+    """The right body with its origin, which may lie anywhere on its axis, opposite to the left
+    one's; one in the middle with its origin there.
+    """
+    gap = left.place - MIRROR * right.place
+    along = float(gap @ left.axis)
+    if abs(along) <= CAD_M:  # which is evened out
+        return right
+    if left.joint == right.joint:
+        place = right.place - along / 2 * right.axis
+    else:
+        place = right.place + MIRROR * (along * left.axis)
+    inertia = pin.SE3(np.eye(3), right.place - place).act(right.inertia)
+    return replace(right, place=place, inertia=inertia)
 
 
 def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
@@ -352,13 +403,17 @@ def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
         if body.name in image:
             continue
         parent = image.get(body.parent)
-        like = [
-            (float(np.abs(MIRROR * b.place - body.place).max()), b.name, b)
-            for b in bodies[1:]
-            if b.parent == parent and abs(MIRROR * body.axis @ b.axis) > SAME
-        ]
-        gap, _, other = min(like, default=(np.inf, "", body))
-        if gap < PAIR_M:
+        like = []
+        for b in bodies[1:]:
+            way = MIRROR * b.place - body.place
+            # an origin may lie anywhere on its axis, but no body is its own counterpart by that
+            along = 0.0 if b is body else way @ body.axis
+            across = way - along * body.axis
+            alike = b.parent == parent and abs(MIRROR * body.axis @ b.axis) > SAME
+            if alike and np.abs(across).max() < PAIR_M:
+                like.append((float(np.abs(way).max()), b.name, b))
+        if like:
+            _, _, other = min(like)
             image |= {body.name: other.name, other.name: body.name}
             out.append((body, other) if body.place[1] >= other.place[1] else (other, body))
     return out

@@ -1,10 +1,18 @@
-"""A robot of MuJoCo's own format as a URDF: the same links, joints, masses and ranges; shapes
-become boxes.
+"""A robot of MuJoCo's own format (MJCF), by MuJoCo's compiled model, in the description that URDFs
+end in too: links, joints with range, torque, armature and losses, shapes.
+
+What MJCF has and that description has not (loops, tendons, springs, other things in a scene) is
+named in its ``<note>`` elements.
 """
 
 from __future__ import annotations
 
+import logging
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
@@ -12,82 +20,466 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.errors import RobotError
-from jumplab.robot_import.write import add, add_boxes, add_joint, add_link
-
-KINDS = {
-    int(mujoco.mjtJoint.mjJNT_HINGE): "revolute",
-    int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic",
-}
-PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
 
 
-def as_urdf(path: Path) -> str:
-    """The text of a URDF of what stands in an MJCF file; raises :class:`RobotError` if MuJoCo
-    cannot read it.
+def _numbers(kinds: Any) -> SimpleNamespace:
+    """The members of one of MuJoCo's enumerations as numbers, which arrays hold."""
+    return SimpleNamespace(**{name: int(kind) for name, kind in kinds.__members__.items()})
 
-    Meshes that are not there are left out. MJCF has no speed limits: the URDF has none either.
+
+JOINT = _numbers(mujoco.mjtJoint)
+GEOM = _numbers(mujoco.mjtGeom)
+TRANSMISSION = _numbers(mujoco.mjtTrn)
+EQUALITY = _numbers(mujoco.mjtEq)
+GAIN = _numbers(mujoco.mjtGain)
+BIAS = _numbers(mujoco.mjtBias)
+DYNAMICS = _numbers(mujoco.mjtDyn)
+ON_JOINT = (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT)
+# an activation of these is no larger than the control
+PLAIN = (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT)
+UNNAMED = "MuJoCo Model"
+# names of files that say nothing of the robot in them
+GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
+POINTER = b"version https://git-lfs"
+
+
+def as_description(path: Path, text: str) -> str:
+    """The description, as XML, of the robot in an MJCF file; raises :class:`RobotError` if MuJoCo
+    cannot read it, if its mass depends on files that are not there, or if it has no robot, or two.
+
+    ``text`` is what the file holds. Links between several joints of one body have no mass.
     """
+    notes = []
+    spec = _spec(path, text)
+    model = _compiled(spec, path, notes)
+    root = _robot_of(model, path.name, notes)
+    xml = ET.Element("robot", name=_name(spec, path, text), format="MJCF")
+    writer = _Writer(model, root, xml, notes)
+    for body in writer.bodies:
+        writer.add_body(body)
+    writer.add_equalities()
+    writer.note_what_is_left_out()
+    for note in notes:
+        add(xml, "note", text=note)
+    return ET.tostring(xml, encoding="unicode")
+
+
+# reading
+# --------------------------------------------------------------------------------------------------
+def _spec(path: Path, text: str) -> mujoco.MjSpec:
+    """MuJoCo's own reading of a file, whatever it is called."""
+    # MuJoCo would write its warnings into a file of the working folder
+    mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        folder = path.parent / spec.meshdir
-        lost = [m for m in spec.meshes if not (folder / m.file).is_file()]
-        names = {m.name for m in lost}
-        for part in [g for g in spec.geoms if g.meshname in names] + lost:
-            spec.delete(part)
-        model = spec.compile()
-    except (ValueError, mujoco.FatalError) as e:
+        # MuJoCo reads only files that are called so
+        if path.suffix in (".xml", ".urdf") and path.read_bytes().startswith(text.encode()[:64]):
+            return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_string(text, include=dict(_included(path.parent, text)))
+        spec.modelfiledir = f"{path.parent}/"
+        return spec
+    except (ValueError, mujoco.FatalError, OSError) as e:
+        raise RobotError(f"{path.name}: MuJoCo cannot read this MJCF file: {_sentence(e)}") from e
+
+
+def _included(folder: Path, text: str) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the files that a text includes, and of those that they include."""
+    for name in re.findall(r"<include\s[^>]*file\s*=\s*[\"']([^\"']+)", text):
+        if (folder / name).is_file():
+            inner = (folder / name).read_bytes()
+            yield name, inner
+            yield from _included(folder, inner.decode("utf-8", "replace"))
+
+
+def _sentence(e: Exception) -> str:
+    """MuJoCo's complaint in a line, with the element that it names."""
+    return "; ".join(line.strip() for line in str(e).splitlines() if line.strip())
+
+
+def _name(spec: mujoco.MjSpec, path: Path, text: str) -> str:
+    """The robot's name: of the model, of a file that it includes, else of file or folder."""
+    inner = [spec.modelname if spec.modelname != UNNAMED else ""]
+    for _, content in _included(path.parent, text):
+        inner += re.findall(
+            r"<mujoco\s[^>]*model\s*=\s*\"([^\"]+)", content.decode("utf-8", "replace")
+        )
+    names = (GENERIC.sub("", name) for name in (*inner, path.stem, path.resolve().parent.name))
+    return next((name for name in names if name.strip(" _-")), path.stem)
+
+
+def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjModel:
+    """The model, without pictures, terrain and the meshes that are not there, if none of them
+    weighs anything.
+    """
+    folders = {"", spec.compiler.meshdir, spec.compiler.texturedir}
+    files = sorted({x.file for x in (*spec.textures, *spec.hfields) if x.file})
+    absent = [f for f in files if not any((path.parent / x / f).is_file() for x in folders)]
+    if absent:
+        notes.append(f"the pictures {listed([*map(repr, absent)])} are not there: left out")
+    pictures = [*spec.textures, *spec.materials, *spec.skins, *spec.sensors, *spec.keys]
+    terrain = [g for g in spec.geoms if int(g.type) == GEOM.mjGEOM_HFIELD]
+    for part in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
+        part.material = ""
+    for part in [*pictures, *terrain, *spec.hfields]:
+        spec.delete(part)
+    spec.compiler.fusestatic = spec.compiler.discardvisual = False
+    for mesh in [m for m in spec.meshes if _missing(m, spec, path.parent)]:
+        _leave_out(spec, mesh, path, notes)
+    while True:
+        try:
+            return spec.compile()
+        except (ValueError, mujoco.FatalError) as e:
+            sentence = _sentence(e)
+            mesh = next((m for m in spec.meshes if _blamed(m, sentence)), None)
+            if mesh is None:
+                raise RobotError(
+                    f"{path.name}: MuJoCo cannot read this MJCF file: {sentence}"
+                ) from e
+            _leave_out(spec, mesh, path, notes)
+
+
+def _missing(mesh: mujoco.MjsMesh, spec: mujoco.MjSpec, folder: Path) -> bool:
+    """Whether the file of a mesh is a pointer that Git LFS has not replaced."""
+    if not mesh.file:
+        return False
+    places = (folder / spec.compiler.meshdir / mesh.file, folder / mesh.file)
+    found = next((file for file in places if file.is_file()), None)
+    if found is None:
+        return False
+    with found.open("rb") as file:
+        return file.read(len(POINTER)) == POINTER
+
+
+def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
+    """Whether MuJoCo complains of the file of a mesh."""
+    opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
+    reading = re.search(r"decoder|\b(STL|OBJ|MSH) file", sentence)
+    return bool(mesh.file) and (opening or bool(reading and Path(mesh.file).name in sentence))
+
+
+def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: list[str]) -> None:
+    """Delete a mesh that is not there, and the geoms that show it; refused if they weigh."""
+    geoms = [g for g in spec.geoms if g.meshname == mesh.name]
+    low, high = spec.compiler.inertiagrouprange
+    always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    for geom in geoms:
+        weighs = geom.mass > 0 if np.isfinite(geom.mass) else geom.density > 0
+        counts = always or not geom.parent.explicitinertial
+        if weighs and counts and low <= geom.group <= high and geom.parent.name != "world":
+            raise RobotError(
+                f"{path.name}: body {geom.parent.name!r}: its mass and inertia are those of the "
+                f"mesh {mesh.file!r}, which is not there or cannot be read; put it into "
+                f"{str(path.parent / spec.compiler.meshdir)!r}, or give the body an <inertial>"
+            )
+    names = {g.name for g in geoms if g.name}
+    pairs = [pair for pair in spec.pairs if {pair.geomname1, pair.geomname2} & names]
+    bodies = sorted({repr(g.parent.name) for g in geoms})
+    for part in [*pairs, *geoms, mesh]:
+        spec.delete(part)
+    where = f" of {listed(bodies)}" if bodies else ""
+    notes.append(f"the mesh {mesh.file!r}{where} is not there or cannot be read: left out")
+
+
+def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
+    """The body at the world that carries the robot: the one with the most hinges."""
+    tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
+    hinges = {top: 0 for top in tops}
+    for body, kind in zip(model.jnt_bodyid, model.jnt_type, strict=True):
+        if model.body_parentid[body] and kind in (JOINT.mjJNT_HINGE, JOINT.mjJNT_BALL):
+            hinges[model.body_rootid[body]] += 1
+    most = max(hinges.values(), default=0)
+    robots = [top for top in tops if hinges[top] == most]
+    names = listed([repr(model.body(top).name) for top in robots])
+    if not most:
+        raise RobotError(f"{where}: no body hangs on another by a hinge; a robot needs legs")
+    if len(robots) > 1:
         raise RobotError(
-            f"{path.name}: MuJoCo cannot read this MJCF file: {str(e).strip().splitlines()[0]}"
-        ) from e
-    robot = ET.Element("robot", name=path.stem)
-    for i in range(1, model.nbody):
-        _body(robot, model, i)
-    return ET.tostring(robot, encoding="unicode")
+            f"{where}: the bodies {names} of the world have {most} hinges each below them, "
+            f"{len(robots)} robots; take out all but one"
+        )
+    others = [repr(model.body(top).name or f"body_{top}") for top in tops if top not in robots]
+    if others:
+        notes.append(f"other bodies of the scene are left out: {listed(others)}")
+    return robots[0]
 
 
+# torques
+# --------------------------------------------------------------------------------------------------
+def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
+    """Least and greatest force (2,) of an actuator, before its gear; infinite if nothing says."""
+    ends = np.array([-np.inf, np.inf])
+    if model.actuator_forcelimited[a]:
+        ends = model.actuator_forcerange[a].copy()
+    fixed = model.actuator_gaintype[a] == GAIN.mjGAIN_FIXED
+    if fixed and model.actuator_biastype[a] == BIAS.mjBIAS_NONE:
+        if model.actuator_dyntype[a] in PLAIN and model.actuator_ctrllimited[a]:
+            given = model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a]
+            ends = np.clip(np.sort(given), *ends)
+        elif model.actuator_actlimited[a]:
+            given = model.actuator_gainprm[a, 0] * model.actuator_actrange[a]
+            ends = np.clip(np.sort(given), *ends)
+    return ends
+
+
+class _Motors:
+    """What the actuators of a model do for its degrees of freedom (nv)."""
+
+    def __init__(self, model: mujoco.MjModel):
+        self.torque = np.zeros((model.nv, 2))  # least, greatest [N m]
+        self.driven = np.zeros(model.nv, bool)
+        # by a tendon or a site, whose lever changes: its torque is not known
+        self.pulled = np.zeros(model.nv, bool)
+        self.armature = model.dof_armature.copy()
+        self.damping = model.dof_damping.copy()
+        self.others = []  # actuators that are not counted
+        for a in range(model.nu):
+            self._add(model, a)
+        for k in np.flatnonzero(model.jnt_actfrclimited):
+            dof = model.jnt_dofadr[k]
+            given = self.torque[dof] if self.driven[dof] else [-np.inf, np.inf]
+            self.torque[dof] = np.clip(given, *model.jnt_actfrcrange[k])
+            self.driven[dof] = True
+
+    def _add(self, model: mujoco.MjModel, a: int) -> None:
+        kind = model.actuator_trntype[a]
+        k = model.actuator_trnid[a, 0]
+        if kind not in ON_JOINT:
+            self.others.append(model.actuator(a).name or f"actuator_{a}")
+            if kind == TRANSMISSION.mjTRN_TENDON:
+                first = model.tendon_adr[k]
+                parts = range(first, first + model.tendon_num[k])
+                fixed = model.wrap_type[first] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+                joints = [model.wrap_objid[i] for i in parts] if fixed else range(model.njnt)
+                self.pulled[model.jnt_dofadr[np.array(joints, int)]] = True
+            elif kind != TRANSMISSION.mjTRN_BODY:
+                self.pulled[:] = True
+            return
+        dof = model.jnt_dofadr[k]
+        count = 3 if model.jnt_type[k] == JOINT.mjJNT_BALL else 1
+        for i, gear in enumerate(model.actuator_gear[a, :count]):
+            if gear:
+                self.torque[dof + i] += np.sort(gear * _force(model, a))
+                self.driven[dof + i] = True
+                self.armature[dof + i] += gear**2 * model.actuator_armature[a]
+                self.damping[dof + i] += gear**2 * model.actuator_damping[a]
+
+    def effort(self, dof: int) -> float | None:
+        """The torque that a joint has both ways [N m], the weaker way; None if nothing says."""
+        if not self.driven[dof]:
+            return None if self.pulled[dof] or not (self.driven.any() or self.others) else 0.0
+        weaker = min(-self.torque[dof, 0], self.torque[dof, 1])
+        return float(max(weaker, 0.0)) if np.isfinite(weaker) else None
+
+
+# writing
+# --------------------------------------------------------------------------------------------------
 def _place(position: np.ndarray, quaternion: np.ndarray) -> pin.SE3:
     return pin.XYZQUATToSE3(np.concatenate([position, np.roll(quaternion, -1)]))
 
 
-def _body(robot: ET.Element, model: mujoco.MjModel, i: int) -> None:
-    """A body's link and the joints above it, with links without mass between several."""
-    name, above = (model.body(k).name or f"body_{k}" for k in (i, model.body_parentid[i]))
-    place = _place(model.body_pos[i], model.body_quat[i])
-    for k in np.flatnonzero(model.jnt_bodyid == i):
-        # a free base; a ball has no motor of its own
-        if (kind := KINDS.get(int(model.jnt_type[k]))) is None:
-            continue
+class _Writer:
+    """The bodies of one robot of a model, as elements of a description."""
+
+    def __init__(self, model: mujoco.MjModel, root: int, xml: ET.Element, notes: list[str]):
+        self.model = model
+        self.root = root
+        self.xml = xml
+        self.notes = notes
+        self.motors = _Motors(model)
+        self.bodies = [i for i in range(1, model.nbody) if model.body_rootid[i] == root]
+        self.names = {i: model.body(i).name or f"body_{i}" for i in self.bodies}
+        self.joints = {}  # number of a joint -> names that it has got
+        paired = {*model.pair_geom1, *model.pair_geom2}
+        self.touching = [
+            bool(model.geom_contype[g] | model.geom_conaffinity[g]) or g in paired
+            for g in range(model.ngeom)
+        ]
+
+    def add_body(self, i: int) -> None:
+        """A body's link and the joints above it, with links without mass between several."""
+        model = self.model
+        name = self.names[i]
+        joints = [int(k) for k in np.flatnonzero(model.jnt_bodyid == i)]
+        if i == self.root:
+            if base := [k for k in joints if model.jnt_type[k] != JOINT.mjJNT_FREE]:
+                self.notes.append(
+                    f"the joints {self._joints(base)} join the body {name!r} to the world: left "
+                    f"out, it moves freely"
+                )
+        else:
+            above = self.names[model.body_parentid[i]]
+            place = _place(model.body_pos[i], model.body_quat[i])
+            for k in joints:
+                above, place = self._add_joint(k, above, place, name, k == joints[-1])
+            if above != name:
+                add_joint(self.xml, f"{name}_fixed", "fixed", (above, name), place)
+        middle = _place(model.body_ipos[i], model.body_iquat[i])
+        inertia = pin.Inertia(model.body_mass[i], np.zeros(3), np.diag(model.body_inertia[i]))
+        link = add_link(self.xml, name, middle.act(inertia))
+        for g in np.flatnonzero(model.geom_bodyid == i):
+            if model.geom_type[g] != GEOM.mjGEOM_PLANE:
+                self._add_shape(link, int(g))
+
+    def _add_joint(
+        self, k: int, above: str, place: pin.SE3, body: str, last: bool
+    ) -> tuple[str, pin.SE3]:
+        """A joint, or the three of a ball; the link that it moves, and the place of the body or
+        of the next joint in it.
+        """
+        model = self.model
+        name = model.joint(k).name or f"{body}_joint_{k}"
+        kind = model.jnt_type[k]
         anchor = pin.SE3(np.eye(3), np.array(model.jnt_pos[k]))
-        child = f"{name}_{model.joint(k).name or k}"
-        add(robot, "link", name=child)
-        joint = model.joint(k).name or f"joint_{k}"
-        limits = _limits(model, k)
-        add_joint(robot, joint, kind, (above, child), place * anchor, model.jnt_axis[k], limits)
-        above = child
-        place = anchor.inverse()
-    if above != "world":
-        add_joint(robot, f"{name}_fixed", "fixed", (above, name), place)
-    middle = _place(model.body_ipos[i], model.body_iquat[i])
-    inertia = pin.Inertia(model.body_mass[i], np.zeros(3), np.diag(model.body_inertia[i]))
-    link = add_link(robot, name, middle.act(inertia))
-    for g in np.flatnonzero(model.geom_bodyid == i):
-        if model.geom_contype[g] | model.geom_conaffinity[g] and model.geom_type[g] != PLANE:
-            middle, half = model.geom_aabb[g].reshape(2, 3)
-            place = _place(model.geom_pos[g], model.geom_quat[g])
-            add_boxes(link, "collision", [(middle, np.maximum(2 * half, 1e-6))], place)
+        ball = kind == JOINT.mjJNT_BALL
+        if ball:
+            self.notes.append(f"the ball joint {name!r} is taken as hinges about x, y and z")
+        self.joints[k] = [f"{name}_{axis}" for axis in "xyz"] if ball else [name]
+        axes = np.eye(3) if ball else model.jnt_axis[k][None]
+        place = place * anchor
+        for n, joint in enumerate(self.joints[k]):
+            end = last and n == len(axes) - 1 and not np.any(model.jnt_pos[k])
+            child = body if end else self._between(f"{body}_{joint}")
+            moving = "prismatic" if kind == JOINT.mjJNT_SLIDE else "revolute"
+            limits, losses = self._limits(k, n)
+            element = add_joint(self.xml, joint, moving, (above, child), place, axes[n], limits)
+            add(element, "dynamics", **losses)
+            above = child
+            place = HERE
+        return above, anchor.inverse()
 
+    def _ref(self, k: int) -> float:
+        """Where a joint counts from [rad, m]: there bodies are as the file places them."""
+        hinge = self.model.jnt_type[k] in (JOINT.mjJNT_HINGE, JOINT.mjJNT_SLIDE)
+        return float(self.model.qpos0[self.model.jnt_qposadr[k]]) if hinge else 0.0
 
-def _limits(model: mujoco.MjModel, k: int) -> dict[str, float]:
-    """A joint's range, and the torque of the joint or of the motor that drives it."""
-    limits = {}
-    if model.jnt_limited[k]:
-        limits |= zip(("lower", "upper"), model.jnt_range[k], strict=True)
-    if model.jnt_actfrclimited[k]:
-        return limits | {"effort": model.jnt_actfrcrange[k, 1]}
-    for a in np.flatnonzero(model.actuator_trnid[:, 0] == k):
-        gear = abs(model.actuator_gear[a, 0])
-        if model.actuator_forcelimited[a]:
-            limits["effort"] = gear * model.actuator_forcerange[a, 1]
-        elif model.actuator_ctrllimited[a] and not model.actuator_biastype[a]:  # a motor
-            limits["effort"] = gear * model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a, 1]
-    return limits
+    def _between(self, name: str) -> str:
+        """A link without mass, of a name that no body has; its name."""
+        while name in self.names.values():
+            name += "_"
+        add(self.xml, "link", name=name, between="joints")
+        return name
+
+    def _limits(self, k: int, n: int) -> tuple[dict[str, float], dict[str, float]]:
+        """Range and torque of the ``n``-th degree of freedom of a joint; armature and losses."""
+        model = self.model
+        dof = model.jnt_dofadr[k] + n
+        limits = {}
+        if model.jnt_limited[k]:
+            low, high = model.jnt_range[k]
+            ball = model.jnt_type[k] == JOINT.mjJNT_BALL
+            limits = {"lower": -high if ball else low - self._ref(k), "upper": high - self._ref(k)}
+        if (effort := self.motors.effort(dof)) is not None:
+            limits["effort"] = effort
+        losses = {
+            "armature": self.motors.armature[dof],
+            "friction": model.dof_frictionloss[dof],
+            "damping": self.motors.damping[dof],
+        }
+        return limits, losses
+
+    def _add_shape(self, link: ET.Element, g: int) -> None:
+        """A geom as a shape of a URDF; a mesh by the corners of its hull, others by a box."""
+        model = self.model
+        shape = add(link, "collision" if self.touching[g] else "visual")
+        place = _place(model.geom_pos[g], model.geom_quat[g])
+        radius, half, _ = model.geom_size[g]
+        kind = model.geom_type[g]
+        hull = model.mesh_graphadr[model.geom_dataid[g]] if kind == GEOM.mjGEOM_MESH else -1
+        if kind == GEOM.mjGEOM_SPHERE:
+            tag, sizes = "sphere", {"radius": radius}
+        elif kind in (GEOM.mjGEOM_CAPSULE, GEOM.mjGEOM_CYLINDER):
+            tag = "capsule" if kind == GEOM.mjGEOM_CAPSULE else "cylinder"
+            sizes = {"radius": radius, "length": 2 * half}
+        elif hull >= 0:
+            count = model.mesh_graph[hull]
+            rows = model.mesh_graph[hull + 2 + count : hull + 2 + 2 * count]
+            first = model.mesh_vertadr[model.geom_dataid[g]]
+            tag, sizes = "mesh", {"vertex": model.mesh_vert[first + rows].astype(float).ravel()}
+        else:
+            middle, half_sizes = model.geom_aabb[g].reshape(2, 3)
+            place = place * pin.SE3(np.eye(3), np.array(middle))
+            tag, sizes = "box", {"size": np.maximum(2 * half_sizes, 1e-6)}
+        add_origin(shape, place)
+        add(add(shape, "geometry"), tag, **sizes)
+
+    # what is between joints, and what is left out
+    # ----------------------------------------------------------------------------------------------
+    def _joints(self, numbers: Iterable[int]) -> str:
+        names = [repr(self.model.joint(int(k)).name or f"joint_{k}") for k in numbers]
+        return listed(names)
+
+    def add_equalities(self) -> None:
+        """Joints that follow others, as mimics; loops are named."""
+        model = self.model
+        for e in np.flatnonzero(model.eq_active0):
+            one, other = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            kind = model.eq_type[e]
+            name = f"the equality {model.equality(e).name or int(e)!r}"
+            if kind == EQUALITY.mjEQ_JOINT:
+                if one in self.joints:
+                    self._follow(name, one, other, model.eq_data[e, :5])
+            elif kind in (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD):
+                sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
+                ends = [int(model.site_bodyid[x]) if sites else x for x in (one, other)]
+                loop = self._loop(*ends)
+                if loop is None:
+                    continue
+                closes = f"closes a loop of the joints {self._joints(loop)}"
+                ties = "ties the robot to the world or to another body"
+                self.notes.append(
+                    f"{name} {closes if min(ends) and loop else ties}: left out, the joints move "
+                    f"as if it were cut"
+                )
+            else:
+                self.notes.append(f"{name} of tendons or flexes is left out")
+
+    def _loop(self, one: int, other: int) -> list[int] | None:
+        """Joints between two bodies, one of which is the robot's; None if neither is."""
+        model = self.model
+        if not {one, other} & set(self.bodies):
+            return None
+        ways = []
+        for body in (one, other):
+            way = []
+            while body:
+                way.append(body)
+                body = int(model.body_parentid[body])
+            ways.append(way)
+        apart = set(ways[0]) ^ set(ways[1])
+        return [k for k in self.joints if model.jnt_bodyid[k] in apart]
+
+    def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
+        """The mimic of a joint that follows another, the one with a motor, along a line."""
+        model = self.model
+        offset, factor = curve[:2]  # from where both joints count
+        named = self._joints(k for k in (one, other) if k >= 0)
+        if np.any(curve[2:]) or (other >= 0 and not factor):
+            self.notes.append(f"{name} couples the joints {named} along a curve: left out")
+            return
+        driven = self.motors.driven[model.jnt_dofadr]
+        if other >= 0 and driven[one] and not driven[other]:
+            one, other = other, one
+            factor, offset = 1 / factor, -offset / factor
+        follower = next(j for j in self.xml.iter("joint") if j.get("name") == self.joints[one][0])
+        if other < 0:
+            limit = follower.find("limit")
+            limit.attrib |= {"effort": "0", "lower": f"{offset:.12g}", "upper": f"{offset:.12g}"}
+            self.notes.append(f"{name} holds the joint {named} at {offset:.3g}")
+        elif other in self.joints:
+            leader = self.joints[other][0]
+            add(follower, "mimic", joint=leader, multiplier=factor, offset=offset)
+
+    def note_what_is_left_out(self) -> None:
+        """Springs, tendons, and actuators that act on no joint."""
+        model = self.model
+        if counted := [k for k in self.joints if self._ref(k)]:
+            self.notes.append(f"the joints {self._joints(counted)} count from their ref, as 0")
+        springs = [k for k in self.joints if model.jnt_stiffness[k]]
+        if springs:
+            self.notes.append(f"the springs of the joints {self._joints(springs)} are left out")
+        tendons = [repr(model.tendon(t).name or t) for t in range(model.ntendon)]
+        if tendons:
+            self.notes.append(f"the tendons {listed(tendons)} are left out")
+        if self.motors.others:
+            names = listed([repr(name) for name in self.motors.others])
+            self.notes.append(f"the actuators {names} act on no joint: their torque is not counted")

@@ -7,6 +7,7 @@ Which joint is which is found from how it moves its links, never from its name.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, takewhile
 from pathlib import Path
@@ -16,9 +17,10 @@ import numpy as np
 
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.checks import MOST_RAD_S
+from jumplab.robot_import.checks import MOST_RAD, MOST_RAD_S, keys_of, wrong_limits
+from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
-from jumplab.robot_import.write import filled, quote
+from jumplab.robot_import.write import filled, key, listed, quote
 
 # None of these numbers is printed by the paper.
 SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
@@ -26,8 +28,14 @@ SWINGS = 0.6  # cosine: joints canted by up to 53 deg swing a leg
 PARALLEL = 0.999
 # share of the robot's height within which the ankles are above the lowest joint: arms end higher
 LOWEST = 0.15
-# a knee whose range is as even as this says nothing of where the robot faces: its feet do
+# a range as even as this says nothing of where the robot faces
 EVEN_RAD = 0.3
+# nor do feet that reach less farther ahead than behind, as a share of the leg's length
+EVEN_FEET = 0.02
+FRAME_VOTE = 0.5  # of the root's x, which is ahead by custom; a range has 1, the feet up to 2
+SHORTEST_LEG = 0.15  # share of the robot's height: shorter ones are fingers
+TOES = 0.25  # of a shank: joints farther beyond the ankle are of the toes
+FOOT_LIKE = 0.6  # a pitch joint this near the one before it, in shanks, is of the toes
 SAME_M = 0.02  # how far from mirror images two limbs may stand
 # ranges of joints that turn without stops, or whose stops nobody told: a person's, nearly
 ASSUMED_RAD = {
@@ -39,12 +47,6 @@ ASSUMED_RAD = {
 }
 BACKWARD_M = 0.01  # feet whose middle is this far behind the ankle seem to be put on backwards
 STEEP = 0.9  # cosine between the leg, hip to ankle, and the vertical
-SMALLEST_M = 0.03  # a shape shorter than this is a marker, no sole
-# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to
-# ankle
-GUESS_X = (-0.143, 0.2)
-GUESS_Y = (-0.071, 0.071)
-GUESS_Z = -0.107
 STANCE_KNEE_RAD = 0.5  # as the default robot stands
 STANCE_TRUNK_RAD = 0.05
 STANCE_ROOM_RAD = 0.15  # from the joint stops
@@ -119,7 +121,10 @@ class _Finder:
         for a, b in combinations(chains, 2):
             gap = self.at[b[-1].name] - self.at[a[-1].name]
             side = float(gap @ self.lateral)
-            mirrored = abs(side) >= SAME_M >= np.linalg.norm(gap - side * self.lateral)
+            axis = self.axis[b[-1].name]  # an origin may lie anywhere on its axis
+            across = gap - side * self.lateral
+            across = across - (across @ axis) * axis
+            mirrored = abs(side) >= SAME_M >= np.linalg.norm(across)
             shared = sum(x is y for x, y in zip(a, b, strict=False))
             if mirrored and shared < len(a) == len(b):
                 pair = (a[shared:], b[shared:])
@@ -136,16 +141,32 @@ class _Finder:
 
     def triple(self, chain: Chain) -> tuple[Joint, ...]:
         """Hip, knee, ankle: the three pitch joints with the longest shorter segment between them,
-        canted ones last; () if there are none.
+        canted ones last, before any of the toes; () if there are none.
         """
+        pitch = self.pitch(chain)
 
         def shorter(three: tuple[Joint, ...]) -> float:
             flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(self.lateral))
             turning = np.prod([self.turning(j) for j in three])
             return turning * min(np.linalg.norm(np.diff(flat, axis=0), axis=1))
 
-        best = max(combinations(self.pitch(chain), 3), key=shorter, default=())
-        return best if best and shorter(best) > 1e-3 else ()
+        best = max(combinations(pitch, 3), key=shorter, default=())
+        if not best or shorter(best) <= 1e-3:
+            return ()
+        hip, knee, ankle = best
+        at = self.at
+        for joint in pitch[pitch.index(knee) + 1 : pitch.index(ankle)]:
+            shank = np.linalg.norm(at[joint.name] - at[knee.name])
+            foot = at[ankle.name] - at[joint.name]
+            flat = abs(foot @ self.up) < np.linalg.norm(foot - (foot @ self.up) * self.up)
+            if flat and 0 < np.linalg.norm(foot) < FOOT_LIKE * shank:
+                return hip, knee, joint
+        return best
+
+    def leg_m(self) -> float:
+        """Length of a leg from hip to ankle [m]."""
+        hip, _, ankle = (self.at[joint.name] for joint in self.legs[0][0])
+        return float(np.linalg.norm(hip - ankle))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
         """True if the leg hangs (from hip to ankle), and ends where the robot does."""
@@ -153,7 +174,9 @@ class _Finder:
             return False
         hip, _, ankle = (self.at[joint.name] for joint in three)
         heights = np.array([*self.at.values()]) @ self.up
-        low = ankle @ self.up < heights.min() + LOWEST * np.ptp(heights)
+        tall = np.ptp(heights)
+        low = ankle @ self.up < heights.min() + LOWEST * tall
+        low = low and np.linalg.norm(hip - ankle) > SHORTEST_LEG * tall
         return low and (hip - ankle) @ self.up > STEEP * np.linalg.norm(hip - ankle)
 
     def _legs(self) -> list[tuple[tuple[Joint, ...], Chain]]:
@@ -164,8 +187,14 @@ class _Finder:
 
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
-        beyond = chain[chain.index(three[2]) + 1 :]
-        still = takewhile(lambda joint: self.turning(joint) < SWINGS, beyond)
+        _, knee, ankle = (self.at[joint.name] for joint in three)
+        near = TOES * np.linalg.norm(ankle - knee)
+
+        def of_ankle(joint: Joint) -> bool:
+            close = np.linalg.norm(self.at[joint.name] - ankle) < near
+            return close and self.turning(joint) < SWINGS
+
+        still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
         return [three[2], *still][-1].child
 
     def ahead(self, forward: np.ndarray) -> float:
@@ -176,24 +205,72 @@ class _Finder:
         for three, chain in self.legs:
             foot = self.foot(three, chain)
             axes = np.stack([forward, np.cross(self.up, forward), self.up])
-            x = self.tree.sole(foot, axes)[:, 0]
+            _, around = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
+            x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
             away = (self.tree.pose[foot].translation - self.at[three[2].name]) @ forward
             out.append(float((np.max(x) + np.min(x)) / 2 + away))
         return max(out)
 
-    def shoulders(self, notes: list[str]) -> tuple[Joint, ...]:
-        """The first pitch joints of the heaviest mirrored pair of limbs that are no legs, on the
-        side of the lateral axis last; or () with a note.
+    def middle(self, joints: Sequence[Joint], left: np.ndarray) -> float:
+        """Where the joints' ranges have their middle about ``left`` (3,), -1, 0 or 1: 0 if that
+        is near 0, or if they have no range.
+        """
+        sums = []
+        for joint in joints:
+            low, high = (joint.limits.get(end, 0.0) for end in ("lower", "upper"))
+            real = max(abs(low), abs(high)) <= MOST_RAD
+            sums.append((low + high) * np.sign(self.axis[joint.name] @ left) * real)
+        mean = float(np.mean(sums)) if sums else 0.0
+        return float(np.sign(mean)) * (abs(mean) >= EVEN_RAD)
+
+    def leftward(self, notes: list[str]) -> np.ndarray:
+        """The axis (3,) to the robot's left: knees bend backwards; those that say nothing leave it
+        to the feet, to what hips and arms swing to, and to the root's frame.
+        """
+        hips, knees, _ = zip(*(three for three, _ in self.legs), strict=True)
+        left = self.lateral
+        bent = self.middle(knees, left)
+        if bent:
+            return left * bent
+        ahead = np.cross(left, self.up)
+        feet = self.ahead(ahead) / self.leg_m()
+        feet = feet if abs(feet) > EVEN_FEET else 0.0
+        arms = [joint for chain in self.arms() for joint in self.pitch(chain)]
+        votes = {
+            "the feet": 2 * np.clip(feet / (3 * EVEN_FEET), -1, 1),
+            "the hips' range": -self.middle(hips, left),
+            "the arms' range": -self.middle(arms, left),
+            "the root's x axis": FRAME_VOTE * round(float(ahead @ AXES["+x"])),
+        }
+        total = sum(votes.values())
+        against = [name for name, vote in votes.items() if vote * total < 0]
+        if not feet or against:
+            by = " and ".join(name for name, vote in votes.items() if vote * total > 0)
+            even = "the feet reach as far ahead as behind"
+            notes.append(
+                f"where it faces is a guess, by {by or 'nothing'}: the knees bend both ways, and "
+                f"{', '.join(against) + ' speak against it' if against else even}; if it faces the "
+                f"other way, give [source] facing"
+            )
+        return left if total > 0 else -left
+
+    def arms(self) -> tuple[Chain, ...]:
+        """The heaviest mirrored pair of limbs that are no legs, on the side of the lateral axis
+        last; () without any.
         """
         firsts = {chain[0] for _, chain in self.legs}
         arms = [limb for limb in self.limbs() if not firsts & {chain[0] for chain in limb}]
+        return max(arms, key=lambda limb: self.tree.carried(limb[0][0].child), default=())
+
+    def shoulders(self, notes: list[str]) -> tuple[Joint, ...]:
+        """The first joints of the arms, if they turn about the pitch axis; or () with a note."""
+        arms = self.arms()
         if not arms:
             notes.append("no arms were found: the shoulder is left out")
             return ()
-        heaviest = max(arms, key=lambda limb: self.tree.carried(limb[0][0].child))
-        pair = tuple(chain[0] for chain in heaviest)
+        pair = tuple(chain[0] for chain in arms)
         cosine = min(map(self.turning, pair))
         if cosine > PARALLEL:
             return pair
@@ -208,21 +285,24 @@ def find_roles(tree: Tree) -> Roles:
     """Legs, knees, feet, arms and forward direction; else a :class:`RobotError` says why."""
     finders = (_Finder(tree, guess) for guess in GUESSES)
     finder = next((finder for finder in finders if finder.legs), None) or _explain(tree)
-    knee = finder.legs[0][0][1]
-    middle = knee.limits.get("lower", 0.0) + knee.limits.get("upper", 0.0)
-    left = finder.lateral * np.sign(finder.axis[knee.name] @ finder.lateral)
-    left = left * (np.sign(middle) or 1.0)
-    if abs(middle) < EVEN_RAD and finder.ahead(np.cross(left, finder.up)) < 0:
-        left = -left
+    for three, _ in finder.legs:
+        refuse_wheel(tree, three[2])
+    notes = []
+    left = finder.leftward(notes)
     forward = np.cross(left, finder.up)
     order = slice(None, None, -1 if left @ finder.lateral > 0 else 1)
-    notes = []
     pairs = [*zip(*(three for three, _ in finder.legs), strict=True), finder.shoulders(notes)]
     joints = {
         role: tuple(joint.name for joint in pair[order])
         for role, pair in zip(ROLES, pairs, strict=True)
     }
     feet = tuple(finder.foot(*leg) for leg in finder.legs)[order]
+    toes = [j.name for foot in feet for j in tree.joints.values() if j.driven and tree.on(j, foot)]
+    if toes:
+        named = listed(map(repr, toes))
+        notes.append(
+            f"the joints {named} beyond the ankles are held, their links belong to the sole"
+        )
     if (reach := finder.ahead(forward)) < -BACKWARD_M:
         notes.append(
             f"the feet point backwards ({reach:.3f} m) for a robot whose knees bend backwards; "
@@ -236,10 +316,10 @@ def find_roles(tree: Tree) -> Roles:
     )
     assumed = _assumed(finder, leg_joints(tree, trunk, feet), joints, left)
     for name, limits in assumed.items():
-        values = ", ".join(f"{key} = {value:g}" for key, value in limits.items())
+        values = ", ".join(f"{part} = {value:g}" for part, value in limits.items())
         notes.append(
-            f"joint {name!r}: {values} assumed, the URDF has none that can be meant; correct "
-            f"[limits.{name}]"
+            f"joint {name!r}: {values} assumed, the {tree.format} has none that can be meant; "
+            f"correct [limits.{key(name)}]"
         )
     return Roles(trunk, ahead, above, joints, feet, assumed, tuple(notes))
 
@@ -279,13 +359,25 @@ def _explain(tree: Tree) -> NoReturn:
             if not joint.driven:
                 kind = f"is of type {joint.kind!r}"
                 if joint.limits.get("effort") == 0:
-                    kind = "has effort = 0 N m"
+                    kind = (
+                        "has effort = 0 N m"
+                        if tree.format == "URDF"
+                        else "has no actuator both ways"
+                    )
                 elif joint.mimic:
                     kind = f"mimics {joint.mimic[0]!r}"
                 raise tree.error(
                     f"joint {joint.name!r} {kind}, but has the place of a "
                     f"{role.replace('_', ' ')}, which must be revolute with a range and a motor "
                     f"of its own"
+                )
+    for pair in zip(*(chain for _, chain in legs), strict=True) if legs else ():
+        for still, moving in (pair, pair[::-1]):
+            if moving.driven and not still.driven:
+                kind = f"follows {still.mimic[0]!r}" if still.mimic else "has no motor of its own"
+                raise tree.error(
+                    f"joint {still.name!r} {kind}, while its counterpart {moving.name!r} moves: "
+                    f"both legs must have the same joints"
                 )
     finder = _Finder(tree, GUESSES[0])
     hanging = {chain[-1].name for chain in finder.tips if finder.along(finder.triple(chain))}
@@ -304,53 +396,32 @@ def _explain(tree: Tree) -> NoReturn:
 
 # the first description
 # ------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
-class Sole:
-    """Rectangle along the robot's axes, from the foot link's origin [m], and its source."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    z: float
-    source: str
-
-
-def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
-    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that
-    are at hand.
-
-    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
-    to ankle, a sole is guessed if the link ``foot`` has no shape.
-    """
-    low = tree.sole(foot, turn)
-    if len(low):
-        x, y, z = zip(low.min(axis=0).tolist(), low.max(axis=0).tolist(), strict=True)
-        if min(x[1] - x[0], y[1] - y[0]) > SMALLEST_M:
-            links = [link for link in tree.bodies[tree.carrier[foot]] if len(tree.points(link))]
-            kinds = sorted({shape.tag for link in links for _, shape in tree.shapes(link)})
-            return Sole(x, y, z[0], f"from its {' and '.join(kinds)}")
-    x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
-    source = "GUESSED from the leg's length: the foot has no shape that is at hand"
-    return Sole(x, y, leg_m * GUESS_Z, source)
-
-
 def starter(
     tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()
 ) -> tuple[str, Roles, Sole]:
     """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are
-    written into it.
+    written into it; numbers that it lacks are asked for in comments.
 
     ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person
     allows to be repaired. Raises :class:`RobotError` if the URDF has no two legs.
     """
     roles = find_roles(tree)
+    other = roles.forward.translate(str.maketrans("+-", "-+"))
     turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
     hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
     leg_m = float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]]))
     sole = find_sole(tree, roles.feet[0], turn, leg_m)
     assumed = "".join(
-        f"\n[limits.{quote(joint)}]  # assumed\n"
-        + "".join(f"{key} = {x:g}\n" for key, x in limits.items())
+        f"\n[assumed.{key(joint)}]  # holds where [limits] has no number\n"
+        + "".join(f"{part} = {x:g}\n" for part, x in limits.items())
         for joint, limits in roles.assumed.items()
+    )
+    asked = "".join(
+        f"# [limits.{key(joint)}]\n" + "".join(f"# {part} =\n" for part in keys_of(wrong))
+        for joint in jumping_joints(tree, roles)
+        if (
+            wrong := wrong_limits(tree.joints[joint].element, roles.assumed.get(joint), tree.format)
+        )
     )
     text = filled(
         "starter.toml.in",
@@ -362,12 +433,22 @@ def starter(
         joints="\n".join(f"{role} = {quote(roles.joints[role])}" for role in ROLES),
         feet=quote(roles.feet),
         sole=sole,
+        trunk_link=quote(roles.trunk),
+        other=other,
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
         assumed=assumed,
+        asked=asked
+        and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
     return text, roles, sole
+
+
+def jumping_joints(tree: Tree, roles: Roles) -> list[str]:
+    """Names of the joints that jump: with a role, and the others of the legs."""
+    names = [name for pair in roles.joints.values() for name in pair]
+    return list(dict.fromkeys(names + leg_joints(tree, roles.trunk, roles.feet)))
 
 
 def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) -> float:
@@ -396,21 +477,28 @@ class Draft:
     faults: tuple[str, ...]
 
 
-def draft(path: str | Path, repair: tuple[str, ...] = ()) -> Draft:
-    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`."""
+def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
+    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`.
+
+    ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
+    """
     path = Path(path)
-    tree = urdf_checks.read_tree(read_urdf(path), path.name, path, repair)
+    text = read_urdf(path) if text is None else text
+    tree = urdf_checks.read_tree(text, path.name, path, repair)
     # a short name of letters, digits, - and _
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
-    text, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
-    roles = replace(roles, notes=(*urdf_checks.notes(tree.xml, repair), *roles.notes))
-    names = [name for pair in roles.joints.values() for name in pair]
-    names += leg_joints(tree, roles.trunk, roles.feet)
+    config, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
+    found = (*urdf_checks.notes(tree.xml, repair), *tree.notes)
+    roles = replace(roles, notes=(*found, *roles.notes))
     wrong = [
-        f"{sentence}, or tell it in [limits.{name}] of the configuration"
-        for name in dict.fromkeys(names)
+        sentence
+        for name in jumping_joints(tree, roles)
         for sentence in urdf_checks.limit_faults(
-            tree.joints[name].element, path.name, roles.assumed.get(name)
+            tree.joints[name].element,
+            path.name,
+            roles.assumed.get(name),
+            form=tree.format,
+            table=f"limits.{key(name)}",
         )
     ]
-    return Draft(text, roles, sole, tuple(wrong))
+    return Draft(config, roles, sole, tuple(wrong))

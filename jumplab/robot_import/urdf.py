@@ -12,6 +12,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from importlib import import_module, metadata
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -33,10 +34,15 @@ PACKAGE_FOLDER = "cmeel.prefix/share/example-robot-data/robots"
 ROOTS = {
     "sdf": "an SDF file, not a URDF",
     "mujoco": "a MuJoCo model, not a URDF",
+    "mujocoinclude": "a part of a MuJoCo model; name the file that includes it",
     "COLLADA": "a COLLADA mesh, not a URDF",
     "html": "a web page (HTML), not a URDF",
 }
+# what may stand before the root element
+BEFORE_ROOT = r"\s|\ufeff|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*>"
 LIMITS = ("lower", "upper", "effort", "velocity")
+# of a motor at its joint [kg m^2, N m, N m s/rad]; no URDF has the first
+OWN = ("armature", "friction", "damping")
 SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": {"radius": 1, "length": 1}}
 SIZES["capsule"] = SIZES["cylinder"]
 SHAPES = {
@@ -56,7 +62,8 @@ FRAME_KG = 5e-4  # lighter links are frames, whose tensor nobody measured; it is
 TRIANGLE = 1e-3
 # radius of gyration of the whole robot: a link's tensor that is wrong by less is mended with a note
 LEFTOVER_M = 0.01
-SOLE_M = 0.012  # points this near the lowest one belong to the sole
+ROUND = ("sphere", "capsule", "cylinder")
+MOST_MESH_M = 5.0  # no link is longer: a larger mesh is in millimetres
 # share of the largest second moment that a repaired inertia keeps: a plate, width over thickness 30
 THINNEST = 1e-3
 
@@ -123,21 +130,33 @@ def have_published() -> bool:
 
 
 def read_urdf(path: str | Path) -> str:
-    """The text of a URDF file. Raises :class:`RobotError` if it cannot be one."""
+    """The text of a URDF file, or the description of an MJCF file as one. Raises
+    :class:`RobotError` if it is neither.
+    """
     text = read_text(Path(path))
     # URDFs may hold a <mujoco> of settings
-    first = re.match(r"(?:\s|<\?.*?\?>|<!--.*?-->)*<([\w:]+)", text, re.DOTALL)
+    first = re.match(rf"(?:{BEFORE_ROOT})*<([\w:]+)", text, re.DOTALL)
     if first is None or first[1] != "mujoco":
         return text
-    from jumplab.robot_import.mjcf import as_urdf
+    from jumplab.robot_import.mjcf import as_description
 
-    return as_urdf(Path(path))
+    return as_description(Path(path), _declared_first(text)[0])
+
+
+def _declared_first(text: str) -> tuple[str, bool]:
+    """A text without an XML declaration that is not its first word, and a DOCTYPE that declares
+    nothing; whether there was such a declaration.
+    """
+    late = re.match(r"((?:\s|<!--.*?-->)+)<\?xml\s[^>]*\?>", text, re.DOTALL)
+    text = late[1] + text[late.end() :] if late else text
+    return re.sub(r"<!DOCTYPE\s+(robot|mujoco)[^\[>]*>", "", text, count=1), late is not None
 
 
 def parse(text: str, where: str) -> ET.Element:
     """Root element of a URDF's text; :class:`RobotError` with the fault's place (line, column)."""
     if re.match(r"\s*<(!doctype\s+html|html)", text, re.IGNORECASE):
         raise RobotError(f"{where}: is {ROOTS['html']}; download the raw file")
+    text, late = _declared_first(text)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RobotError(
             f"{where}: declares a DOCTYPE or entities, which can expand without limit; remove them"
@@ -167,6 +186,13 @@ def parse(text: str, where: str) -> ET.Element:
         raise RobotError(
             f"{where}: the root element is <{tag}>, {ROOTS.get(tag, 'a URDF begins with <robot>')}"
         )
+    for element in root.iter():  # of a default namespace
+        element.tag = (
+            str(element.tag).rpartition("}")[2] if "xacro" not in str(element.tag) else element.tag
+        )
+    if late:
+        words = "the XML declaration stands behind a comment or a space, and is passed over"
+        ET.SubElement(root, "note", text=words)
     return root
 
 
@@ -185,11 +211,14 @@ def _place(element: ET.Element) -> pin.SE3:
     origin = element.find("origin")
     if origin is None:
         return HERE
-    xyz, rpy = (numbers(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    # where it matters, the checks have refused what are no numbers
+    given = (numbers(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
+    xyz, rpy = (np.zeros(3) if x is None else x for x in given)
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
 
 
-def _placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
+def placed(place: pin.SE3, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of a frame at ``place``, where that is."""
     return points @ place.rotation.T + place.translation
 
 
@@ -250,6 +279,7 @@ class Joint:
     place: pin.SE3
     axis: np.ndarray  # (3,)
     limits: dict[str, float]  # of LIMITS, those that are finite numbers
+    losses: dict[str, float]  # of OWN, those that the file has and that can be
     mimic: tuple[str, float, float] | None  # leader, multiplier, offset
     driven: bool  # it turns by a motor of its own, between two stops or without
     element: ET.Element = field(repr=False)
@@ -257,10 +287,12 @@ class Joint:
     @classmethod
     def read(cls, e: ET.Element) -> Joint:
         """The joint of an element that has passed the checks."""
-        axis, limit, mimic = (e.find(tag) for tag in ("axis", "limit", "mimic"))
+        axis, limit, mimic, own = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
         values = {key: numbers(limit.get(key), 1) for key in LIMITS} if limit is not None else {}
         limits = {key: float(value[0]) for key, value in values.items() if value is not None}
+        given = {key: numbers(own.get(key), 1) for key in OWN} if own is not None else {}
+        losses = {key: float(x[0]) for key, x in given.items() if x is not None and x[0] > 0}
         driven = e.get("type") in ("revolute", "continuous") and limits.get("effort") != 0
         follows = None
         if mimic is not None:
@@ -269,7 +301,9 @@ class Joint:
             follows = (mimic.get("joint"), factor, offset)
         ends = (e.find(end).get("link") for end in ("parent", "child"))
         axis = direction / max(np.linalg.norm(direction), 1e-12)
-        return cls(e.get("name"), e.get("type"), *ends, _place(e), axis, limits, follows, driven, e)
+        place = _place(e)
+        kind = e.get("type")
+        return cls(e.get("name"), kind, *ends, place, axis, limits, losses, follows, driven, e)
 
 
 class Tree:
@@ -287,7 +321,9 @@ class Tree:
         self, root: ET.Element, where: str, path: Path | None = None, repair_inertia: bool = False
     ):
         self.xml = root
+        self.format = root.get("format", "URDF")
         self.where = where
+        self.notes = []  # on files that were read on the way
         self.path = path
         self.elements = {e.get("name"): e for e in root.findall("link")}
         self.joints = {e.get("name"): Joint.read(e) for e in root.findall("joint")}
@@ -330,11 +366,15 @@ class Tree:
         """Inertia of a link and all fixed to it, in their joint's frame [kg, m, kg m^2]."""
         return self.model.inertias[self.carrier[link]]
 
-    def carried(self, link: str) -> float:
-        """Mass of the body of a link and of all that hangs on it [kg]."""
+    @cached_property
+    def _carried(self) -> list[float]:
         data = self.model.createData()
         pin.computeSubtreeMasses(self.model, data)
-        return data.mass[self.carrier[link]]
+        return list(data.mass)
+
+    def carried(self, link: str) -> float:
+        """Mass of the body of a link and of all that hangs on it [kg]."""
+        return self._carried[self.carrier[link]]
 
     def holding(self, held: Mapping[str, float], moving: Collection[str]) -> pin.Model:
         """Pinocchio's model whose other joints do not move: they are ``held`` [rad, m], else at 0.
@@ -368,53 +408,66 @@ class Tree:
             (_place(e), shape)
             for e in self.elements[link].findall(kind)
             for shape in e.findall("geometry/*")
-            if shape.tag in (*SIZES, "mesh")
+            if shape.tag == "mesh" or faultless(shape)
         ]
 
-    def points(self, link: str) -> np.ndarray:
-        """(n, 3) points of a link, in its frame, whose hull holds its collision shapes."""
+    def points(self, link: str, kind: str = "collision") -> np.ndarray:
+        """(n, 3) points of a link, in its frame, whose hull holds its shapes of a kind."""
         out = [np.zeros((0, 3))]
-        for place, shape in self.shapes(link):
-            if shape.tag != "mesh":
-                out.append(_placed(place, _corners(shape)))
-            elif mesh := self._mesh(shape):
-                out.append(_placed(place, np.array(mesh.vertices())))
+        out += [placed(place, self.corners(shape)) for place, shape in self.shapes(link, kind)]
         return np.concatenate(out)
 
-    def sole(self, foot: str, turn: np.ndarray) -> np.ndarray:
-        """(n, 3) lowest points of a foot from its origin along the axes ``turn`` (3, 3)."""
-        axes = pin.SE3(turn, -turn @ self.pose[foot].translation)
-        parts = self.bodies[self.carrier[foot]]
-        points = [_placed(axes * self.pose[part], self.points(part)) for part in parts]
-        points = np.concatenate(points)
-        return points[points[:, 2] < points[:, 2].min(initial=np.inf) + SOLE_M]
+    def corners(self, shape: ET.Element) -> np.ndarray:
+        """(n, 3) points of a shape, in its own frame [m], none of a mesh that is not there."""
+        if shape.get("vertex"):  # of an MJCF
+            return np.array(shape.get("vertex").split(), float).reshape(-1, 3)
+        if shape.tag != "mesh":
+            return _box_around(shape)
+        mesh = self._mesh(shape)
+        return np.array(mesh.vertices()) if mesh else np.zeros((0, 3))
+
+    def below(self, link: str) -> list[str]:
+        """The links that move with a link, and those that hang on them, with their joints at 0."""
+        carrier = self.carrier[link]
+        hanging = [c for c in self.bodies if c == carrier or carrier in self.model.supports[c]]
+        return [part for c in hanging for part in self.bodies[c]]
+
+    def on(self, joint: Joint, link: str) -> bool:
+        """Whether a joint hangs on a link, or on what that carries."""
+        return joint.parent in self.below(link)
 
     def meshes(self, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
         """Points (n, 3) in a link's frame, triangles (m, 3) of the meshes that are found."""
         out = []
         for place, shape in self.shapes(link, "visual"):
-            mesh = self._mesh(shape) if shape.tag == "mesh" else None
+            mesh = self._mesh(shape) if shape.get("filename") else None
             if mesh and mesh.num_tris:
                 corners = map(mesh.tri_indices, range(mesh.num_tris))
                 triangles = np.array([[corner[i] for i in range(3)] for corner in corners])
-                out.append((_placed(place, np.array(mesh.vertices())), triangles))
+                out.append((placed(place, np.array(mesh.vertices())), triangles))
         return out
 
     def _mesh(self, shape: ET.Element) -> coal.BVHModelBase | None:
         """A mesh from beside the URDF or above it; None if it is not there, or cannot be read."""
-        inside = shape.get("filename").split("://", 1)[-1].lstrip("/")
+        inside = shape.get("filename", "").split("://", 1)[-1].lstrip("/")
         packages = filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))
         folders = [*(self.path.resolve().parents if self.path else ()), *map(Path, packages)]
         names = (inside, inside.split("/", 1)[-1])
-        for file in (folder / name for folder in folders for name in names):
-            if file.is_file():
-                scale = numbers(shape.get("scale", "1 1 1"), 3)
-                try:
-                    return coal.MeshLoader(coal.BV_AABB).load(str(file), scale)
-                # a pointer to a mesh that was not downloaded, or a format of its own
-                except (RuntimeError, ValueError):
-                    return None
-        return None
+        file = next((f / name for f in folders for name in names if (f / name).is_file()), None)
+        if file is None:
+            return None
+        scale = numbers(shape.get("scale", "1 1 1"), 3)
+        loader = coal.MeshLoader(coal.BV_AABB)
+        try:
+            mesh = loader.load(str(file), scale)
+            if np.abs(mesh.vertices()).max(initial=0.0) > MOST_MESH_M:
+                note = f"the mesh {inside!r} is taken in millimetres"
+                self.notes += [note] if note not in self.notes else []
+                mesh = loader.load(str(file), scale / 1000)
+            return mesh
+        # a pointer to a mesh that was not downloaded, or a format of its own
+        except (RuntimeError, ValueError):
+            return None
 
 
 def links_of(model: pin.Model) -> dict[str, int]:
@@ -430,7 +483,13 @@ def link_poses(model: pin.Model) -> dict[str, pin.SE3]:
     return {name: data.oMf[i].copy() for name, i in links_of(model).items()}
 
 
-def _corners(shape: ET.Element) -> np.ndarray:
+def faultless(shape: ET.Element) -> bool:
+    """Whether a shape is known, and its sizes are positive numbers."""
+    sizes = [numbers(shape.get(key), count) for key, count in SIZES.get(shape.tag, {}).items()]
+    return bool(sizes) and all(x is not None and np.all(x >= 0) for x in sizes)
+
+
+def _box_around(shape: ET.Element) -> np.ndarray:
     """(8, 3) corners of the box around a shape, in its own frame [m]."""
     sizes = (numbers(shape.get(key), count) for key, count in SIZES[shape.tag].items())
     geometry = SHAPES[shape.tag](*np.concatenate([*sizes]))

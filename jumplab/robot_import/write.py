@@ -5,6 +5,7 @@ templates of this folder.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
+MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
 
 
@@ -37,7 +39,7 @@ def add_joint(
     place: pin.SE3 | None = None,
     axis: np.ndarray | None = None,
     limits: Mapping[str, float] | None = None,
-) -> None:
+) -> ET.Element:
     """A joint between two links, ``place`` of the child in the parent; if it moves, its
     ``axis`` (3,) and limits [rad, N m, rad/s].
     """
@@ -49,6 +51,7 @@ def add_joint(
     if axis is not None:
         add(joint, "axis", xyz=axis)
         add(joint, "limit", **limits)
+    return joint
 
 
 def add_link(robot: ET.Element, name: str, inertia: pin.Inertia) -> ET.Element:
@@ -84,6 +87,18 @@ def filled(template: str, **values: Any) -> str:
 def quote(value: Any) -> str:
     """A text or an array of texts, the same in TOML as in JSON."""
     return json.dumps(value, ensure_ascii=False)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a sentence, the first of many."""
+    names = list(names)
+    more = len(names) - MOST_NAMES
+    return ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def key(name: str) -> str:
+    """A name as a key of a TOML file: bare if it can be."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else quote(name)
 
 
 def rows(values: Mapping[str, float]) -> str:

@@ -73,7 +73,7 @@ def trace(robot: Robot, states: np.ndarray) -> Trace:
     """Joints, feet and CoM at states (N, nq)."""
     model = robot.model
     data = model.createData()
-    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    frames = [model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
     rows = []
     for q in states:
         com = pin.centerOfMass(model, data, q).copy()
@@ -116,7 +116,7 @@ def _published(robot: Robot) -> tuple[list[Part], list[str]]:
     parts = []
     for link, body in jumper.lumped.links.items():
         place = jumper.lumped.place(link)
-        joint = robot.model.frames[robot.model.getFrameId(body)].parentJoint
+        joint = robot.model.frames[robot.model.getFrameId(body, pin.FrameType.BODY)].parentJoint
         for points, triangles in jumper.tree.meshes(link):
             moved = points @ place.rotation.T + place.translation
             parts.append(Part(joint, _kind(robot, joint), moved, triangles, True))
@@ -141,7 +141,10 @@ def _coarser(part: Part, cell_m: float) -> Part:
 
 
 def _kind(robot: Robot, joint: int) -> str:
-    frames = [robot.model.frames[robot.model.getFrameId(name)] for name in robot.foot.frames]
+    frames = [
+        robot.model.frames[robot.model.getFrameId(name, pin.FrameType.BODY)]
+        for name in robot.foot.frames
+    ]
     feet = [frame.parentJoint for frame in frames]
     return "trunk" if joint == 1 else "rest" if joint in feet else "limb"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,6 +14,9 @@ from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.engine import Engine, Kept, Presses, inertial
 from jumplab.sim.scene import REACH_M, Contacts
+
+# MuJoCo would write its warnings into a file of the working folder
+mujoco.set_mju_user_warning(logging.getLogger(__name__).info)
 
 
 @dataclass(frozen=True)

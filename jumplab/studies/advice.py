@@ -5,13 +5,12 @@ audited clean.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 from jumplab.auditing import audit
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.io.progress import tell
-from jumplab.ocp.nlp import unexplained
+from jumplab.ocp.nlp import left_s, patience, unexplained
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import USUAL, Planner
 from jumplab.task import JumpTask
@@ -19,54 +18,74 @@ from jumplab.task import JumpTask
 MILDER = 0.6  # of a number that was refused
 BEYOND = 1.4  # times the least distance that a platform takes
 ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is the next
-# so many easier targets are tried, and none is begun after so long [s of CPU time]
+# so many easier targets are tried, and none is begun after so long [s of CPU time], or AFTER_S if
+# the patience for the target itself is spent
 TRIES = 8
 LONGEST_S = 30.0
+AFTER_S = 5.0
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 
 
-def plan_or_advise(planner: Planner, task: JumpTask, method: str = USUAL) -> JumpPlan:
+def plan_or_advise(
+    planner: Planner, task: JumpTask, method: str = USUAL, patience_s: float = math.inf
+) -> JumpPlan:
     """The plan of a target, as :meth:`jumplab.Planner.plan` (by ``method``); a refusal ends with an
     easier target that has a plan.
 
-    Looking for that takes some seconds, so studies of many targets leave it out.
+    Planning ends after ``patience_s`` of processor time [s]. Looking for another target takes some
+    seconds more, so studies of many targets leave it out.
     """
-    try:
-        return planner.plan(task, method)
-    except (InfeasibleError, SolverError) as e:
-        raise advised(e, planner, task, method) from e
+    if not patience_s > 0:
+        raise InputError(f"patience_s must be a positive number of seconds, got {patience_s!r}")
+    with patience(patience_s):
+        try:
+            return planner.plan(task, method)
+        except (InfeasibleError, SolverError) as e:
+            refusal = e
+            spent = left_s() <= 0
+    raise advised(refusal, planner, task, method, patience_s if spent else None) from refusal
 
 
 def advised(
-    refusal: JumplabError, planner: Planner, task: JumpTask, method: str = USUAL
+    refusal: JumplabError,
+    planner: Planner,
+    task: JumpTask,
+    method: str = USUAL,
+    spent_s: float | None = None,
 ) -> JumplabError:
     """The ``refusal`` again (same type, same fields), ending with an easier target that has a clean
-    plan, or saying that none was found.
+    plan, or saying which were tried.
 
-    Each target that is tried is milder than the one before, in one of its numbers.
+    Each target that is tried is milder than the one before, in one of its numbers. ``spent_s`` is
+    the processor time [s] after which planning was given up, if it was.
     """
-    with unexplained():
+    with unexplained(), patience(LONGEST_S if spent_s is None else AFTER_S):
         advice = _advice(refusal, planner, task, method)
+    if spent_s is not None:
+        advice = f"planning was given up after {spent_s:g} s of processor time; {advice}"
     return type(refusal)(f"{refusal}; {advice}", **vars(refusal))
 
 
 def _advice(refusal: JumplabError, planner: Planner, task: JumpTask, method: str) -> str:
-    began = time.process_time()
     # stage 1's limits are not the robot's
     by_steps = method == "three-step" or getattr(refusal, "stage", "") in THREE_STEPS
     if by_steps and _refused(planner, task, "direct") is None:
         return "ask for the method 'direct', which has a plan"
     easier = task
+    tried = []
     for number in range(TRIES):
         easier = _easier(easier, refusal, number)
-        if easier is None or time.process_time() - began > LONGEST_S:
+        if easier is None or left_s() <= 0:
             break
-        tell(f"refused; trying {words(task, easier)}")
+        tried.append(words(task, easier))
+        tell(f"refused; trying {tried[-1]}")
         refusal = _refused(planner, easier, method)
         if refusal is None:
-            return f"ask for {words(task, easier)}, which has a plan"
-    return "none of the easier targets that were tried has a plan either"
+            return f"ask for {tried[-1]}, which has a plan"
+    if not tried:
+        return "no easier target was tried"
+    return f"none of the easier targets that were tried has a plan either: {'; '.join(tried)}"
 
 
 def _refused(planner: Planner, task: JumpTask, method: str) -> JumplabError | None:

@@ -174,7 +174,7 @@ class WholeBodyPlanner:
             patient = explain and program is programs[-1]
             usual = self._starts(program, asked, patient) if starts is None else starts
             for start in usual:
-                if asked.spent_s > program.patience_s:
+                if program.spent(asked):
                     break
                 try:
                     plans.append(self._refined(program, asked, start))
@@ -221,7 +221,7 @@ class WholeBodyPlanner:
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
         for further in REFINED:
-            if best.used <= 1 or asked.spent_s > program.patience_s:
+            if best.used <= 1 or program.spent(asked):
                 break
             program = program if further is SETTLED else program.finer
             try:

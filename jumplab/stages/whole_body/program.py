@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import Shown, SolverError
-from jumplab.ocp.nlp import Nlp, Solution
+from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
 from jumplab.ocp.solution import PhaseSolution
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
@@ -50,7 +50,6 @@ FINER = 1.5  # times as many intervals, where a motion passes limits between the
 # to 40 s
 PATIENCE_S = 60.0
 USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have more time
-LEAST_S = 1.0  # for a solve that begins as the time ends
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -129,10 +128,14 @@ class Program(Shown):
         )
         return replace(self, contacts=replace(self.contacts, phases=phases))
 
-    @property
-    def patience_s(self) -> float:
-        """Processor time [s] after which no other start of a program of this size is tried."""
-        return PATIENCE_S * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+    def left_s(self, asked: Asked) -> float:
+        """Processor time [s] that further attempts of a program of this size may take."""
+        usual = PATIENCE_S * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+        return min(usual - asked.spent_s, left_s())
+
+    def spent(self, asked: Asked) -> bool:
+        """Whether no other start and no finer mesh is tried: there was one, and time is over."""
+        return bool(asked.attempts) and self.left_s(asked) <= 0
 
     def solve(
         self, asked: Asked, start: Start, begin: Beginning | None = None, *, explain: bool = False
@@ -142,8 +145,7 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        left_s = max(LEAST_S, self.patience_s - asked.spent_s)
-        limit = {"max_iter": start.patience, "max_cpu_time": left_s}
+        limit = {"max_iter": start.patience, "max_cpu_time": max(LEAST_S, self.left_s(asked))}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
         began = time.process_time()

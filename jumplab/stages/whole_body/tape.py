@@ -119,7 +119,7 @@ def feet_of(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     model = robot.model
     data = model.createData()
-    frames = [model.getFrameId(name) for name in robot.foot.frames]
+    frames = [model.getFrameId(name, pin.FrameType.BODY) for name in robot.foot.frames]
     origin = np.empty((len(q), len(frames), 3))
     turn = np.empty((len(q), len(frames), 3, 3))
     for k, configuration in enumerate(q):

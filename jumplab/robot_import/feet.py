@@ -1,0 +1,166 @@
+"""What the feet of a robot stand on: soles from the shapes of their links; and legs that end in
+wheels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.robot_import.checks import MOST_RAD
+from jumplab.robot_import.urdf import ROUND, Joint, Tree, numbers, placed
+from jumplab.robot_import.write import listed
+
+# None of these numbers is printed by the paper.
+STANDS = 0.1  # sine: a cylinder that leans by less than 6 deg stands on its end
+# shares of the leg's length: shapes smaller than this are markers or points, no soles; and what is
+# so little above the lowest point belongs to the sole, at most SOLE_M
+SMALLEST = 0.04
+SOLE_SHARE = 0.02
+SOLE_M = 0.012
+# a sole where nothing is known: the default robot's, as shares of the leg's length from hip to
+# ankle
+GUESS_X = (-0.143, 0.2)
+GUESS_Y = (-0.071, 0.071)
+GUESS_Z = -0.107
+SAME_WAY = 0.95  # of a wheel: cosine of its axis, and of its radius what belongs to the rim
+SECTORS = 12  # of the rim, all of which a wheel has
+
+
+@dataclass(frozen=True)
+class Sole:
+    """Rectangle along the robot's axes, from the foot link's origin [m], and its source."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    z: float
+    source: str
+
+
+def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
+    """Sole of the left foot, from whatever shapes its links have: boxes, spheres, or meshes that
+    are at hand.
+
+    ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
+    to ankle, a sole is guessed if the link ``foot`` has no shape.
+    """
+    touching, around = sole_points(tree, foot, turn, thickness(leg_m))
+    if not len(around):
+        x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
+        files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
+        lost = listed(sorted({repr(file) for file in files if file}))
+        source = "GUESSED from the leg's length: the foot has no shape that is at hand"
+        source += f", the mesh {lost} is not there" if lost else ""
+        return Sole(x, y, leg_m * GUESS_Z, source)
+    parts = tree.below(foot)
+    drawn = "visual" if not any(len(tree.points(part)) for part in parts) else "collision"
+    kinds = {shape.tag for part in parts for _, shape in tree.shapes(part, drawn)}
+    source = f"from its {' and '.join(sorted(kinds))}"
+    least = SMALLEST * leg_m
+    if max(np.ptp(touching[:, :2], axis=0)) < least:
+        _, whole = sole_points(tree, foot, turn, np.inf)
+        if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
+            raise tree.error(
+                f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
+                f"point; give it a shape whose lower side is level in that pose, such as a box"
+            )
+        wide = 1e3 * max(np.ptp(around[:, :2], axis=0))
+        raise tree.error(
+            f"the foot {foot!r} touches the ground in a point ({source}, {wide:.0f} mm wide): it "
+            f"has no sole, and jumps are planned for feet that stand flat; give the foot a shape "
+            f"with a level lower side"
+        )
+    ends = []
+    for axis in range(2):
+        points = touching if np.ptp(touching[:, axis]) >= least else around
+        ends.append((float(points[:, axis].min()), float(points[:, axis].max())))
+        source += ", whose round side counts as level" if points is around else ""
+    return Sole(*ends, float(touching[:, 2].min()), source)
+
+
+def thickness(leg_m: float) -> float:
+    """How far above the lowest point of a foot [m] its sole ends."""
+    return min(SOLE_M, SOLE_SHARE * leg_m)
+
+
+def sole_points(
+    tree: Tree, foot: str, turn: np.ndarray, thick_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a foot and its toes at most ``thick_m`` [m] above the lowest, (n, 3) from its
+    origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
+    its shapes, which are farther out where these are round.
+
+    What is drawn counts where nothing collides.
+    """
+    axes = pin.SE3(turn, -turn @ tree.pose[foot].translation)
+    parts = tree.below(foot)
+    touching = np.zeros((0, 3))
+    around = touching
+    for kind in ("collision", "visual"):
+        for part in parts if not len(around) else ():
+            for place, shape in tree.shapes(part, kind):
+                at = axes * tree.pose[part] * place
+                around = np.concatenate([around, placed(at, tree.corners(shape))])
+                touching = np.concatenate([touching, _lowest(tree, shape, at)])
+    level = touching[:, 2].min(initial=np.inf) + thick_m
+    return touching[touching[:, 2] < level], around[around[:, 2] < level]
+
+
+def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
+    """(n, 3) points of a placed shape that may touch level ground: one of a sphere, two of a
+    capsule or of a cylinder that lies, else its corners.
+    """
+    if shape.tag not in ROUND:
+        return placed(place, tree.corners(shape))
+    radius = numbers(shape.get("radius"), 1)[0]
+    length = 0.0 if shape.tag == "sphere" else numbers(shape.get("length"), 1)[0]
+    along = place.rotation[:, 2]
+    down = np.array([0.0, 0.0, -1.0])
+    if shape.tag == "cylinder":
+        down = down - (down @ along) * along
+        if np.linalg.norm(down) < STANDS:
+            return placed(place, tree.corners(shape))
+        down = down / np.linalg.norm(down)
+    ends = np.array([-0.5, 0.5]) if length else np.zeros(1)
+    return place.translation + np.outer(ends * length, along) + radius * down
+
+
+def refuse_wheel(tree: Tree, ankle: Joint) -> None:
+    """Raise if a leg ends in a wheel: a joint without stops whose body is round about it."""
+    stops = [ankle.limits.get(end, np.inf) for end in ("lower", "upper")]
+    if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
+        return
+    place = tree.pose[ankle.child]
+    for part in tree.bodies[tree.carrier[ankle.child]]:
+        for kind in ("collision", "visual"):
+            for at, shape in tree.shapes(part, kind):
+                to_joint = place.inverse() * tree.pose[part] * at
+                if _round(tree, shape, to_joint, ankle.axis):
+                    raise tree.error(
+                        f"the legs end in wheels: joint {ankle.name!r} turns without stops, and "
+                        f"its body {part!r} is round about it; jumps are planned for feet with "
+                        f"soles"
+                    )
+
+
+def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> bool:
+    """Whether a shape, at its ``place`` in the frame of a joint, is round about the joint's axis
+    (3,).
+    """
+    if shape.tag in ROUND:
+        centre = place.translation - (place.translation @ axis) * axis
+        radius = float(shape.get("radius"))
+        along = shape.tag == "sphere" or abs(place.rotation[:, 2] @ axis) > SAME_WAY
+        return along and np.linalg.norm(centre) < radius / 2
+    if shape.tag != "mesh":
+        return False
+    points = tree.corners(shape) @ place.rotation.T + place.translation
+    across = points - np.outer(points @ axis, axis)
+    far = np.linalg.norm(across, axis=1)
+    rim = across[far > SAME_WAY * far.max(initial=0.0)]
+    side = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
+    sectors = np.floor((np.arctan2(*(rim @ side.T).T) + np.pi) / (2 * np.pi) * SECTORS)
+    return len(set(sectors[sectors < SECTORS])) == SECTORS

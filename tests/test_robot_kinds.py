@@ -1,0 +1,388 @@
+"""Kinds of robot files: each is read right, or refused with its true cause. A mini humanoid of 30.8 kg, as URDF and as
+MJCF, with one thing changed.
+"""
+
+import re
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures_robots import refused
+
+from jumplab.robot.files import files_of
+from jumplab.robot_import.checkup import check, examine
+from jumplab.robot_import.roles import draft
+from jumplab.robot_import.urdf import parse, read_urdf
+
+HERE = Path(__file__).parent
+URDF = (HERE / "mini.urdf").read_text()
+MJCF = (HERE / "mini.xml").read_text()
+KNEE = '<motor joint="left_knee" ctrlrange="-160 160"/>'
+PELVIS = '<body name="pelvis" pos="0 0 .75"><freejoint/>'
+BOX = '<collision><origin xyz="0.03 0 -0.05"/><geometry><box size="0.2 0.08 0.03"/></geometry></collision>'
+SOLE = pytest.approx((-0.07, 0.13, -0.065))
+TOLD = "\n".join(f"[limits.{role}]\nvelocity = 20.0" for role in ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch"))
+TOLD += "".join(
+    f"\n[limits.{side}_{name}]\nvelocity = 20.0"
+    for side in ("left", "right")
+    for name in ("hip_roll", "hip_yaw", "ankle_roll")
+)
+
+
+def changed(text: str, *pairs: tuple[str, str]) -> str:
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.fixture
+def put(tmp_path):
+    """Writes a file and gives its path."""
+
+    def write(text: str | bytes, name: str = "mini.urdf") -> Path:
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def told(path: Path) -> "object":
+    """The robot of an MJCF whose speeds are told."""
+    return check(path, draft(path).text + TOLD).robot
+
+
+def limit(path: Path, joint: str, key: str = "effort") -> float | None:
+    element = next(j for j in parse(read_urdf(path), "x").findall("joint") if j.get("name") == joint)
+    text = element.find("limit").get(key)
+    return None if text is None else float(text)
+
+
+def notes(path: Path) -> str:
+    return "\n".join(draft(path).roles.notes)
+
+
+# whatever it is called, and however it is written ----------------------------------------------------------------
+@pytest.mark.parametrize("name", ["a.mjcf", "a.urdf", "A.XML", "noext"])
+@pytest.mark.parametrize("before", ["", "\ufeff", "<!-- a > b <robot> -->\n<?xml version='1.0'?>", "<!DOCTYPE mujoco>"])
+def test_mjcf_is_recognised_by_its_content(put, name, before):
+    path = put(before + MJCF, name)
+    assert files_of(path) == (name, path.parent, None)
+    root = parse(read_urdf(path), name)
+    assert root.get("name") == "mini" and limit(path, "left_knee") == 160
+
+
+@pytest.mark.parametrize("encoding", ["ISO-8859-1", "GB2312", "UTF-16"])
+def test_urdf_in_the_encoding_that_it_declares(put, encoding):
+    head = f'<?xml version="1.0" encoding="{encoding}"?><!-- {"Füße" if encoding[0] == "I" else "机器人"} -->'
+    path = put(URDF.replace('<?xml version="1.0"?>', head).encode(encoding))
+    assert parse(read_urdf(path), "x").get("name") == "mini"
+
+
+def test_other_encodings_are_named(put):
+    path = put(URDF.replace("<robot", "<!-- Füße --><robot").encode("latin-1"))
+    assert "declare its encoding in the first line" in refused(lambda: read_urdf(path))
+    path = put(URDF.replace("?>", ' encoding="klingon"?>', 1))
+    assert "declares the encoding 'klingon', which is unknown" in refused(lambda: read_urdf(path))
+    assert "stands behind a comment" in notes(put("<!-- mine -->\n" + URDF))
+
+
+def test_a_default_namespace_does_no_harm(put):
+    assert draft(put(URDF.replace("<robot", '<robot xmlns="http://a.org"'))).roles.trunk == "pelvis"
+
+
+# MJCF --------------------------------------------------------------------------------------------------------------
+MOTORS = {
+    "gear, negative": (('ctrlrange="-1.6 1.6" gear="-100"',), 160),
+    "two that add": (('ctrlrange="-80 80"', 'ctrlrange="-80 80"'), 160),
+    "one each way": (('ctrlrange="-160 0"', 'ctrlrange="0 160"'), 160),
+    "one way only": (('ctrlrange="0 160"',), 0),
+    "weaker way": (('ctrlrange="-160 160" forcerange="-60 100"',), 60),
+}
+
+
+@pytest.mark.parametrize(("kinds", "effort"), MOTORS.values(), ids=MOTORS)
+def test_torque_of_motors(put, kinds, effort):
+    motors = "".join(f'<motor joint="left_knee" {kind}/>' for kind in kinds)
+    assert limit(put(changed(MJCF, (KNEE, motors)), "a.xml"), "left_knee") == effort
+
+
+def test_servos_tell_no_torque_but_by_their_force_range(put):
+    servo = '<position joint="left_knee" kp="100" ctrlrange="-2 2" {}/>'
+    path = put(changed(MJCF, (KNEE, servo.format(""))), "a.xml")
+    assert limit(path, "left_knee") is None
+    assert any("tell effort, velocity in [limits.left_knee]" in sentence for sentence in draft(path).faults)
+    path = put(changed(MJCF, (KNEE, servo.format('forcerange="-50 80"'))), "a.xml")
+    assert limit(path, "left_knee") == 50
+    frames = ('<joint name="left_knee"', '<joint actuatorfrcrange="-30 40" name="left_knee"')
+    assert limit(put(changed(MJCF, frames), "a.xml"), "left_knee") == 30
+
+
+def test_a_motor_on_a_tendon_is_not_that_of_the_joint_of_its_number(put):
+    motors = "".join(f'<motor name="m{i}" tendon="t" ctrlrange="-7 7"/>' for i in range(5))
+    tendon = '<tendon><fixed name="t"><joint joint="left_elbow" coef="1"/></fixed></tendon>'
+    path = put(changed(MJCF, ("</actuator>", f"{motors}</actuator>{tendon}")), "a.xml")
+    assert limit(path, "left_knee") == 160 and limit(path, "left_elbow") == 30
+    assert "the tendons 't' are left out" in notes(path) and "act on no joint" in notes(path)
+
+
+@pytest.mark.parametrize("base", ["", '<joint name="root" type="free"/>', "planar"])
+def test_however_the_base_moves_it_is_free(put, base):
+    slide = '<joint name="{0}" type="slide" axis="{1}"/>'
+    planar = slide.format("x", "1 0 0") + slide.format("z", "0 0 1") + '<joint name="y" axis="0 1 0"/>'
+    path = put(changed(MJCF, ("<freejoint/>", planar if base == "planar" else base)), "a.xml")
+    assert told(path).total_mass == pytest.approx(30.8)
+    assert ("the joints 'x', 'z', 'y' join the body 'pelvis' to the world" in notes(path)) == (base == "planar")
+
+
+def test_other_things_in_the_scene_are_left_out(put):
+    others = '<geom type="plane" size="5 5 .1"/><body name="ball"><freejoint/><geom size=".1"/></body>'
+    others += '<body name="table"><geom type="box" size=".5 .5 .4"/></body>'
+    path = put(changed(MJCF, (PELVIS, others + PELVIS)), "a.xml")
+    assert told(path).total_mass == pytest.approx(30.8)
+    assert "other bodies of the scene are left out: 'ball', 'table'" in notes(path)
+    twin = re.search(r'<body name="pelvis".*</body>(?=</worldbody>)', MJCF, re.DOTALL)[0].replace('name="', 'name="b_')
+    two = put(changed(MJCF, ("</worldbody>", f"{twin}</worldbody>")), "a.xml")
+    assert "'pelvis', 'b_pelvis' of the world have 16 hinges each below them, 2 robots" in refused(lambda: draft(two))
+
+
+def test_pictures_and_terrain_may_be_missing_and_are_named(put):
+    asset = '<asset><texture name="t" type="2d" file="skin.png"/><material name="m" texture="t"/>'
+    asset += '<hfield name="h" file="land.png" size="5 5 1 .1"/></asset><worldbody><geom type="hfield" hfield="h"/>'
+    path = put(changed(MJCF, ("<worldbody>", asset), ('size=".08', 'material="m" size=".08')), "a.xml")
+    assert "the pictures 'land.png', 'skin.png' are not there" in notes(path)
+
+
+def test_a_mesh_that_is_not_there_costs_a_picture_but_never_mass(put):
+    asset = ("<worldbody>", '<asset><mesh name="m" file="lost.stl"/></asset><worldbody>')
+    inertial = '<inertial pos="0 0 .2" mass="12" diaginertia=".4 .35 .12"/>'
+    shown = ("<freejoint/>", '<freejoint/><geom type="mesh" mesh="m" {}/>')
+    path = put(changed(MJCF, asset, (shown[0], shown[1].format(""))), "a.xml")
+    assert "the mesh 'lost.stl' of 'pelvis' is not there" in notes(path)
+    for weight in ('mass="8"', 'density="600"', ""):
+        path = put(changed(MJCF, asset, (inertial, ""), (shown[0], shown[1].format(weight))), "a.xml")
+        sentence = refused(lambda path=path: draft(path))
+        assert "body 'pelvis': its mass and inertia are those of the mesh 'lost.stl'" in sentence
+
+
+def test_several_hinges_in_one_body(put):
+    text = MJCF
+    for side, y in (("left", "0.09"), ("right", "-0.09")):
+        hinges = re.findall(rf'<joint name="{side}_hip_\w+"[^>]*/>', text)
+        first = rf'<body name="{side}_hip_pitch_link".*?(?=<inertial pos="0 0 -0.13" mass="2.4")'
+        body = f'<body name="{side}_thigh" pos="0 {y} -0.06">{"".join(hinges)}'
+        text = re.sub(first, body, text, count=1, flags=re.DOTALL)
+    text = text.replace("</body></body></body></body></body></body>", "</body></body></body></body>")
+    robot = told(put(text, "a.xml"))
+    assert len(robot.joint_names) == 14 and robot.planar and robot.total_mass == pytest.approx(26.0)
+
+
+def test_balls_are_three_hinges_and_angles_count_from_ref(put):
+    ball = changed(
+        MJCF,
+        ('<joint name="left_elbow" axis="0 1 0" range="-2 0"/>', '<joint name="left_elbow" type="ball" range="0 2"/>'),
+        ('<motor joint="left_elbow" ctrlrange="-30 30"/>', '<motor joint="left_elbow" gear="0 30" ctrlrange="-1 1"/>'),
+    )
+    path = put(ball, "a.xml")
+    assert limit(path, "left_elbow_y") == 30 and limit(path, "left_elbow_x") == 0
+    assert (limit(path, "left_elbow_z", "lower"), limit(path, "left_elbow_z", "upper")) == (-2, 2)
+    ref = MJCF
+    for side in ("left", "right"):
+        knee = f'{side}_knee" axis="0 1 0" range='
+        ref = changed(ref, (f'{knee}"0.0 2.3"', f'{knee}".5 2.8" ref=".5"'))
+    path = put(ref, "a.xml")
+    assert (limit(path, "left_knee", "lower"), limit(path, "left_knee", "upper")) == (0, pytest.approx(2.3))
+    assert told(path).foot.heel == pytest.approx(-0.07)
+
+
+def test_loops_and_couplings_are_named(put):
+    equality = (
+        '<equality><connect name="rod" body1="left_ankle_roll_link" body2="left_knee_link" anchor="0 0 0"/>'
+        '<joint joint1="left_elbow" joint2="left_shoulder_pitch" polycoef="0 2 0 0 0"/></equality>'
+    )
+    told_ = notes(put(changed(MJCF, ("</worldbody>", f"</worldbody>{equality}")), "a.xml"))
+    assert "the equality 'rod' closes a loop of the joints 'left_ankle_pitch', 'left_ankle_roll'" in told_
+    assert "joint 'left_elbow' follows 'left_shoulder_pitch': held" in told_
+
+
+def test_losses_of_the_file_are_those_of_the_motors(put):
+    joint = ("<joint name=", '<joint armature=".02" damping=".5" frictionloss="1" name=')
+    knee = told(put(changed(MJCF, joint), "a.xml")).actuators["left_knee"]
+    assert (knee["armature"], knee["friction"], knee["damping"]) == (0.02, 1.0, 0.5)
+    limits = 'velocity="20"/></joint>'
+    urdf = put(changed(URDF, (limits, limits.replace("</", '<dynamics damping="0.5" friction="-1"/></'))))
+    assert examine(urdf).robot.actuators["left_knee"]["damping"] == 0.5
+    assert "friction = '-1' of 'left_hip_pitch', 'left_knee', 'right_hip_pitch', 'right_knee' must be" in notes(urdf)
+
+
+def test_a_scene_is_called_after_its_robot(put):
+    put(MJCF, "robot.xml")
+    path = put('<mujoco model="mini scene"><include file="robot.xml"/></mujoco>', "scene.xml")
+    assert parse(read_urdf(path), "x").get("name") == "mini"
+    path = put('<mujoco><include file="robot.xml"/></mujoco>', "scene.xml")
+    assert parse(read_urdf(path), "x").get("name") == "mini"
+
+
+def test_mujoco_leaves_no_log_behind(tmp_path):
+    ball = '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    lines = f"import mujoco, jumplab.sim.mujoco; m = mujoco.MjModel.from_xml_string({ball!r}); d = mujoco.MjData(m)"
+    lines += "; d.qvel[0] = 1e30; mujoco.mj_step(m, d)"
+    subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, check=True)
+    assert not list(tmp_path.iterdir())
+
+
+# geometry ------------------------------------------------------------------------------------------------------------
+def test_an_origin_may_lie_anywhere_on_its_axis(put):
+    """A knee 30 mm along its axis, an ankle's roll 15 mm along its own: the same machine."""
+    text = URDF
+    for joint, link, shift, below in (
+        ("right_knee", "right_knee_link", np.array([0.0, 0.03, 0.0]), "right_ankle_pitch"),
+        ("right_ankle_roll", "right_ankle_roll_link", np.array([0.015, 0.0, 0.0]), None),
+    ):
+        text = _shifted(text, rf'<joint name="{joint}" .*?</joint>', shift)
+        text = _shifted(text, rf'<link name="{link}">.*?</link>', -shift)
+        text = _shifted(text, rf'<joint name="{below}" .*?</joint>', -shift) if below else text
+    plain, moved = (examine(put(x)).robot for x in (URDF, text))
+    assert moved.planar and moved.foot.heel == pytest.approx(plain.foot.heel)
+    for name in ("mass", "inertia", "com", "span", "heel"):
+        np.testing.assert_allclose(getattr(moved.sagittal, name), getattr(plain.sagittal, name), atol=1e-9)
+
+
+def _shifted(text: str, pattern: str, shift: np.ndarray) -> str:
+    """Every origin within the first match of a pattern moved."""
+
+    def move(xyz: re.Match) -> str:
+        return 'origin xyz="{:g} {:g} {:g}"'.format(*(np.array(xyz[1].split(), float) + shift))
+
+    return re.sub(pattern, lambda m: re.sub(r'origin xyz="([^"]+)"', move, m[0]), text, count=1, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("shank", ["-0.29", "-0.31", "-0.33"])
+def test_toes_are_held_and_belong_to_the_sole(put, shank):
+    text = URDF
+    for side in ("left", "right"):
+        toe = f'<link name="{side}_toe"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" '
+        toe += 'ixz="0" iyz="0"/></inertial><collision><origin xyz=".03 0 -.01"/><geometry><box size=".06 .08 .03"/>'
+        toe += f'</geometry></collision></link><joint name="{side}_toe" type="revolute"><child link="{side}_toe"/>'
+        toe += (
+            f'<parent link="{side}_ankle_roll_link"/><origin xyz=".13 0 -.04"/><axis xyz="0 1 0"/><limit '
+        )
+        text = text.replace("</robot>", toe + 'lower="-.5" upper=".5" effort="9" velocity="9"/></joint></robot>')
+        ankle = f'<child link="{side}_ankle_pitch_link"/><origin xyz="0 0 '
+        text = changed(text, (f"{ankle}-0.31", f"{ankle}{shank}"))
+    found = examine(put(text)).robot
+    assert found.joints["ankle_pitch"] == ("left_ankle_pitch", "right_ankle_pitch")
+    assert (found.foot.heel, found.foot.toe) == pytest.approx((-0.07, 0.19))
+    assert "the joints 'left_toe', 'right_toe' beyond the ankles are held" in notes(put(text))
+
+
+def test_feet_that_are_points_and_legs_that_end_in_wheels(put):
+    sphere = '<collision><origin xyz="0 0 -.05"/><geometry><sphere radius=".02"/></geometry></collision>'
+    sentence = refused(lambda: draft(put(changed(URDF, (BOX, sphere)))))
+    assert "the foot 'left_ankle_roll_link' touches the ground in a point (from its sphere" in sentence
+    wheel = '<collision><origin rpy="1.5708 0 0"/><geometry><cylinder radius=".07" length=".04"/></geometry>'
+    wheel += "</collision>"
+    text = URDF
+    for side in ("left", "right"):
+        link = f'<link name="{side}_ankle_pitch_link">'
+        text = changed(text, (link, link + wheel))
+    words = "the legs end in wheels: joint 'right_ankle_pitch' turns without stops"
+    for stops, kind in (('lower="-1e6" upper="1e6"', "revolute"), ("", "continuous")):
+        endless = text.replace('lower="-0.9" upper="0.7"', stops)
+        path = put(endless.replace('ankle_pitch" type="revolute"', f'ankle_pitch" type="{kind}"'))
+        assert words in refused(lambda path=path: draft(path))
+
+
+def test_soles_from_what_is_drawn_and_from_millimetres(put):
+    corners = np.array([[x, y, z] for x in (-70, 130) for y in (-40, 40) for z in (-65, -35)], float)
+    facets = [(0, 1, 2), (1, 2, 3), (4, 5, 6), (5, 6, 7), (0, 1, 4), (1, 4, 5), (2, 3, 6), (3, 6, 7)]
+    rows = b"".join(struct.pack("<12fH", 0, 0, 1, *corners[list(f)].ravel(), 0) for f in facets)
+    put(bytes(80) + struct.pack("<I", len(facets)) + rows, "foot.stl")
+    mesh = '<collision><geometry><mesh filename="foot.stl"/></geometry></collision>'
+    path = put(changed(URDF, (BOX, mesh)))
+    assert "the mesh 'foot.stl' is taken in millimetres" in notes(path)
+    for text in (path.read_text(), changed(URDF, (BOX, BOX.replace("collision", "visual")))):
+        foot = examine(put(text)).robot.foot
+        assert (foot.heel, foot.toe, foot.sole_z) == SOLE and foot.half_width == pytest.approx(0.04)
+
+
+def test_where_it_faces_by_several_signs_and_by_word(put):
+    """Knees, hips and ankles without stops, feet centred by 0.1 mm: arms and the root's frame decide."""
+    text = changed(URDF, ('xyz="0.03 0 -0.05"', 'xyz="-0.0001 0 -0.05"'))
+    for name in ("hip_pitch", "knee", "ankle_pitch"):
+        text = re.sub(rf'(\w+_{name}") type="revolute"(.*?)lower="\S+" upper="\S+"', r'\1 type="continuous"\2', text)
+    path = put(text)
+    found = draft(path)
+    assert found.roles.joints["knee"] == ("left_knee", "right_knee") and found.roles.forward == "+x"
+    assert "where it faces is a guess, by the arms' range and the root's x axis" in notes(path)
+    turned = check(path, found.text.replace('# facing = "-x"', 'facing = "-x"')).robot
+    assert turned.joints["knee"] == ("right_knee", "left_knee") and turned.sagittal.upper[1] == pytest.approx(2.3)
+    sideways = found.text.replace('# facing = "-x"', 'facing = "+y"')
+    assert "'source.facing' = '+y' must be +x or -x" in refused(lambda: check(path, sideways))
+    swapped = re.sub(r'\["(left_\w+)", "(right_\w+)"\]', r'["\2", "\1"]', found.text)
+    assert "is named as the left one, and is on the right" in refused(lambda: check(path, swapped))
+
+
+# masses, limits, words -----------------------------------------------------------------------------------------------
+def test_no_repair_mends_units(put):
+    text = changed(URDF, ('ixx="0.036000000000000004" iyy="0.036000000000000004"', 'ixx="40" iyy="40"'))
+    for repair in ((), ("inertia",)):
+        sentence = refused(lambda repair=repair: draft(put(text), repair))
+        assert "moment of inertia 40 kg m^2 on 1.8 kg is a radius of gyration of 4.71 m" in sentence
+
+
+def test_a_trunk_without_mass_is_refused(put):
+    path = put(changed(URDF, ('<mass value="12"/>', '<mass value="0"/>')))
+    assert "the trunk 'pelvis' and all that is held on it weigh 0 kg" in refused(lambda: examine(path))
+
+
+def test_bodies_without_mass_are_mended_as_advised(put):
+    path = put(re.sub(r'(<link name="\w+_hip_roll_link">)<inertial>.*?</inertial>', r"\1", URDF))
+    assert "or let it have a gram: --repair massless" in refused(lambda: draft(path))
+    assert examine(path, ("massless",)).robot.total_mass == pytest.approx(28.8)
+
+
+def test_a_joint_without_a_motor_is_held_and_links_share_names_with_joints(put):
+    text = changed(URDF, ('effort="40" velocity="16"', 'effort="0" velocity="0"'))
+    assert len(examine(put(text)).robot.joint_names) == 12
+    same = re.sub(r"(\w+)_link\"", r'\1"', URDF)
+    robot = examine(put(same)).robot
+    assert robot.foot.frames == ("left_ankle_roll", "right_ankle_roll") and robot.planar
+
+
+def test_what_is_advised_is_enough(put):
+    """All that a joint lacks is asked for at once, in a table that can be appended as it is written."""
+    text = changed(URDF, ("left_knee", "left.knee"), ("right_knee", "right.knee"))
+    text = text.replace('<limit lower="0.0" upper="2.3" effort="160" velocity="20"/>', "<limit/>")
+    path = put(text)
+    found = draft(path)
+    assert [re.search(r"tell (.*) in \[(.*)\]", x).groups() for x in found.faults] == [
+        ("effort, velocity", 'limits."left.knee"'),
+        ("effort, velocity", 'limits."right.knee"'),
+    ]
+    assert '# [limits."left.knee"]\n# effort =\n# velocity =\n' in found.text
+    both = "".join(f'[limits."{side}.knee"]\neffort = 160.0\nvelocity = 20.0\n' for side in ("left", "right"))
+    knee = check(path, found.text + both).robot.actuators["left.knee"]
+    assert (knee["lower"], knee["upper"], knee["effort"]) == (0.0, 2.3, 160.0)
+    bare = found.text + "[limits.left.knee]\neffort = 1.0\n"
+    assert 'names with dots are quoted: [limits."left.knee"]' in refused(lambda: check(path, bare))
+
+
+@pytest.mark.parametrize(("line", "sentence"), [
+    ("[limts.knee]\neffort = 1.0", "robot configuration: [limts] is nothing that is read; did you mean limits?"),
+    ("[shapes]\ntigh_thickness_m = 0.1", "robot configuration: [shapes] 'tigh_thickness_m' is nothing that is read; "
+                                         "did you mean thigh_thickness_m?"),
+])  # fmt: skip
+def test_misspelt_tables_are_refused(put, line, sentence):
+    path = put(URDF)
+    assert refused(lambda: check(path, draft(path).text + line)) == sentence
+
+
+@pytest.mark.parametrize("name", ["base\\pelvis", 'base "A"', "骨盆", "a.b", "{a}", "100%"])
+def test_any_name_is_written_as_valid_toml(put, name):
+    path = put(URDF.replace('"pelvis"', f'"{name.replace(chr(34), "&quot;")}"'))
+    assert examine(path).robot.planar
