@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import RobotError, quoted
 
 HERE = Path(__file__).parent
@@ -20,7 +21,6 @@ SHIPPED = {
 }
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 LEG = ROLES[:3]
-MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
 _REQUIRED = object()
 
 
@@ -39,7 +39,7 @@ def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return path.name, path.parent, None
     try:
-        text = path.read_text()
+        text = reading.content(path, "robot", error=RobotError).decode()
     except UnicodeDecodeError as e:
         raise RobotError(f"{path}: not a text file, byte {e.start} cannot be read as UTF-8") from e
     except (OSError, ValueError) as e:
@@ -61,10 +61,7 @@ def read_text(path: Path) -> str:
     try:
         if path.is_dir():
             raise RobotError(f"{path}: is a folder; name the URDF file inside it")
-        if (size := path.stat().st_size) > MAX_BYTES:
-            most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
-            raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
-        return decode(path.read_bytes(), str(path))
+        return decode(reading.content(path, "robot", error=RobotError), str(path))
     except FileNotFoundError:
         raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
     except (OSError, ValueError) as e:
@@ -103,7 +100,7 @@ def read_toml(text: str, where: str) -> dict:
     """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as e:
+    except (tomllib.TOMLDecodeError, RecursionError) as e:
         raise RobotError(f"{where}: not a TOML file: {e}") from e
 
 

@@ -1,0 +1,151 @@
+"""The one way to read a file that somebody else may have made, with its limits.
+
+Only regular files are read (no device, pipe or folder, which may never end), none that is larger
+than :data:`MOST_BYTES` allows, and nothing is unpacked or allocated before its header says that it
+fits. Robots are named by the user, and may be links; a result folder holds none, see
+:func:`below`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from jumplab.errors import InputError
+
+# [bytes] of a file, by what it is: several times the largest that this package or a publisher of
+# robots makes
+MOST_BYTES = {
+    "robot": 20_000_000,  # URDF, MJCF or TOML; the largest published URDF is under 1 MB
+    "mesh": 200_000_000,
+    "report": 100_000_000,  # JSON
+    "arrays": 200_000_000,  # packed; an atlas of 2500 nodes has some 30 MB
+    "log": 4_000_000_000,  # read line by line
+    "line": 20_000_000,  # of a log
+}
+MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
+MOST_ARRAYS = 1000  # in one file
+# how what others may have made is opened: no link is followed, no pipe is waited for
+SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+# what reading a cut, altered or foreign file of arrays may raise
+DAMAGE = (
+    OSError,
+    ValueError,
+    TypeError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@contextmanager
+def opened(
+    path: str | Path, kind: str, *, error: type[InputError] = InputError, link: bool = True
+) -> Iterator[BinaryIO]:
+    """A regular file of a ``kind`` (one of :data:`MOST_BYTES`), open to be read.
+
+    Raises ``error`` if it is no regular file, is too large, or is a symbolic link where no
+    ``link`` is followed; OSError if the system refuses it.
+    """
+    if not link:
+        refuse_link(path)
+    flags = os.O_RDONLY | (SAFE & ~os.O_NOFOLLOW if link else SAFE)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        check(file, path, kind, error)
+        yield file
+
+
+def check(
+    file: BinaryIO, path: str | Path, kind: str, error: type[InputError] = InputError
+) -> None:
+    """Raise ``error`` unless an open file is a regular one, and not larger than its ``kind`` is."""
+    about = os.fstat(file.fileno())
+    if not stat.S_ISREG(about.st_mode):
+        raise error(f"{path}: is no regular file but a pipe or a device; name a file")
+    if about.st_size > MOST_BYTES[kind]:
+        raise error(
+            f"{path}: has {about.st_size / 1e6:.0f} MB, a file of this kind ({kind}) at most "
+            f"{MOST_BYTES[kind] / 1e6:.0f}; name another one"
+        )
+
+
+def content(
+    path: str | Path, kind: str, *, error: type[InputError] = InputError, link: bool = True
+) -> bytes:
+    """All bytes of a file, see :func:`opened`."""
+    with opened(path, kind, error=error, link=link) as file:
+        return file.read(MOST_BYTES[kind])
+
+
+def refuse_link(path: str | Path) -> None:
+    """Raise :class:`InputError` if ``path`` itself is a symbolic link."""
+    if os.path.islink(path):
+        raise InputError(
+            f"{str(path)!r} is a symbolic link, which no result folder holds; remove it"
+        )
+
+
+def require_private(path: str | Path, about: os.stat_result) -> None:
+    """Raise :class:`InputError` unless this user owns a file or folder (its status is ``about``),
+    and nobody else can write it.
+    """
+    if about.st_uid != os.geteuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise InputError(
+            f"{path}: belongs to another user, or others can write it; delete it, or choose "
+            "another folder"
+        )
+
+
+def below(folder: str | Path, *names: str) -> Path:
+    """A path below a result folder, which itself may be a link; raises :class:`InputError` if a
+    part of the way below it is one, since what it leads to is not the folder's.
+    """
+    path = Path(folder)
+    for name in names:
+        path = path / name
+        refuse_link(path)
+    return path
+
+
+def arrays(raw: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file by name, none of objects; raises one of :data:`DAMAGE`.
+
+    Every size is known from the headers, and checked, before anything is unpacked or allocated.
+    """
+    with zipfile.ZipFile(io.BytesIO(raw)) as file:
+        members = file.infolist()
+        unpacked = sum(member.file_size for member in members)
+        if len(members) > MOST_ARRAYS or unpacked > MOST_UNPACKED_BYTES:
+            raise ValueError(f"{len(members)} arrays of {unpacked} bytes are too many")
+        return {m.filename.removesuffix(".npy"): _array(file.read(m)) for m in members}
+
+
+def _array(raw: bytes) -> np.ndarray:
+    """One array of a ``.npy`` file whose header says as much as follows it."""
+    file = io.BytesIO(raw)
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    shape, _, kind = read[version](file)
+    count = math.prod(shape)
+    if kind.hasobject or min(shape, default=0) < 0 or count > len(raw):
+        raise ValueError(f"an array of kind {kind} and shape {shape} does not fit its file")
+    if count * kind.itemsize != len(raw) - file.tell():
+        raise ValueError(f"an array of {count * kind.itemsize} bytes has another number in it")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
