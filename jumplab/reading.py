@@ -14,10 +14,11 @@ import os
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -30,11 +31,15 @@ MOST_BYTES = {
     "mesh": 200_000_000,
     "report": 100_000_000,  # JSON
     "arrays": 200_000_000,  # packed; an atlas of 2500 nodes has some 30 MB
-    "log": 4_000_000_000,  # read line by line
+    "log": 1_000_000_000,  # read line by line
     "line": 20_000_000,  # of a log
 }
 MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
 MOST_ARRAYS = 1000  # in one file
+MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
+MOST_COPIES = 1000  # that an MJCF file asks for
+MOST_POINTS = 4_000_000  # of a height field
+COPYING = ("replicate", "composite", "flexcomp")
 # how what others may have made is opened: no link is followed, no pipe is waited for
 SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 # what reading a cut, altered or foreign file of arrays may raise
@@ -96,6 +101,46 @@ def refuse_link(path: str | Path) -> None:
         raise InputError(
             f"{str(path)!r} is a symbolic link, which no result folder holds; remove it"
         )
+
+
+def xml(
+    text: str | bytes, where: str, error: type[InputError] = InputError
+) -> ElementTree.Element:
+    """Root element of an XML text; raises ``error`` for too many elements,
+    :class:`xml.etree.ElementTree.ParseError` if it is none.
+    """
+    if (count := text.count("<" if isinstance(text, str) else b"<")) > MOST_TAGS:
+        raise error(f"{where}: has {count} XML tags, a robot at most {MOST_TAGS}; is it one?")
+    return ElementTree.fromstring(text)
+
+
+def check_mjcf(
+    path: Path, folder: Path, error: type[InputError] = InputError, seen: Collection[Path] = ()
+) -> None:
+    """Refuse (``error``) an MJCF file that makes more copies or points than a robot has, or
+    includes what is no file of it; ``folder`` is that of the first file, ``seen`` are those before.
+
+    MuJoCo itself has no such limits. What is no XML is left to it.
+    """
+    try:
+        todo = [(xml(content(path, "robot", error=error), path.name, error), 1)]
+    except (OSError, ElementTree.ParseError):
+        return
+    for element, above in todo:
+        get = element.get
+        numbers = [get("count")] if element.tag in COPYING else []
+        numbers += [get("nrow"), get("ncol")] if element.tag == "hfield" else []
+        copies = math.prod(int(x) for text in numbers for x in (text or "").split() if x.isdecimal())
+        most = MOST_POINTS if element.tag == "hfield" else MOST_COPIES
+        if above * copies > most:
+            raise error(
+                f"{path.name}: <{element.tag}> makes {above * copies:.3g} copies or points, at "
+                f"most {most} are read; remove it, or ask for fewer"
+            )
+        todo += [(child, above * copies) for child in element]
+        included = (folder / get("file", "")).resolve()
+        if element.tag == "include" and included not in seen:
+            check_mjcf(included, folder, error, {*seen, included})
 
 
 def require_private(path: str | Path, about: os.stat_result) -> None:

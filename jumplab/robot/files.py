@@ -5,6 +5,7 @@ file, each refused in one sentence.
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ SHIPPED = {
 ROLES = ("hip_pitch", "knee", "ankle_pitch", "shoulder_pitch")
 LEG = ROLES[:3]
 _REQUIRED = object()
+DEEPEST = 100  # the parser takes memory by the square of the parts of a key
+NESTED = re.compile(rf"(?:[^\s.=]{{1,64}}[ \t]*\.[ \t]*){{{DEEPEST}}}")
 
 
 def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
@@ -98,6 +101,8 @@ def decode(raw: bytes, where: str) -> str:
 # -------------------------------------------------------------------------------------------
 def read_toml(text: str, where: str) -> dict:
     """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
+    if NESTED.search(text):
+        raise RobotError(f"{where}: a key of more than {DEEPEST} parts between dots; is it a robot?")
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as e:
