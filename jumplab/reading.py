@@ -1,7 +1,7 @@
 """The one way to read a file that somebody else may have made, with its limits.
 
 Only regular files are read (no device, pipe or folder, which may never end), none that is larger
-than :data:`MOST_BYTES` allows, and nothing is unpacked or allocated before its header says that it
+than :data:`KINDS` allows, and nothing is unpacked or allocated before its header says that it
 fits. Robots are named by the user, and may be links; a result folder holds none, see
 :func:`below`.
 """
@@ -24,22 +24,23 @@ import numpy as np
 
 from jumplab.errors import InputError
 
-# [bytes] of a file, by what it is: several times the largest that this package or a publisher of
-# robots makes
-MOST_BYTES = {
-    "robot": 20_000_000,  # URDF, MJCF or TOML; the largest published URDF is under 1 MB
-    "mesh": 200_000_000,
-    "report": 100_000_000,  # JSON
-    "arrays": 200_000_000,  # packed; an atlas of 2500 nodes has some 30 MB
-    "log": 1_000_000_000,  # read line by line
-    "line": 20_000_000,  # of a log
-}
+LINE_BYTES = 20_000_000  # of a log, which is read line by line
 MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
 MOST_ARRAYS = 1000  # in one file
 MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
 MOST_COPIES = 1000  # that an MJCF file asks for
 MOST_POINTS = 4_000_000  # of a height field
 COPYING = ("replicate", "composite", "flexcomp")
+# [bytes] of a file, by what it is: several times the largest that this package or a publisher of
+# robots makes; in words; what to do
+KINDS = {
+    # MJCF and TOML as well; the largest published URDF is under 1 MB
+    "robot": (20_000_000, "a URDF", "name the URDF, not a mesh"),
+    "report": (100_000_000, "a report", "delete it, and make it again"),
+    # packed; an atlas of 2500 nodes has some 30 MB
+    "arrays": (200_000_000, "a file of arrays", "delete it, and make it again"),
+    "log": (1_000_000_000, "a log", "choose another folder"),
+}
 # how what others may have made is opened: no link is followed, no pipe is waited for
 SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 # what reading a cut, altered or foreign file of arrays may raise
@@ -60,7 +61,7 @@ DAMAGE = (
 def opened(
     path: str | Path, kind: str, *, error: type[InputError] = InputError, link: bool = True
 ) -> Iterator[BinaryIO]:
-    """A regular file of a ``kind`` (one of :data:`MOST_BYTES`), open to be read.
+    """A regular file of a ``kind`` (one of :data:`KINDS`), open to be read.
 
     Raises ``error`` if it is no regular file, is too large, or is a symbolic link where no
     ``link`` is followed; OSError if the system refuses it.
@@ -79,12 +80,11 @@ def check(
     """Raise ``error`` unless an open file is a regular one, and not larger than its ``kind`` is."""
     about = os.fstat(file.fileno())
     if not stat.S_ISREG(about.st_mode):
-        raise error(f"{path}: is no regular file but a pipe or a device; name a file")
-    if about.st_size > MOST_BYTES[kind]:
-        raise error(
-            f"{path}: has {about.st_size / 1e6:.0f} MB, a file of this kind ({kind}) at most "
-            f"{MOST_BYTES[kind] / 1e6:.0f}; name another one"
-        )
+        raise error(f"{path}: is a pipe or a device; save it to a file first")
+    most, what, remedy = KINDS[kind]
+    if about.st_size > most:
+        size = f"{about.st_size / 1e6:.0f} MB, {what} has at most {most / 1e6:.0f}"
+        raise error(f"{path}: has {size}; {remedy}")
 
 
 def content(
@@ -92,7 +92,7 @@ def content(
 ) -> bytes:
     """All bytes of a file, see :func:`opened`."""
     with opened(path, kind, error=error, link=link) as file:
-        return file.read(MOST_BYTES[kind])
+        return file.read(KINDS[kind][0])
 
 
 def refuse_link(path: str | Path) -> None:

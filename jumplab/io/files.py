@@ -153,7 +153,7 @@ class Log(Generic[K, V]):
         line = b"\n"
         at = 0  # where the line begins
         # one that is longer than any of ours comes in pieces, which are no JSON either
-        while piece := file.readline(reading.MOST_BYTES["line"]):
+        while piece := file.readline(reading.LINE_BYTES):
             at, line = file.tell() - len(piece), piece
             if line.endswith(b"\n"):
                 with contextlib.suppress(

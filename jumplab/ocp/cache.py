@@ -17,9 +17,10 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any
+from threading import RLock
+from typing import Any, TypeVar
 
 import casadi as ca
 from platformdirs import user_cache_path
@@ -36,6 +37,21 @@ HOME = ("jumplab.",)
 # and misses none
 BUILT_BY = ("errors", "reading", "task", "ocp", "models", "robot", "stages.srmp", "stages.whole_body")
 KNOWN: dict[str, dict[str, ca.Function]] = {}  # of this process, by fingerprint
+# CasADi's expressions, and ipopt with MUMPS, are no affair of two threads, and equal parts are
+# shared by all planners: threads build and solve in turn
+TURN = RLock()
+F = TypeVar("F", bound=Callable)
+
+
+def in_turn(work: F) -> F:
+    """The same function, which one thread of this process runs at a time."""
+
+    @wraps(work)
+    def waiting(*args: Any, **options: Any) -> Any:
+        with TURN:
+            return work(*args, **options)
+
+    return waiting
 
 
 def folder() -> Path | None:
