@@ -47,7 +47,12 @@ def _import_robot(name_or_path: Any, repair: tuple[str, ...]) -> Any:
     return import_module("jumplab.robot_import.checkup").load(name_or_path, repair)
 
 
-register(_import_robot)
+def _check_robot(urdf: str, config_text: str, where: str) -> None:
+    """The importer's check of what is already a pair of texts."""
+    import_module("jumplab.robot_import.checkup").check_texts(urdf, config_text, where)
+
+
+register(_import_robot, _check_robot)
 _PLACES = {
     "JumpTask": "task",
     "Contacts": "stages.whole_body",

@@ -17,7 +17,7 @@ from jumplab.auditing.report import METHOD
 from jumplab.errors import RobotError
 from jumplab.io import export
 from jumplab.io.motion import Motion
-from jumplab.robot import Robot
+from jumplab.robot import Robot, changes
 from jumplab.robot.files import read_toml
 from jumplab.robot.motors import SLIDING_RATE
 from jumplab.robot.sagittal import JOINT_OF_ANGLES
@@ -51,7 +51,7 @@ def with_motors(robot: Robot, keys=KEYS, **more) -> Robot:
             told += f"\n[actuators.{key}]\n" + "".join(f"{n} = {x}\n" for r, x in rows for n in robot.joints[r])
     for key, rows in more.items():
         told += f"\n[actuators.{key}]\n" + "".join(f"{n} = {x}\n" for n, x in rows.items())
-    return Robot.from_text(robot.urdf, robot.config_text + told)
+    return Robot(robot.urdf, robot.config_text + told)
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +253,8 @@ def test_torque_at_speed_ends_at_the_no_load_speed(bhr):
 @pytest.mark.parametrize("keys", [("armature",), ("armature", "damping"), KEYS], ids=len)
 def test_a_pendulum_with_a_motor(bhr, engine, keys):
     """An arm on a trunk that nothing moves: I q'' = tau - f - d q', from rest and in free fall, in closed form."""
-    robot = with_motors(bhr.with_mass("trunk", mass_kg=1e7), keys)
+    heavy, _ = changes.masses(bhr, "trunk", 1e7, None)  # heavier than a robot that is read
+    robot = with_motors(Robot(heavy, bhr.config_text), keys)
     k, model = robot.joint_names.index("left_shoulder_pitch"), robot.model
     data, q = model.createData(), stance_configuration(robot).copy()
     q[2] = 10.0

@@ -1,7 +1,8 @@
 """The command line, ``jumplab COMMAND`` (the same as ``python -m jumplab COMMAND``).
 
 Whatever goes wrong is said in one sentence on stderr. Exit codes: 0 done, 2 bad input, 3 infeasible
-or not within the limits, 4 internal failure, 130 and 143 interrupted.
+or not within the limits, 4 internal failure (or a full disk takes no output), 130 and 143
+interrupted. A reader of the output that has gone changes nothing.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from jumplab.cli.common import add_common, declare
 from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
 from jumplab.cli.robots import check, list_, robot
+from jumplab.cli.streams import patient_streams
 from jumplab.cli.studies import (
     atlas,
     bench,
@@ -115,7 +117,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     alone = argv is None
     argv = sys.argv[1:] if argv is None else list(argv)
-    sys.stdout.reconfigure(errors="backslashreplace")  # a path need not be printable
+    with patient_streams() as lost:
+        code = _main(argv, alone)
+        sys.stdout.flush()
+        if lost and not code:
+            print(f"jumplab: the output cannot be written ({lost[0]})", file=sys.stderr)
+            code = INTERNAL
+    return code
+
+
+def _main(argv: list[str], alone: bool) -> int:
+    """Run one command, with standard streams that never fail."""
     interrupts = Interrupts(alone)
     results = {}
     code, sentence = 0, None
@@ -124,9 +136,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             _work(argv, results)
             if interrupts.number is not None:  # and lost
                 raise KeyboardInterrupt
-    except BrokenPipeError:  # the reader of our output has gone, as in `jumplab plan ... | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return INTERNAL
     except (KeyboardInterrupt, Exception) as e:
         code, sentence = _explain(e, interrupts.number)
         sentence = " ".join(sentence.split())

@@ -27,7 +27,7 @@ from subprocess import DEVNULL
 from types import ModuleType
 from typing import Any
 
-from jumplab import errors, sim
+from jumplab import errors, reading, sim
 from jumplab.cli.common import robots, store
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
@@ -201,7 +201,8 @@ def run_notebooks(
             with suppress(InputError):
                 figures = store.ensure_writable(root / "figures")
     figures = store.ensure_writable(figures).resolve()
-    executed = out / "notebooks"
+    executed = reading.below(out, "notebooks")
+    reading.below(out, "failed")
     if executed.is_dir():
         with store.locked(executed, wait_s=0.0):
             pass  # another chain is refused at once

@@ -19,6 +19,7 @@ from jumplab.control import STEP_S
 from jumplab.control.kinematics import Gauge, Motion, about_vertical, rotation, turned, yaw_of
 from jumplab.errors import JumplabError
 from jumplab.io.tape import Tape
+from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
 
@@ -36,9 +37,10 @@ LEAST_HEIGHT_M = 0.3  # of the CoM, where the capture point of a squatting robot
 
 @lru_cache(maxsize=4)  # robots of one session; a planner holds a few megabytes
 def _planner_of(urdf: str, config_text: str, gravity: float) -> LandingPlanner:
-    return LandingPlanner(Robot.from_text(urdf, config_text).under_gravity(gravity))
+    return LandingPlanner(Robot(urdf, config_text, gravity))
 
 
+@in_turn
 def landing_planner(robot: Robot) -> LandingPlanner:
     """The landing planner of ``robot``, built once (0.3 s)."""
     return _planner_of(robot.urdf, robot.config_text, robot.gravity)

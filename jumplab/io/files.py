@@ -18,6 +18,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
+from jumplab import reading
 from jumplab.errors import InputError, as_path
 
 K = TypeVar("K", bound=Hashable)
@@ -33,12 +34,9 @@ def settle() -> None:
 
 
 @contextlib.contextmanager
-def made(folder: Path) -> Iterator[list[Path]]:
-    """Make ``folder`` with its parents, and yield the new ones, innermost first; they go again if
-    the block fails.
-
-    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in
-    the block.
+def _refusals(folder: Path) -> Iterator[None]:
+    """Say in a sentence (:class:`InputError`) that ``folder`` is a file, or is refused by the
+    system.
     """
     if "\0" in str(folder):
         raise InputError(
@@ -47,36 +45,49 @@ def made(folder: Path) -> Iterator[list[Path]]:
         )
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InputError(f"{str(folder)!r} is a file; choose a folder")
-    new = [p for p in (folder, *folder.parents) if not os.path.exists(p)]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield new
-    except BaseException as e:
-        _unmake(new)
-        if not isinstance(e, OSError):
-            raise
+        yield
+    except OSError as e:
         reason = e.strerror or type(e).__name__
         raise InputError(
             f"the folder {str(folder)!r} cannot be written ({reason}); choose another one"
         ) from e
 
 
-def _unmake(folders: list[Path]) -> None:
-    for p in folders:
-        with contextlib.suppress(OSError):
-            p.rmdir()
+@contextlib.contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make ``folder`` with its parents; the new ones go again if the block fails.
+
+    Raises :class:`InputError` if ``folder`` is a file, or the system refuses anything here or in
+    the block.
+    """
+    with _refusals(folder):
+        new = [p for p in (folder, *folder.parents) if not os.path.exists(p)]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            yield
+        except BaseException:
+            for p in new:
+                with contextlib.suppress(OSError):
+                    p.rmdir()
+            raise
 
 
 def ensure_writable(folder: str | Path) -> Path:
-    """Check that ``folder`` can be written into, and leave no trace; raises as :func:`made`."""
+    """Check that ``folder`` can be written into, or made; raises as :func:`made`.
+
+    It is not made for that: another process might see it, and it would go again.
+    """
     folder = as_path(folder, "a result folder")
-    with made(folder) as new:
-        tempfile.TemporaryFile(dir=folder).close()
-    _unmake(new)
+    with _refusals(folder):
+        with contextlib.suppress(FileNotFoundError):
+            folder.stat()  # refuses names that the system cannot have
+        there = next(filter(os.path.exists, (folder, *folder.parents)))
+        tempfile.TemporaryFile(dir=there).close()
     return folder
 
 
-def write_file(path: str | Path, content: bytes) -> Path:
+def write_file(path: str | Path, content: bytes, mode: int = 0o644) -> Path:
     """Write one file whole or not at all, and make its folder; raises :class:`InputError`."""
     path = Path(path)
     if path.is_dir():
@@ -86,7 +97,7 @@ def write_file(path: str | Path, content: bytes) -> Path:
         try:
             with os.fdopen(handle, "wb") as file:
                 # readable by all; temporary files are private by default
-                os.fchmod(file.fileno(), 0o644)
+                os.fchmod(file.fileno(), mode)
                 file.write(content)
             os.replace(half, path)
         except BaseException:
@@ -137,23 +148,25 @@ class Log(Generic[K, V]):
 
     def __init__(self, file: BinaryIO, parse: Callable[[Any], tuple[K, V]]):
         file.seek(0)
-        content = file.read()
         self._file = file
-        whole, _, rest = content.rpartition(b"\n")
-        if rest.startswith(b"{"):  # killed in the middle of a line
-            file.truncate(len(content) - len(rest))
-            content = whole
-        elif rest:
-            file.write(b"\n")
-        lines = content.splitlines()
-        self.empty = not lines
         self.done = {}
-        for line in lines:
-            with contextlib.suppress(
-                ValueError, KeyError, TypeError, AttributeError, RecursionError
-            ):
-                key, value = parse(json.loads(line))
-                self.done[key] = value
+        line = b"\n"
+        at = 0  # where the line begins
+        # one that is longer than any of ours comes in pieces, which are no JSON either
+        while piece := file.readline(reading.LINE_BYTES):
+            at, line = file.tell() - len(piece), piece
+            if line.endswith(b"\n"):
+                with contextlib.suppress(
+                    ValueError, KeyError, TypeError, AttributeError, RecursionError
+                ):
+                    key, value = parse(json.loads(line))
+                    self.done[key] = value
+        if line.startswith(b"{") and not line.endswith(b"\n"):  # killed in the middle of a line
+            file.truncate(at)
+            line = b"\n"
+        elif not line.endswith(b"\n"):
+            file.write(b"\n")
+        self.empty = at == 0 and line == b"\n"
 
     def add(self, data: Mapping[str, Any]) -> None:
         """Append one line of JSON; it is on the disk when this returns."""
@@ -174,14 +187,18 @@ def open_log(
     file cannot be written, or another process has it.
     """
     path = Path(path)
+    reading.refuse_link(path)
     try:
-        file = open(path, "a+b")
+        file = os.fdopen(
+            os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | reading.SAFE, 0o644), "a+b"
+        )
     except OSError as e:
         raise InputError(
             f"{path}: cannot be written ({e.strerror}); choose a writable folder"
         ) from e
     try:
         with file:
+            reading.check(file, path, "log")
             if not _try_lock(file.fileno(), fcntl.LOCK_EX):
                 raise InputError(
                     f"{path}: another 'jumplab {command}' is writing it; wait until that is done"

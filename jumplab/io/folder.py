@@ -27,6 +27,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import InputError, as_path, require_type
 from jumplab.io.files import ensure_writable as ensure_writable
 from jumplab.io.files import locked, made, settle
@@ -83,6 +84,7 @@ def transaction(folder: str | Path) -> Iterator[Path]:
     staging = folder / _STAGING
     with made(folder), locked(folder):
         _finish(folder)
+        reading.refuse_link(staging)
         shutil.rmtree(staging, ignore_errors=True)  # left by a writer that was killed
         staging.mkdir()
         try:
@@ -100,7 +102,7 @@ def transaction(folder: str | Path) -> Iterator[Path]:
 
 def _finish(folder: Path) -> None:
     """Put what is committed in its place, the summary last. Needs the lock; may be repeated."""
-    commit = folder / _COMMIT
+    commit = reading.below(folder, _COMMIT)
     if not commit.is_dir():
         return
     names = {p.name for p in commit.iterdir()}
@@ -155,8 +157,8 @@ def _plain(x: Any) -> Any:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """SHA-256 of a file of a result folder, in hexadecimal digits."""
+    return hashlib.sha256(reading.content(path, "arrays", link=False)).hexdigest()
 
 
 def write_plan(
@@ -254,7 +256,7 @@ def _read_summary(folder: Path) -> dict[str, Any]:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raises :class:`InputError` if it is missing or damaged."""
     try:
-        data = json.loads(path.read_bytes())
+        data = json.loads(reading.content(path, "report", link=False))
     except (OSError, ValueError, RecursionError) as e:
         raise InputError(f"{path}: not a readable JSON file ({type(e).__name__})") from e
     if not isinstance(data, dict):
@@ -275,22 +277,25 @@ def read_plan(folder: str | Path) -> tuple[Tape, Robot, dict[str, Any]]:
             raise InputError(
                 f"there is no folder {str(folder)!r}; make a plan with 'jumplab plan --out' first"
             )
-        if (folder / _COMMIT).is_dir():  # a writer was killed
+        if reading.below(folder, _COMMIT).is_dir():  # a writer was killed
             with locked(folder):
                 _finish(folder)
         with locked(folder, shared=True):
             summary = _read_summary(folder)
-            for name in HASHED:
-                if sha256(folder / name) != summary["manifest"]["files"][name]:
+            files = {
+                name: reading.content(folder / name, kind, link=False)
+                for name, kind in zip(HASHED, ("arrays", "robot", "robot"), strict=True)
+            }
+            for name, raw in files.items():
+                if hashlib.sha256(raw).hexdigest() != summary["manifest"]["files"][name]:
                     raise InputError(
                         f"{folder / name}: changed or damaged since it was written; plan the jump "
                         "again"
                     )
-            urdf, config = ((folder / name).read_bytes().decode() for name in (URDF, CONFIG))
-            robot = Robot.from_text(urdf, config).under_gravity(
+            robot = Robot.from_text(files[URDF].decode(), files[CONFIG].decode()).under_gravity(
                 summary["target"].get("gravity", GRAVITY)
             )
-            return Tape.load(folder / PLAN), robot, summary
+            return Tape.from_bytes(files[PLAN], folder / PLAN), robot, summary
     except (OSError, ValueError) as e:
         reason = (e.strerror if isinstance(e, OSError) else str(e)) or type(e).__name__
         raise InputError(f"the plan in {str(folder)!r} cannot be read ({reason})") from e

@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jumplab import reading
 from jumplab.errors import InputError
-from jumplab.io.tape import DAMAGE
 from jumplab.robot import Robot
 
 SIMULATION_NAME = "simulation.npz"
@@ -145,11 +145,11 @@ def read_simulation(
     """
     path = Path(folder) / SIMULATION_NAME
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {k: file[k] for k in (*names, *(k for k in more if k in file.files))}
-            schema = str(file["schema"])
-            joints = tuple(str(n) for n in file["joint_names"])
-    except DAMAGE as e:
+        file = reading.arrays(reading.content(path, "arrays", link=False))
+        data = {k: file[k] for k in (*names, *(k for k in more if k in file))}
+        schema = str(file["schema"])
+        joints = tuple(str(n) for n in file["joint_names"])
+    except reading.DAMAGE as e:
         raise InputError(
             f"{path}: not a readable simulation ({type(e).__name__}); simulate the plan again"
         ) from e

@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import InputError, Shown, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
 # of the arrays, in the order of the fields
 _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
-# what reading a cut, altered or foreign file may raise
-DAMAGE = (
-    OSError,
-    ValueError,
-    TypeError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,16 +91,26 @@ class Tape(Shown):
         """Read ``plan.npz``; raises :class:`InputError` if it is missing, damaged or foreign."""
         path = as_path(path, "a plan's file")
         try:
-            if not path.is_file():
-                raise InputError(
-                    f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'"
-                )
-            with np.load(path, allow_pickle=False) as file:
-                data = {k: file[k] for k in file.files}
-        except DAMAGE as e:
+            raw = reading.content(path, "arrays", link=False)
+        except FileNotFoundError:
             raise InputError(
-                f"{path}: not a readable plan ({type(e).__name__}); it may be truncated"
-            ) from e
+                f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'"
+            ) from None
+        except (OSError, ValueError) as e:
+            raise cls._unreadable(path, e) from e
+        return cls.from_bytes(raw, path)
+
+    @staticmethod
+    def _unreadable(path: Path, e: Exception) -> InputError:
+        return InputError(f"{path}: not a readable plan ({type(e).__name__}); it may be truncated")
+
+    @classmethod
+    def from_bytes(cls, raw: bytes, path: Path) -> Tape:
+        """The tape whose file ``path`` has the content ``raw``; raises as :meth:`load`."""
+        try:
+            data = reading.arrays(raw)
+        except reading.DAMAGE as e:
+            raise cls._unreadable(path, e) from e
         schema = str(data.pop("schema", "none"))
         if schema != SCHEMA:
             raise InputError(

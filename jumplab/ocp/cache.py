@@ -2,7 +2,9 @@
 
 A file is named by a hash of all that its content depends on: what it is built by
 (:data:`BUILT_BY`), CasADi's version, the words that say what it is, and the caller's key (robot and
-settings). It begins with a check sum; a file that does not fit it is passed over and replaced. The
+settings). It begins with a check sum; a file that does not fit it is passed over and replaced. A
+serialised function can name a library to load, so that reading it may run foreign code: folder and
+files are private to the user, and what others own or can write is passed over. The
 folder is ``$JUMPLAB_CACHE``, else the user's cache folder of this system; an empty
 ``$JUMPLAB_CACHE`` means that nothing is kept. Functions are kept by parts of a problem
 (:class:`.Part`), so that problems which share a part share its functions.
@@ -15,13 +17,15 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any
+from threading import RLock
+from typing import Any, TypeVar
 
 import casadi as ca
 from platformdirs import user_cache_path
 
+from jumplab import reading
 from jumplab.errors import InputError
 from jumplab.io.files import write_file
 from jumplab.ocp.derivatives import Formulator, Part
@@ -31,8 +35,32 @@ from jumplab.ocp.problem import Problem
 HOME = ("jumplab.",)
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules
 # and misses none
-BUILT_BY = ("errors", "task", "ocp", "models", "robot", "stages.srmp", "stages.whole_body")
+BUILT_BY = (
+    "errors",
+    "reading",
+    "task",
+    "ocp",
+    "models",
+    "robot",
+    "stages.srmp",
+    "stages.whole_body",
+)
 KNOWN: dict[str, dict[str, ca.Function]] = {}  # of this process, by fingerprint
+# CasADi's expressions, and ipopt with MUMPS, are no affair of two threads, and equal parts are
+# shared by all planners: threads build and solve in turn
+TURN = RLock()
+F = TypeVar("F", bound=Callable)
+
+
+def in_turn(work: F) -> F:
+    """The same function, which one thread of this process runs at a time."""
+
+    @wraps(work)
+    def waiting(*args: Any, **options: Any) -> Any:
+        with TURN:
+            return work(*args, **options)
+
+    return waiting
 
 
 def folder() -> Path | None:
@@ -75,15 +103,22 @@ def remembered(words: list, key: str, make: Callable[[], Any]) -> Any:
         return make()
     path = place / f"{fingerprint(words, key)[:32]}.json"
     try:
-        total, _, body = path.read_bytes().partition(b"\n")
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        reading.require_private(place, place.lstat())
+        with reading.opened(path, "report", link=False) as file:
+            reading.require_private(path, os.fstat(file.fileno()))
+            total, _, body = file.read().partition(b"\n")
         if hashlib.sha256(body).hexdigest().encode() == total:
             return json.loads(body)
-    except (OSError, ValueError):
+    except (OSError, ValueError, InputError):
         pass
     made = make()
     body = json.dumps(made).encode()
-    with suppress(InputError):  # a folder that cannot be written is no reason to fail
-        write_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+    # a folder that cannot be written, or that others can write, is no reason to fail
+    with suppress(OSError, InputError):
+        reading.require_private(place, place.lstat())
+        content = hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+        write_file(path, content, mode=0o600)
     return made
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from jumplab.errors import SolverError
 from jumplab.io.progress import tell
 from jumplab.ocp.assembly import Assembled, ipopt
+from jumplab.ocp.cache import in_turn
 from jumplab.ocp.conflicts import check_start, reasons
 from jumplab.ocp.derivatives import JERK_CHAIN
 from jumplab.ocp.posing import Posed, pack_multipliers, pose, unpack, unpack_multipliers
@@ -97,6 +98,7 @@ class Nlp:
         :func:`jumplab.ocp.cache.functions`.
     """
 
+    @in_turn
     def __init__(self, problem: Problem, options: Mapping | None = None, key: str | None = None):
         began = time.perf_counter()
         tell(f"building {problem.name}")
@@ -125,6 +127,7 @@ class Nlp:
             functions = functions | {"hess_lag": self.assembled.held_hessian(self._hold)}
         return ipopt(functions, self._options)
 
+    @in_turn
     def solve(
         self,
         parameters: Mapping,

@@ -19,6 +19,7 @@ from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes, foreign
 from jumplab.robot.files import (
     ROLES,
+    SHIPPED,
     TABLES,
     check_entries,
     entry,
@@ -122,11 +123,15 @@ class Robot(Shown):
         urdf, folder, config = files_of(name_or_path)
         if config is None or "source" in read_toml(config, urdf):
             return foreign.load(name_or_path, repair)
-        return cls(read_text(folder / urdf), config)
+        text = read_text(folder / urdf)
+        if name_or_path not in SHIPPED:
+            foreign.check(text, config, urdf)
+        return cls(text, config)
 
     @classmethod
     def from_text(cls, urdf: str, config_text: str) -> Robot:
-        """The robot of two texts (URDF, TOML); raises :class:`RobotError`."""
+        """The robot of two texts (URDF, TOML), checked as files are; raises :class:`RobotError`."""
+        foreign.check(urdf, config_text)
         return cls(urdf, config_text)
 
     def __post_init__(self) -> None:
@@ -324,6 +329,7 @@ class Robot(Shown):
             return self
         lines = "".join(f"# changed: {remark}\n" for remark in remarks)
         robot = replace(self, urdf=urdf, config_text=f"{self.config_text.rstrip()}\n{lines}")
+        foreign.check(robot.urdf, robot.config_text)
         check_stance(robot)
         return robot
 

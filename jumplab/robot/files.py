@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import RobotError, quoted
 
 HERE = Path(__file__).parent
@@ -41,8 +42,9 @@ TABLES = {
     ),
     "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
 }
-MAX_BYTES = 20_000_000  # the largest published URDF is under 1 MB; meshes do not belong here
 _REQUIRED = object()
+DEEPEST = 100  # the parser takes memory by the square of the parts of a key
+NESTED = re.compile(rf"(?:[^\s.=]{{1,64}}[ \t]*\.[ \t]*){{{DEEPEST}}}")
 
 
 def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
@@ -60,7 +62,7 @@ def files_of(name_or_path: str | Path) -> tuple[str, Path, str | None]:
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return path.name, path.parent, None
     try:
-        raw = path.read_bytes()
+        raw = reading.content(path, "robot", error=RobotError)
     except (OSError, ValueError) as e:
         known = ", ".join(SHIPPED)
         short = name if len(name) < 80 else name[:77] + "..."
@@ -98,12 +100,7 @@ def read_text(path: Path) -> str:
     try:
         if path.is_dir():
             raise RobotError(f"{path}: is a folder; name the URDF file inside it")
-        if path.exists() and not path.is_file():
-            raise RobotError(f"{path}: is a pipe or a device; save the robot to a file first")
-        if (size := path.stat().st_size) > MAX_BYTES:
-            most = f"a URDF has at most {MAX_BYTES / 1e6:.0f}; name the URDF, not a mesh"
-            raise RobotError(f"{path}: has {size / 1e6:.0f} MB, {most}")
-        return decode(path.read_bytes(), str(path))
+        return decode(reading.content(path, "robot", error=RobotError), str(path))
     except FileNotFoundError:
         raise RobotError(f"{path}: there is no such file; give the path of a URDF") from None
     except (OSError, ValueError) as e:
@@ -165,9 +162,13 @@ def decode(raw: bytes, where: str) -> str:
 # -------------------------------------------------------------------------------------------
 def read_toml(text: str, where: str) -> dict:
     """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
+    if NESTED.search(text):
+        raise RobotError(
+            f"{where}: a key of more than {DEEPEST} parts between dots; is it a robot?"
+        )
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as e:
+    except (tomllib.TOMLDecodeError, RecursionError) as e:
         raise RobotError(f"{where}: not a TOML file: {e}") from e
 
 

@@ -8,11 +8,22 @@ from collections.abc import Callable
 from typing import Any
 
 _importers: list[Callable[..., Any]] = []
+_checks: list[Callable[..., None]] = []
 
 
-def register(importer: Callable[..., Any]) -> None:
-    """Let ``importer(name_or_path, repair)`` make robots of what is no pair of files yet."""
+def register(importer: Callable[..., Any], check: Callable[..., None]) -> None:
+    """Let ``importer(name_or_path, repair)`` make robots of what is no pair of files yet, and
+    ``check(urdf, config_text, where)`` refuse pairs by the same rules; without ``where`` it is a
+    robot of this package's own making, whose motors may be what no file has.
+    """
     _importers[:] = [importer]
+    _checks[:] = [check]
+
+
+def check(urdf: str, config_text: str, where: str = "") -> None:
+    """Let the registered check refuse a pair of texts; ``where`` names the URDF's file."""
+    (registered,) = _checks
+    registered(urdf, config_text, where)
 
 
 def load(name_or_path: Any, repair: tuple[str, ...]) -> Any:

@@ -37,6 +37,7 @@ TYPES = (*MOVING, "fixed", "floating", "planar")
 # what a humanoid can have; the paper prints none of these numbers
 MASSES_KG = (0.5, 400.0)  # hand-sized, to twice the heaviest published one
 SIZES_M = (0.1, 5.0)  # longest chain of joints in the neutral pose, likewise
+MOST_LINKS = 1000  # several times a humanoid's with two hands
 GYRATION_M = 1.0  # of one link; the longest published limb link has 0.2 m
 MOST_NM = 2000.0  # five times the strongest published electric humanoid joint
 # twice the fastest published humanoid pitch joint; above it, deg/s or a placeholder
@@ -153,6 +154,8 @@ def _structure_faults(root: ET.Element, where: str) -> list[str]:
         return [f"{where}: has no <link>; a robot needs a trunk, legs and feet"]
     if not joints:
         return [f"{where}: has {len(links)} links and no <joint>; nothing can move"]
+    if len(links) > MOST_LINKS:
+        return [f"{where}: has {len(links)} links, a humanoid at most {MOST_LINKS}; is it one?"]
     doubtful = []
     for kind, elements in (("link", links), ("joint", joints)):
         for name, times in Counter(e.get("name") for e in elements).items():

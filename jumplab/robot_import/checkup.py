@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from jumplab.errors import RobotError
+from jumplab.errors import RobotError, quoted
 from jumplab.robot.description import Robot
-from jumplab.robot.files import files_of, read_toml
+from jumplab.robot.files import files_of, read_toml, roles_table
 from jumplab.robot.stance import check_stance, stance_configuration
 from jumplab.robot_import import checks as urdf_checks
 from jumplab.robot_import.jumper import REPAIRS, Jumper, make_jumper
@@ -102,6 +102,33 @@ def check(path: str | Path, config_text: str, text: str | None = None) -> Checku
     robot = Robot(jumper.urdf, jumper.config_text)
     check_stance(robot)
     return Checkup(robot, jumper)
+
+
+def check_texts(urdf: str, config_text: str, where: str) -> None:
+    """Refuse (:class:`RobotError`) the texts of a robot by the rules of a bare URDF: its file, and
+    the limits of the joints that the configuration names.
+
+    ``where`` names the URDF's file; texts without one may have been changed for a study, whose
+    motors may be stronger and faster than any.
+    Engines and viewers read these texts, and would open the meshes that they name.
+    """
+    from_file = bool(where)
+    where = where or "robot.urdf"
+    root = parse(urdf, where)
+    for link in root.iterfind("link"):
+        for mesh in link.iterfind("*/geometry/mesh"):
+            raise RobotError(
+                f"{where}: link {link.get('name')!r}: the mesh {quoted(mesh.get('filename'))} is not "
+                f"opened; make it a box, or describe the robot by a TOML with [source]"
+            )
+    faults = urdf_checks.faults(root, where)
+    joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
+    for pair in roles_table(read_toml(config_text, "robot configuration")).values():
+        for name in pair if from_file and not faults else ():
+            if name in joints:  # one that is missing is refused by the robot itself
+                faults += urdf_checks.limit_faults(joints[name], where)
+    if faults:
+        raise RobotError(faults[0])
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:

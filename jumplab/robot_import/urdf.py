@@ -21,6 +21,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from jumplab import reading
 from jumplab.errors import RobotError
 from jumplab.robot.changes import MOMENTS
 from jumplab.robot.files import read_text
@@ -140,6 +141,7 @@ def read_urdf(path: str | Path) -> str:
         return text
     from jumplab.robot_import.mjcf import as_description
 
+    reading.check_mjcf(Path(path), Path(path).parent, RobotError)
     return as_description(Path(path), _declared_first(text)[0])
 
 
@@ -163,7 +165,7 @@ def parse(text: str, where: str) -> ET.Element:
         )
     xacro = f"{where}: is a xacro template; expand it first: 'xacro robot.xacro > robot.urdf'"
     try:
-        root = ET.fromstring(text)
+        root = reading.xml(text, where, RobotError)
     except ET.ParseError as e:
         line, column = e.position
         reason = str(e).partition(":")[0]

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jumplab.errors import InputError
-from jumplab.io.folder import versions
+from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
 from jumplab.show.waiting import show_waiting
 from jumplab.task import JumpTask
@@ -180,16 +180,14 @@ def save_figure(
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
         raise InputError(f"figure name {name!r}: {must}")
-    path = Path(folder, name)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fig.savefig(f"{path}.png", dpi=DPI, metadata=PNG_METADATA)
-        fig.set_layout_engine("none")
-        fig.savefig(f"{path}.pdf", metadata=PDF_METADATA)
-        Path(f"{path}.txt").write_text(caption_text(caption, task, robot), encoding="utf-8")
-    except OSError as e:
-        words = f"figure {name!r} cannot be written into {str(folder)!r}: {e.strerror}"
-        raise InputError(words) from e
+    png = io.BytesIO()
+    pdf = io.BytesIO()
+    fig.savefig(png, format="png", dpi=DPI, metadata=PNG_METADATA)
+    fig.set_layout_engine("none")
+    fig.savefig(pdf, format="pdf", metadata=PDF_METADATA)
+    text = caption_text(caption, task, robot).encode()
+    for ending, content in (("png", png.getvalue()), ("pdf", pdf.getvalue()), ("txt", text)):
+        write_file(Path(folder, f"{name}.{ending}"), content)
     return fig
 
 

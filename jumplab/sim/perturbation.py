@@ -289,7 +289,7 @@ class Perturbation:
             moment = f"{self.payload_kg * PAYLOAD_SIDE_M**2 / 6:.12g}"
             place = " ".join(f"{x:.12g}" for x in self.payload_m)
             root.extend(ET.fromstring(PAYLOAD.format(**values, moment=moment, place=place)))
-        real = Robot.from_text(ET.tostring(root, encoding="unicode"), robot.config_text)
+        real = Robot(ET.tostring(root, encoding="unicode"), robot.config_text)
         return real.under_gravity(robot.gravity)
 
     def ground(self, scene: Scene, robot: Robot, tape: Tape | None) -> Scene:

@@ -17,6 +17,7 @@ import numpy as np
 from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
+from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
@@ -131,6 +132,7 @@ class Planner:
 
     # what plans are made of
     # ------------------------------------------------------------------------------------------
+    @in_turn
     def stage(self, name: str, *, flip: bool = False) -> Any:
         """A stage's planner, of jumps or of flips: "srmp", "direct", "whole body" (which
         follows stage 1).
@@ -156,6 +158,7 @@ class Planner:
         """The robot as all whole-body programs see it."""
         return Body(self.robot)
 
+    @in_turn
     def program(self, task: JumpTask = ANY, weights: Mapping[str, float] = NOTHING) -> Program:
         """The whole-body program that plans a target directly; ``weights`` as in :meth:`plan`
         ("term" -> weight).
@@ -172,6 +175,7 @@ class Planner:
         stance = stance_configuration(self.robot)
         return changed_problem(FullBody(self.robot), stance, changes=self._joint_changes(asked))
 
+    @in_turn
     def terms(self, task: JumpTask = ANY, *, method: str = USUAL) -> list[dict[str, Any]]:
         """All terms and bounds of the stages for a target, own ones included; ``jl.plots.table``
         shows them.
@@ -220,6 +224,7 @@ class Planner:
         changed = [f"{s!r}" for s in FIRST_STAGES if self.changes[s] or asked[s]]
         return changed + ["the settings of 'srmp'"] * (self._given[SrmpSettings] is not None)
 
+    @in_turn
     def prepared(
         self, method: str = USUAL, weights: Mapping[str, float] | None = None, task: JumpTask = ANY
     ) -> dict[str, StageChanges]:
@@ -267,6 +272,7 @@ class Planner:
 
     # plans
     # ------------------------------------------------------------------------------------------
+    @in_turn
     def plan(
         self,
         task: JumpTask,
@@ -371,6 +377,7 @@ class Planner:
         near = None if anew else previous
         return self.plan(task, previous.method, start=start, near=near)
 
+    @in_turn
     def follow(
         self,
         contacts: Contacts,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import InputError, SolverError, require_type
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.cache import fingerprint
@@ -242,9 +242,9 @@ class Atlas:
         """
         path = Path(folder) / FILE
         try:
-            with np.load(path, allow_pickle=False) as file:
-                head = json.loads(str(file["head"]))
-                rows = file["rows"]
+            file = reading.arrays(reading.content(path, "arrays", link=False))
+            head = json.loads(str(file["head"]))
+            rows = file["rows"]
             if head["format"] != FORMAT or not np.all(np.isfinite(rows)):
                 raise ValueError("other format, or numbers that are none")
             if len(head["done"]) < len(head["heights"]):
@@ -256,7 +256,7 @@ class Atlas:
             raise InputError(
                 f"{str(path.parent)!r} has no {FILE}; build one with 'jumplab atlas'"
             ) from None
-        except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as e:
+        except (*reading.DAMAGE, IndexError) as e:
             raise InputError(
                 f"{str(path)!r} is damaged or no atlas ({type(e).__name__}); "
                 f"delete it and build it again"

@@ -19,11 +19,12 @@ import joblib
 import numpy as np
 import pinocchio as pin
 
+from jumplab import reading
 from jumplab.auditing import write_audit
 from jumplab.errors import InputError, JumplabError
 from jumplab.io import export
 from jumplab.io import folder as store
-from jumplab.io.files import made
+from jumplab.io.files import locked, made
 from jumplab.io.motion import Motion
 from jumplab.robot import Robot
 from jumplab.sim import DEFAULT_ENGINE, ENGINES, Scene, SimulationResult, simulate_jump
@@ -107,19 +108,21 @@ def make_clips(
         for name, task in chosen.items()
     ]
     rows: dict[bool, list[Plain]] = {True: [], False: []}
-    for row in in_parallel(work, jobs, "generator"):
-        rows[row["passed"]].append(row)
-        say(f"{row['name']}: {'passed' if row['passed'] else 'left out, ' + row['reasons'][0]}")
-    clips = {"clips": rows[True], "left_out": rows[False]}
     head = {
         "schema": SCHEMA,
         "robot": {"name": robot.name, "hash": robot.hash},
         "format": format_name,
         "fps": fps,
     }
-    shutil.rmtree(out / STAGING, ignore_errors=True)
-    store.settle()
-    store.write_file(out / INDEX, store.to_json(head | clips).encode())
+    with made(out), locked(out, wait_s=0.0):  # one library at a time
+        for row in in_parallel(work, jobs, "generator"):
+            rows[row["passed"]].append(row)
+            words = "passed" if row["passed"] else f"left out, {row['reasons'][0]}"
+            say(f"{row['name']}: {words}")
+        clips = {"clips": rows[True], "left_out": rows[False]}
+        shutil.rmtree(out / STAGING, ignore_errors=True)
+        store.settle()
+        store.write_file(out / INDEX, store.to_json(head | clips).encode())
     return clips
 
 
@@ -130,12 +133,12 @@ def _clip(
     leaves its plan.
     """
     robot = planner.robot
-    folder = out / name
+    folder = reading.below(out, name)
     key = key_of("clip", robot.hash, asdict(task))
     row = store.read_json(folder / ROW) if (folder / ROW).is_file() else {}
     if not (row.get("passed") and row.get("key") == key):
         head = {"name": name, "target": asdict(task), "robot": robot.hash, "key": key}
-        staging = out / STAGING / name
+        staging = reading.below(out, STAGING, name)
         shutil.rmtree(staging, ignore_errors=True)  # left by a run that was killed
         with made(staging):
             row = head | {"versions": store.versions()} | _judged(here(planner), task, staging)

@@ -14,6 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import Any
 import joblib
 from tqdm import tqdm
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, JumplabError
 from jumplab.io import folder as store
 from jumplab.io.files import Log, made, open_log
 from jumplab.io.progress import tell
@@ -32,7 +33,10 @@ PACKAGE = Path(__file__).parent.parent
 # whose versions decide a result
 DECIDING = ("jumplab", "casadi", "numpy", "pin", "proxsuite", "pybullet", "mujoco")
 SHOWING = ("show", "cli", "api.py", "__main__.py", "notebooks")  # what decides no result
-_CLUSTER: list[str] = []  # that does the work, see on_cluster
+ANSWER_S = 10  # in which a cluster answers, or has none
+SAFE_PATH = "PYTHONSAFEPATH"
+_CLUSTER: list[Any] = []  # client of the cluster that does the work, see on_cluster
+_POOL = threading.RLock()  # joblib's processes are one pool, which threads use in turn
 Task = tuple[Callable, tuple, dict]  # as :func:`joblib.delayed` makes it
 
 
@@ -58,8 +62,13 @@ def key_of(*decisive: Any) -> str:
     """Name of a case: a short hash of all ``decisive`` plain data (target, robot's hash, settings),
     of the code and of the packages that it runs on.
     """
+    return short_hash([decisive, *deciding().values()])
+
+
+def deciding() -> dict[str, str]:
+    """What decides results besides their case, here: the code, and versions of packages."""
     versions = store.versions()
-    return short_hash([decisive, code(), [versions[name] for name in DECIDING]])
+    return {"code": code()} | {name: versions[name] for name in DECIDING}
 
 
 def check_numbers(n: int, seed: int, jobs: int | None) -> None:
@@ -156,8 +165,7 @@ def open_study(
 
 
 def _named(name: str, task: Task) -> tuple[str, Any]:
-    work, arguments, options = task
-    return name, work(*arguments, **options)
+    return name, _done(task)
 
 
 # processes -------------------------------------------------------------------------------------
@@ -166,34 +174,100 @@ def in_parallel(
 ) -> Iterator[Any]:
     """Results of ``work`` (n tasks), as they come unless ``order`` is "generator".
 
-    In ``jobs`` processes, one per core if None; or where :func:`on_cluster` has it done.
+    In ``jobs`` processes, one per core if None; or where :func:`on_cluster` has it done. Raises
+    :class:`JumplabError` if a process is killed.
     """
     if _CLUSTER:
-        return joblib.Parallel(return_as=order)(work)
-    jobs = min(jobs or joblib.cpu_count(), max(len(work), 1))
-    options = {"initializer": _serve, "initargs": (os.getpid(),)} if jobs > 1 else {}
-    return joblib.Parallel(jobs, return_as=order, max_nbytes=None, **options)(work)
+        yield from _by_cluster(_CLUSTER[-1], work, order)
+        return
+    jobs = min(jobs or joblib.cpu_count(), len(work))
+    if jobs <= 1:
+        yield from map(_done, work)
+        return
+    begin = {"initializer": _serve, "initargs": (os.getpid(),)}
+    with _POOL, _safe_path():
+        try:
+            yield from joblib.Parallel(jobs, return_as=order, max_nbytes=None, **begin)(work)
+        except BrokenProcessPool as e:
+            raise JumplabError(
+                "a worker process was killed, perhaps for lack of memory; what was finished is "
+                "kept: run it again, with fewer jobs at a time"
+            ) from e
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Within the block, a Python that is started imports nothing from its current folder."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 @contextmanager
 def on_cluster(address: str) -> Iterator[None]:
-    """Within the block, work is done by the Dask scheduler at ``address``, "tcp://host:8786";
-    raises :class:`InputError` if none answers.
+    """Within the block, work is done by the Dask scheduler at ``address``, "tcp://host:8786".
+
+    Raises :class:`InputError` if none answers, it has no worker, or a worker has other versions
+    than this process of what decides results.
     """
     try:
         from distributed import Client
-
-        client = Client(address, timeout="10s")
     except ImportError:
         raise InputError("a cluster needs Dask: install jumplab[cluster]") from None
+    try:
+        client = Client(address, timeout=f"{ANSWER_S} s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as e:
         raise InputError(f"no Dask scheduler answers at {address!r} ({type(e).__name__})") from None
-    _CLUSTER.append(address)
-    try:
-        with joblib.parallel_config("dask", client=client):
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=ANSWER_S)
+            theirs = client.run(deciding)
+        except (OSError, TimeoutError, ImportError, AttributeError) as e:
+            raise InputError(
+                f"the cluster at {address!r} has no worker with this version of jumplab "
+                f"({type(e).__name__}); start one with 'dask worker'"
+            ) from None
+        for worker, values in theirs.items():
+            for name, value in deciding().items():
+                if values.get(name) != value:
+                    raise InputError(
+                        f"worker {worker} has {name} {values.get(name)}, this process {value}; "
+                        f"install the same on both"
+                    )
+        _CLUSTER.append(client)
+        try:
             yield
+        finally:
+            _CLUSTER.remove(client)
+
+
+def _by_cluster(client: Any, work: Sequence[Task], order: str) -> Iterator[Any]:
+    """Results of work from the workers of a cluster, however many threads they have."""
+    from distributed import as_completed
+    from distributed.scheduler import KilledWorker
+
+    futures = [client.submit(_done, task, pure=False) for task in work]
+    try:
+        for future in futures if order == "generator" else as_completed(futures):
+            yield future.result()
+    except (KilledWorker, OSError) as e:
+        raise JumplabError(
+            f"the cluster has lost a worker ({type(e).__name__}); what was finished is kept: run "
+            f"it again"
+        ) from e
     finally:
-        _CLUSTER.remove(address)
+        client.cancel(futures)
+
+
+def _done(task: Task) -> Any:
+    function, arguments, options = task
+    return function(*arguments, **options)
 
 
 def _serve(parent: int) -> None:

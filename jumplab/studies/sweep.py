@@ -21,6 +21,7 @@ from typing import Any
 import joblib
 import numpy as np
 
+from jumplab import reading
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.io.files import ensure_writable, settle, write_file
 from jumplab.io.tape import Tape
@@ -180,12 +181,12 @@ def run(
     folder = ensure_writable(out)
     places = {}
     for name in dict.fromkeys(case.robot for case in cases) if atlas else ():
-        places[name] = _atlas(folder / "atlas", cases, name, jobs)
+        places[name] = _atlas(reading.below(folder, "atlas"), cases, name, jobs)
     work = {}
     for case in cases:
         place = places.get(case.robot)
         name = case.key(tapes_hz, place and place.name)
-        tape = folder / TAPES / f"{name}.npz" if tapes_hz else None
+        tape = reading.below(folder, TAPES) / f"{name}.npz" if tapes_hz else None
         work[name] = joblib.delayed(run_case)(case, place, tape, tapes_hz)
     study = open_study(folder / CASES, "sweep", total=len(cases), jobs=jobs, progress=progress)
     with on_cluster(cluster) if cluster else nullcontext(), study as study:
@@ -216,7 +217,7 @@ def _atlas(folder: Path, cases: Sequence[Case], robot: str, jobs: int | None) ->
     for name, step in ATLAS_STEPS.items():
         low, high = (extreme(getattr(task, name) for task in ours) for extreme in (min, max))
         axes.append(np.linspace(low, high, 1 + math.ceil((high - low) / step - 1e-9)).tolist())
-    place = folder / short_hash([robot_of(robot).hash, axes])
+    place = reading.below(folder, short_hash([robot_of(robot).hash, axes]))
     Atlas.build(robot_of(robot), *axes, folder=place, jobs=jobs, progress=False)
     return place
 

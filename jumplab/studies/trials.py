@@ -22,6 +22,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.stats import binomtest
 
+from jumplab import reading
 from jumplab.control.launch import check_mode
 from jumplab.control.servo import servo_of
 from jumplab.errors import Shown, SolverError
@@ -425,7 +426,7 @@ def run_trials(
     report = TrialReport(tuple(trials), seed, settings, plan.hash, target, study.resumed)
     plan.write("trials.json", report.to_json())
     for trial in [t for t in report.failed if t.metrics is not None][:keep_falls]:
-        place = Path(folder, "falls", str(trial.key.index))
+        place = reading.below(folder, "falls", str(trial.key.index))
         store.write_plan(place, plan.tape, plan.robot, plan.summary)
         drawn = settings.draw(plan.robot, trial.key.robot_seed)
         fall = settings.simulate(plan, drawn)

@@ -19,6 +19,7 @@ import numpy as np
 from jumplab.models.full import FullBody, FullTerms
 from jumplab.models.srmp import COORDINATES
 from jumplab.ocp import Nlp, PhaseGuess, Statistics
+from jumplab.ocp.cache import in_turn
 from jumplab.ocp.problem import Bound, Phase, Problem, Term
 from jumplab.robot import Robot
 from jumplab.robot.reach import FORCE_SHARE, Reach, reach
@@ -220,12 +221,14 @@ def build_landing(robot: Robot, settings: LandingSettings, envelope: Reach) -> P
 class LandingPlanner:
     """Landings of one robot: built once, solved from any touchdown."""
 
+    @in_turn
     def __init__(self, robot: Robot, settings: LandingSettings = LandingSettings()):
         self.robot = robot
         self.settings = settings
         self.reach = reach(robot)
         self.nlp = Nlp(build_landing(robot, settings, self.reach))
 
+    @in_turn
     def plan(self, touchdown: Touchdown) -> LandingPlan:
         """Plan from ``touchdown``, with velocities right after the impact, to standing.
 

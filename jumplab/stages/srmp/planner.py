@@ -13,6 +13,7 @@ import numpy as np
 from jumplab.errors import Shown, SolverError
 from jumplab.models.srmp import SrmpState
 from jumplab.ocp import Nlp, PhaseGuess, PhaseSolution, Solution
+from jumplab.ocp.cache import in_turn
 from jumplab.ocp.nlp import WARM
 from jumplab.robot import Robot
 from jumplab.robot.reach import Reach, reach
@@ -164,6 +165,7 @@ class SrmpPlanner:
     terms left out.
     """
 
+    @in_turn
     def __init__(
         self,
         robot: Robot,
@@ -180,6 +182,7 @@ class SrmpPlanner:
         self.nlp = Nlp(changes.applied(build_problem(robot, settings, self.reach)), OPTIONS, key)
         self._warm = self.nlp.with_options(WARM | OPTIONS)
 
+    @in_turn
     def plan(
         self,
         task: JumpTask,

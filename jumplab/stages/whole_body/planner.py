@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.ocp.cache import in_turn
 from jumplab.ocp.nlp import EXPLAINED, Nlp
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
@@ -122,12 +123,14 @@ class WholeBodyPlanner:
             return [self.usual]
         return [self._even] if self._even.free.plane else [self._even, self.usual]
 
+    @in_turn
     def program(
         self, task: JumpTask, weights: Mapping[str, float] = MappingProxyType({})
     ) -> Program:
         """The first of :meth:`programs` (same arguments)."""
         return self.programs(task, weights)[0]
 
+    @in_turn
     def plan(
         self,
         task: JumpTask,

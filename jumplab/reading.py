@@ -1,0 +1,196 @@
+"""The one way to read a file that somebody else may have made, with its limits.
+
+Only regular files are read (no device, pipe or folder, which may never end), none that is larger
+than :data:`KINDS` allows, and nothing is unpacked or allocated before its header says that it
+fits. Robots are named by the user, and may be links; a result folder holds none, see
+:func:`below`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import stat
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jumplab.errors import InputError
+
+LINE_BYTES = 20_000_000  # of a log, which is read line by line
+MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
+MOST_ARRAYS = 1000  # in one file
+MOST_TAGS = 100_000  # of an XML text; the largest published robot has some 5000
+MOST_COPIES = 1000  # that an MJCF file asks for
+MOST_POINTS = 4_000_000  # of a height field
+COPYING = ("replicate", "composite", "flexcomp")
+# [bytes] of a file, by what it is: several times the largest that this package or a publisher of
+# robots makes; in words; what to do
+KINDS = {
+    # MJCF and TOML as well; the largest published URDF is under 1 MB
+    "robot": (20_000_000, "a URDF", "name the URDF, not a mesh"),
+    "report": (100_000_000, "a report", "delete it, and make it again"),
+    # packed; an atlas of 2500 nodes has some 30 MB
+    "arrays": (200_000_000, "a file of arrays", "delete it, and make it again"),
+    "log": (1_000_000_000, "a log", "choose another folder"),
+}
+# how what others may have made is opened: no link is followed, no pipe is waited for
+SAFE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+# what reading a cut, altered or foreign file of arrays may raise
+DAMAGE = (
+    OSError,
+    ValueError,
+    TypeError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@contextmanager
+def opened(
+    path: str | Path, kind: str, *, error: type[InputError] = InputError, link: bool = True
+) -> Iterator[BinaryIO]:
+    """A regular file of a ``kind`` (one of :data:`KINDS`), open to be read.
+
+    Raises ``error`` if it is no regular file, is too large, or is a symbolic link where no
+    ``link`` is followed; OSError if the system refuses it.
+    """
+    if not link:
+        refuse_link(path)
+    flags = os.O_RDONLY | (SAFE & ~os.O_NOFOLLOW if link else SAFE)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        check(file, path, kind, error)
+        yield file
+
+
+def check(
+    file: BinaryIO, path: str | Path, kind: str, error: type[InputError] = InputError
+) -> None:
+    """Raise ``error`` unless an open file is a regular one, and not larger than its ``kind`` is."""
+    about = os.fstat(file.fileno())
+    if not stat.S_ISREG(about.st_mode):
+        raise error(f"{path}: is a pipe or a device; save it to a file first")
+    most, what, remedy = KINDS[kind]
+    if about.st_size > most:
+        size = f"{about.st_size / 1e6:.0f} MB, {what} has at most {most / 1e6:.0f}"
+        raise error(f"{path}: has {size}; {remedy}")
+
+
+def content(
+    path: str | Path, kind: str, *, error: type[InputError] = InputError, link: bool = True
+) -> bytes:
+    """All bytes of a file, see :func:`opened`."""
+    with opened(path, kind, error=error, link=link) as file:
+        return file.read(KINDS[kind][0])
+
+
+def refuse_link(path: str | Path) -> None:
+    """Raise :class:`InputError` if ``path`` itself is a symbolic link."""
+    if os.path.islink(path):
+        raise InputError(
+            f"{str(path)!r} is a symbolic link, which no result folder holds; remove it"
+        )
+
+
+def xml(text: str | bytes, where: str, error: type[InputError] = InputError) -> ElementTree.Element:
+    """Root element of an XML text; raises ``error`` for too many elements,
+    :class:`xml.etree.ElementTree.ParseError` if it is none.
+    """
+    if (count := text.count("<" if isinstance(text, str) else b"<")) > MOST_TAGS:
+        raise error(f"{where}: has {count} XML tags, a robot at most {MOST_TAGS}; is it one?")
+    return ElementTree.fromstring(text)
+
+
+def check_mjcf(
+    path: Path, folder: Path, error: type[InputError] = InputError, seen: Collection[Path] = ()
+) -> None:
+    """Refuse (``error``) an MJCF file that makes more copies or points than a robot has, or
+    includes what is no file of it; ``folder`` is that of the first file, ``seen`` are those before.
+
+    MuJoCo itself has no such limits. What is no XML is left to it.
+    """
+    try:
+        todo = [(xml(content(path, "robot", error=error), path.name, error), 1)]
+    except (OSError, ElementTree.ParseError):
+        return
+    for element, above in todo:
+        get = element.get
+        numbers = [get("count")] if element.tag in COPYING else []
+        numbers += [get("nrow"), get("ncol")] if element.tag == "hfield" else []
+        copies = math.prod(
+            int(x) for text in numbers for x in (text or "").split() if x.isdecimal()
+        )
+        most = MOST_POINTS if element.tag == "hfield" else MOST_COPIES
+        if above * copies > most:
+            raise error(
+                f"{path.name}: <{element.tag}> makes {above * copies:.3g} copies or points, at "
+                f"most {most} are read; remove it, or ask for fewer"
+            )
+        todo += [(child, above * copies) for child in element]
+        included = (folder / get("file", "")).resolve()
+        if element.tag == "include" and included not in seen:
+            check_mjcf(included, folder, error, {*seen, included})
+
+
+def require_private(path: str | Path, about: os.stat_result) -> None:
+    """Raise :class:`InputError` unless this user owns a file or folder (its status is ``about``),
+    and nobody else can write it.
+    """
+    if about.st_uid != os.geteuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise InputError(
+            f"{path}: belongs to another user, or others can write it; delete it, or choose "
+            "another folder"
+        )
+
+
+def below(folder: str | Path, *names: str) -> Path:
+    """A path below a result folder, which itself may be a link; raises :class:`InputError` if a
+    part of the way below it is one, since what it leads to is not the folder's.
+    """
+    path = Path(folder)
+    for name in names:
+        path = path / name
+        refuse_link(path)
+    return path
+
+
+def arrays(raw: bytes) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file by name, none of objects; raises one of :data:`DAMAGE`.
+
+    Every size is known from the headers, and checked, before anything is unpacked or allocated.
+    """
+    with zipfile.ZipFile(io.BytesIO(raw)) as file:
+        members = file.infolist()
+        unpacked = sum(member.file_size for member in members)
+        if len(members) > MOST_ARRAYS or unpacked > MOST_UNPACKED_BYTES:
+            raise ValueError(f"{len(members)} arrays of {unpacked} bytes are too many")
+        return {m.filename.removesuffix(".npy"): _array(file.read(m)) for m in members}
+
+
+def _array(raw: bytes) -> np.ndarray:
+    """One array of a ``.npy`` file whose header says as much as follows it."""
+    file = io.BytesIO(raw)
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    shape, _, kind = read[version](file)
+    count = math.prod(shape)
+    if kind.hasobject or min(shape, default=0) < 0 or count > len(raw):
+        raise ValueError(f"an array of kind {kind} and shape {shape} does not fit its file")
+    if count * kind.itemsize != len(raw) - file.tell():
+        raise ValueError(f"an array of {count * kind.itemsize} bytes has another number in it")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
