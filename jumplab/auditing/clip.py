@@ -202,24 +202,36 @@ def _drop(flags: np.ndarray, value: bool, least: int) -> None:
 
 
 def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
-    """Wrenches (n, 2, 6) at the feet: the best that friction at the soles' corners can do."""
+    """Wrenches (n, 2, 6) at the feet: what friction at the soles' corners can do for the base, and
+    with least torques.
+    """
     from scipy.optimize import nnls  # slow to import
 
     mu = METHOD.clip_friction
     edges = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
     corners = np.concatenate([r.toe_corners, r.heel_corners], axis=2)
+    effort = r.model.upperEffortLimit[6:, None]
+    data = r.model.createData()
+    frames = [r.model.getFrameId(str(name)) for name in r.tape.contact_frames]
     f = np.zeros((*ground.shape, 6))
     for k in np.flatnonzero(ground.any(axis=1)):
-        sides = np.flatnonzero(ground[k])
-        points = corners[k, sides].reshape(-1, 3)
-        force = np.repeat(edges[None], len(points), axis=0).reshape(-1, 3)
-        at = np.repeat(points, len(edges), axis=0)
-        columns = np.hstack([force, np.cross(at - r.com[k], force)]).T
-        shares, _ = nnls(columns, r.base_residual[k])
-        for side, part in zip(sides, np.split(np.arange(len(at)), len(sides)), strict=True):
-            pushed = shares[part, None] * force[part]
-            arm = at[part] - r.foot[k, side]
-            f[k, side] = [*pushed.sum(axis=0), *np.cross(arm, pushed).sum(axis=0)]
+        pin.computeJointJacobians(r.model, data, r.tape.q[k])
+        columns = []
+        wrenches = []
+        for side in np.flatnonzero(ground[k]):
+            force = np.tile(edges, (corners.shape[2], 1))
+            arms = np.repeat(corners[k, side], len(edges), axis=0)
+            wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
+            slope = pin.getFrameJacobian(r.model, data, frames[side], pin.LOCAL_WORLD_ALIGNED)
+            base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
+            torques = METHOD.torque_weight * (slope.T @ wrench)[6:] / effort
+            columns.append(np.vstack([base, torques]))
+            wrenches.append(wrench)
+        asked = [r.base_residual[k] / r.weight, METHOD.torque_weight * r.tau[k] / effort[:, 0]]
+        shares, _ = nnls(np.hstack(columns), np.concatenate(asked))
+        parts = np.split(shares, len(wrenches))
+        for side, wrench, part in zip(np.flatnonzero(ground[k]), wrenches, parts, strict=True):
+            f[k, side] = wrench @ part
     return f
 
 
@@ -230,14 +242,11 @@ def _measures(r: Replay, ground: np.ndarray) -> Iterator[Measure]:
     t = r.tape.t
     feet = r.tape.contact_frames
     height = r.sole_points[..., 2].min(axis=2)
-    floating = [np.median(height[rows, k]) for k, rows in r.stands]
-    places = np.array([k for k, _ in r.stands])
-    middle = [t[rows][len(t[rows]) // 2] for _, rows in r.stands]
-    table = np.full((len(middle), len(feet)), -np.inf)
-    table[np.arange(len(middle)), places] = floating
-    yield "standing feet float", table, middle, feet
+    standing = _inner(ground, t)
+    floating = np.where(standing, height, -np.inf)
+    yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
     yield "feet in the ground", -height, t, feet
-    yield "feet on the ground slide", *_most(_sliding(r, ground), t, METHOD.slide_percent), feet
+    yield "feet on the ground slide", *_most(_sliding(r, standing), t, METHOD.slide_percent), feet
     falls = _free_falls(r, ground)
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", off, [times[0] for times, _, _ in falls]
@@ -245,6 +254,14 @@ def _measures(r: Replay, ground: np.ndarray) -> Iterator[Measure]:
     yield "force from nowhere", *_most(missing, t, METHOD.force_percent)
     moment = norm(r.base_residual[:, 3:]) / r.weight
     yield "moment from nowhere", *_most(moment, t, METHOD.force_percent)
+
+
+def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Contacts (n, 2) without what is close to their ends."""
+    from scipy.ndimage import binary_erosion  # slow to import
+
+    rim = max(1, round(METHOD.rim_s / np.median(np.diff(t))))
+    return binary_erosion(ground, np.ones((2 * rim + 1, 1)))
 
 
 def _most(values: np.ndarray, t: np.ndarray, percent: float) -> tuple[np.ndarray, np.ndarray]:

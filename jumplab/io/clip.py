@@ -346,29 +346,31 @@ def _fitted(where: str, raw: _Raw, robot: Robot, order: str) -> tuple[Robot, np.
     """The robot whose joints are the clip's, and configurations (n, nq)."""
     count = raw.joints.shape[1]
     turn = raw.turn / np.linalg.norm(raw.turn, axis=1, keepdims=True)
-    head = np.hstack([raw.base, turn])
     counts = set()
+    refusal = ""
     for one in _siblings(robot):
         whole = Whole(one)
-        counts |= {len(one.joint_names), len(whole.joints)}
-        names = raw.names or (ordered(one.urdf, order)[0] if count == len(one.joint_names) else ())
-        if set(names) == set(one.joint_names):
-            columns = [names.index(name) for name in one.joint_names]
-            return one, np.hstack([head, raw.joints[:, columns]])
-    whole = Whole(robot)
-    names = raw.names or ordered(whole.urdf, order)[0]
-    if count == len(whole.joints) and set(names) == set(whole.joints):
-        columns = [names.index(name) for name in whole.joints]
-        q, moved = whole.own(np.hstack([head, raw.joints[:, columns]]))
-        for name, way in moved.items():
-            if way > STILL_RAD:
-                raise InputError(
-                    f"{where}: joint {name!r} moves by {way:.2f} rad, and robot {robot.name} holds "
-                    f"it; pass a robot that moves it"
-                )
-        return robot, q
+        for joints, urdf in ((one.joint_names, one.urdf), (whole.joints, whole.urdf)):
+            counts.add(len(joints))
+            names = raw.names or ordered(urdf, order)[0]
+            if count != len(joints) or set(names) != set(joints):
+                continue
+            columns = [names.index(name) for name in joints]
+            q = np.hstack([raw.base, turn, raw.joints[:, columns]])
+            if joints == one.joint_names:
+                return one, q
+            q, moved = whole.own(q)
+            name = max(moved, key=moved.get)
+            if moved[name] < STILL_RAD:
+                return one, q
+            refusal = refusal or (
+                f"{where}: joint {name!r} moves by {moved[name]:.2f} rad, and robot {one.name} "
+                f"holds it; pass a robot that moves it"
+            )
+    if refusal:
+        raise InputError(refusal)
     what = f"{count} joints"
-    strange = sorted(set(raw.names or ()) - set(whole.joints))
+    strange = sorted(set(raw.names or ()) - set(Whole(robot).joints))
     if strange:
         what += f", of which {strange[0]!r} is none of the robot's"
     listed = ", ".join(map(str, sorted(counts)))
