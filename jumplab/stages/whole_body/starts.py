@@ -188,6 +188,8 @@ GIVEN = (
     Start(MENDED, from_mended, True, 3.0, {"max_iter": 60}),
     Start(MENDED, from_mended, False, 5.0),
 )
+# of a motion that is followed: near it the exact Hessian settles, the held one wanders
+FOLLOWED = (Start("given motion", from_motion, False, 12.0),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 4.0, NEAR),
     Start(NEIGHBOUR, from_neighbour, False, 6.0, WARM | {"acceptable_iter": 1}),
