@@ -5,8 +5,8 @@ code where that applies.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,11 +37,13 @@ class ClipReport(AuditReport):
     clip : that was judged.
     tape : the same with rates by differences, the ground's best forces, and torques.
     ground : (n, 2) whether left and right foot carry, as found.
+    series : by name with unit, what the table has worst values of, over time (n,) or (n, 2).
     """
 
     clip: Clip | None = None
     tape: Tape | None = None
     ground: np.ndarray | None = None
+    series: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def line(self) -> str:
         """The clip, and the verdict."""
@@ -133,7 +135,7 @@ def _judged(clip: Clip) -> ClipReport:
         ],
         "versions": versions(),
     }
-    report = ClipReport(checks, manifest, clip, tape, ground)
+    report = ClipReport(checks, manifest, clip, tape, ground, _series(r))
     manifest["phases"] = [list(phase) for phase in report.phases]
     return report
 
@@ -262,6 +264,15 @@ def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:
 
     rim = max(1, round(METHOD.rim_s / np.median(np.diff(t))))
     return binary_erosion(ground, np.ones((2 * rim + 1, 1)))
+
+
+def _series(r: Replay) -> dict[str, np.ndarray]:
+    torque = np.abs(r.tape.tau) / r.model.upperEffortLimit[6:]
+    return {
+        "lowest point of each sole [m]": r.sole_points[..., 2].min(axis=2),
+        "force from nowhere [m g]": norm(r.base_residual[:, :3]) / r.weight,
+        "largest torque [of the limit]": torque.max(axis=1),
+    }
 
 
 def _most(values: np.ndarray, t: np.ndarray, percent: float) -> tuple[np.ndarray, np.ndarray]:

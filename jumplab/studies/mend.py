@@ -28,12 +28,12 @@ from jumplab.stages.whole_body.motions import HEEL_UP, Motion, Reach, configurat
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
 
-AROUND_S = 0.7  # of standing, before the first and after the last event
+AROUND_S = 0.6  # of standing, before the first and after the last event
 MERGED_S = 0.12  # phases that are shorter are events of one
 TOES_S = 0.1  # on the toes before a flight, ...
 ROLLING_S = 0.22  # ... if the phase before it is this long
-# steps [s] of phases on flat feet, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.035, "toe": 0.018, FLIGHT: 0.03}
+# steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
+STEPS_S = {"flat": 0.033, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
 LEAST_STEPS = 6
 MOST_STEPS = 60
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
@@ -264,6 +264,8 @@ class Draft:
             lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
             low, high = FLIGHT_STRETCH if feet == FLIGHT else STRETCH
             kind = feet if feet == FLIGHT else "toe" if feet.islower() else "flat"
+            if k and self.phases[k - 1][0] == FLIGHT:
+                kind = "landing"
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
             phases.append(ContactPhase(feet, (low * lasts, high * lasts), lasts, steps))
             for side, hold in self.holds[k].items():

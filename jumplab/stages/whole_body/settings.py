@@ -94,6 +94,7 @@ class Limits:
         """The same for a motion that follows another one: its feet, arms and load are its own."""
         return replace(
             self,
+            torque_share=0.8,  # landings need more between the nodes
             straight_knee_rad=0.25,
             foot_share=0.02,
             sides_share=0.3,
@@ -151,7 +152,7 @@ class Weights:
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""
-        return replace(self, acceleration=2e-4, torque=5e-5)
+        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5)
 
     def of_flip(self) -> Weights:
         """The same for a jump that turns over: stage 1's inertia, of a rod that turns as one, is
