@@ -36,13 +36,14 @@ class ClipReport(AuditReport):
     ----------
     clip : that was judged.
     tape : the same with rates by differences, the ground's best forces, and torques.
-    ground : (n, 2) whether left and right foot carry, as found.
+    ground : (n, 2) whether left and right foot carry, as found.  still : whether they are slow.
     series : by name with unit, what the table has worst values of, over time (n,) or (n, 2).
     """
 
     clip: Clip | None = None
     tape: Tape | None = None
     ground: np.ndarray | None = None
+    still: np.ndarray | None = None
     series: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def line(self) -> str:
@@ -53,11 +54,7 @@ class ClipReport(AuditReport):
     @property
     def phases(self) -> list[tuple[str, float, float]]:
         """Feet that carry ("LR", "L", "R", "-"), from and to [s]."""
-        words = ["".join(s for s, on in zip(SIDES, x, strict=True) if on) for x in self.ground]
-        edges = np.flatnonzero([True, *(a != b for a, b in zip(words[1:], words, strict=False))])
-        ends = np.append(edges, len(words) - 1) / self.clip.fps
-        rows = zip(edges.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True)
-        return [(words[k] or "-", a, b) for k, a, b in rows]
+        return phases_of(self.ground, self.clip.fps)
 
     @property
     def flights(self) -> list[tuple[float, float]]:
@@ -70,6 +67,13 @@ class ClipReport(AuditReport):
         values = {c.name: c.value for c in self.checks}
         row = {"clip": self.clip.name, "physical": self.passed, "flights [s]": flown or "none"}
         return row | {f"{c.name} [{c.unit}]": values[c.name] for c in self.checks}
+
+
+def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
+    """Feet that carry ("LR", "L", "R", "-"), from and to [s], of contacts (n, 2)."""
+    words = ["".join(s for s, on in zip(SIDES, x, strict=True) if on) for x in ground]
+    edges = [0, *(k for k in range(1, len(words)) if words[k] != words[k - 1]), len(words) - 1]
+    return [(words[a] or "-", a / fps, b / fps) for a, b in pairwise(edges)]
 
 
 def judge(
@@ -107,7 +111,7 @@ def judge(
 def _judged(clip: Clip) -> ClipReport:
     bare = tape_of(clip)
     r = replay(bare, clip.robot, None)
-    ground, level = contacts(r, clip.fps)
+    ground, still, level = contacts(r, clip.fps)
     tape = dataclasses.replace(
         bare,
         f=_pushed(r, ground),
@@ -135,7 +139,7 @@ def _judged(clip: Clip) -> ClipReport:
         ],
         "versions": versions(),
     }
-    report = ClipReport(checks, manifest, clip, tape, ground, _series(r))
+    report = ClipReport(checks, manifest, clip, tape, ground, still, _series(r))
     manifest["phases"] = [list(phase) for phase in report.phases]
     return report
 
@@ -161,8 +165,9 @@ def tape_of(clip: Clip) -> Tape:
 
 # contacts
 # ----------------------------------------------------------------------------------------------
-def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each foot carries (n, 2), and how high it would stand (n, 2) [m].
+def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether each foot carries (n, 2), whether it is still (n, 2), and how high it would stand
+    (n, 2) [m].
 
     A foot stands where its sole is slow, and not far above the lowest one around: so far its height
     is that of the ground, and linear between. In the air it is while it is
@@ -192,7 +197,7 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray]:
     kept = flying.copy()
     _drop(kept, True, least)
     carrying[flying & ~kept] = True
-    return carrying, level
+    return carrying, still, level
 
 
 def _drop(flags: np.ndarray, value: bool, least: int) -> None:

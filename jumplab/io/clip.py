@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.errors import InputError, Shown, as_path, quoted
 from jumplab.io.motion import Motion, steady
-from jumplab.io.tape import DAMAGE
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED, read_toml
@@ -129,7 +128,9 @@ def _content(path: Path) -> Mapping[str, Any]:
         return _columns(raw.decode())
     except pickle.UnpicklingError as e:
         raise InputError(f"{path}: refused, {e}; ask for the clip as npz") from e
-    except (*DAMAGE, AttributeError, IndexError, UnicodeDecodeError, MemoryError) as e:
+    except InputError:
+        raise
+    except Exception as e:  # damaged pickles raise whatever they like
         reason = getattr(e, "strerror", None) or type(e).__name__
         raise InputError(
             f"{path}: not a readable clip ({reason}); give a pickle, npz or csv file"
@@ -143,7 +144,10 @@ def _columns(text: str) -> Mapping[str, Any]:
         float(first[0])
         return {"rows": np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)}
     except ValueError:
-        table = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2)
+        rows = text.lstrip().partition("\n")[2]
+        if not rows.strip():
+            raise ValueError("no rows") from None
+        table = np.loadtxt(io.StringIO(rows), delimiter=",", ndmin=2)
         return dict(zip(first, table.T, strict=True))
 
 
@@ -263,7 +267,7 @@ def read_clips(
         keys = list(content)[:6] if isinstance(content, Mapping) else quoted(content)
         known = "; ".join(", ".join(names) for names, _ in FORMS)
         raise InputError(f"{path}: holds no clip, but {keys}; a clip has one of: {known}")
-    return found
+    return found if len(found) > 1 else [replace(found[0], name=path.stem)]
 
 
 # checks
@@ -331,14 +335,14 @@ def _check_axes(where: str, raw: _Raw) -> None:
 
     if upright(raw.turn) > 0.5:
         return
+    if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
+        raise InputError(
+            f"{where}: the robot's up is the world's y; turn the clip so that z points up"
+        )
     if upright(_first_wxyz(raw.turn)) > 0.9:
         raise InputError(
             f"{where}: the robot lies or stands on its head, but not if its quaternions are "
             f"w x y z; pass x y z w"
-        )
-    if upright(raw.turn, 1) > 0.9:
-        raise InputError(
-            f"{where}: the robot's up is the world's y; turn the clip so that z points up"
         )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.clip import ClipReport, judge
+from jumplab.auditing.clip import ClipReport, judge, phases_of
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, require_type
 from jumplab.io.clip import Clip
 from jumplab.io.progress import tell
@@ -33,7 +33,7 @@ MERGED_S = 0.12  # phases that are shorter are events of one
 TOES_S = 0.1  # on the toes before a flight, ...
 ROLLING_S = 0.22  # ... if the phase before it is this long
 # steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.033, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
+STEPS_S = {"flat": 0.035, "landing": 0.03, "toe": 0.018, FLIGHT: 0.03}
 LEAST_STEPS = 6
 MOST_STEPS = 60
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
@@ -151,11 +151,19 @@ def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended
 
 # the schedule
 # ----------------------------------------------------------------------------------------------
-def phases_of(before: ClipReport) -> list[tuple[str, float, float]]:
+def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     """Feet that carry, from and to [s]: those of the clip without events of less than
     :data:`MERGED_S`, cut to what is :data:`AROUND_S` around the others.
+
+    Where both feet are fast for long but low, the clip skips, and flies here.
     """
-    rows = [[feet, a, b] for feet, a, b in before.phases]
+    fps = before.clip.fps
+    ground = before.ground.copy()
+    fast = np.diff((~before.still.any(axis=1)).astype(int), prepend=0, append=0)
+    for a, b in np.flatnonzero(fast).reshape(-1, 2):
+        if b - a > MERGED_S * fps and ground[a:b].any(axis=1).all():
+            ground[a:b] = False
+    rows = [[feet, a, b] for feet, a, b in phases_of(ground, fps)]
     k = 0
     while k < len(rows):
         feet, a, b = rows[k]
@@ -206,7 +214,7 @@ class Draft:
         self.clip: Clip = before.clip
         self.body = Body(self.clip.robot)
         self.reach = Reach(self.body, Limits().range_margin_rad)
-        self.phases = phases_of(before)
+        self.phases = planned_phases(before)
         self.span_s = self.phases[0][1], self.phases[-1][2]
         charts = self.body.model.of_pinocchio(self.clip.q)
         charts = _level(self._ahead(charts), before)
