@@ -21,7 +21,9 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time __getattr__ load
     from jumplab import errors as errors
     from jumplab import show as plots  # noqa: F401
     from jumplab.api import audit as audit
+    from jumplab.api import judge as judge
     from jumplab.api import load as load
+    from jumplab.api import mend as mend
     from jumplab.api import plan as plan
     from jumplab.api import save as save
     from jumplab.api import simulate as simulate
@@ -64,6 +66,8 @@ _PLACES = {
     "Term": "ocp",
     "plan": "api",
     "audit": "api",
+    "judge": "api",
+    "mend": "api",
     "simulate": "api",
     "save": "api",
     "load": "api",

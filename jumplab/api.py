@@ -17,9 +17,10 @@ from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 if TYPE_CHECKING:  # what only some of the functions need is imported by them
-    from jumplab.auditing import AuditReport
+    from jumplab.auditing import AuditReport, ClipReport
     from jumplab.show.viewer import Page
     from jumplab.sim import Ranges, SimulationResult
+    from jumplab.studies.mend import Mended
 
 
 class Saved(NamedTuple):
@@ -94,6 +95,53 @@ def audit(plan: JumpPlan) -> AuditReport:
 
     require_type(plan, JumpPlan, "the plan to audit")
     return check(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+
+
+def judge(
+    motion: Any, robot: Robot | str | Path = "bhr", **reading: Any
+) -> ClipReport | list[ClipReport]:
+    """Judge a motion, however it was made: feet that float, sink or slide, flights that are no free
+    fall, forces from nowhere, motors, joints, collisions.
+
+    Parameters
+    ----------
+    motion : a plan or a simulation; or the path of a clip (pickles of motion libraries and
+        retargeters, npz, csv, told by their content; pickles are read without running them), or of
+        a folder of clips.
+    robot : whose motion it is, if it does not carry its own: what :meth:`Robot.load` takes. Of a
+        clip with more joints than it moves, the shipped robot of the same URDF that has those.
+    reading : ``fps`` [1/s] of files that do not say, ``order`` of joints without names
+        ("depth-first" or "breadth-first").
+
+    Returns a report, of several clips a list. Raises :class:`InputError` for what holds no clip of
+    the robot.
+    """
+    from jumplab.auditing.clip import judge as judged
+
+    return judged(motion, robot, **reading)
+
+
+def mend(motion: Any, robot: Robot | str | Path = "bhr", **options: Any) -> Mended:
+    """The nearest motion to a clip that the robot can do: the clip's contacts, all limits hard.
+
+    Parameters
+    ----------
+    motion, robot : as of :func:`judge`, one clip, or what that returned of it.
+    options : ``fps``, ``order`` as there; ``weights``, ``limits`` as of :class:`jumplab.Planner`.
+
+    Returns
+    -------
+    Mended
+        ``.plan`` is a plan as any other, ``.changes`` a table of what became of the clip.
+
+    Raises
+    ------
+    InputError, InfeasibleError
+        If there is no clip, or no motion near it; then with the largest part that can be done.
+    """
+    from jumplab.studies.mend import mend as mended
+
+    return mended(motion, robot, **options)
 
 
 def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from jumplab.cli.common import add_common, declare
 from jumplab.cli.interrupts import CODES, UNCHANGED, Interrupts, end_soon
 from jumplab.cli.jumps import audit, export, plan, run, simulate, view
+from jumplab.cli.motions import judge, mend
 from jumplab.cli.robots import check, list_, robot
 from jumplab.cli.streams import patient_streams
 from jumplab.cli.studies import (
@@ -46,7 +47,8 @@ def completion(args: argparse.Namespace) -> None:
     print(args.found["script"])
 
 
-COMMANDS = (run, plan, audit, simulate, trials, margins, certify, chain, clips, view, export)
+COMMANDS = (run, plan, audit, simulate, trials, margins, certify, chain, clips, judge, mend)
+COMMANDS += (view, export)
 COMMANDS += (robot, envelope, atlas, sweep, bench, completion)
 
 

@@ -80,7 +80,8 @@ def _encoded(ending: str, content: Any) -> bytes:
 # and their rate [1/s].
 # -----------------------------------------------------------------------------------
 def joint_table(whole: Whole, x: Motion, fps: float) -> str:
-    """Time, phase, contacts, position, velocity and torque of every joint (F) with commas between.
+    """Time, phase, contacts, position, velocity and torque of every joint (F), then the base's
+    place and quaternion, with commas between.
 
     One header line with units, one line per frame; take-off, which a tape holds twice, stands once.
     """
@@ -88,8 +89,10 @@ def joint_table(whole: Whole, x: Motion, fps: float) -> str:
     head = ["time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right"]
     head += [f"{name}_{kind}" for kind in kinds for name in whole.joints]
     codes = [PHASE_CODES[str(phase)] for phase in x.phase]
-    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * 3 * len(whole.joints)]
-    return _rows(np.column_stack([x.t, codes, x.contact, *kinds.values()]), ",".join(head), digits)
+    head += [f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * (3 * len(whole.joints) + 7)]
+    table = np.column_stack([x.t, codes, x.contact, *kinds.values(), x.q[:, :7]])
+    return _rows(table, ",".join(head), digits)
 
 
 def bare_states(whole: Whole, x: Motion, fps: float) -> str:

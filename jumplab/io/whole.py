@@ -105,6 +105,26 @@ class Whole:
         t = x.t - x.t[0]
         return Motion(t, q, v, tau[:, order], x.phase, x.source, contact=x.contact)
 
+    def own(self, q: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
+        """The inverse of :meth:`frames`: configurations (F, nq) of the robot that jumps, from those
+        of the published one (F, 7 + J), joints depth-first; and how far joints that it holds move
+        off where they are held [rad].
+        """
+        data = self.model.createData()
+        own = [7 + self.joints.index(name) for name in self.robot.joint_names]
+        state = np.hstack([q[:, :7], q[:, 7:][:, np.argsort(self._order)]])
+        places = []
+        for row in state:
+            pin.forwardKinematics(self.model, data, row)
+            trunk = pin.updateFramePlacement(self.model, data, self._trunk)
+            places.append(pin.SE3ToXYZQUAT(trunk * self._offset.inverse()))
+        moved = {
+            name: float(np.abs(q[:, 7 + k] - self._held.get(name, 0.0)).max())
+            for k, name in enumerate(self.joints)
+            if name not in self.robot.joint_names
+        }
+        return np.hstack([places, q[:, own]]), moved
+
     def _check_places(self, q: np.ndarray, own: np.ndarray) -> None:
         """The joints of the two robots are in the same places, but for what was evened out."""
         names = self.robot.joint_names

@@ -336,9 +336,27 @@ def _boxes(
         while foot.parent:
             foot = lumped.named(foot.parent)
             out.setdefault(foot.name, [])
+    out |= _given_boxes(config, {body.name for body in lumped.bodies})
     for body in lumped.bodies:
         if body.name not in out:
             out[body.name] = _arm(lumped, body, width["arm"])
+    return out
+
+
+def _given_boxes(config: dict, links: set[str]) -> dict[str, Boxes]:
+    """Boxes of links that the configuration gives as [rear, front, right, left, bottom, top] from
+    the link's joint, in the robot's axes [m]: of a waist that moves, and of what it carries.
+    """
+    given = table(table(config, "shapes"), "boxes_m")
+    out = {}
+    for name in given:
+        ends = np.reshape(entry(config, "shapes", "boxes_m", name, count=6), (3, 2))
+        if name not in links or np.any(ends[:, 0] >= ends[:, 1]):
+            raise RobotError(
+                f"robot configuration: 'shapes.boxes_m.{name}' must be of a link that moves, each "
+                f"first number below the second"
+            )
+        out[name] = [(ends.mean(axis=1), np.ptp(ends, axis=1))]
     return out
 
 

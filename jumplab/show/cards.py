@@ -18,6 +18,7 @@ from jumplab.show.jumps import inertia_and_momentum, joint_trajectories, jump_st
 from jumplab.show.maps import margin_radar
 from jumplab.show.style import (
     COLUMN_IN,
+    FLIGHT,
     LANDING,
     LAUNCH,
     LIMIT_STYLE,
@@ -31,10 +32,11 @@ from jumplab.show.tables import Table, table
 from jumplab.stages.plan import JumpPlan
 
 if TYPE_CHECKING:  # pictures need no simulator
-    from jumplab.auditing import AuditReport
+    from jumplab.auditing import AuditReport, ClipReport
     from jumplab.robot import Robot
     from jumplab.sim import SimulationResult
     from jumplab.studies.margins import MarginReport
+    from jumplab.studies.mend import Mended
     from jumplab.studies.trials import TrialReport
 
 Card = tuple[Table, Picture | None]
@@ -125,6 +127,42 @@ def _shares(report: AuditReport) -> Figure | None:
     return fig
 
 
+def _of_clip(report: ClipReport) -> Card:
+    rows = [
+        {
+            "": c.name,
+            "found": c.value,
+            "limit": c.limit,
+            "unit": c.unit,
+            "at [s]": c.time,
+            "passed": c.passed,
+        }
+        for c in report.checks
+    ]
+    return table(rows), clip_sheet(report)
+
+
+@styled
+def clip_sheet(report: ClipReport) -> Figure:
+    """What a judged clip does over time; shaded where no foot carries."""
+    fig = new_figure(PAGE_IN, 4.2)
+    axes = fig.subplots(len(report.series), 1, sharex=True)
+    for ax, (label, values) in zip(axes, report.series.items(), strict=True):
+        columns = values.T if values.ndim == 2 else [values]
+        for column, opacity in zip(columns, (1.0, 0.45), strict=False):
+            ax.plot(report.clip.t, column, color=LAUNCH, alpha=opacity)
+        for begin, end in report.flights:
+            ax.axvspan(begin, end, color=FLIGHT, alpha=0.2, linewidth=0)
+        ax.set_ylabel(label.replace(" [", "\n["))
+    axes[-1].set_xlabel("time [s]")
+    return fig
+
+
+def _of_mended(mended: Mended) -> Card:
+    rows = [{"what": "", "clip": None, "mended": None, "change": None} | x for x in mended.changes]
+    return table(rows), jump_strobe(mended.plan.tape, mended.plan.robot)
+
+
 def _of_trials(report: TrialReport) -> Card:
     return table(report.rows()), _scatter(report)
 
@@ -151,6 +189,8 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
     "SimulationResult": _of_run,
     "Robot": _of_robot,
     "AuditReport": _of_audit,
+    "ClipReport": _of_clip,
+    "Mended": _of_mended,
     "TrialReport": _of_trials,
     "MarginReport": _of_margins,
 }

@@ -21,7 +21,7 @@ from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import configuration, stance_configuration
-from jumplab.stages.changes import LAST, StageChanges, settled, sorted_out
+from jumplab.stages.changes import LAST, StageChanges, named, settled, sorted_out
 from jumplab.stages.joint_qp import JointPlan, changed_problem, map_to_joints
 from jumplab.stages.plan import JumpPlan, planned
 from jumplab.stages.srmp import SrmpPlanner
@@ -38,7 +38,7 @@ from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.ground import surface_of_jump
 from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.program import Program
-from jumplab.stages.whole_body.starts import GIVEN
+from jumplab.stages.whole_body.starts import FOLLOWED, GIVEN
 from jumplab.task import GRAVITY, JumpTask
 
 METHODS = ("three-step", "direct")
@@ -384,6 +384,8 @@ class Planner:
         *,
         gravity: float = GRAVITY,
         weights: Mapping[str, float] | None = None,
+        motion: Motion | None = None,
+        stance: np.ndarray | None = None,
     ) -> JumpPlan:
         """Plan a motion along a contact schedule: hops, run-ups, leaps, bounds, or one of your own.
 
@@ -392,6 +394,8 @@ class Planner:
         contacts : the schedule; it ends at rest.
         gravity : [m/s^2].
         weights : of cost terms of stage "whole body" in this plan, instead of their own.
+        motion : along the schedule, that the plan shall be near to, and begins with.
+        stance : configuration (nq,) in which it begins, soles flat in the first places.
 
         Raises
         ------
@@ -406,8 +410,14 @@ class Planner:
         asked = sorted_out(weights=weights)[LAST]
         # a schedule has its own places; of a target only gravity is taken
         level = JumpTask(0.0, 0.1, gravity=gravity)
-        last = self._whole_body(limits=self.limits, contacts=contacts)
-        body = last.plan(level, weights=asked.weights)
+        settings = {"limits": self.limits}
+        options = {}
+        if motion is not None:
+            limits = replace(Limits().of_clip(), **named(Limits, self._given[Limits]))
+            settings = {"limits": limits, "weights": Weights().of_clip(), "follows": True}
+            options = {"begin": motion, "stance": stance, "starts": FOLLOWED}
+        last = self._whole_body(contacts=contacts, **settings)
+        body = last.plan(level, weights=asked.weights, **options)
         found = planned(body.tape)
         task = JumpTask(
             found["planned_distance_m"],

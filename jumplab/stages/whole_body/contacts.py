@@ -113,6 +113,7 @@ class Contacts:
     places : of all contacts after the first ones, in the order of the phases, left before right.
     ends : "rest" (the robot stands still) or "touchdown" (in flight, both flat soles about to meet
         the ground).
+    first : places of the first contacts, left before right; those of the stance if empty.
 
     Raises
     ------
@@ -123,6 +124,7 @@ class Contacts:
     phases: tuple[ContactPhase, ...]
     places: tuple[Place, ...] = ()
     ends: str = "rest"
+    first: tuple[Place, ...] = ()
     # (phase, side) of each contact, the first ones included
     landings: tuple[tuple[int, int], ...] = field(init=False)
 
@@ -132,6 +134,8 @@ class Contacts:
         named = [replace(p, name=p.name or f"{k} {p.feet}") for k, p in enumerate(self.phases, 1)]
         object.__setattr__(self, "phases", tuple(named))
         object.__setattr__(self, "places", tuple(self.places))
+        usual = (Place(0.0, free_m=(0.0, 0.0)),) * len(self.phases and self.phases[0].modes)
+        object.__setattr__(self, "first", tuple(self.first) or usual)
         for fault in self._faults():
             raise InputError(fault)
         _ = self.surface

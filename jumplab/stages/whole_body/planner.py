@@ -50,9 +50,10 @@ HELD_TURN_RAD = np.radians(100)
 class WholeBodyPlanner:
     """Plans motions of one robot along one schedule, by programs that are built once.
 
-    ``contacts`` are by default those of a standing jump; ``tracking`` makes a jump follow stage 1.
-    ``free`` are the coordinates where nothing asks for others: by default all, with tracking those
-    of even motions. ``changes``, ``options`` and ``keep`` as in :class:`.Program`.
+    ``contacts`` are by default those of a standing jump; ``tracking`` makes a jump follow stage 1,
+    ``follows`` a plan the motion that it begins with. ``free`` are the coordinates where nothing
+    asks for others: by default all, with tracking those of even motions. ``changes``, ``options``
+    and ``keep`` as in :class:`.Program`.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class WholeBodyPlanner:
         *,
         contacts: Contacts | None = None,
         tracking: bool = False,
+        follows: bool = False,
         options: Mapping[str, Any] = MappingProxyType({}),
         keep: bool = False,
         changes: StageChanges = StageChanges(),
@@ -83,7 +85,7 @@ class WholeBodyPlanner:
             )
         self.free = free or (even(self.body) if tracking else whole(self.body))
         given = self.body, self.contacts, limits, weights, self.free, tracking, changes
-        self.usual = Program(*given, options, keep)
+        self.usual = Program(*given, options, keep, follows)
 
     @cached_property
     def _even(self) -> Program | None:
@@ -114,7 +116,8 @@ class WholeBodyPlanner:
         ``weights`` ("term" -> weight) of one plan may ask for an uneven motion.
         """
         changes = self.usual.changes
-        if self.free.even or not (task.in_plane and self.contacts.even) or self._even is None:
+        own = self.usual.follows or self.free.even or not (task.in_plane and self.contacts.even)
+        if own or self._even is None:
             return [self.usual]
         names = (*weights, *changes.weights, *changes.off)
         # an own term may ask for an uneven motion, but in the plane there is none

@@ -48,10 +48,12 @@ class Schedule:
         apart: Iterable[Apart] = (),
         free: Coordinates | None = None,
         tracking: bool = False,
+        follows: bool = False,
     ):
         """``apart`` has rows for links that met; ``free`` are all coordinates if None; with
-        ``tracking`` a jump follows stage 1's trajectories."""
+        ``tracking`` a jump follows stage 1's trajectories, or it ``follows`` a given motion."""
         self.tracking = tracking
+        self.follows = follows
         self.free = free or whole(body)
         self.body = body
         self.contacts = contacts
@@ -128,6 +130,7 @@ class Schedule:
             landed=landed,
             both_carry=all(p.flying or len(p.modes) == 2 for p in around),
             tracked=self.tracking,
+            follows=self.follows,
             last=k == len(phases) - 1 and self.contacts.ends == "touchdown",
         )
         terms += [link_distance(mode, x, given.intervals) for x in self.apart if x.phase == k]
@@ -135,6 +138,9 @@ class Schedule:
         references = {f"{SIDES[side]}_clearance": 1 for side in swinging}
         if self.tracking:
             references |= TRACKED_IN_FLIGHT if mode.flying else TRACKED
+        if self.follows:
+            references |= {"chart": len(self.body.stance), "lasts": 1}
+            references |= {f"{SIDES[side]}_hold": len(HOLD) for side in landed}
         effort = np.maximum(mode.motors.effort, 1.0)
         sizes = np.concatenate([np.full(mode.n_forces, self.body.mg), effort])
         return Phase(
@@ -170,10 +176,7 @@ class Schedule:
         """Bounds of x, y, z [m] and yaw [rad] of the middle of the toe edge in one contact."""
         _, side = self.contacts.landings[contact]
         first = self.body.places[side]
-        number = contact - len(self.contacts.phases[0].modes)
-        if number < 0:
-            return [(x, x) for x in (*first, 0.0)]
-        p = self.contacts.places[number]
+        p = (*self.contacts.first, *self.contacts.places)[contact]
         middle = (first[0] + p.ahead_m, first[1] + p.left_m, first[2] + p.up_m, p.turn_rad)
         free = (*p.free_m, 0.0, p.free_rad)
         return [(x - y, x + y) for x, y in zip(middle, free, strict=True)]

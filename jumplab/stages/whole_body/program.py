@@ -15,7 +15,7 @@ import numpy as np
 
 from jumplab.errors import Shown, SolverError
 from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
-from jumplab.ocp.solution import PhaseSolution
+from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
 from jumplab.stages.srmp import SrmpPlan
@@ -24,6 +24,7 @@ from jumplab.stages.whole_body.body import Body
 from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import Coordinates
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump, surface_of_schedule
+from jumplab.stages.whole_body.motions import Motion
 from jumplab.stages.whole_body.problem import Schedule
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
@@ -74,7 +75,7 @@ class Program(Shown):
     Attributes
     ----------
     free : the coordinates that move.
-    tracking : whether a jump follows stage 1.
+    tracking : whether a jump follows stage 1.  follows : whether it follows a given motion.
     changes : own terms, weights and switches.
     options : of ipopt besides :data:`IPOPT`.
     keep : whether what was built is kept for later processes.
@@ -89,6 +90,7 @@ class Program(Shown):
     changes: StageChanges = StageChanges()
     options: Mapping[str, Any] = field(default_factory=dict)
     keep: bool = False
+    follows: bool = False
     _built: dict[tuple, Nlp] = field(default_factory=dict, init=False)
 
     @property
@@ -99,7 +101,7 @@ class Program(Shown):
     def schedule(self, apart: tuple[Apart, ...] = ()) -> Schedule:
         """Its schedule, with rows for links that met (none by default)."""
         given = self.body, self.contacts, self.limits, self.weights
-        return Schedule(*given, apart, self.free, self.tracking)
+        return Schedule(*given, apart, self.free, self.tracking, self.follows)
 
     @property
     def nlp(self) -> Nlp:
@@ -114,7 +116,8 @@ class Program(Shown):
                 self._built.clear()
                 self._built[()] = usual
             words = (
-                f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking}"
+                f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
+                f"{self.follows}"
             )
             problem = self.changes.applied(self.schedule(apart).problem())
             self._built[key] = Nlp(problem, {}, words if self.keep else None)
@@ -153,7 +156,7 @@ class Program(Shown):
             solution = nlp.solve(
                 self.parameters(asked.task, asked.stance, asked.srmp),
                 begin.guess,
-                references=self.references(asked.srmp),
+                references=self.references(asked.srmp, asked.motion),
                 weights=self.changes.spread(self.nlp.problem, asked.weights),
                 multipliers=begin.multipliers,
                 explain=explain,
@@ -232,9 +235,12 @@ class Program(Shown):
             values |= {"momentum": srmp.launch.L[-1], "launch_s": [flat_s, srmp.toe_s]}
         return values
 
-    def references(self, srmp: SrmpPlan | None = None) -> dict[str, dict[str, np.ndarray]]:
+    def references(
+        self, srmp: SrmpPlan | None = None, motion: Motion | None = None
+    ) -> dict[str, dict[str, np.ndarray]]:
         """How high the soles of feet in the air shall be at each node (1, N + 1) [m], by phase and
-        foot; with tracking also stage 1's trajectories, by share of each phase.
+        foot; with tracking also stage 1's trajectories, or the given motion, by share of each
+        phase.
         """
         phases = self.contacts.phases
         values = {p.name: {} for p in phases}
@@ -253,7 +259,27 @@ class Program(Shown):
         if self.tracking:
             for p in phases:
                 values[p.name] |= _followed(srmp, p.name, p.intervals)
+        if self.follows:
+            schedule = self.schedule()
+            for k, p in enumerate(phases):
+                values[p.name] |= _given(schedule, motion, k)
         return values
+
+
+def _given(schedule: Schedule, motion: Motion, k: int) -> dict[str, np.ndarray]:
+    """The given motion at the nodes of phase ``k``, its duration and its footholds, each
+    (size, N + 1).
+    """
+    count = schedule.contacts.phases[k].intervals + 1
+    shares = [np.linspace(0, 1, n) for n in (len(motion.charts[k]), count)]
+    values = {
+        "chart": resampled(shares[0], motion.charts[k], shares[1]).T,
+        "lasts": np.full((1, count), motion.durations[k]),
+    }
+    for side in schedule.landed(k):
+        hold = np.mean(schedule.foothold(schedule.contacts.contact_of(k, side)), axis=1)
+        values[f"{SIDES[side]}_hold"] = np.tile(hold[:, None], count)
+    return values
 
 
 def _followed(srmp: SrmpPlan, name: str, intervals: int) -> dict[str, np.ndarray]:

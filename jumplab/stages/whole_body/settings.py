@@ -90,6 +90,16 @@ class Limits:
     momentum_share: float = 0.01  # L at take-off within this share of stage 1's
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
+    def of_clip(self) -> Limits:
+        """The same for a motion that follows another one: its feet, arms and load are its own."""
+        return replace(
+            self,
+            straight_knee_rad=0.25,
+            foot_share=0.02,
+            sides_share=0.3,
+            hands_inward_m=1.0,
+        )
+
     def of_flip(self) -> Limits:
         """The same for a jump that turns over: time to wind up, a trunk that arrives turning,
         caught by momentum.
@@ -130,6 +140,18 @@ class Weights:
     heel_velocity: float = 0.5  # [1] / [m/s]^2 / [s]
     ankle_rate: float = 0.02  # [1] / [rad/s]^2 / [s]
     track_duration: float = 50.0  # [1] / [s]^2
+
+    # where a given motion is followed
+    follow_joints: float = 20.0  # [1] / [rad]^2 / [s]
+    follow_base: float = 100.0  # [1] / [m]^2 / [s]
+    follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
+    follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
+    # [1] / [m, rad]^2; with a tenth of it feet are shuffled instead of jumped
+    follow_foothold: float = 300.0
+
+    def of_clip(self) -> Weights:
+        """The same for a motion that follows another one: what it costs counts less."""
+        return replace(self, acceleration=2e-4, jerk=3e-7, torque=5e-5)
 
     def of_flip(self) -> Weights:
         """The same for a jump that turns over: stage 1's inertia, of a rod that turns as one, is

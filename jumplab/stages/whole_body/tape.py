@@ -30,7 +30,7 @@ from jumplab.stages.whole_body.problem import Schedule
 
 SHORTEST_S = 0.05 / RATE_HZ  # a shorter last step is joined to the one before
 # over which a phase passes from where the one before ended on the tape to its own plan
-JOINING_S = 0.05
+JOINING_S = 0.15
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 LANDED_RAD = 1e-6  # [rad, rad/s] by which legs may miss their plan at the end of a flight
 LANDINGS = 60  # corrections of that end at most; a jump takes two or three
@@ -197,8 +197,9 @@ def _ground(
         pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
         holds = holds_of(phase, b)
         legs = Legs.of(schedule.body, list(holds))
-        motion = _balanced(legs, motion, pitch, holds, instants, robot)
-        parts.append((motion, *_planned(b, phase, holds, at)))
+        wrench, contacts = _planned(b, phase, holds, at)
+        motion = _balanced(legs, motion, pitch, holds, instants, robot, wrench.sum(axis=1))
+        parts.append((motion, wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
     motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
     return Piece(t, motion, np.concatenate(wrenches), np.concatenate(codes))
@@ -228,16 +229,18 @@ def _balanced(
     holds: Mapping[int, np.ndarray],
     t: np.ndarray,
     robot: Robot,
+    wrench: np.ndarray,
 ) -> Motion:
     """The motion with feet held, its base moved by some micrometres so that the ground's force
     stays on the toes.
 
-    Where all feet that carry are on their toes, in one line, no ground force has a moment about
-    that line: what the motion between nodes needs of it goes.
+    Where all feet that carry are on their toes, no ground force but the planned ``wrench`` (n, 6)
+    has a moment about the line of their edges: what the motion between nodes needs of it besides
+    goes.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
-    if len(pitch) < len(holds) or not _in_line(holds) or len(t) < 2:
+    if len(pitch) < len(holds) or len(t) < 2:
         return legs.held(motion, holds, pitch)
     q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
@@ -251,6 +254,8 @@ def _balanced(
         held = legs.body.model.to_pinocchio(*legs.held((q, v, gain), holds, pitch))
         need = [needed(x[0], pin.rnea(model, data, *x)) for x in zip(*held, strict=True)]
         force, about = np.split(np.array(need), 2, axis=1)
+        force -= wrench[:, :3]
+        about -= wrench[:, 3:]
         return (about - np.cross(edge[:3], force)) @ across
 
     missing = moment()
@@ -262,13 +267,6 @@ def _balanced(
         for x, change in ((q, place), (v, rate), (a, more)):
             x[:, :3] += np.outer(change, ahead)
     return legs.held((q, v, a), holds, pitch)
-
-
-def _in_line(holds: Mapping[int, np.ndarray]) -> bool:
-    """Whether toe edges at x, y, z, yaw are parts of one level line."""
-    edge = np.array(list(holds.values()))
-    ahead = edge[:, :2] @ [np.cos(edge[0, 3]), np.sin(edge[0, 3])]
-    return np.ptp(edge[:, 2:], axis=0).max() < 1e-6 and np.ptp(ahead) < 1e-4
 
 
 def needed(q: np.ndarray, torques: np.ndarray) -> np.ndarray:

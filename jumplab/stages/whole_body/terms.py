@@ -20,7 +20,7 @@ from jumplab.stages.whole_body.legs import independent, off_foothold
 from jumplab.stages.whole_body.mode import Mode
 from jumplab.stages.whole_body.settings import LATE_SHARE, RESERVE_SHARE
 from jumplab.stages.whole_body.shapes import Apart
-from jumplab.stages.whole_body.tracking import tracking
+from jumplab.stages.whole_body.tracking import following, tracking
 from jumplab.task import GRAVITY
 
 MOMENT_ARM_M = 0.2  # nominal size of moments over that of forces
@@ -554,6 +554,7 @@ def phase_terms(
     landed: Iterable[int],
     both_carry: bool,
     tracked: bool,
+    follows: bool,
     last: bool,
 ) -> list[Term]:
     """Terms of a phase (all but links that would meet).
@@ -563,7 +564,8 @@ def phase_terms(
     joined : its first node is the last one of the phase before.  first : it begins in the stance.
     landed : feet that come down as it begins.  both_carry : on flat feet, between phases on both
         feet or in flight; where one foot steps the load goes from foot to foot.
-    tracked : it follows stage 1.  last : it ends with a touchdown.
+    tracked : it follows stage 1.  follows : it follows a given motion.
+    last : it ends with a touchdown.
     """
     terms = all_phases(m, joined)
     for side in m.sides:  # the first node is given, so it needs no rows
@@ -573,6 +575,8 @@ def phase_terms(
         terms += opening_rows(m)
     if tracked:
         terms += tracking(m)
+    if follows:
+        terms += following(m, landed)
     if m.feet == "LR":
         terms += reserve(m)
         if both_carry and (m.limits.least_push or not m.free.even):

@@ -1,6 +1,8 @@
-"""Terms of a whole-body program that follows stage 1."""
+"""Terms of a whole-body program that follows stage 1, or a given motion."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import casadi as ca
 import numpy as np
@@ -8,6 +10,8 @@ import numpy as np
 from jumplab.ocp.problem import Term
 from jumplab.robot.reach import rod_of
 from jumplab.robot.stance import stance_angles
+from jumplab.stages.whole_body.contacts import SIDES
+from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.mode import Mode
 
 
@@ -59,3 +63,40 @@ def tracking(m: Mode) -> list[Term]:
         rows.append(follow("heel velocity", "WL-J3", *heel, w.heel_velocity))
         rows.append(Term(*words, momentum_kept, upper=np.inf))
     return rows
+
+
+def following(m: Mode, landed: Iterable[int]) -> list[Term]:
+    """A given motion as reference, at the same share of each phase: joints, base, how long the
+    phase lasts, and where the feet that have ``landed`` stand.
+    """
+    w = m.weights
+
+    def row(name, unit, at, of, weight):
+        return Term(f"follow {name}", "ours: the nearest motion", unit, at, of, float(weight))
+
+    def foothold(side):
+        def missed(p):
+            place, yaw = p.foothold(side)
+            return ca.vertcat(place, yaw) - getattr(p.ref, f"{SIDES[side]}_hold")
+
+        return row(f"{SIDES[side]} foothold", "m, rad", "start", missed, w.follow_foothold)
+
+    def joints(p):
+        return p.tree.q[BASE:] - p.ref.chart[BASE:]
+
+    def place(p):
+        return p.tree.q[:3] - p.ref.chart[:3]
+
+    def attitude(p):
+        return p.attitude - p.ref.chart[3:BASE]
+
+    def duration(p):
+        return p.duration / p.ref.lasts - 1
+
+    return [
+        row("joints", "rad", "node", joints, w.follow_joints),
+        row("base", "m", "node", place, w.follow_base),
+        row("attitude", "rad", "node", attitude, w.follow_attitude),
+        row("duration", "1", "start", duration, w.follow_duration),
+        *(foothold(side) for side in landed),
+    ]

@@ -1,0 +1,309 @@
+"""Judging a motion clip: contacts as found, and what of it no robot could do; by the audit's own
+code where that applies.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from jumplab.auditing.audit import _checks
+from jumplab.auditing.contact import collisions
+from jumplab.auditing.dynamics import joints
+from jumplab.auditing.replay import Replay, norm, replay
+from jumplab.auditing.report import METHOD, AuditReport, Measure
+from jumplab.errors import InputError
+from jumplab.io.clip import ENDINGS, Clip, read_clips
+from jumplab.io.folder import versions
+from jumplab.io.tape import Tape
+from jumplab.robot import Robot
+
+SIDES = "LR"
+
+
+@dataclass(frozen=True, repr=False)
+class ClipReport(AuditReport):
+    """Outcome of judging a clip: an audit, and what was found on the way.
+
+    Attributes
+    ----------
+    clip : that was judged.
+    tape : the same with rates by differences, the ground's best forces, and torques.
+    ground : (n, 2) whether left and right foot carry, as found.  still : whether they are slow.
+    series : by name with unit, what the table has worst values of, over time (n,) or (n, 2).
+    """
+
+    clip: Clip | None = None
+    tape: Tape | None = None
+    ground: np.ndarray | None = None
+    still: np.ndarray | None = None
+    series: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def line(self) -> str:
+        """The clip, and the verdict."""
+        verdict = "physical" if self.passed else f"not physical: {super().line()}"
+        return f"{self.clip.name}: {verdict}"
+
+    @property
+    def phases(self) -> list[tuple[str, float, float]]:
+        """Feet that carry ("LR", "L", "R", "-"), from and to [s]."""
+        return phases_of(self.ground, self.clip.fps)
+
+    @property
+    def flights(self) -> list[tuple[float, float]]:
+        """From and to [s] of each flight."""
+        return [(a, b) for feet, a, b in self.phases if feet == "-"]
+
+    def row(self) -> dict[str, Any]:
+        """What a table of many clips says of this one."""
+        flown = ", ".join(f"{a:.2f} to {b:.2f}" for a, b in self.flights)
+        values = {c.name: c.value for c in self.checks}
+        row = {"clip": self.clip.name, "physical": self.passed, "flights [s]": flown or "none"}
+        return row | {f"{c.name} [{c.unit}]": values[c.name] for c in self.checks}
+
+
+def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
+    """Feet that carry ("LR", "L", "R", "-"), from and to [s], of contacts (n, 2)."""
+    words = ["".join(s for s, on in zip(SIDES, x, strict=True) if on) for x in ground]
+    edges = [0, *(k for k in range(1, len(words)) if words[k] != words[k - 1]), len(words) - 1]
+    return [(words[a] or "-", a / fps, b / fps) for a, b in pairwise(edges)]
+
+
+def judge(
+    motion: Any, robot: Robot | str = "bhr", *, fps: float | None = None, order: str = "depth-first"
+) -> ClipReport | list[ClipReport]:
+    """Judge a motion: float, penetration, slip, flights against free fall, forces from nowhere,
+    motors, joints, collisions.
+
+    Parameters
+    ----------
+    motion : a plan, tape or simulation; a :class:`.Clip`; the path of a file as of
+        :func:`.read_clips`, or of a folder of such files.
+    robot : whose motion it is, if it does not carry its own.
+    fps, order : as of :func:`.read_clips`.
+
+    Returns a report, of a folder and of a file with several clips a list of them. Raises
+    :class:`InputError` for what holds no clip of the robot.
+    """
+    if isinstance(motion, Clip):
+        return _judged(motion)
+    robot = robot if isinstance(robot, Robot) else Robot.load(robot)
+    if not isinstance(motion, str | Path):
+        return _judged(Clip.of(motion, robot, fps))
+    path = Path(motion)
+    paths = [path]
+    if path.is_dir():
+        paths = sorted(x for x in path.iterdir() if x.suffix in ENDINGS)
+        if not paths:
+            raise InputError(f"{path}: holds no file that ends in {', '.join(ENDINGS)}")
+    clips = [clip for one in paths for clip in read_clips(one, robot, fps=fps, order=order)]
+    reports = [_judged(clip) for clip in clips]
+    return reports if path.is_dir() or len(reports) > 1 else reports[0]
+
+
+def _judged(clip: Clip) -> ClipReport:
+    bare = tape_of(clip)
+    r = replay(bare, clip.robot, None)
+    ground, still, level = contacts(r, clip.fps)
+    tape = dataclasses.replace(
+        bare,
+        f=_pushed(r, ground),
+        phase=np.where(ground.any(axis=1), "launch", "flight"),
+        extra={"contacts": ground.astype(np.int8)},
+    )
+    r = replay(tape, clip.robot, None)
+    tape = dataclasses.replace(tape, tau=r.tau)
+    r = dataclasses.replace(r, tape=tape)
+    checks = _checks([*_measures(r, ground), *joints(r), *collisions(r)])
+    checks = tuple(c for c in checks if c.name != "body clearance")
+    flights = _free_falls(r, ground)
+    manifest = {
+        "clip": clip.name,
+        "format": clip.origin,
+        "notes": list(clip.notes),
+        "fps": clip.fps,
+        "frames": len(clip.q),
+        "robot": clip.robot.name,
+        "robot_hash": clip.robot.hash,
+        "standing_m": level.tolist(),
+        "flights": [
+            {"from_s": t[0], "to_s": t[-1], "acceleration_m_s2": a.tolist(), "rise_m": float(up)}
+            for t, a, up in flights
+        ],
+        "versions": versions(),
+    }
+    report = ClipReport(checks, manifest, clip, tape, ground, still, _series(r))
+    manifest["phases"] = [list(phase) for phase in report.phases]
+    return report
+
+
+def tape_of(clip: Clip) -> Tape:
+    """A clip as a tape, rates (n, nv) by differences over METHOD.smoothing_s, without forces."""
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
+    model = clip.robot.model
+    steps = [pin.difference(model, a, b) for a, b in pairwise(clip.q)]
+    steps = np.array(steps) * clip.fps
+    width = METHOD.smoothing_s * clip.fps
+    v = np.gradient(np.vstack([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)]), axis=0)
+    v = gaussian_filter1d(v, width, axis=0, mode="nearest")
+    a = np.gradient(v, 1 / clip.fps, axis=0)
+    n = len(clip.q)
+    names = np.array(clip.robot.joint_names)
+    frames = np.array(clip.robot.foot.frames)
+    tau = np.zeros((n, len(names)))
+    none = np.zeros((n, len(frames), 6))
+    return Tape(clip.t, clip.q, v, a, tau, np.full(n, "launch"), frames, none, names)
+
+
+# contacts
+# ----------------------------------------------------------------------------------------------
+def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether each foot carries (n, 2), whether it is still (n, 2), and how high it would stand
+    (n, 2) [m].
+
+    A foot stands where its sole is slow, and not far above the lowest one around: so far its height
+    is that of the ground, and linear between. In the air it is while it is
+    ``METHOD.lifted_m`` higher than that, or fast while the other one stands. What is shorter than
+    ``METHOD.short_s`` is passed over.
+    """
+    from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
+
+    least = max(1, round(METHOD.short_s * fps))
+    middle = gaussian_filter1d(r.sole_points.mean(axis=2), METHOD.smoothing_s * fps, axis=0)
+    speed = norm(np.gradient(middle, 1 / fps, axis=0))
+    height = r.sole_points[..., 2].min(axis=2)
+    around = minimum_filter1d(height.min(axis=1), round(METHOD.around_s * fps) | 1, mode="nearest")
+    still = (speed < METHOD.still_m_s) & (height - around[:, None] < METHOD.high_m)
+    for column in still.T:
+        _drop(column, False, least + 1)
+        _drop(column, True, least + 1)
+    if not still.any(axis=0).all():
+        still |= ~still.any(axis=0)  # a foot that never rests tells no ground
+    rows = np.arange(len(height))
+    level = np.column_stack(
+        [np.interp(rows, rows[s], h[s]) for s, h in zip(still.T, height.T, strict=True)]
+    )
+    low = height - level < METHOD.lifted_m
+    carrying = still | (low & ~still.any(axis=1, keepdims=True))
+    flying = ~carrying.any(axis=1)
+    kept = flying.copy()
+    _drop(kept, True, least)
+    carrying[flying & ~kept] = True
+    return carrying, still, level
+
+
+def _drop(flags: np.ndarray, value: bool, least: int) -> None:
+    """Turn runs of a ``value`` over that are shorter than ``least``, but at both ends."""
+    edges = np.flatnonzero(np.diff(flags.astype(int))) + 1
+    for a, b in pairwise(edges.tolist()):
+        if flags[a] == value and b - a < least:
+            flags[a:b] = not value
+
+
+def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
+    """Wrenches (n, 2, 6) at the feet: what friction at the soles' corners can do for the base, and
+    with least torques.
+    """
+    from scipy.optimize import nnls  # slow to import
+
+    mu = METHOD.clip_friction
+    edges = np.array([[mu, 0, 1], [-mu, 0, 1], [0, mu, 1], [0, -mu, 1]])
+    corners = np.concatenate([r.toe_corners, r.heel_corners], axis=2)
+    effort = r.model.upperEffortLimit[6:, None]
+    data = r.model.createData()
+    frames = [r.model.getFrameId(str(name)) for name in r.tape.contact_frames]
+    f = np.zeros((*ground.shape, 6))
+    for k in np.flatnonzero(ground.any(axis=1)):
+        pin.computeJointJacobians(r.model, data, r.tape.q[k])
+        columns = []
+        wrenches = []
+        for side in np.flatnonzero(ground[k]):
+            force = np.tile(edges, (corners.shape[2], 1))
+            arms = np.repeat(corners[k, side], len(edges), axis=0)
+            wrench = np.hstack([force, np.cross(arms - r.foot[k, side], force)]).T
+            slope = pin.getFrameJacobian(r.model, data, frames[side], pin.LOCAL_WORLD_ALIGNED)
+            base = np.vstack([force.T, np.cross(arms - r.com[k], force).T]) / r.weight
+            torques = METHOD.torque_weight * (slope.T @ wrench)[6:] / effort
+            columns.append(np.vstack([base, torques]))
+            wrenches.append(wrench)
+        asked = [r.base_residual[k] / r.weight, METHOD.torque_weight * r.tau[k] / effort[:, 0]]
+        shares, _ = nnls(np.hstack(columns), np.concatenate(asked))
+        parts = np.split(shares, len(wrenches))
+        for side, wrench, part in zip(np.flatnonzero(ground[k]), wrenches, parts, strict=True):
+            f[k, side] = wrench @ part
+    return f
+
+
+# measures
+# ----------------------------------------------------------------------------------------------
+def _measures(r: Replay, ground: np.ndarray) -> Iterator[Measure]:
+    """Measures of the group "clip"."""
+    t = r.tape.t
+    feet = r.tape.contact_frames
+    height = r.sole_points[..., 2].min(axis=2)
+    standing = _inner(ground, t)
+    floating = np.where(standing, height, -np.inf)
+    yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
+    yield "feet in the ground", -height, t, feet
+    yield "feet on the ground slide", *_most(_sliding(r, standing), t, METHOD.slide_percent), feet
+    falls = _free_falls(r, ground)
+    off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
+    yield "flights fall freely", off, [times[0] for times, _, _ in falls]
+    missing = norm(r.base_residual[:, :3]) / r.weight
+    yield "force from nowhere", *_most(missing, t, METHOD.force_percent)
+    moment = norm(r.base_residual[:, 3:]) / r.weight
+    yield "moment from nowhere", *_most(moment, t, METHOD.force_percent)
+
+
+def _inner(ground: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Contacts (n, 2) without what is close to their ends."""
+    from scipy.ndimage import binary_erosion  # slow to import
+
+    rim = max(1, round(METHOD.rim_s / np.median(np.diff(t))))
+    return binary_erosion(ground, np.ones((2 * rim + 1, 1)))
+
+
+def _series(r: Replay) -> dict[str, np.ndarray]:
+    torque = np.abs(r.tape.tau) / r.model.upperEffortLimit[6:]
+    return {
+        "lowest point of each sole [m]": r.sole_points[..., 2].min(axis=2),
+        "force from nowhere [m g]": norm(r.base_residual[:, :3]) / r.weight,
+        "largest torque [of the limit]": torque.max(axis=1),
+    }
+
+
+def _most(values: np.ndarray, t: np.ndarray, percent: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n, ...) without their largest, beyond a percentile; and their times."""
+    if not np.isfinite(values).any():
+        return values[:0], t[:0]
+    most = np.percentile(values[np.isfinite(values)], percent)
+    return np.where(values <= most, values, -np.inf), t
+
+
+def _sliding(r: Replay, ground: np.ndarray) -> np.ndarray:
+    """Speed (n, 2) [m/s] over the ground of the lower edge of each sole that carries; else -inf."""
+    edges = np.stack([r.toe_corners.mean(axis=2), r.heel_corners.mean(axis=2)], axis=2)
+    speed = norm(np.gradient(edges[..., :2], r.tape.t, axis=0))
+    low = edges[..., 2] - edges[..., 2].min(axis=2, keepdims=True) < METHOD.same_edge_m
+    return np.where(ground, np.where(low, speed, np.inf).min(axis=2), -np.inf)
+
+
+def _free_falls(r: Replay, ground: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Of each flight its times [s], the CoM's mean acceleration (3,) [m/s^2], and its rise [m]."""
+    flying = ~ground.any(axis=1)
+    edges = np.flatnonzero(np.diff(flying.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    out = []
+    for a, b in edges.tolist():
+        t, com = r.tape.t[a:b], r.com[a:b]
+        if b - a > METHOD.least_flight:
+            bent = 2 * np.polyfit(t - t[0], com, 2)[0]
+            out.append((t, bent, com[:, 2].max() - com[0, 2]))
+    return out

@@ -1,0 +1,419 @@
+"""Motion clips in other people's files: read by content, run by nobody, refused in a sentence."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib.numpy_pickle import NumpyUnpickler
+from scipy.spatial.transform import Rotation
+
+from jumplab.errors import InputError, Shown, as_path, quoted
+from jumplab.io.motion import Motion, steady
+from jumplab.io.whole import ORDERS, Whole, ordered
+from jumplab.robot import Robot
+from jumplab.robot.files import SHIPPED, read_toml
+
+ENDINGS = (".pkl", ".npz", ".csv")
+USUAL_FPS = 30.0  # of files that do not say
+RECORD_FPS = 100.0  # at which plans and simulations are looked at
+LEAST_FRAMES = 10
+MOST_BYTES = 500_000_000
+TURN_RAD = 7.0  # no joint turns further
+BEYOND_RAD = 0.5  # of its range, by which a joint of the right robot is not most of the time
+STILL_RAD = 0.02  # by which a joint that the robot holds may move
+# what a pickle may name: arrays and nothing that could run
+ARRAYS = {
+    ("joblib.numpy_pickle", "NumpyArrayWrapper"),
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("_codecs", "encode"),
+    *(
+        (f"numpy.{core}.multiarray", x)
+        for core in ("core", "_core")
+        for x in ("_reconstruct", "scalar")
+    ),
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Clip(Shown):
+    """Configurations of a robot at a frame rate, and nothing else.
+
+    Attributes
+    ----------
+    q : (n, nq) x y z qx qy qz qw of the base in the world, then joint angles [m, rad].
+    fps : frames a second [1/s].
+    origin : format of the file, in words; ``notes`` say what was taken for granted.
+    """
+
+    name: str
+    robot: Robot
+    q: np.ndarray
+    fps: float
+    origin: str
+    notes: tuple[str, ...] = ()
+
+    def line(self) -> str:
+        """Name, robot, frames, rate, format, and what was taken for granted."""
+        size = f"{len(self.q)} frames at {self.fps:g} per second"
+        return "; ".join([f"{self.name}, {self.robot.name}, {size}, {self.origin}", *self.notes])
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times (n,) of the frames [s]."""
+        return np.arange(len(self.q)) / self.fps
+
+    @classmethod
+    def of(cls, record: Any, robot: Robot | None = None, fps: float | None = None) -> Clip:
+        """That of a plan, a tape or a simulation; ``robot`` if it does not carry its own."""
+        robot = getattr(record, "robot", None) or robot
+        if robot is None:
+            raise InputError("the motion does not know its robot; pass it as robot=")
+        motion = Motion.of(getattr(record, "tape", record)).every(fps or RECORD_FPS)
+        return cls(motion.source, robot, motion.q, fps or RECORD_FPS, "a motion of this package")
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """What a file holds: base (n, 3) [m], its quaternions (n, 4) x y z w, joints (n, k) [rad]."""
+
+    base: np.ndarray
+    turn: np.ndarray
+    joints: np.ndarray
+    origin: str
+    fps: float | None = None
+    names: tuple[str, ...] | None = None
+
+
+# files
+# ----------------------------------------------------------------------------------------------
+class _Arrays(NumpyUnpickler):
+    """Reads pickles of arrays, joblib's too, and refuses to name or call anything else."""
+
+    dispatch = NumpyUnpickler.dispatch.copy()
+
+    def find_class(self, module: str, name: str) -> Any:
+        """An allowed class; raises for others."""
+        if (module, name) not in ARRAYS:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which could run code")
+        return super().find_class(module, name)
+
+    def load_build(self) -> None:
+        """As joblib's, but arrays of objects, whose content it would unpickle freely."""
+        state = self.stack[-1]
+        if isinstance(state, Mapping) and getattr(state.get("dtype"), "hasobject", False):
+            raise pickle.UnpicklingError("it holds an array of objects, which could run code")
+        super().load_build()
+
+    dispatch[pickle.BUILD[0]] = load_build
+
+
+def _content(path: Path) -> Mapping[str, Any]:
+    """Arrays and numbers of a file by name; of a CSV file by column."""
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: larger than {MOST_BYTES / 1e6:.0f} MB; no motion clip")
+        raw = path.read_bytes()
+        if raw[:2] == b"PK":
+            with np.load(io.BytesIO(raw), allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
+        if raw[:1] == b"\x80":
+            return _Arrays(str(path), io.BytesIO(raw), ensure_native_byte_order=True).load()
+        return _columns(raw.decode())
+    except pickle.UnpicklingError as e:
+        raise InputError(f"{path}: refused, {e}; ask for the clip as npz") from e
+    except InputError:
+        raise
+    except Exception as e:  # damaged pickles raise whatever they like
+        reason = getattr(e, "strerror", None) or type(e).__name__
+        raise InputError(
+            f"{path}: not a readable clip ({reason}); give a pickle, npz or csv file"
+        ) from e
+
+
+def _columns(text: str) -> Mapping[str, Any]:
+    """A table with commas: of names in its first line, else of x y z, quaternion and joints."""
+    first = text.lstrip().splitlines()[0].split(",")
+    try:
+        float(first[0])
+        return {"rows": np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2)}
+    except ValueError:
+        rows = text.lstrip().partition("\n")[2]
+        if not rows.strip():
+            raise ValueError("no rows") from None
+        table = np.loadtxt(io.StringIO(rows), delimiter=",", ndmin=2)
+        return dict(zip(first, table.T, strict=True))
+
+
+def _rate(x: Mapping[str, Any]) -> float | None:
+    """Frames a second that a file states, or that its times have [1/s]."""
+    for name in ("fps", "hz"):
+        if name in x:
+            return float(np.ravel(x[name])[0])
+    for name in ("time_s", "time", "t"):
+        if name in x and len(x[name]) > 1:
+            return float(1 / np.median(np.diff(x[name])))
+    return None
+
+
+def _names(x: Mapping[str, Any]) -> tuple[str, ...] | None:
+    return tuple(str(name) for name in x["joint_names"]) if "joint_names" in x else None
+
+
+def _first_wxyz(x: np.ndarray) -> np.ndarray:
+    return np.roll(x, -1, axis=-1)
+
+
+def _of_tracker(x: Mapping[str, Any]) -> _Raw:
+    joints = x["joint_pos"]
+    world = "body_names" in x and str(x["body_names"][0]) == "world"
+    place, turn = (x[name][:, int(world)] for name in ("body_pos_w", "body_quat_w"))
+    words = "arrays of a motion tracker, quaternion w x y z"
+    return _Raw(place, _first_wxyz(turn), joints[:, 7 * world :], words)
+
+
+def _of_table(x: Mapping[str, Any]) -> _Raw:
+    base = [f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+    ending = "_position_rad"
+    names = tuple(name.removesuffix(ending) for name in x if name.endswith(ending))
+    columns = [x[name] for name in (*base, *(name + ending for name in names))]
+    q = np.column_stack(columns)
+    return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], "a table of joints by name", names=names)
+
+
+def _of_rows(q: np.ndarray, words: str) -> _Raw:
+    return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], f"{words}, quaternion x y z w")
+
+
+def _of_mujoco(x: Mapping[str, Any]) -> _Raw:
+    q = x["qpos"]
+    return _Raw(q[:, :3], _first_wxyz(q[:, 3:7]), q[:, 7:], "MuJoCo's qpos, quaternion w x y z")
+
+
+def _named(words: str, *names: str) -> Callable[[Mapping[str, Any]], _Raw]:
+    return lambda x: _Raw(*(x[name] for name in names), f"{words}, quaternion x y z w")
+
+
+# names that a file has to have -> how it is read; the first that fits counts
+FORMS: tuple[tuple[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw]], ...] = tuple(
+    (names, reader if callable(reader) else _named(reader, *names))
+    for names, reader in (
+        (("root_trans_offset", "root_rot", "dof"), "pickle of a motion library"),
+        (("root_pos", "root_rot", "dof_pos"), "pickle of a retargeter"),
+        (("base_position_m", "base_quaternion_xyzw", "joint_position_rad"), "arrays with units"),
+        (("body_pos_w", "body_quat_w", "joint_pos"), _of_tracker),
+        (("qpos",), _of_mujoco),
+        (("q", "t", "joint_names"), lambda x: _of_rows(x["q"], "a plan or simulation")),
+        (("rows",), lambda x: _of_rows(x["rows"], "rows of numbers")),
+        (("base_x_m", "base_qw"), _of_table),
+    )
+)
+
+
+def _entries(content: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any], Callable]]:
+    """Clips of a file: name, content, and what reads it; files may hold many by name."""
+    if isinstance(content, Mapping):
+        for names, reader in FORMS:
+            if set(names) <= content.keys():
+                yield name, content, reader
+                return
+        for key, part in content.items():
+            yield from _entries(part, str(key))
+
+
+def read_clips(
+    path: str | Path, robot: Robot, *, fps: float | None = None, order: str = ORDERS[0]
+) -> list[Clip]:
+    """The clips of a file, found by its content: pickles of motion libraries and retargeters, npz,
+    csv.
+
+    Pickles are read without running anything that is in them.
+
+    Parameters
+    ----------
+    robot : whose clips they are; where a clip has other joints than it, the shipped robot of the
+        same URDF that has those.
+    fps : frames a second [1/s], if the file does not say (then :data:`USUAL_FPS`).
+    order : "depth-first" or "breadth-first", of joints without names.
+
+    Raises
+    ------
+    InputError
+        For files that hold no clip, or one of another robot, in other units, axes or orders.
+    """
+    path = as_path(path, "a clip's file")
+    if order not in ORDERS:
+        raise InputError(f"order = {quoted(order)}: choose one of {', '.join(ORDERS)}")
+    if fps is not None and not 0 < fps <= 1e4:
+        raise InputError(f"fps = {fps:g} must lie above 0 and not above 10000")
+    content = _content(path)
+    found = []
+    for name, x, reader in _entries(content, path.stem):
+        where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
+        try:
+            raw = reader(x)
+            raw = replace(raw, fps=_rate(x) if raw.fps is None else raw.fps)
+            raw = replace(raw, names=raw.names or _names(x))
+        except (KeyError, IndexError, TypeError, ValueError) as e:
+            raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
+        found.append(_clip(where, name, raw, robot, fps, order))
+    if not found:
+        keys = list(content)[:6] if isinstance(content, Mapping) else quoted(content)
+        known = "; ".join(", ".join(names) for names, _ in FORMS)
+        raise InputError(f"{path}: holds no clip, but {keys}; a clip has one of: {known}")
+    return found if len(found) > 1 else [replace(found[0], name=path.stem)]
+
+
+# checks
+# ----------------------------------------------------------------------------------------------
+def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, order: str) -> Clip:
+    """A clip of what a file holds, or a sentence."""
+    notes = []
+    rate = raw.fps or fps or USUAL_FPS
+    if raw.fps is None:
+        notes.append(f"{rate:g} frames per second {'as told' if fps else 'taken for granted'}")
+    elif fps is not None and abs(fps - raw.fps) > 0.01 * raw.fps:
+        raise InputError(
+            f"{where}: has {raw.fps:g} frames per second by itself, and fps = {fps:g} is given; "
+            f"leave fps away"
+        )
+    _check_numbers(where, raw)
+    _check_axes(where, raw)
+    robot, q = _fitted(where, raw, robot, order)
+    if raw.names is None:
+        notes.append(f"joints taken for {order}")
+    q = np.hstack([q[:, :3], steady(q[:, 3:7]), q[:, 7:]])
+    _check_joints(where, robot, q, raw.names is None, order)
+    return Clip(name, robot, q, rate, raw.origin, tuple(notes))
+
+
+def _check_numbers(where: str, raw: _Raw) -> None:
+    n = len(raw.base)
+    shapes = raw.base.shape == (n, 3) and raw.turn.shape == (n, 4)
+    if not shapes or raw.joints.ndim != 2 or len(raw.joints) != n:
+        sizes = f"{raw.base.shape}, {raw.turn.shape}, {raw.joints.shape}"
+        raise InputError(
+            f"{where}: base, quaternions and joints have shapes {sizes}; they must be (n, 3), "
+            f"(n, 4), (n, joints)"
+        )
+    if n < LEAST_FRAMES:
+        raise InputError(f"{where}: has {n} frames; a motion has {LEAST_FRAMES} or more")
+    whole = np.hstack([raw.base, raw.turn, raw.joints]).astype(float)
+    bad = np.argwhere(~np.isfinite(whole))
+    if len(bad):
+        frame, column = bad[0]
+        raise InputError(f"{where}: frame {frame}, column {column} is no finite number; repair it")
+    length = np.linalg.norm(raw.turn, axis=1)
+    if np.abs(length - 1).max() > 0.01:
+        frame = int(np.abs(length - 1).argmax())
+        raise InputError(
+            f"{where}: the quaternion of frame {frame} has length {length[frame]:.3g}, not 1"
+        )
+    most = np.abs(raw.joints).max()
+    if most > TURN_RAD:
+        raise InputError(
+            f"{where}: joint angles up to {most:.0f}; they look like degrees: pass radians"
+        )
+    if np.median(np.abs(raw.base).max(axis=1)) > 50:
+        raise InputError(
+            f"{where}: the base is {np.abs(raw.base).max():.0f} m away; it looks like "
+            f"centimetres: pass metres"
+        )
+
+
+def _check_axes(where: str, raw: _Raw) -> None:
+    """Refuse quaternions w x y z, and worlds whose y points up."""
+
+    def upright(turn: np.ndarray, axis: int = 2) -> float:
+        return float(np.median(Rotation.from_quat(turn).as_matrix()[:, axis, 2]))
+
+    if upright(raw.turn) > 0.5:
+        return
+    if upright(raw.turn, 1) > 0.9 and np.median(raw.base[:, 1]) > np.median(raw.base[:, 2]):
+        raise InputError(
+            f"{where}: the robot's up is the world's y; turn the clip so that z points up"
+        )
+    if upright(_first_wxyz(raw.turn)) > 0.9:
+        raise InputError(
+            f"{where}: the robot lies or stands on its head, but not if its quaternions are "
+            f"w x y z; pass x y z w"
+        )
+
+
+def _fitted(where: str, raw: _Raw, robot: Robot, order: str) -> tuple[Robot, np.ndarray]:
+    """The robot whose joints are the clip's, and configurations (n, nq)."""
+    count = raw.joints.shape[1]
+    turn = raw.turn / np.linalg.norm(raw.turn, axis=1, keepdims=True)
+    counts = set()
+    refusal = ""
+    for one in _siblings(robot):
+        whole = Whole(one)
+        for joints, urdf in ((one.joint_names, one.urdf), (whole.joints, whole.urdf)):
+            counts.add(len(joints))
+            names = raw.names or ordered(urdf, order)[0]
+            if count != len(joints) or set(names) != set(joints):
+                continue
+            columns = [names.index(name) for name in joints]
+            q = np.hstack([raw.base, turn, raw.joints[:, columns]])
+            if joints == one.joint_names:
+                return one, q
+            q, moved = whole.own(q)
+            name = max(moved, key=moved.get)
+            if moved[name] < STILL_RAD:
+                return one, q
+            refusal = refusal or (
+                f"{where}: joint {name!r} moves by {moved[name]:.2f} rad, and robot {one.name} "
+                f"holds it; pass a robot that moves it"
+            )
+    if refusal:
+        raise InputError(refusal)
+    what = f"{count} joints"
+    strange = sorted(set(raw.names or ()) - set(Whole(robot).joints))
+    if strange:
+        what += f", of which {strange[0]!r} is none of the robot's"
+    listed = ", ".join(map(str, sorted(counts)))
+    raise InputError(
+        f"{where}: has {what}; clips of robot {robot.name} have {listed}: pass the robot that the "
+        f"clip was made for"
+    )
+
+
+def _siblings(robot: Robot) -> Iterator[Robot]:
+    """The robot, and the shipped ones that are made of the same URDF."""
+    yield robot
+    if robot.name not in SHIPPED:
+        return
+    texts = {name: read_toml(path.read_text(), name) for name, path in SHIPPED.items()}
+    for name, config in texts.items():
+        if name != robot.name and config["urdf"] == texts[robot.name]["urdf"]:
+            yield Robot.load(name)
+
+
+def _check_joints(where: str, robot: Robot, q: np.ndarray, unnamed: bool, order: str) -> None:
+    """Refuse joints that are out of their ranges most of the time: another order, or robot."""
+    limits = robot.limits
+
+    def beyond(joints: np.ndarray) -> np.ndarray:
+        return np.median(np.maximum(limits.lower - joints, joints - limits.upper), axis=0)
+
+    off = beyond(q[:, 7:])
+    worst = int(off.argmax())
+    if off[worst] <= BEYOND_RAD:
+        return
+    words = (
+        f"{where}: joint {robot.joint_names[worst]!r} is {off[worst]:.1f} rad beyond its range "
+        f"most of the time"
+    )
+    other = ORDERS[order == ORDERS[0]]
+    if unnamed:
+        names = [ordered(robot.urdf, x)[0] for x in (order, other)]
+        joints = q[:, [7 + names[1].index(name) for name in names[0]]]
+        if beyond(joints).max() < BEYOND_RAD:
+            raise InputError(f"{words}, but none in {other} order; pass order = {other!r}")
+    raise InputError(f"{words}: another order of joints, or another robot's clip")
