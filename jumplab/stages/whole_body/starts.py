@@ -190,7 +190,7 @@ GIVEN = (
     Start(MENDED, from_mended, False, 150),
 )
 # of a motion that is followed: near it the exact Hessian settles, the held one wanders
-FOLLOWED = (Start("given motion", from_motion, False, 12.0),)
+FOLLOWED = (Start("given motion", from_motion, False, 120),)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
     Start(NEIGHBOUR, from_neighbour, False, 150, WARM | {"acceptable_iter": 1}),
