@@ -23,7 +23,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 CODE = {title: "".join(blocks(body, "python")) for title, body in TASKS.items()}
 QUICK = [title for title, code in CODE.items() if code and not any(word in code for word in PLANS)]
-CLIPS = "Judge and mend a clip of others"  # its file is not there; tests of judging have one
+CLIPS = "Judge and mend a motion clip"  # its file is not there; tests of judging have one
 SLOW = [title for title, code in CODE.items() if code and title not in (*QUICK, CLIPS)]
 
 
