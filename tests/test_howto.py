@@ -5,6 +5,8 @@ import shlex
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
+import pinocchio as pin
 import pytest
 from fixtures_core import jump
 
@@ -68,6 +70,18 @@ def test_what_plans_runs(title, names):
     for code in blocks(TASKS[title], "python"):
         exec(compile(code, "howto.md", "exec"), names)
     assert "run" not in names or names["run"].landed, names["run"].reason
+
+
+def test_path_and_momentum_of_a_plan_are_those_of_its_tape():
+    """By Pinocchio, of the same states; angular momentum about the CoM, in the direction of +y."""
+    plan = jump(0.4, 0.2, method="direct")
+    model = plan.robot.model
+    data = model.createData()
+    for row in range(0, len(plan.t), 150):
+        pin.computeCentroidalMomentum(model, data, plan.tape.q[row], plan.tape.v[row])
+        np.testing.assert_allclose(plan.com[row], data.com[0], atol=1e-9)
+        np.testing.assert_allclose(plan.com_velocity[row], data.hg.linear / plan.robot.total_mass, atol=1e-9)
+        assert plan.L[row] == pytest.approx(data.hg.angular[1], abs=1e-6)
 
 
 def test_lines_about_clips_can_be_read():
