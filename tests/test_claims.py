@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 from paper import claims, hard_cases
 from paper.claims import Start, against_crouch, compare_starts, judge, readings, readings_markdown
+from paper.tracking import jump_tracking
 
 from jumplab.cli import notebooks
 from jumplab.errors import InputError
@@ -247,6 +248,19 @@ def test_a_guess_with_much_noise_is_planned_with_its_feet_in_place():
     case = hard_cases.cases()[95]
     assert case.kind == "bad guesses" and hard_cases.NOISE_RAD[case.variant // 5 % 4] == 0.8
     assert hard_cases.solve(case, "direct")["clean"]  # neither Hessian leads anywhere from the motion as it is
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [(0.0, 0.2), (0.4, 0.5), (1.0, 0.5)])
+def test_the_jump_follows_stage_one(bhr, target):
+    """In the launch, rms over the time, at the same share of each phase, as README says."""
+    plan = Planner(bhr).plan(JumpTask(*target), "three-step")
+    missed, asked = jump_tracking(plan)["launch"], plan.srmp.launch
+    assert missed["L"]["rms"] < 0.10 * np.abs(asked.L).max()
+    assert missed["velocity"]["rms"] < 0.05 * np.linalg.norm(asked.com_velocity, axis=1).max()
+    assert missed["rho"]["relative_rms"] < 0.03
+    loose = Planner(bhr, weights={"track momentum": 0.02}).plan(JumpTask(*target), "three-step")
+    assert jump_tracking(loose)["launch"]["L"]["rms"] > 4 * missed["L"]["rms"]
 
 
 def test_the_same_words_everywhere():

@@ -62,6 +62,7 @@ def test_draws_stay_within_their_ranges(bhr):
         assert [s.phase for s in one.shoves] == ["launch", "flight", "landing"] and 0 <= one.soft_m <= 0.03
         assert all(0 <= s.impulse_n_s <= 25 and 0 <= s.share <= 1 for s in one.shoves)
         assert all(abs(x) <= np.radians(3) for x in one.posture_rad.values())
+        assert all(0 <= x <= 0.05 for x in one.armature.values()) and all(0 <= x <= 3 for x in one.damping.values())
         assert 0 <= one.noise.gyro <= 4 * SensorNoise.typical().gyro
         assert (np.array(one.payload_m)[:2] >= low[:2]).all() and (np.array(one.payload_m)[:2] <= high[:2]).all()
     assert len({one.payload_m for one in drawn}) == 40 and max(one.payload_kg for one in drawn) > 4
@@ -110,6 +111,20 @@ def test_a_payload_is_a_cube_fixed_to_the_trunk(engine, bhr):
     assert other.toDynamicParameters() == pytest.approx((one + cube).toDynamicParameters())
     with engine(real, stance_configuration(bhr)) as world:
         assert world.kept().mass_kg == pytest.approx(bhr.total_mass + 4) and world.read_back()["inertia_error"] < 1e-9
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+def test_rotors_and_damping_beside_the_planned_ones_are_felt(bhr, name):
+    ranges = Ranges.none(rotor_kg_m2=(0.02, 0.02), damping_n_m_s=(1.0, 1.0))
+    assert str(ranges).endswith("rotors heavier by 0.02 ... 0.02 kg m^2, joints damped more by 1 ... 1 N m s/rad")
+    drawn = Perturbation.draw(bhr, 4, ranges)
+    real = drawn.robot(bhr)
+    for key, more in (("armature", 0.02), ("damping", 1.0)):
+        assert getattr(real.limits, key) == pytest.approx(getattr(bhr.limits, key) + more, abs=1e-15)
+    assert real.total_mass == pytest.approx(bhr.total_mass, abs=1e-9)
+    run = sim.simulate_jump(tape(), bhr, perturbation=drawn, engine=name, stand_s=0.1)
+    assert run.checks_passed, [str(f) for f in run.checks if not f.passed]
+    assert run.robot.limits.damping == pytest.approx(real.limits.damping)
 
 
 def test_weak_motors_and_an_empty_battery_shrink_the_limit_curve(bhr):

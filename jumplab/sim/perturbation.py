@@ -12,6 +12,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
+import tomlkit
 
 from jumplab.control.estimator import SensorNoise
 from jumplab.control.kinematics import Gauge
@@ -55,7 +56,13 @@ Pair = tuple[float, float]  # from ... to
 Vector = tuple[float, float, float]
 ByName = dict[str, float]  # of links or joints
 NONE = 0.0, 0.0
-FACTORS = {"%": 100.0, "m": 1e3}  # of what is said, by how its unit begins
+FACTORS = {
+    "%": 100.0,
+    "%/kW": 100.0,
+    "mm": 1e3,
+    "mm per axis": 1e3,
+    "ms late": 1e3,
+}  # of what is said, by its unit
 
 
 def _up_to(default: Any, most: float, words: str, unit: str = "", least: float = 0.0) -> Any:
@@ -69,8 +76,8 @@ class Ranges:
     and joint by itself.
 
     A pair is drawn from ... to, a single number is the half-width around nothing. What is beyond
-    the last number of a field's declaration is refused with an :class:`InputError`. The last
-    thirteen are off unless they are asked for.
+    the last number of a field's declaration is refused with an :class:`InputError`. From the
+    payload on they are off unless they are asked for.
     """
 
     mass: float = _up_to(0.05, 0.2, "masses", "%")  # [1], relative
@@ -97,6 +104,9 @@ class Ranges:
     shove_landing_n_s: Pair = _up_to(NONE, 25.0, "a shove within 1 s of the landing of", "N s")
     posture_deg: float = _up_to(0.0, 3.0, "joints off at the start by", "degrees")  # [degrees]
     sensors: Pair = _up_to((1.0, 1.0), 4.0, "sensor errors times")  # [1]
+    # [kg m^2] and [N m s/rad] at every joint, beside what the plan knows of
+    rotor_kg_m2: Pair = _up_to(NONE, 0.05, "rotors heavier by", "kg m^2")
+    damping_n_m_s: Pair = _up_to(NONE, 3.0, "joints damped more by", "N m s/rad")
 
     def __post_init__(self):
         for f in fields(self):
@@ -136,7 +146,7 @@ class Ranges:
         return ", ".join(words)
 
     def _says(self, f: Field) -> str:
-        factor = FACTORS.get(f.metadata["unit"][:1], 1.0)
+        factor = FACTORS.get(f.metadata["unit"], 1.0)
         value = getattr(self, f.name)
         if isinstance(f.default, tuple):
             amount = " ... ".join(f"{factor * x:g}" for x in value)
@@ -208,6 +218,9 @@ class Perturbation:
     shoves: tuple[Shove, ...] = ()
     # joint -> wished error at the start
     posture_rad: ByName = field(default_factory=dict)
+    # joint -> what its motor has beside the planned armature [kg m^2] and damping [N m s/rad]
+    armature: ByName = field(default_factory=dict)
+    damping: ByName = field(default_factory=dict)
 
     def __post_init__(self):
         if not 0 < self.friction <= 2:
@@ -262,14 +275,18 @@ class Perturbation:
             shoves=_shoves(more, ranges),
             posture_rad=each(-half_rad, half_rad),
             noise=noise.times(float(more.uniform(*ranges.sensors))),
+            armature=each(*ranges.rotor_kg_m2),
+            damping=each(*ranges.damping_n_m_s),
         )
 
     def robot(self, robot: Robot) -> Robot:
-        """The robot as it really is: ``robot`` with masses, inertias, centres of mass, payload and
-        limits changed.
+        """The robot as it really is: ``robot`` with masses, inertias, centres of mass, payload,
+        limits and motors changed.
         """
         lost = {"effort": self.torque_loss, "speed": self.speed_loss}
-        if not (self.mass or self.inertia or self.com or self.payload_kg or any(lost.values())):
+        heavier = {key: more for key in ("armature", "damping") if (more := getattr(self, key))}
+        same = not (self.mass or self.inertia or self.com or self.payload_kg)
+        if same and not any(lost.values()) and not heavier:
             return robot
         left = {k: {name: 1 - x for name, x in losses.items()} for k, losses in lost.items()}
         root = ET.fromstring(limits(robot, left, {})[0])
@@ -289,7 +306,11 @@ class Perturbation:
             moment = f"{self.payload_kg * PAYLOAD_SIDE_M**2 / 6:.12g}"
             place = " ".join(f"{x:.12g}" for x in self.payload_m)
             root.extend(ET.fromstring(PAYLOAD.format(**values, moment=moment, place=place)))
-        real = Robot(ET.tostring(root, encoding="unicode"), robot.config_text)
+        config = tomlkit.parse(robot.config_text)
+        for key, more in heavier.items():
+            known = robot.motors[key]
+            config["actuators"][key] = {name: known.get(name, 0.0) + x for name, x in more.items()}
+        real = Robot(ET.tostring(root, encoding="unicode"), tomlkit.dumps(config))
         return real.under_gravity(robot.gravity)
 
     def ground(self, scene: Scene, robot: Robot, tape: Tape | None) -> Scene:

@@ -40,6 +40,9 @@ def tracking(m: Mode) -> list[Term]:
     def velocity(p):
         return p.com_velocity[[0, 2]] - p.ref.velocity
 
+    def momentum(p):
+        return p.L[1] - p.ref.L
+
     def momentum_kept(p):
         slack = ca.fmax(lim.momentum_share * ca.fabs(p.p.momentum), lim.momentum_slack)
         difference = p.L[1] - p.p.momentum
@@ -55,7 +58,7 @@ def tracking(m: Mode) -> list[Term]:
     spin = "WL-D1, as a cost on L"
     rows += [
         follow("track velocity", origin, "m/s", velocity, w.track_velocity),
-        follow("track momentum", spin, "kg m^2/s", lambda p: p.L[1] - p.ref.L, w.track_momentum),
+        follow("track momentum", spin, "kg m^2/s", momentum, w.track_momentum / size**2),
     ]
     if m.raised:
         words = "L at take-off", "WL-D1", "kg m^2/s", "end"
