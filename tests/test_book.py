@@ -45,6 +45,7 @@ def site(tmp_path_factory):
     clone = tmp_path_factory.mktemp("clone")
     for name in ("notebooks", "figures"):
         shutil.copytree(ROOT / name, clone / name, ignore=shutil.ignore_patterns("__pycache__", ".ipynb_checkpoints"))
+    shutil.copy(ROOT / "CHANGELOG.md", clone)
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     for line in ("jumplab run 00 --out executed --figures figures", "sphinx -b html -c notebooks/book notebooks site"):
         done = subprocess.run(

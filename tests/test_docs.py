@@ -1,4 +1,4 @@
-"""Every public name has a docstring, nothing is longer than what one reads in one go, the README leaves nothing out."""
+"""Public names have docstrings, nothing is longer than what one reads in one go, README and book leave nothing out."""
 
 import ast
 import importlib
@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from paper import tuning
+from paper import tuning, worlds
 
 from jumplab.auditing.report import LIMITS
 from jumplab.cli import main as command_line
@@ -21,7 +21,9 @@ MODULES = sorted((ROOT / "jumplab").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
 NOTEBOOKS = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-FUNCTION_LINES, CELL_LINES = 60, 25
+BOOK = ROOT / "notebooks" / "book"
+PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted(BOOK.glob("*.md"))}
+FUNCTION_LINES, CELL_LINES, README_WORDS = 60, 25, 1200
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -72,10 +74,14 @@ def long_functions(tree):
     return {name: n for name, n in lines.items() if n > FUNCTION_LINES}
 
 
-def test_readme_counts_the_lines_of_the_six_files_to_read():
+def test_the_readme_is_short():
+    assert len(README.split()) <= README_WORDS
+
+
+def test_the_book_counts_the_lines_of_the_six_files_to_read():
     """Rounded to hundreds."""
-    said = int(re.search(r"Six files of ([\d,]+) lines", README)[1].replace(",", ""))
-    files = re.findall(r"^\d\. `(jumplab/\S+\.py)`", README, re.M)
+    said = int(re.search(r"Six files of ([\d,]+) lines", PAGES["course"])[1].replace(",", ""))
+    files = re.findall(r"^\d\. `(jumplab/\S+\.py)`", PAGES["course"], re.M)
     lines = sum(len((ROOT / name).read_text(encoding="utf-8").splitlines()) for name in files)
     assert len(files) == 6 and abs(said - lines) <= 50, lines
 
@@ -110,10 +116,10 @@ def everything_said(parser):
     return parser.format_help() + "".join(map(everything_said, below))
 
 
-def test_readme_knows_every_notebook_and_command():
-    """And nothing that is not there: files that it links or names in code, commands with options that exist."""
-    assert {p.stem for p in NOTEBOOKS} == set(re.findall(r"^\| `(\d\d_\w+)` \|", README, re.M))
-    lines = re.findall(r"^jumplab (\w+) +(.*?) *(?:#.*)?$", README, re.M)
+def test_the_book_knows_every_notebook_and_command():
+    """And nothing that is not there: commands with options that exist."""
+    assert {p.stem for p in NOTEBOOKS} == set(re.findall(r"^\| `(\d\d_\w+)` \|", PAGES["course"], re.M))
+    lines = re.findall(r"^jumplab (\w+) +(.*?) *(?:#.*)?$", PAGES["commands"], re.M)
     assert {name for name, _ in lines} == {c.__name__ for c in command_line.COMMANDS}
     commands = next(a for a in command_line._parser()._actions if a.dest == "command").choices
     for name, options in lines:
@@ -121,24 +127,38 @@ def test_readme_knows_every_notebook_and_command():
             assert option in everything_said(commands[name]), (name, option)
 
 
-def test_readme_points_at_files_that_exist():
-    named = re.findall(r"\]\(([^):]+)\)", README) + re.findall(
-        r"`((?:jumplab|notebooks|tests|figures)/[\w./]*)`", README
-    )
-    named += ["CITATION.cff", "LICENSE", "CHANGELOG.md", ".pre-commit-config.yaml", ".ci/run"]
-    assert len(named) > 8 and all((ROOT / name).exists() for name in named), named
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(BOOK.glob("*.md"))], ids=short)
+def test_pages_point_at_what_exists_and_describe_their_pictures(page):
+    """Links, and files named in code."""
+    text = page.read_text(encoding="utf-8")
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^):]+)\)", text)]
+    assert all((page.parent / link).exists() for link in links), links
+    named = re.findall(r"`((?:jumplab|notebooks|tests|figures)/[\w./]*)`", text)
+    named += re.findall(r"`(C[A-Z]+\.\w+)`", text)
+    assert all((ROOT / name).exists() for name in named), named
+    assert all(len(words.split()) >= 4 for words in re.findall(r"!\[([^]]*)\]", text)), "a picture without words"
+    if page.name == "README.md":
+        assert len(links) > 8 and len(named) >= 3
+        assert all((ROOT / name).exists() for name in ("LICENSE", "CHANGELOG.md", ".pre-commit-config.yaml", ".ci/run"))
 
 
-def test_readme_says_the_friction_that_plans_obey():
+def test_the_book_says_the_friction_that_plans_obey():
     """Each stage's, at its nodes; and what the audit refuses between them is the least that trials simulate."""
     sentence = r"Stage 3 counts on a friction of ([\d.]+) at its nodes, stages 1 and 2 on ([\d.]+); "
     sentence += r"between nodes plans stay below ([\d.]+)"
-    said = re.search(sentence, " ".join(README.split()))  # lines may break anywhere
+    said = re.search(sentence, " ".join(PAGES["validity"].split()))  # lines may break anywhere
     assert {s().friction for s in (srmp.settings.SrmpSettings, joint_qp.settings.Limits)} == {FRICTION}
     limits = whole_body.Limits()
     assert float(said[1]) == limits.friction == limits.of_flip().friction < float(said[2])
     assert float(said[2]) == FRICTION
     assert float(said[3]) == LIMITS["friction used"].limit == Ranges().friction[0]
+
+
+def test_the_book_has_the_stored_counts_of_backflips():
+    landed = [[r["landed"] for r in worlds.stored(worlds.FLIPS) if r["engine"] == name] for name in worlds.ENGINES]
+    rows = r"^\| (?:backflip of 0\.5 m, robust plan.*|the same) \|.* (\d+) of 200 \|$"
+    counts = re.findall(rows, PAGES["validity"], re.M)
+    assert [(sum(x), len(x)) for x in landed] == [(int(count), 200) for count in counts]
 
 
 def test_these_checks_can_fail():
@@ -151,13 +171,11 @@ def test_these_checks_can_fail():
 
 
 def test_the_book_has_all_that_it_names():
-    """Every module of the reference can be imported; every picture and notebook that a page names is there."""
-    book = ROOT / "notebooks" / "book"
-    modules = re.findall(r"automodule:: ([\w.]+)", (book / "api.md").read_text(encoding="utf-8"))
+    """Every module of the reference can be imported; every page is in the index."""
+    modules = re.findall(r"automodule:: ([\w.]+)", PAGES["api"])
     assert len(modules) > 30 and all(importlib.import_module(name).__doc__ for name in modules)
-    for page in ("index.md", "gallery.md"):
-        links = re.findall(r"\]\(([^):]+)\)", (book / page).read_text(encoding="utf-8"))
-        assert links and all((book / link).exists() for link in links), links
+    listed = re.findall(r"^([a-z]+)$", PAGES["index"], re.M)
+    assert sorted([*listed, "index"]) == sorted(PAGES)
     assert (ROOT / "figures" / "jump.gif").stat().st_size <= 1.5e6
 
 

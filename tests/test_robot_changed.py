@@ -17,7 +17,7 @@ from jumplab.robot.files import ROLES
 from jumplab.robot_import.urdf import have_published
 
 BHR = Robot.load()
-README = Path(__file__).parent.parent / "README.md"
+PAGE = Path(__file__).parent.parent / "notebooks" / "book" / "robots.md"
 SHORT = dict(zip(("hip", "knee", "ankle", "shoulder"), ROLES, strict=True))
 LINKS = ("trunk", "left_thigh", "right_thigh", "left_foot", "right_arm")
 KEYS = st.sampled_from([*BHR.joint_names, *ROLES, *SHORT])
@@ -257,8 +257,8 @@ def test_a_robot_that_is_heavier_on_one_side_jumps_in_space(bhr):
 
 
 @pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
-def test_the_lines_of_the_readme():
-    (block,) = re.findall(r"```python\n([^`]*with_limits[^`]*)```", README.read_text())
+def test_the_lines_of_the_book():
+    (block,) = re.findall(r"```python\n([^`]*with_limits[^`]*)```", PAGE.read_text(encoding="utf-8"))
     exec(f"import jumplab as jl\n{block}", said := {})
     robot, g1 = said["robot"], Robot.load("g1")
     assert robot.stance["knee_rad"] == 0.6 and robot.model.inertias[1].mass == pytest.approx(12.0)

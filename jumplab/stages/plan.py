@@ -134,6 +134,21 @@ class JumpPlan(Shown, Named):
         return self.tape.t
 
     @property
+    def com(self) -> np.ndarray:
+        """CoM (N, 3) over :attr:`t` [m]: x forward, y to the left, z up, as a simulation has it."""
+        return self.tape.extra["com"]
+
+    @property
+    def com_velocity(self) -> np.ndarray:
+        """Velocity (N, 3) of the CoM over :attr:`t` [m/s]."""
+        return self.tape.extra["com_velocity"]
+
+    @property
+    def L(self) -> np.ndarray:
+        """Angular momentum (N,) about the CoM, about +y, over :attr:`t` [kg m^2/s]."""
+        return self.tape.extra["angular_momentum"][:, 1]
+
+    @property
     def planned_distance_m(self) -> float:
         """Travel of the toe over the whole tape, of the middle between the soles in a jump out of
         the plane [m].

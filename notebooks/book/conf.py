@@ -28,6 +28,7 @@ myst_heading_anchors = 3
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "description"
 suppress_warnings = ["mystnb.unknown_mime_type", "myst.xref_missing", "docutils"]
+suppress_warnings += ["ref.python"]  # types in docstrings are short names, of which two classes may have the same
 
 
 def with_outputs(app, name, source):
