@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
@@ -190,6 +190,8 @@ class WholeBodyPlanner:
             if best is not None and best.used <= BROKEN:
                 return replace(best, attempts=tuple(asked.attempts))
         if best is None:
+            if left_s() <= 0:
+                raise _farthest(failures)
             raise (explain and self._explained(programs[-1], asked)) or failures[-1]
         name = programs[-1].nlp.problem.name
         raise SolverError(
@@ -269,3 +271,10 @@ def _spent(program: Program, asked: Asked) -> bool:
     return bool(asked.attempts) and (
         left_s() <= 0 or asked.spent_s > program.patience_s(PATIENCE_S)
     )
+
+
+def _farthest(failures: Sequence[JumplabError]) -> JumplabError:
+    """The failure of the longest search, with what its last motion violates most."""
+    e = max(failures, key=lambda e: getattr(e, "iterations", 0))
+    worst = getattr(e, "violations", ())
+    return type(e)(f"{e}; it was still off {worst[0]}", **vars(e)) if worst else e
