@@ -21,7 +21,8 @@ def reasons(
 ) -> tuple[str, tuple[str, ...]]:
     """(end of a sentence, terms) about a solve that ended at ``last`` (n,) without a plan.
 
-    To ``explain`` a conflict costs about as much as a solve; ``seconds`` of processor time at most.
+    To ``explain`` a conflict costs about as much as a solve, ``seconds`` of processor time at most;
+    else the terms are those that the last iterate violates.
     """
     for where, x in {"initial guess": posed.x0, "last iterate": last}.items():
         lost = tuple(f"{name}{place}" for name, place in _without_number(a, x, posed.p).items())
@@ -33,8 +34,8 @@ def reasons(
                 lost,
             )
     if not explain:
-        return "", ()
-    worst = _conflicts(a, posed, seconds)
+        return "", _violated(a, posed, last)
+    worst = _violated(a, posed, _least_violation(a, posed, seconds))
     if not worst:
         return (
             ": a motion that meets every constraint exists, but the search did not settle; try "
@@ -93,11 +94,8 @@ def _without_number(a: Assembled, x: np.ndarray, p: np.ndarray) -> dict[str, str
     return out
 
 
-def _conflicts(a: Assembled, posed: Posed, seconds: float) -> tuple[str, ...]:
-    """The terms that the least violating motion violates most, where and by how much, in their
-    units.
-    """
-    x = _least_violation(a, posed, seconds)
+def _violated(a: Assembled, posed: Posed, x: np.ndarray) -> tuple[str, ...]:
+    """The terms that a motion ``x`` (n,) violates most, where and by how much, in their units."""
     beyond = np.nan_to_num(posed.beyond(a.nlp(x, posed.p)[1].full().ravel()), nan=np.inf)
     phases = unpack(a, x)
     worst = []

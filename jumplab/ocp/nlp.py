@@ -31,7 +31,6 @@ EXPLAINED: ContextVar[bool] = ContextVar("explained", default=True)
 # processor time of this process [s] at which a search ends with the best that it has
 DEADLINE: ContextVar[float] = ContextVar("deadline", default=math.inf)
 LEAST_S = 1.0  # that a solve gets all the same
-EXPLAINING_S = 2.5  # that an explanation gets
 GOOD_STATUSES = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 RESIDUAL_LIMIT = 1e-4  # scaled row error above which a "solved" status is not believed
 IPOPT = {
@@ -180,7 +179,7 @@ class Nlp:
             residual = float(np.max(posed.beyond(g), initial=0.0))
         if status not in GOOD_STATUSES or not residual < RESIDUAL_LIMIT:
             asked = explain and EXPLAINED.get()
-            because, violations = reasons(a, posed, x, asked, max(left_s(), EXPLAINING_S))
+            because, violations = reasons(a, posed, x, asked and left_s() > 0, left_s())
             raise SolverError(
                 f"{self.problem.name}: no plan ({status} after {iterations} iterations){because}",
                 stage=self.problem.name,

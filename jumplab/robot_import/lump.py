@@ -143,7 +143,7 @@ def _moving_joints(
     moving = list(dict.fromkeys(moving))
     for name in moving:
         if name not in tree.joints:
-            raise tree.error(f"a role names the joint {name!r}, which the URDF lacks")
+            raise tree.error(f"a role names the joint {name!r}, which the {tree.format} lacks")
         joint = tree.joints[name]
         if not joint.driven:
             kind = "a mimic" if joint.mimic else joint.kind
@@ -179,7 +179,7 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
             out[joint.name] = float(np.clip(0.0, *sorted(ends)))
     for name in locked:
         if name not in tree.joints:
-            raise tree.error(f"[locked] names the joint {name!r}, which the URDF lacks")
+            raise tree.error(f"[locked] names the joint {name!r}, which the {tree.format} lacks")
         out[name] = entry(config, "locked", name)
     for joint in tree.joints.values():  # a follower goes where its leader is held
         if joint.mimic and joint.name not in locked:

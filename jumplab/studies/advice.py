@@ -22,7 +22,7 @@ ON_THE_SPOT = 3  # after so many tries a jump on the level that goes nowhere is 
 # the patience for the target itself is spent
 TRIES = 8
 LONGEST_S = 30.0
-AFTER_S = 5.0
+AFTER_S = 3.0
 THREE_STEPS = ("SRMP", "joint_map")  # where a refusal is none of the method "direct"
 LEAST_M = 0.03  # of a height; no target may be lower than 0.02 m
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import InfeasibleError, InputError, SolverError
+from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.ocp.cache import in_turn
 from jumplab.ocp.nlp import EXPLAINED, Nlp
 from jumplab.ocp.solution import PhaseGuess
@@ -193,6 +193,8 @@ class WholeBodyPlanner:
             if best is not None and best.used <= BROKEN:
                 return replace(best, attempts=tuple(asked.attempts))
         if best is None:
+            if left_s() <= 0:
+                raise _farthest(failures)
             raise (explain and self._explained(programs[-1], asked)) or failures[-1]
         name = programs[-1].nlp.problem.name
         raise SolverError(
@@ -265,3 +267,10 @@ class WholeBodyPlanner:
                 f"of {effort:.3g}; if these are motors' efforts before their gears, give those of "
                 f"the joints in [limits]"
             )
+
+
+def _farthest(failures: Sequence[JumplabError]) -> JumplabError:
+    """The failure of the longest search, with what its last motion violates most."""
+    e = max(failures, key=lambda e: getattr(e, "iterations", 0))
+    worst = getattr(e, "violations", ())
+    return type(e)(f"{e}; it was still off {worst[0]}", **vars(e)) if worst else e
