@@ -12,7 +12,7 @@ import numpy as np
 
 from jumplab.errors import InfeasibleError, InputError, JumplabError, SolverError
 from jumplab.ocp.cache import in_turn
-from jumplab.ocp.nlp import EXPLAINED, Nlp
+from jumplab.ocp.nlp import EXPLAINED, Nlp, left_s
 from jumplab.ocp.solution import PhaseGuess
 from jumplab.robot import Robot
 from jumplab.robot.stance import holding

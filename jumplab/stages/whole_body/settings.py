@@ -129,7 +129,8 @@ class Weights:
     force: float = 1e-5  # [1] / [N]^2 / [s], of each corner's generators
     mirror: float = 10.0  # [1] / [rad]^2 / [s], of jumps straight ahead
     track_velocity: float = 200.0  # [1] / [m/s]^2 / [s]
-    # inertia and momentum in shares of the stance's, so that weights mean the same for robots of any size
+    # inertia and momentum in shares of the stance's, so that weights mean the same for robots of
+    # any size
     # [1] / [share]^2 / [s]; tracking it is the task of the paper's flight
     track_inertia: float = 6800.0
     # [1] / [share/s]^2 / [s], in launch, whose end is faster than legs can be
