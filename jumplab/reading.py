@@ -103,9 +103,7 @@ def refuse_link(path: str | Path) -> None:
         )
 
 
-def xml(
-    text: str | bytes, where: str, error: type[InputError] = InputError
-) -> ElementTree.Element:
+def xml(text: str | bytes, where: str, error: type[InputError] = InputError) -> ElementTree.Element:
     """Root element of an XML text; raises ``error`` for too many elements,
     :class:`xml.etree.ElementTree.ParseError` if it is none.
     """
@@ -130,7 +128,9 @@ def check_mjcf(
         get = element.get
         numbers = [get("count")] if element.tag in COPYING else []
         numbers += [get("nrow"), get("ncol")] if element.tag == "hfield" else []
-        copies = math.prod(int(x) for text in numbers for x in (text or "").split() if x.isdecimal())
+        copies = math.prod(
+            int(x) for text in numbers for x in (text or "").split() if x.isdecimal()
+        )
         most = MOST_POINTS if element.tag == "hfield" else MOST_COPIES
         if above * copies > most:
             raise error(

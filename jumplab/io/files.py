@@ -189,7 +189,9 @@ def open_log(
     path = Path(path)
     reading.refuse_link(path)
     try:
-        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | reading.SAFE, 0o644), "a+b")
+        file = os.fdopen(
+            os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | reading.SAFE, 0o644), "a+b"
+        )
     except OSError as e:
         raise InputError(
             f"{path}: cannot be written ({e.strerror}); choose a writable folder"

@@ -35,7 +35,17 @@ from jumplab.ocp.problem import Problem
 HOME = ("jumplab.",)
 # modules and rooms that a problem is built by; a test walks the imports of the problems' modules
 # and misses none
-BUILT_BY = ("errors", "reading", "task", "ocp", "models", "robot", "stages.srmp", "stages.whole_body")
+BUILT_BY = (
+    "errors",
+    "arguments",
+    "reading",
+    "task",
+    "ocp",
+    "models",
+    "robot",
+    "stages.srmp",
+    "stages.whole_body",
+)
 KNOWN: dict[str, dict[str, ca.Function]] = {}  # of this process, by fingerprint
 # CasADi's expressions, and ipopt with MUMPS, are no affair of two threads, and equal parts are
 # shared by all planners: threads build and solve in turn

@@ -102,7 +102,9 @@ def decode(raw: bytes, where: str) -> str:
 def read_toml(text: str, where: str) -> dict:
     """The file as nested tables; :class:`RobotError` (with the name ``where``) if it is none."""
     if NESTED.search(text):
-        raise RobotError(f"{where}: a key of more than {DEEPEST} parts between dots; is it a robot?")
+        raise RobotError(
+            f"{where}: a key of more than {DEEPEST} parts between dots; is it a robot?"
+        )
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as e:

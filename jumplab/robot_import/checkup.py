@@ -111,8 +111,8 @@ def check_texts(urdf: str, config_text: str, where: str) -> None:
     for link in root.iterfind("link"):
         for mesh in link.iterfind("*/geometry/mesh"):
             raise RobotError(
-                f"{where}: link {link.get('name')!r}: the mesh {quoted(mesh.get('filename'))} is not "
-                f"opened; make it a box, or describe the robot by a TOML with [source]"
+                f"{where}: link {link.get('name')!r}: the mesh {quoted(mesh.get('filename'))} is "
+                f"not opened; make it a box, or describe the robot by a TOML with [source]"
             )
     faults = urdf_checks.faults(root, where)
     joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
