@@ -267,7 +267,7 @@ class Planner:
             )
         if start is not None and np.shape(start) != (LINKS,):
             raise InputError(
-                f"start has the shape {np.shape(start)}, the angles of {LINKS} links have ({LINKS},)"
+                f"start has the shape {np.shape(start)}; the links have {LINKS} angles, ({LINKS},)"
             )
         if start is not None and not self.robot.planar:
             raise InputError(
