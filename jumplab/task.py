@@ -108,6 +108,6 @@ class JumpTask:
         if not rest >= 0:
             raise InputError(
                 f"a CoM rise of {self.height_m:g} m cannot reach a touchdown "
-                f"{com_rise_at_touchdown_m:.3g} m above take-off; it takes at least that height"
+                f"{com_rise_at_touchdown_m:.3f} m above take-off; it takes at least that height"
             )
         return (v + math.sqrt(rest)) / g

@@ -200,7 +200,7 @@ def _number(robot: Robot, what: str, value: Any, positive: bool = False) -> floa
         number = math.inf
     if not abs(number) < MOST or (positive and not number > 0):
         wanted = "a positive number" if positive else "a finite number"
-        raise robot.error(f"{what} must be {wanted} below {MOST:g}, got {quoted(value)}")
+        raise robot.error(f"{what} must be {wanted}, got {quoted(value)}")
     return number
 
 

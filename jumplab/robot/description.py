@@ -314,7 +314,6 @@ class Robot(Shown):
         """
         return self._changed(*changes.masses(self, link, mass_kg, factor))
 
-    @checked
     def with_legs(self, factor: float) -> Robot:
         """Another robot, whose thighs and shanks are ``factor`` [1] times as long, and weigh the
         same. The URDF gets the new numbers, the TOML a remark on each, so the :attr:`hash` is new.

@@ -20,8 +20,6 @@ from typing import Any
 
 import lazy_loader as lazy
 
-from jumplab.arguments import checked
-
 _NAMES = {  # module: its public names, loaded when they are first used
     # for plans, for simulations, and the map of what a robot can do
     "jumps": "joint_trajectories inertia_and_momentum margins ground_reaction jump_strobe momentum",
@@ -46,6 +44,8 @@ _load, __dir__, __all__ = lazy.attach(
 
 
 def __getattr__(name: str) -> Any:
+    from jumplab.arguments import checked  # not before something is drawn
+
     value = _load(name)
     if inspect.isfunction(value):  # whoever comes by this door is told what does not fit
         value = globals()[name] = checked(value)
