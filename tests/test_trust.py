@@ -4,7 +4,6 @@ import io
 import json
 import os
 import random
-import re
 import resource
 import struct
 import subprocess
@@ -63,7 +62,7 @@ def npy(shape, kind="<f8", content=b""):
 
 def npz(**members):
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         for name, content in members.items():
             file.writestr(f"{name}.npy", content)
     return buffer.getvalue()
@@ -83,9 +82,9 @@ def plan_folder(place, robot, **files):
 def hostile(folder, robot):
     """(reader, path, what the sentence says) of every file."""
     big = 200_000_000
-    mesh = re.sub(
-        "<collision>", '<collision><geometry><mesh filename="/dev/zero"/></geometry></collision><collision>', robot.urdf
-    )
+    shape = '<collision><geometry><mesh filename="/dev/zero"/></geometry></collision>'
+    mesh = robot.urdf.replace("<collision>", f"{shape}<collision>", 1)
+    field = '<asset><hfield name="h" nrow="30000" ncol="30000" size="1 1 1 1"/></asset>'
     bombs = dict.fromkeys(("schema", "t", "q", "v", "a"), npy((big // 8,), content=bytes(big)))
     texts = {
         "deep.urdf": ("<robot>" + "<link>" * 60_000 + "</link>" * 60_000 + "</robot>", "has 120002 XML tags"),
@@ -93,10 +92,7 @@ def hostile(folder, robot):
         "deep.toml": ("a = " + "[" * 100_000, "not a TOML file"),
         "keys.toml": (".".join("a" * 20_000) + " = 1", "a key of more than 100 parts"),
         "copies.xml": (MJCF.format("", COPIES.format(10**9)), "<replicate> makes 1e+09 copies"),
-        "field.xml": (
-            MJCF.format('<asset><hfield name="h" nrow="30000" ncol="30000" size="1 1 1 1"/></asset>', ""),
-            "<hfield> makes 9e+08",
-        ),
+        "field.xml": (MJCF.format(field, ""), "<hfield> makes 9e+08"),
         "pipe.xml": (MJCF.format('<include file="pipe.urdf"/>', ""), "is a pipe or a device"),
     }
     os.mkfifo(folder / "pipe.urdf")
@@ -106,15 +102,12 @@ def hostile(folder, robot):
     for name, (text, sentence) in texts.items():
         (folder / name).write_text(text)
         out.append(("robot", folder / name, sentence))
-    for name, content in (
-        ("bomb", npz(**bombs)),
-        ("head", npz(schema=npy((10**10,)))),
-        ("texts", npz(schema=npy((10**12,), "<U0"))),
-    ):
+    heads = {"head": npy((10**10,)), "texts": npy((10**12,), "<U0")}
+    files = {"bomb": npz(**bombs)} | {name: npz(schema=head) for name, head in heads.items()}
+    for name, content in files.items():
         out.append(("plan", plan_folder(folder / name, robot, plan_npz=content), "not a readable plan"))
-    out.append(
-        ("plan", plan_folder(folder / "mesh", robot, robot_urdf=mesh.encode()), "the mesh '/dev/zero' is not opened")
-    )
+    place = plan_folder(folder / "mesh", robot, robot_urdf=mesh.encode())
+    out.append(("plan", place, "the mesh '/dev/zero' is not opened"))
     (folder / "atlas").mkdir()
     (folder / "atlas" / "atlas.npz").write_bytes(npz(head=npy((10**10,))))
     out.append(("atlas", folder / "atlas", "is damaged or no atlas"))
@@ -133,9 +126,8 @@ def test_hostile_files_are_refused_in_little_memory_and_time(bhr, tmp_path):
 
     asked = "".join(f"{kind} {path}\n" for kind, path, _ in cases)
     how = dict(cwd=ROOT, input=asked, capture_output=True, text=True, preexec_fn=limit, timeout=300)
-    done = subprocess.run(
-        [sys.executable, "-c", "import jumplab\n" + READ], env=os.environ | {"OMP_NUM_THREADS": "1"}, **how
-    )
+    how["env"] = os.environ | {"OMP_NUM_THREADS": "1"}  # threads take address space
+    done = subprocess.run([sys.executable, "-c", "import jumplab\n" + READ], **how)
     said = done.stdout.splitlines()
     assert done.returncode == 0 and len(said) == len(cases), done.stderr[-500:]
     for (_, path, sentence), line in zip(cases, said, strict=True):
@@ -161,7 +153,7 @@ def test_no_link_below_a_result_folder_is_followed(bhr, tmp_path, name):
         "trials.jsonl": lambda: open_study(place / name, "trials").__enter__(),
         "falls": lambda: reading.below(place, name, "1"),
     }
-    with pytest.raises(InputError, match="is a symbolic link, which no result folder holds; remove it$"):
+    with pytest.raises(InputError, match=r"is a symbolic link, which no result folder holds; remove it$"):
         calls[name]()
     if foreign.is_file():
         assert foreign.read_text() == "mine\n{half"
@@ -204,6 +196,7 @@ def test_workers_import_nothing_from_the_current_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists() and "PYTHONSAFEPATH" not in os.environ
 
 
+@pytest.mark.slow
 def test_threads_take_turns():
     """Landings of two threads share a solver, and two studies the processes."""
     plan = jl.plan(jl.JumpTask(0.3, 0.2))
@@ -225,8 +218,8 @@ def test_threads_take_turns():
 # wrong calls --------------------------------------------------------------------------------------------------------
 ENDLESS = []
 ENDLESS.append(ENDLESS)
-WRONG = [None, np.True_, "far", "", b"x", 1e300, 10**400, 1j, {}, ENDLESS, np.array([1.0, 2.0]), np.array(["a"]), object(),
-         print, "x" * 5000, {"a": 1}, int, range(3), lambda x: x, np.complex128(1), [1.0, 2.0]]  # fmt: skip
+WRONG = [None, np.True_, "far", "", b"x", 1e300, 10**400, 1j, {}, ENDLESS, np.array([1.0, 2.0]), np.array(["a"]),
+         object(), print, "x" * 5000, {"a": 1}, int, range(3), lambda x: x, np.complex128(1), [1.0, 2.0]]  # fmt: skip
 
 
 def doors(robot, tmp_path):
@@ -250,7 +243,7 @@ def doors(robot, tmp_path):
         "envelope": (jl.envelope, dict(robot=robot, distances=[], heights=[0.3], jobs=1)),
         "run_trials": (jl.run_trials, dict(folder=tmp_path / "none", n=1, seed=0, jobs=1, keep_falls=0)),
         "grid": (sweep.grid, dict(distances=[0.4], heights=[0.3], platforms=(0.0,), method="direct")),
-        "tint": (jl.plots.tint, dict(color="red", share=0.5)),
+        "legend_above": (jl.plots.legend_above, dict(fig=None, handles=[])),
         "new_figure": (jl.plots.new_figure, dict(width=3.0, height=2.0)),
     }
 
