@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, require_type
 from jumplab.io import folder as folders
 from jumplab.robot import Robot
@@ -166,6 +167,7 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     return simulate_jump(plan.tape, plan.robot, **options)
 
 
+@checked
 def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None) -> AuditReport:
     """Write a plan, its audit and its simulation (if given) into a result folder, whole or not at
     all; returns the audit.
@@ -173,12 +175,15 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
     from jumplab.auditing import write_audit
 
     require_type(plan, JumpPlan, "the plan to save")
+    if run is not None:
+        _require_run(run)
     report = folders.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
     if run is not None:
         folders.write_simulation(folder, run, folders.read_plan(folder)[2])
     return report
 
 
+@checked
 def load(folder: str | Path) -> Saved:
     """Read a result folder: ``plan, run = jl.load("out")``; raises :class:`InputError` if there is
     no sound plan.
@@ -190,6 +195,13 @@ def load(folder: str | Path) -> Saved:
     return Saved(plan, SimulationResult.load(folder, robot))
 
 
+def _require_run(run: Any) -> None:
+    from jumplab.sim import SimulationResult
+
+    require_type(run, SimulationResult, "the simulation")
+
+
+@checked
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     """The jump in 3-D, plan and simulation: a notebook shows the page,
     ``view(...).save("jump.html")`` writes it.
@@ -198,5 +210,7 @@ def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     from jumplab.sim import Scene
 
     require_type(plan, JumpPlan, "the plan to view")
+    if run is not None:
+        _require_run(run)
     scene = Scene.of_plan(plan.summary, plan.robot)
     return page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)

@@ -6,12 +6,14 @@ the message alone and exits with ``exit_code``.
 """
 
 import os
+import re
 import reprlib
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
 
+_ENDLESS = re.compile(r"\S{240,}")
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60  # enough to recognise what one has typed
 
@@ -20,6 +22,10 @@ class JumplabError(Exception):
     """Root of all deliberate errors of the package."""
 
     exit_code = 4
+
+    def __init__(self, message: str):
+        # a value of thousands of characters is not quoted whole, wherever it comes from
+        super().__init__(_ENDLESS.sub(lambda word: f"{word[0][:60]}...{word[0][-60:]}", message))
 
 
 class InputError(JumplabError):

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jumplab.errors import InputError, quoted
+from jumplab.arguments import checked, real
+from jumplab.errors import InputError
 
 GRAVITY = 9.8  # [m/s^2], the paper's value; every model of the package uses it
 # [1] that every stage counts on at its nodes; between them, the audit refuses what trials may not
@@ -32,12 +33,7 @@ UNITS = {"m": "m", "rad": "rad", "gravity": "m/s^2"}  # by the ends of names
 
 
 def _number(name: str, value: Any, low: float, high: float, unit: str) -> float:
-    try:
-        x = float("" if isinstance(value, bool) else value)  # True is no number of metres
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must be a number in {unit}, got {quoted(value)}") from None
-    if not math.isfinite(x):
-        raise InputError(f"{name} must be finite, got {x}")
+    x = real(value, name, unit)
     if not low <= x <= high:
         raise InputError(f"{name} = {x:g} {unit} is outside {low:g} ... {high:g} {unit}")
     return x
@@ -99,6 +95,7 @@ class JumpTask:
         """Vertical CoM speed at take-off, sqrt(2 g h) [m/s] (v_z^exp, Sec. III)."""
         return math.sqrt(2 * self.gravity * self.height_m)
 
+    @checked
     def flight_time(self, com_rise_at_touchdown_m: float = 0.0) -> float:
         """Time in the air [s] when the CoM touches down ``com_rise_at_touchdown_m`` above its
         take-off height.

@@ -3,6 +3,7 @@
 import math
 from dataclasses import FrozenInstanceError
 
+import numpy as np
 import pytest
 
 from jumplab.errors import InputError
@@ -36,7 +37,7 @@ def test_gravity_is_the_papers():  # N-8
 
 
 def test_numbers_become_floats_and_stay():
-    task = JumpTask("0.5", 1, platform_m=-0.2)
+    task = JumpTask(np.float32(0.5), 1, platform_m=-0.2)
     assert (task.distance_m, task.height_m, type(task.height_m)) == (0.5, 1.0, float)
     with pytest.raises(FrozenInstanceError):
         task.distance_m = 2.0
@@ -50,7 +51,9 @@ def test_whole_turns(turns):
 REFUSED = [
     ((math.nan, 0.5), "distance must be finite, got nan"),
     ((1.0, math.inf), "height must be finite, got inf"),
-    (("far", 0.5), "distance must be a number in m, got 'far'"),
+    (("0.5", 0.5), "distance must be a number in m, got '0.5'"),
+    ((np.True_, 0.5), "distance must be a number in m, got np.True_"),
+    ((1j, 0.5), "distance must be a number in m, got 1j"),
     ((None, 0.5), "distance must be a number in m, got None"),
     (([1.0, 2.0], 0.5), "distance must be a number in m, got [1.0, 2.0]"),
     ((3.5, 0.5), "distance = 3.5 m is outside -3 ... 3 m"),
@@ -79,7 +82,7 @@ def test_refusals(values, sentence):
 
 
 def test_a_number_too_large_for_a_float():
-    with pytest.raises(InputError, match=r"^distance must be a number in m, got 10"):
+    with pytest.raises(InputError, match=r"^distance must be finite, got 10"):
         JumpTask(10**400, 0.5)
 
 

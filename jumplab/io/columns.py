@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumplab.errors import InputError, Shown
+from jumplab.errors import InputError, Shown, quoted
 from jumplab.robot import Robot
 
 if TYPE_CHECKING:
@@ -33,10 +33,9 @@ class Columns(Mapping[str, np.ndarray]):
         self._columns = self._pairs | short | self._joints
 
     def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._columns:
-            raise InputError(
-                f"there is no joint {name!r}; there are {', '.join([*self._pairs, *self._joints])}"
-            )
+        if not isinstance(name, str) or name not in self._columns:
+            known = ", ".join([*self._pairs, *self._joints])
+            raise InputError(f"there is no joint {quoted(name)}; there are {known}")
         return self._values[:, self._columns[name]]
 
     def __contains__(self, name: object) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
@@ -29,6 +30,7 @@ def default_name(format_name: str, source: str) -> str:
     return name if source == "plan" else f"simulated_{name}"
 
 
+@checked
 def rate_of(format_name: str, fps: float | None = None) -> float:
     """Rate of a format, or ``fps`` [1/s]; raises :class:`InputError` if it cannot be meant."""
     if format_name not in FORMATS:
@@ -36,6 +38,7 @@ def rate_of(format_name: str, fps: float | None = None) -> float:
     return checked_rate(FORMATS[format_name][1] if fps is None else fps)
 
 
+@checked
 def write(
     format_name: str, motion: Motion, robot: Robot, path: str | Path, *, fps: float | None = None
 ) -> Path:

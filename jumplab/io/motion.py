@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jumplab import reading
+from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 
@@ -22,6 +23,7 @@ CONTACT_FORCE_N = 5.0  # "a few newtons"; a height threshold would see the lift-
 END_TOLERANCE = 1e-9  # [s], so that a grid of k / rate reaches the last sample in spite of rounding
 
 
+@runtime_checkable
 class Record(Protocol):
     """What a motion is made from: a ``Tape`` or a ``SimulationResult``."""
 
@@ -56,6 +58,7 @@ class Motion:
             object.__setattr__(self, "contact", both)
 
     @classmethod
+    @checked
     def of(cls, record: Record | Motion) -> Motion:
         """The motion of a ``Tape`` (which has accelerations) or of a ``SimulationResult``."""
         if isinstance(record, Motion):
@@ -82,6 +85,7 @@ class Motion:
         """Time from the first to the last sample [s]."""
         return float(self.t[-1] - self.t[0])
 
+    @checked
     def at(self, times: np.ndarray) -> Motion:
         """The motion at ``times`` (M,) [s]: everything linear between samples, the base's attitude
         along the arc.
@@ -113,6 +117,7 @@ class Motion:
         states = (times, q, between(self.v), between(self.tau), self.phase[late])
         return Motion(*states, self.source, wrench, self.contact[late])
 
+    @checked
     def every(self, rate_hz: float, *, end: bool = False) -> Motion:
         """The motion on a grid of ``rate_hz`` [1/s], from its start to the last grid
         point within it.
@@ -126,6 +131,7 @@ class Motion:
         return self.at(np.append(times, self.t[-1:] if more else []))
 
 
+@checked
 def checked_rate(rate_hz: float) -> float:
     """A rate [1/s] that a motion can be sampled with; raises :class:`InputError` if it is none."""
     if not 0 < rate_hz <= MAX_RATE_HZ:

@@ -37,6 +37,7 @@ HOME = ("jumplab.",)
 # and misses none
 BUILT_BY = (
     "errors",
+    "arguments",
     "reading",
     "task",
     "ocp",

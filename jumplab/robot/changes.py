@@ -4,14 +4,14 @@ file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
-from jumplab.errors import quoted
+from jumplab.arguments import real
+from jumplab.errors import InputError, quoted
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot.sagittal import SAGITTAL_JOINTS
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 # of a URDF's <limit>
 ATTRIBUTES = {"effort": "effort", "speed": "velocity", "lower": "lower", "upper": "upper"}
+MOST = 1e9  # factor or number of a changed robot
 UNITS = {"effort": "N m", "speed": "rad/s", "lower": "rad", "upper": "rad"}
 ENDS = {"lower": "upper", "upper": "lower"}  # of a range, and the other one
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -193,11 +194,14 @@ def _joints(robot: Robot, given: Mapping, where: str) -> list[tuple[str, Sequenc
 
 
 def _number(robot: Robot, what: str, value: Any, positive: bool = False) -> float:
-    good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not good or not np.isfinite(value) or (positive and not value > 0):
+    try:
+        number = real(value, what)
+    except InputError:
+        number = math.inf
+    if not abs(number) < MOST or (positive and not number > 0):
         wanted = "a positive number" if positive else "a finite number"
         raise robot.error(f"{what} must be {wanted}, got {quoted(value)}")
-    return float(value)
+    return number
 
 
 def scale(element: ET.Element, attributes: Sequence[str], factor: float) -> None:

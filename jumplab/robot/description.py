@@ -15,6 +15,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
+from jumplab.arguments import checked, real
 from jumplab.errors import RobotError, Shown, quoted
 from jumplab.robot import changes, foreign
 from jumplab.robot.files import (
@@ -129,6 +130,7 @@ class Robot(Shown):
         return cls(text, config)
 
     @classmethod
+    @checked
     def from_text(cls, urdf: str, config_text: str) -> Robot:
         """The robot of two texts (URDF, TOML), checked as files are; raises :class:`RobotError`."""
         foreign.check(urdf, config_text)
@@ -265,6 +267,7 @@ class Robot(Shown):
         """
         return self._model.copy()
 
+    @checked
     def under_gravity(self, gravity: float) -> Robot:
         """The same robot whose :attr:`model` feels another gravity [m/s^2]; itself at its own."""
         return self if gravity == self.gravity else replace(self, gravity=gravity)
@@ -346,7 +349,7 @@ class Robot(Shown):
         import tomlkit
 
         config = tomlkit.parse(self.config_text)
-        config["stance"].update({key: float(angle) for key, angle in stance.items()})
+        config["stance"].update({key: real(angle, key, "rad") for key, angle in stance.items()})
         return replace(self, config_text=tomlkit.dumps(config))
 
     @cached_property

@@ -15,6 +15,9 @@ draws bodies; :func:`legend_above` takes :func:`phase_handles`. The 3-D page is 
 are :func:`table`.
 """
 
+import inspect
+from typing import Any
+
 import lazy_loader as lazy
 
 _NAMES = {  # module: its public names, loaded when they are first used
@@ -35,6 +38,15 @@ _NAMES = {  # module: its public names, loaded when they are first used
         PHASE_COLORS LAUNCH FLIGHT LANDING PURPLE SKY VERMILION INK LIMIT_STYLE REFERENCE_STYLE
         MIN_FONT_PT""",
 }
-__getattr__, __dir__, __all__ = lazy.attach(
+_load, __dir__, __all__ = lazy.attach(
     __name__, submod_attrs={module: names.split() for module, names in _NAMES.items()}
 )
+
+
+def __getattr__(name: str) -> Any:
+    from jumplab.arguments import checked  # not before something is drawn
+
+    value = _load(name)
+    if inspect.isfunction(value):  # whoever comes by this door is told what does not fit
+        value = globals()[name] = checked(value)
+    return value

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, quoted
 from jumplab.show.style import (
     COLUMN_IN,
     FLIGHT,
@@ -115,6 +115,9 @@ def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     left to show.
     """
     several = dict(reports) if isinstance(reports, Mapping) else {"": reports}
+    for report in several.values():
+        if not hasattr(report, "margins"):
+            raise InputError(f"the radar shows reports of margins, got {quoted(report)}")
     counts = Counter(m.names for report in several.values() for m in report.margins if m.reaim)
     names = [name for name, count in counts.items() if count > 1 or len(several) == 1]
     if not names or len(several) > len(RADAR_COLORS):

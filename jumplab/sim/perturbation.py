@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 import tomlkit
 
+from jumplab.arguments import checked, real
 from jumplab.control.estimator import SensorNoise
 from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError, quoted
@@ -223,13 +224,14 @@ class Perturbation:
     damping: ByName = field(default_factory=dict)
 
     def __post_init__(self):
-        if not 0 < self.friction <= 2:
+        if not 0 < real(self.friction, "friction") <= 2:
             raise InputError(f"friction = {self.friction:g} is outside 0 ... 2")
         for name, delay_s in (("delay", self.delay_s), ("known delay", self.known_delay_s)):
-            if not 0 <= delay_s <= 0.02:
+            if not 0 <= real(delay_s, name, "s") <= 0.02:
                 raise InputError(f"{name} = {delay_s:g} s is outside 0 ... 0.02 s")
 
     @classmethod
+    @checked
     def draw(
         cls, robot: Robot, seed: int, ranges: Ranges = Ranges(), noise: SensorNoise = SensorNoise()
     ) -> Perturbation:
@@ -415,6 +417,7 @@ def is_pair(name: str) -> bool:
     return isinstance(getattr(Ranges, name, None), tuple)
 
 
+@checked
 def ranges_of(asked: Mapping[str, tuple[float, ...]], base: Ranges | None = None) -> Ranges:
     """``base`` (nothing differs if None) with what is asked: name -> from, to; a single number is a
     half-width, or goes from nothing to there. Raises :class:`InputError` for names that

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from jumplab.arguments import checked
 from jumplab.control.kinematics import Gauge, about_vertical, rotation
 from jumplab.errors import InputError
 from jumplab.robot import Robot
@@ -92,6 +93,7 @@ class Scene:
         return cls.level("flat", {})
 
     @classmethod
+    @checked
     def level(cls, name: str, tops: Mapping[float, float], along_rad: float = 0.0) -> Scene:
         """Level ground at z = 0 that from each place [m] on has another height [m], such as the
         ditch {0.3: -1.0, 0.8: 0.0}, the platform {0.5: 0.4} or the stairs {0.3: 0.1, 0.6: 0.2}.

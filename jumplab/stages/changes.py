@@ -105,8 +105,8 @@ def sorted_out(
     weights = {} if weights is None else weights
     require_type(terms, Mapping, "own terms")
     require_type(weights, Mapping, "weights")
-    if isinstance(off, str):
-        raise InputError(f"off must be a list of names, got {off!r}")
+    if isinstance(off, str) or not isinstance(off, Iterable):
+        raise InputError(f"off must be a list of names, got {quoted(off)}")
     for name, extra in terms.items():
         stage, phase = _stage_and_phase(name)
         extra = (extra,) if isinstance(extra, Term) else extra

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, SolverError, quoted, require_type
 from jumplab.models.full import FullBody
 from jumplab.ocp import Problem, Term
@@ -47,6 +48,7 @@ FIRST_STAGES = "srmp", "joint qp"  # those that the direct method leaves out ...
 FOLLOWING = "track "  # ... as it does the terms by which stage 3 follows them
 # stage 2's steps [s]: on flat feet, on the toes, in flight; fine enough for a start
 STEPS_S = (0.015, 0.0125, 0.02)
+LINKS = 5  # of the robot in the plane
 LEAST_RISE_M = 0.02  # that a target can say
 ANY = JumpTask(0.5, 0.3)  # a jump straight ahead: its terms are those of all of them
 NOTHING: Mapping[str, float] = MappingProxyType({})
@@ -132,6 +134,7 @@ class Planner:
 
     # what plans are made of
     # ------------------------------------------------------------------------------------------
+    @checked
     @in_turn
     def stage(self, name: str, *, flip: bool = False) -> Any:
         """A stage's planner, of jumps or of flips: "srmp", "direct", "whole body" (which
@@ -158,6 +161,7 @@ class Planner:
         """The robot as all whole-body programs see it."""
         return Body(self.robot)
 
+    @checked
     @in_turn
     def program(self, task: JumpTask = ANY, weights: Mapping[str, float] = NOTHING) -> Program:
         """The whole-body program that plans a target directly; ``weights`` as in :meth:`plan`
@@ -175,6 +179,7 @@ class Planner:
         stance = stance_configuration(self.robot)
         return changed_problem(FullBody(self.robot), stance, changes=self._joint_changes(asked))
 
+    @checked
     @in_turn
     def terms(self, task: JumpTask = ANY, *, method: str = USUAL) -> list[dict[str, Any]]:
         """All terms and bounds of the stages for a target, own ones included; ``jl.plots.table``
@@ -224,6 +229,7 @@ class Planner:
         changed = [f"{s!r}" for s in FIRST_STAGES if self.changes[s] or asked[s]]
         return changed + ["the settings of 'srmp'"] * (self._given[SrmpSettings] is not None)
 
+    @checked
     @in_turn
     def prepared(
         self, method: str = USUAL, weights: Mapping[str, float] | None = None, task: JumpTask = ANY
@@ -259,6 +265,10 @@ class Planner:
                 f"method {quoted(method)}: stages 1 and 2 are planar, and this target goes to the "
                 f"side or turns; choose 'direct'"
             )
+        if start is not None and np.shape(start) != (LINKS,):
+            raise InputError(
+                f"start has the shape {np.shape(start)}; the links have {LINKS} angles, ({LINKS},)"
+            )
         if start is not None and not self.robot.planar:
             raise InputError(
                 f"robot {self.robot.name} begins in its stance: five links do not describe it; "
@@ -272,6 +282,7 @@ class Planner:
 
     # plans
     # ------------------------------------------------------------------------------------------
+    @checked
     @in_turn
     def plan(
         self,
@@ -352,6 +363,7 @@ class Planner:
                 return body
         return last.plan(task, **begin)
 
+    @checked
     def replan(
         self, previous: JumpPlan, task: JumpTask, *, start: np.ndarray | None = None
     ) -> JumpPlan:
@@ -377,6 +389,7 @@ class Planner:
         near = None if anew else previous
         return self.plan(task, previous.method, start=start, near=near)
 
+    @checked
     @in_turn
     def follow(
         self,

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from jumplab import reading
+from jumplab.arguments import checked
 from jumplab.errors import InputError, SolverError, require_type
 from jumplab.io.files import locked, made, write_file
 from jumplab.ocp.cache import fingerprint
@@ -83,6 +84,7 @@ class Atlas:
 
     # building ----------------------------------------------------------------------------------
     @classmethod
+    @checked
     def build(
         cls,
         robot: Robot,
@@ -213,6 +215,7 @@ class Atlas:
         return short_hash([self.key, self.distances, self.heights, costs])
 
     # file --------------------------------------------------------------------------------------
+    @checked
     def save(self, folder: str | Path) -> Path:
         """Write ``atlas.npz`` (its head as JSON, motions (nodes, n)) into ``folder``; returns its
         path.
@@ -236,6 +239,7 @@ class Atlas:
             return write_file(folder / FILE, buffer.getvalue())
 
     @classmethod
+    @checked
     def load(cls, folder: str | Path) -> Atlas:
         """The atlas of a ``folder`` (that of :meth:`save`); raises :class:`InputError` if there is
         none, or it is damaged or unfinished.

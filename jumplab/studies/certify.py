@@ -17,6 +17,7 @@ from typing import Any
 import joblib
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.auditing import AuditReport, audit
 from jumplab.io import folder as store
 from jumplab.robot import Robot
@@ -266,6 +267,7 @@ def _as_planned(plan: PlanOnFile, mode: str, engine: str, **how: Any) -> dict[st
     return {key.name: joblib.delayed(run_trial)(plan, exact, key, Perturbation())}
 
 
+@checked
 def certify(
     folder: str | Path,
     n: int = 10,

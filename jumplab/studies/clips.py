@@ -20,6 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab import reading
+from jumplab.arguments import checked
 from jumplab.auditing import write_audit
 from jumplab.errors import InputError, JumplabError
 from jumplab.io import export
@@ -66,6 +67,7 @@ def targets(robot: Robot) -> dict[str, JumpTask]:
     return tasks
 
 
+@checked
 def make_clips(
     robot: Robot,
     out: str | Path,

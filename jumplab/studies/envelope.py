@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.ocp.nlp import unexplained
 from jumplab.robot import Robot
@@ -94,6 +95,7 @@ class Envelope:
         return max(solved, key=lambda c: [getattr(c, name) for name in names], default=None)
 
 
+@checked
 def envelope(
     robot: Robot,
     distances: Sequence[float],

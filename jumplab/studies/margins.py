@@ -12,6 +12,7 @@ from pathlib import Path
 
 import joblib
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown, quoted
 from jumplab.io import folder as store
 from jumplab.io.progress import tell
@@ -135,6 +136,7 @@ class MarginReport(Shown):
             ) from e
 
 
+@checked
 def margins(
     folder: str | Path,
     names: Sequence[str] = (*SINGLE, *PAIRS),

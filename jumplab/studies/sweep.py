@@ -22,6 +22,7 @@ import joblib
 import numpy as np
 
 from jumplab import reading
+from jumplab.arguments import checked
 from jumplab.errors import InputError, JumplabError, quoted
 from jumplab.io.files import ensure_writable, settle, write_file
 from jumplab.io.tape import Tape
@@ -60,6 +61,7 @@ class Case:
         return key_of(self.method, robot_of(self.robot).hash, weights, asdict(self.task), *more)
 
 
+@checked
 def grid(
     distances: Sequence[float],
     heights: Sequence[float],
@@ -94,6 +96,7 @@ VARIED = {  # what of a robot a sweep varies -> the robot with a factor on it
 }
 
 
+@checked
 def varied(robots: Sequence[str], factors: Sequence[Mapping[str, float]]) -> list[str]:
     """Names of robots, each with all the factors [1] on :data:`VARIED`, such as "bhr mass=1.1"."""
     unknown = next((what for each in factors for what in each if what not in VARIED), None)
@@ -144,6 +147,7 @@ def run_case(
     return place | which | row | {"tape": f"{TAPES}/{tape.name}" if kept else None}
 
 
+@checked
 def run(
     cases: list[Case],
     out: str | Path,

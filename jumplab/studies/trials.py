@@ -23,6 +23,7 @@ import pinocchio as pin
 from scipy.stats import binomtest
 
 from jumplab import reading
+from jumplab.arguments import checked
 from jumplab.control.launch import check_mode
 from jumplab.control.servo import servo_of
 from jumplab.errors import Shown, SolverError
@@ -399,6 +400,7 @@ def wilson(landed: int, count: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
+@checked
 def run_trials(
     folder: str | Path,
     n: int,

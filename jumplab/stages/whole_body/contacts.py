@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, quoted, require_type
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
@@ -221,6 +222,7 @@ class Contacts:
     # the usual ones, with steps of usual length where none is given [m]
     # ------------------------------------------------------------------------------------------
     @classmethod
+    @checked
     def of(
         cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest"
     ) -> Contacts:
@@ -231,6 +233,7 @@ class Contacts:
         return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends)
 
     @classmethod
+    @checked
     def hop(
         cls, robot: Robot, ahead_m: float | None = None, *, foot: str = "left", same: bool = False
     ) -> Contacts:
@@ -244,6 +247,7 @@ class Contacts:
         return cls.of(f"LR {up} {up.lower()} - {f'{up} ' * same}LR", robot, [place, place])
 
     @classmethod
+    @checked
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
         """One or more steps of ``step_m`` [m], then off one foot, and down on both."""
         d = _step(robot, step_m)
@@ -256,6 +260,7 @@ class Contacts:
         return cls.of(" ".join(words), robot, [Place(x) for x in (*ahead, jump, jump)])
 
     @classmethod
+    @checked
     def leap(cls, robot: Robot, step_m: float | None = None, *, share: float = 2.4) -> Contacts:
         """A step of ``step_m`` [m], then off the right foot, and down on the left one, the other
         following; ``share`` is how many steps ahead they land.
@@ -264,11 +269,13 @@ class Contacts:
         return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(share * d), Place(share * d)])
 
     @classmethod
+    @checked
     def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
         """A leap that goes farther, ``step_m`` [m] as there."""
         return cls.leap(robot, step_m, share=2.8)
 
     @classmethod
+    @checked
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
         """Jumps of ``jump_m`` [m] off both feet and down on both, in a row."""
         d = _step(robot, jump_m)
@@ -276,12 +283,14 @@ class Contacts:
         return cls.of("LR" + " lr - LR" * jumps, robot, places)
 
     @classmethod
+    @checked
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
         low = Place(_off(robot, ahead_m), up_m=-drop_m)
         return cls.of("LR L l - LR", robot, [low, low])
 
     @classmethod
+    @checked
     def drop_jump(
         cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None
     ) -> Contacts:

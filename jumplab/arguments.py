@@ -1,0 +1,175 @@
+"""What public functions take: one conversion of arguments, by their annotations.
+
+Real numbers are those of Python and NumPy, and finite ones where nothing else is said; truth
+values, complex numbers and texts are none. What does not fit is refused (:class:`InputError`) in
+one sentence, before anything is done with it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache, wraps
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from jumplab.errors import InputError, as_path, quoted
+
+F = TypeVar("F", bound=Callable)
+UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
+
+
+def real(value: Any, what: str, unit: str = "") -> float:
+    """A finite real number; raises :class:`InputError`, which calls it ``what``, in ``unit``."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        raise InputError(
+            f"{what} must be a number{f' in {unit}' * bool(unit)}, got {quoted(value)}"
+        )
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{what} must be finite, got {quoted(value)}")
+    return number
+
+
+def checked(function: F) -> F:
+    """The same function, whose arguments are converted by their annotations.
+
+    Sequences and mappings are looked into. Parameters without an annotation, or with one of which
+    nothing is known (``Any``), are left alone.
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def checking(*args: Any, **options: Any) -> Any:
+        given = signature.bind(*args, **options)
+        for name, value in given.arguments.items():
+            parameter = signature.parameters[name]
+            if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                continue
+            if value is not parameter.default:
+                hint = _hint(parameter.annotation, function)
+                given.arguments[name] = fitting(value, hint, name)
+        return function(*given.args, **given.kwargs)
+
+    return checking
+
+
+def _hint(annotation: Any, function: Callable) -> Any:
+    """An annotation as an object; :data:`UNKNOWN` if its names are not to be had at run time."""
+    if not isinstance(annotation, str):
+        return annotation
+    return _evaluated(annotation, inspect.unwrap(function))
+
+
+@lru_cache(1000)
+def _evaluated(annotation: str, function: Callable) -> Any:
+    try:
+        return eval(annotation, function.__globals__)  # of this package's own sources
+    except NameError:
+        return UNKNOWN
+
+
+def fitting(value: Any, hint: Any, what: str) -> Any:
+    """A value as its ``hint`` has it; raises :class:`InputError`, which calls it ``what``."""
+    if hint is UNKNOWN or hint is Any:
+        return value
+    if hint in SIMPLE:
+        return SIMPLE[hint](value, what)
+    if hint is None or hint is types.NoneType:
+        return _of(value, types.NoneType, what, "None")
+    origin = typing.get_origin(hint)
+    inner = typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return _one_of(value, inner, what)
+    if origin is tuple and inner[-1] is not ...:
+        items = list(_items(value, what))
+        if len(items) != len(inner):
+            raise InputError(f"{what} must have {len(inner)} entries, got {quoted(value)}")
+        return tuple(
+            fitting(x, h, f"an entry of {what}") for x, h in zip(items, inner, strict=True)
+        )
+    if origin is not None and issubclass(origin, Mapping):
+        _of(value, Mapping, what, "a mapping")
+        key, item = inner
+        return {
+            fitting(k, key, f"a name in {what}"): fitting(x, item, f"{what} of {quoted(k)}")
+            for k, x in value.items()
+        }
+    if origin is not None and origin is not type and issubclass(origin, Iterable):
+        items = [fitting(x, inner[0], f"an entry of {what}") for x in _items(value, what)]
+        return items if origin is list else tuple(items)
+    if isinstance(hint, type):
+        try:
+            return _of(value, hint, what, f"a {hint.__name__}")
+        except TypeError:  # a protocol that is not for run time
+            return value
+    return value
+
+
+def _one_of(value: Any, hints: tuple, what: str) -> Any:
+    for hint in hints:
+        if isinstance(hint, type) and hint not in SIMPLE and isinstance(value, hint):
+            return value
+    wanted = []
+    for hint in hints:
+        try:
+            return fitting(value, hint, what)
+        except InputError as e:
+            wanted.append(str(e))
+    raise InputError(next((w for w in wanted if "must be None" not in w), wanted[0]))
+
+
+def _of(value: Any, kind: type, what: str, words: str) -> Any:
+    if not isinstance(value, kind):
+        raise InputError(f"{what} must be {words}, got {quoted(value)}")
+    return value
+
+
+def _whole(value: Any, what: str) -> int:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
+        raise InputError(f"{what} must be a whole number, got {quoted(value)}")
+    return int(value)
+
+
+def _flag(value: Any, what: str) -> bool:
+    return bool(_of(value, bool | np.bool_, what, "True or False"))
+
+
+def _array(value: Any, what: str) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.array(None)
+    if array.dtype.kind not in "fiu" or array.ndim == 0:
+        raise InputError(f"{what} must be an array of numbers, got {quoted(value)}")
+    return array
+
+
+def _items(value: Any, what: str) -> Iterable:
+    """Entries of what is a sequence; a text or a mapping is none."""
+    if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
+        raise InputError(f"{what} must be a sequence, got {quoted(value)}")
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        raise InputError(f"{what} must be a sequence, got {quoted(value)}")
+    return value
+
+
+SIMPLE = {
+    float: real,
+    int: _whole,
+    bool: _flag,
+    str: lambda value, what: _of(value, str, what, "a text"),
+    Path: as_path,
+    np.ndarray: _array,
+}

@@ -1,0 +1,279 @@
+"""Hostile files, foreign folders and wrong calls: each is refused in a sentence, in little memory and time."""
+
+import io
+import json
+import os
+import random
+import resource
+import struct
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+from test_store import make_summary, make_tape
+
+import jumplab as jl
+from jumplab import reading
+from jumplab.errors import InputError, JumplabError
+from jumplab.io import folder as store
+from jumplab.io.files import ensure_writable
+from jumplab.ocp import cache
+from jumplab.sim import Scene
+from jumplab.studies import sweep
+from jumplab.studies.study import in_parallel, open_study
+
+ROOT = Path(__file__).resolve().parent.parent
+MEMORY_BYTES, CPU_S = 1 << 30, 30
+MJCF = "<mujoco>{}<worldbody>{}</worldbody></mujoco>"
+COPIES = '<replicate count="{}"><geom size="1"/></replicate>'
+# runs in a process of its own: a line per file, the name of the error and its sentence
+READ = """
+import sys
+from jumplab.errors import JumplabError
+from jumplab.robot import Robot
+from jumplab.io import folder, motion
+from jumplab.studies.atlas import Atlas
+from jumplab.studies.study import open_study
+from pathlib import Path
+def log(path):
+    with open_study(Path(path), "trials"):
+        pass
+READERS = {"robot": Robot.load, "plan": folder.read_plan, "atlas": Atlas.load, "log": log}
+for line in sys.stdin.read().splitlines():
+    kind, path = line.split(" ", 1)
+    try:
+        READERS[kind](path)
+        print("accepted")
+    except JumplabError as e:
+        print(e)
+"""
+
+
+def npy(shape, kind="<f8", content=b""):
+    head = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    head += b" " * (63 - (len(head) + 10) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + content
+
+
+def npz(**members):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
+        for name, content in members.items():
+            file.writestr(f"{name}.npy", content)
+    return buffer.getvalue()
+
+
+def plan_folder(place, robot, **files):
+    """A result folder whose manifest fits its files, some of them foreign."""
+    store.write_plan(place, make_tape(robot), robot, make_summary())
+    for name, content in files.items():
+        (place / name.replace("_", ".")).write_bytes(content)
+    summary = json.loads((place / "summary.json").read_text())
+    summary["manifest"]["files"] = {name: store.sha256(place / name) for name in store.HASHED}
+    (place / "summary.json").write_text(json.dumps(summary))
+    return place
+
+
+def hostile(folder, robot):
+    """(reader, path, what the sentence says) of every file."""
+    big = 200_000_000
+    shape = '<collision><geometry><mesh filename="/dev/zero"/></geometry></collision>'
+    mesh = robot.urdf.replace("<collision>", f"{shape}<collision>", 1)
+    field = '<asset><hfield name="h" nrow="30000" ncol="30000" size="1 1 1 1"/></asset>'
+    bombs = dict.fromkeys(("schema", "t", "q", "v", "a"), npy((big // 8,), content=bytes(big)))
+    texts = {
+        "deep.urdf": ("<robot>" + "<link>" * 60_000 + "</link>" * 60_000 + "</robot>", "has 120002 XML tags"),
+        "long.urdf": ("<robot name='x'>" + "<link name='a'/>" * 1100 + "<joint/></robot>", "has 1100 links"),
+        "deep.toml": ("a = " + "[" * 100_000, "not a TOML file"),
+        "keys.toml": (".".join("a" * 20_000) + " = 1", "a key of more than 100 parts"),
+        "copies.xml": (MJCF.format("", COPIES.format(10**9)), "<replicate> makes 1e+09 copies"),
+        "field.xml": (MJCF.format(field, ""), "<hfield> makes 9e+08"),
+        "pipe.xml": (MJCF.format('<include file="pipe.urdf"/>', ""), "is a pipe or a device"),
+    }
+    os.mkfifo(folder / "pipe.urdf")
+    os.mkfifo(folder / "pipe.toml")
+    (folder / "zero.urdf").symlink_to("/dev/zero")
+    out = [("robot", folder / name, "is a pipe or a device") for name in ("pipe.urdf", "pipe.toml", "zero.urdf")]
+    for name, (text, sentence) in texts.items():
+        (folder / name).write_text(text)
+        out.append(("robot", folder / name, sentence))
+    heads = {"head": npy((10**10,)), "texts": npy((10**12,), "<U0")}
+    files = {"bomb": npz(**bombs)} | {name: npz(schema=head) for name, head in heads.items()}
+    for name, content in files.items():
+        out.append(("plan", plan_folder(folder / name, robot, plan_npz=content), "not a readable plan"))
+    place = plan_folder(folder / "mesh", robot, robot_urdf=mesh.encode())
+    out.append(("plan", place, "the mesh '/dev/zero' is not opened"))
+    (folder / "atlas").mkdir()
+    (folder / "atlas" / "atlas.npz").write_bytes(npz(head=npy((10**10,))))
+    out.append(("atlas", folder / "atlas", "is damaged or no atlas"))
+    with open(folder / "trials.jsonl", "wb") as file:
+        file.truncate(3_000_000_000)
+    out.append(("log", folder / "trials.jsonl", "has 3000 MB, a log has at most 1000"))
+    return out
+
+
+def test_hostile_files_are_refused_in_little_memory_and_time(bhr, tmp_path):
+    cases = hostile(tmp_path, bhr)
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
+
+    asked = "".join(f"{kind} {path}\n" for kind, path, _ in cases)
+    how = dict(cwd=ROOT, input=asked, capture_output=True, text=True, preexec_fn=limit, timeout=300)
+    how["env"] = os.environ | {"OMP_NUM_THREADS": "1"}  # threads take address space
+    done = subprocess.run([sys.executable, "-c", "import jumplab\n" + READ], **how)
+    said = done.stdout.splitlines()
+    assert done.returncode == 0 and len(said) == len(cases), done.stderr[-500:]
+    for (_, path, sentence), line in zip(cases, said, strict=True):
+        assert sentence in line and len(line) <= 300, (path.name, line)
+
+
+@pytest.mark.parametrize("name", [".commit", ".staging", "plan.npz", "trials.jsonl", "falls"])
+def test_no_link_below_a_result_folder_is_followed(bhr, tmp_path, name):
+    """What it leads to stays as it was, whoever reads or writes the folder."""
+    place = plan_folder(tmp_path / "out", bhr)
+    foreign = tmp_path / "foreign"
+    if "." in name[1:]:
+        foreign.write_text("mine\n{half")
+        (place / name).unlink(missing_ok=True)
+    else:
+        foreign.mkdir()
+        (foreign / "mine").write_text("mine")
+    (place / name).symlink_to(foreign)
+    calls = {
+        ".commit": lambda: store.read_plan(place),
+        "plan.npz": lambda: store.read_plan(place),
+        ".staging": lambda: store.write_plan(place, make_tape(bhr), bhr, make_summary()),
+        "trials.jsonl": lambda: open_study(place / name, "trials").__enter__(),
+        "falls": lambda: reading.below(place, name, "1"),
+    }
+    with pytest.raises(InputError, match=r"is a symbolic link, which no result folder holds; remove it$"):
+        calls[name]()
+    if foreign.is_file():
+        assert foreign.read_text() == "mine\n{half"
+    else:
+        assert [p.name for p in foreign.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("how", ["folder", "file", "link"])
+def test_a_cache_that_others_can_write_is_not_read(tmp_path, monkeypatch, how):
+    """Unserialising a function may load a library that it names."""
+    place = tmp_path / "cache"
+    monkeypatch.setenv("JUMPLAB_CACHE", str(place))
+
+    def kept(value):
+        return cache.remembered(["words"], "key", lambda: value)
+
+    assert (kept(1), kept(2)) == (1, 1)
+    (path,) = place.iterdir()
+    assert (place.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
+    if how == "link":
+        path.rename(tmp_path / "other")
+        path.symlink_to(tmp_path / "other")
+    else:
+        (place if how == "folder" else path).chmod(0o777)
+    assert kept(3) == 3
+    if how != "folder":  # it was replaced
+        assert kept(4) == 3 and path.stat().st_mode & 0o777 == 0o600
+
+
+def _square(x):
+    return x * x
+
+
+def test_workers_import_nothing_from_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("joblib", "jumplab", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"open('{tmp_path}/run', 'w')")
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    assert sorted(in_parallel([joblib.delayed(_square)(x) for x in range(4)], 2)) == [0, 1, 4, 9]
+    assert not (tmp_path / "run").exists() and "PYTHONSAFEPATH" not in os.environ
+
+
+@pytest.mark.slow
+def test_threads_take_turns():
+    """Landings of two threads share a solver, and two studies the processes."""
+    plan = jl.plan(jl.JumpTask(0.3, 0.2))
+    out = {}
+
+    def work(k):
+        run = jl.simulate(plan, stand_s=0.1)
+        squares = sorted(in_parallel([joblib.delayed(_square)(x) for x in range(3)], 2))
+        out[k] = run.metrics.foot_distance_touchdown_m, squares
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert out[0] == out[1] and out[0][1] == [0, 1, 4]
+
+
+# wrong calls --------------------------------------------------------------------------------------------------------
+ENDLESS = []
+ENDLESS.append(ENDLESS)
+WRONG = [None, np.True_, "far", "", b"x", 1e300, 10**400, 1j, {}, ENDLESS, np.array([1.0, 2.0]), np.array(["a"]),
+         object(), print, "x" * 5000, {"a": 1}, int, range(3), lambda x: x, np.complex128(1), [1.0, 2.0]]  # fmt: skip
+
+
+def doors(robot, tmp_path):
+    """Name -> function, good arguments."""
+    planner = jl.Planner(robot)
+    return {
+        "JumpTask": (jl.JumpTask, dict(distance_m=0.4, height_m=0.3, platform_m=0.0, yaw_rad=0.0)),
+        "flight_time": (jl.JumpTask(0.4, 0.3).flight_time, dict(com_rise_at_touchdown_m=0.0)),
+        "from_text": (jl.Robot.from_text, dict(urdf=robot.urdf, config_text=robot.config_text)),
+        "under_gravity": (robot.under_gravity, dict(gravity=9.0)),
+        "with_stance": (robot.with_stance, dict(knee_rad=0.3)),
+        "chosen": (planner.chosen, dict(method="usual", weights=None)),
+        "Planner": (jl.Planner, dict(robot=robot, off=(), weights=None, terms=None, limits=None, mesh=None)),
+        "level": (Scene.level, dict(name="platform", tops={0.3: 0.2}, along_rad=0.0)),
+        "draw": (jl.Perturbation.draw, dict(robot=robot, seed=0)),
+        "Perturbation": (jl.Perturbation, dict(friction=0.8, delay_s=0.0)),
+        "hop": (jl.Contacts.hop, dict(robot=robot, ahead_m=0.2, foot="left", same=False)),
+        "of": (jl.Contacts.of, dict(feet="LR - LR", robot=robot, places=[])),
+        "Atlas.load": (jl.Atlas.load, dict(folder=tmp_path / "none")),
+        "load": (jl.load, dict(folder=tmp_path / "none")),
+        "envelope": (jl.envelope, dict(robot=robot, distances=[], heights=[0.3], jobs=1)),
+        "run_trials": (jl.run_trials, dict(folder=tmp_path / "none", n=1, seed=0, jobs=1, keep_falls=0)),
+        "grid": (sweep.grid, dict(distances=[0.4], heights=[0.3], platforms=(0.0,), method="direct")),
+        "legend_above": (jl.plots.legend_above, dict(fig=None, handles=[])),
+        "new_figure": (jl.plots.new_figure, dict(width=3.0, height=2.0)),
+    }
+
+
+def test_wrong_calls_are_refused_in_a_sentence(bhr, tmp_path):
+    """Drawn calls of public functions with one wrong argument: none ends in a bare error, none is endless."""
+    rng = random.Random(3)
+    functions = doors(bhr, tmp_path)
+    for number in range(600):
+        name = list(functions)[number % len(functions)]
+        function, good = functions[name]
+        wrong = rng.choice(list(good))
+        value = rng.choice(WRONG)
+        try:
+            function(**good | {wrong: value})
+        except JumplabError as e:
+            assert "\n" not in str(e) and len(str(e)) <= 500, (name, wrong)
+        except Exception as e:
+            raise AssertionError(f"{name}({wrong}={value!r:.60}): {type(e).__name__}") from e
+
+
+def test_whether_a_folder_can_be_made_is_seen_without_making_it(tmp_path):
+    assert ensure_writable(tmp_path / "a" / "b") == tmp_path / "a" / "b" and not list(tmp_path.iterdir())
+
+
+def test_a_pair_of_texts_is_checked_as_a_urdf_is(bhr, tmp_path):
+    """Without [source] as well: Pinocchio reads a mass with a unit as nothing."""
+    wrong = bhr.urdf.replace('"19.994"', '"19.994kg"')
+    (tmp_path / "bhr.urdf").write_text(wrong)
+    (tmp_path / "my.toml").write_text(bhr.config_text)
+    for call in (lambda: jl.Robot.load(tmp_path / "my.toml"), lambda: jl.Robot.from_text(wrong, bhr.config_text)):
+        with pytest.raises(InputError, match=r"link 'trunk': mass = '19\.994kg' must be a finite number of kg$"):
+            call()
