@@ -198,7 +198,10 @@ def _ground(
         holds = holds_of(phase, b)
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
-        motion = _balanced(legs, motion, pitch, holds, instants, robot, wrench.sum(axis=1))
+        leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
+        if len(instants) > 1 and (_on_a_line(holds, pitch) or leaves):
+            motion = _balanced(legs, motion, pitch, holds, instants, robot, wrench.sum(axis=1))
+        motion = legs.held(motion, holds, pitch)
         parts.append((motion, wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
     motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
@@ -222,6 +225,14 @@ def _planned(
     return wrench, codes
 
 
+def _on_a_line(holds: Mapping[int, np.ndarray], pitch: Mapping[int, Motion]) -> bool:
+    """Whether all feet that carry are on their toes, and their edges parts of one level line."""
+    edge = np.array(list(holds.values()))
+    ahead = edge[:, :2] @ [np.cos(edge[0, 3]), np.sin(edge[0, 3])]
+    level = np.ptp(edge[:, 2:], axis=0).max() < 1e-6 and np.ptp(ahead) < 1e-4
+    return len(pitch) == len(holds) and level
+
+
 def _balanced(
     legs: Legs,
     motion: Motion,
@@ -231,42 +242,42 @@ def _balanced(
     robot: Robot,
     wrench: np.ndarray,
 ) -> Motion:
-    """The motion with feet held, its base moved by some micrometres so that the ground's force
-    stays on the toes.
+    """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
-    Where all feet that carry are on their toes, no ground force but the planned ``wrench`` (n, 6)
-    has a moment about the line of their edges: what the motion between nodes needs of it besides
-    goes.
+    Where all feet that carry are on their toes, in one line, no ground force has a moment about
+    that line: what the motion between nodes needs of it goes. Elsewhere, in the last phase before
+    feet leave, all that it needs besides the planned ``wrench`` (n, 6) goes: there the load is so
+    low that little of it would tip the feet.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
-    if len(pitch) < len(holds) or len(t) < 2:
-        return legs.held(motion, holds, pitch)
     q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
     ahead, across, _ = pin.rpy.rpyToMatrix(0.0, 0.0, edge[3]).T
+    line = _on_a_line(holds, pitch)
+    ways = np.array([[*ahead, 0.0, 0.0, 0.0]]) if line else np.eye(BASE)
+    seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)
     model = robot.model
     data = model.createData()
 
-    def moment(change: np.ndarray | float = 0.0) -> np.ndarray:
+    def missing(change: np.ndarray | float = 0.0) -> np.ndarray:
         gain = a.copy()
-        gain[:, :3] += change
+        gain[:, :BASE] += change
         held = legs.body.model.to_pinocchio(*legs.held((q, v, gain), holds, pitch))
         need = [needed(x[0], pin.rnea(model, data, *x)) for x in zip(*held, strict=True)]
-        force, about = np.split(np.array(need), 2, axis=1)
-        force -= wrench[:, :3]
-        about -= wrench[:, 3:]
-        return (about - np.cross(edge[:3], force)) @ across
+        force, about = np.split(np.array(need) - wrench, 2, axis=1)
+        return np.hstack([force, about - np.cross(edge[:3], force)]) @ seen.T
 
-    missing = moment()
-    slope = moment(ahead) - missing  # hardly changed by the corrections
-    for k in range(BALANCING):
-        more = -(moment() if k else missing) / slope
-        rate = cumulative_trapezoid(more, t, initial=0.0)
-        place = cumulative_trapezoid(rate, t, initial=0.0)
+    first = missing()
+    # slopes hardly change by the corrections
+    back = np.linalg.pinv(np.stack([missing(way) - first for way in ways], axis=-1))
+    for k in range(BALANCING + (not line)):
+        more = -_times_each(back, missing() if k else first) @ ways
+        rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
+        place = cumulative_trapezoid(rate, t, axis=0, initial=0.0)
         for x, change in ((q, place), (v, rate), (a, more)):
-            x[:, :3] += np.outer(change, ahead)
-    return legs.held((q, v, a), holds, pitch)
+            x[:, :BASE] += change
+    return q, v, a
 
 
 def needed(q: np.ndarray, torques: np.ndarray) -> np.ndarray:
