@@ -29,11 +29,12 @@ from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
 
 AROUND_S = 0.6  # of standing, before the first and after the last event
-MERGED_S = 0.12  # phases that are shorter are events of one
+MERGED_S = 0.12  # phases that are shorter are events of one ...
+SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
 TOES_S = 0.1  # on the toes before a flight, ...
 ROLLING_S = 0.22  # ... if the phase before it is this long
 # steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.035, "landing": 0.03, "toe": 0.018, FLIGHT: 0.03}
+STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
 LEAST_STEPS = 6
 MOST_STEPS = 60
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
@@ -171,7 +172,7 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             rows[k - 1][2] = b
             rows.pop(k)
             k = 0
-        elif b - a < MERGED_S and len(rows) > 1:
+        elif len(rows) > 1 and b - a < _shortest(rows, k):
             middle = (a + b) / 2 if 0 < k < len(rows) - 1 else (a, b)[k == 0]
             if k:
                 rows[k - 1][2] = middle
@@ -197,6 +198,12 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
         else:
             out.append((feet, a, b))
     return out
+
+
+def _shortest(rows: list[list], k: int) -> float:
+    """The least time [s] that phase ``k`` of (feet, from, to) has to last to count."""
+    beside = [row[0] for row in rows[max(k - 1, 0) : k + 2]]
+    return SHUFFLED_S if beside in (["LR", "L", "LR"], ["LR", "R", "LR"]) else MERGED_S
 
 
 class Draft:
