@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,25 @@ class Mended(Shown):
     def line(self) -> str:
         """The clip and the plan."""
         return f"{self.before.clip.name} as {self.plan.line()}"
+
+    @cached_property
+    def jump(self) -> JumpPlan | None:
+        """The plan up to touchdown, which control can play and catch; None unless both feet leave
+        the ground together, and once.
+        """
+        tape = self.plan.tape
+        carrying = tape.extra["contacts"] > 0
+        flying = ~carrying.any(axis=1)
+        edges = np.flatnonzero(np.diff(flying.astype(int), append=0))
+        if len(edges) != 2 or not carrying[~flying].all():
+            return None
+        end = int(edges[1]) + 1
+        rows = ("t", "q", "v", "a", "tau", "phase", "f")
+        cut = {name: getattr(tape, name)[:end] for name in rows}
+        long = {k: x[:end] for k, x in tape.extra.items() if np.shape(x)[:1] == tape.t.shape}
+        tape = replace(tape, **cut, extra={**tape.extra, **long})
+        summary = {k: x for k, x in self.plan.summary.items() if k != "contacts"}
+        return JumpPlan.on_file(tape, self.plan.robot, summary)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data of all but the plan."""

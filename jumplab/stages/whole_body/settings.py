@@ -94,7 +94,6 @@ class Limits:
         """The same for a motion that follows another one: its feet, arms and load are its own."""
         return replace(
             self,
-            torque_share=0.82,  # landings need more between the nodes
             straight_knee_rad=0.25,
             foot_share=0.02,
             sides_share=0.3,

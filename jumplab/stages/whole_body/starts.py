@@ -198,7 +198,7 @@ FROM_NEIGHBOUR = (
 MET = WARM | {"acceptable_iter": 1, "mu_init": 1e-3, "max_iter": 80}
 APART = (
     Start("links apart", from_neighbour, True, 5.0, MET),
-    Start("links apart", from_neighbour, False, 5.0, MET),
+    Start("links apart", from_neighbour, False, 8.0, MET),
 )
 SETTLED = Start("settled", from_neighbour, False, 8.0, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 10.0, WARM | {"acceptable_iter": 1})

@@ -30,7 +30,7 @@ from jumplab.stages.whole_body.problem import Schedule
 
 SHORTEST_S = 0.05 / RATE_HZ  # a shorter last step is joined to the one before
 # over which a phase passes from where the one before ended on the tape to its own plan
-JOINING_S = 0.15
+JOINING_S = 0.25
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 LANDED_RAD = 1e-6  # [rad, rad/s] by which legs may miss their plan at the end of a flight
 LANDINGS = 60  # corrections of that end at most; a jump takes two or three
