@@ -91,11 +91,10 @@ class Limits:
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
     def of_clip(self) -> Limits:
-        """The same for a motion that follows another one: its feet, arms and load are its own."""
+        """The same for a motion that follows another one: where its legs and arms are is its own."""
         return replace(
             self,
             straight_knee_rad=0.25,
-            foot_share=0.02,
             sides_share=0.3,
             hands_inward_m=1.0,
         )
