@@ -91,7 +91,7 @@ class Limits:
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
     def of_clip(self) -> Limits:
-        """The same for a motion that follows another one: where its legs and arms are is its own."""
+        """The same for a motion that follows another one, whose legs and arms are its own."""
         return replace(
             self,
             straight_knee_rad=0.25,
