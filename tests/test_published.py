@@ -24,7 +24,8 @@ from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
-PUBLISHED = [name for name in SHIPPED if name not in ("bhr", "g1_arms", *DOWNLOADED)]
+SPATIAL = ("g1_arms", "g1_23", "g1_29")
+PUBLISHED = [name for name in SHIPPED if name not in ("bhr", *SPATIAL, *DOWNLOADED)]
 
 
 here = pytest.mark.skipif(not have_published(), reason=f"the optional package {PACKAGE} is not installed")

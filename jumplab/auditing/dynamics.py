@@ -34,7 +34,8 @@ def _forces(r: Replay) -> Iterator[Measure]:
     missing = np.abs(r.tau - r.tape.tau) / r.model.upperEffortLimit[6:]
     yield "joint torque consistency", missing, t, r.joints
     s = slice(0, int(np.flatnonzero(r.ground)[-1]) + 1)  # until the last foot leaves
-    last = r.flights[0].start - 1 if r.flights else s.stop - 1
+    # a motion without a flight ends at rest, so its largest momentum is the scale
+    last = r.flights[0].start - 1 if r.flights else int(norm(r.com_velocity).argmax())
     push = r.tape.f[..., :3].sum(axis=1) - [0.0, 0.0, r.weight]
     gained = r.mass * (r.com_velocity - r.com_velocity[0])
     turned = r.momentum - r.momentum[0] - r.integral(_contact_moment(r))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,11 +30,12 @@ from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
 
 AROUND_S = 0.6  # of standing, before the first and after the last event
-MERGED_S = 0.12  # phases that are shorter are events of one
+MERGED_S = 0.12  # phases that are shorter are events of one ...
+SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
 TOES_S = 0.1  # on the toes before a flight, ...
 ROLLING_S = 0.22  # ... if the phase before it is this long
 # steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.035, "landing": 0.03, "toe": 0.018, FLIGHT: 0.03}
+STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
 LEAST_STEPS = 6
 MOST_STEPS = 60
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
@@ -78,6 +80,25 @@ class Mended(Shown):
     def line(self) -> str:
         """The clip and the plan."""
         return f"{self.before.clip.name} as {self.plan.line()}"
+
+    @cached_property
+    def jump(self) -> JumpPlan | None:
+        """The plan up to touchdown, which control can play and catch; None unless both feet leave
+        the ground together, and once.
+        """
+        tape = self.plan.tape
+        carrying = tape.extra["contacts"] > 0
+        flying = ~carrying.any(axis=1)
+        edges = np.flatnonzero(np.diff(flying.astype(int), append=0))
+        if len(edges) != 2 or not carrying[~flying].all():
+            return None
+        end = int(edges[1]) + 1
+        rows = ("t", "q", "v", "a", "tau", "phase", "f")
+        cut = {name: getattr(tape, name)[:end] for name in rows}
+        long = {k: x[:end] for k, x in tape.extra.items() if np.shape(x)[:1] == tape.t.shape}
+        tape = replace(tape, **cut, extra={**tape.extra, **long})
+        summary = {k: x for k, x in self.plan.summary.items() if k != "contacts"}
+        return JumpPlan.on_file(tape, self.plan.robot, summary)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data of all but the plan."""
@@ -171,7 +192,7 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             rows[k - 1][2] = b
             rows.pop(k)
             k = 0
-        elif b - a < MERGED_S and len(rows) > 1:
+        elif len(rows) > 1 and b - a < _shortest(rows, k):
             middle = (a + b) / 2 if 0 < k < len(rows) - 1 else (a, b)[k == 0]
             if k:
                 rows[k - 1][2] = middle
@@ -197,6 +218,12 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
         else:
             out.append((feet, a, b))
     return out
+
+
+def _shortest(rows: list[list], k: int) -> float:
+    """The least time [s] that phase ``k`` of (feet, from, to) has to last to count."""
+    beside = [row[0] for row in rows[max(k - 1, 0) : k + 2]]
+    return SHUFFLED_S if beside in (["LR", "L", "LR"], ["LR", "R", "LR"]) else MERGED_S
 
 
 class Draft:

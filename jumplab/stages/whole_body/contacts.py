@@ -135,10 +135,10 @@ class Contacts:
         named = [replace(p, name=p.name or f"{k} {p.feet}") for k, p in enumerate(self.phases, 1)]
         object.__setattr__(self, "phases", tuple(named))
         object.__setattr__(self, "places", tuple(self.places))
-        usual = (Place(0.0, free_m=(0.0, 0.0)),) * len(self.phases and self.phases[0].modes)
-        object.__setattr__(self, "first", tuple(self.first) or usual)
         for fault in self._faults():
             raise InputError(fault)
+        usual = (Place(0.0, free_m=(0.0, 0.0)),) * len(self.phases[0].modes)
+        object.__setattr__(self, "first", tuple(self.first) or usual)
         _ = self.surface
 
     def _faults(self) -> Iterator[str]:
@@ -179,6 +179,8 @@ class Contacts:
         pairs = enumerate(zip(before, phases, strict=False))
         landings = [(k, side) for k, (old, p) in pairs for side in p.modes if side not in old]
         object.__setattr__(self, "landings", tuple(landings))
+        if self.first and len(self.first) != len(first.modes):
+            yield f"first: {len(self.first)} places given for {len(first.modes)} feet that stand"
         later = landings[len(first.modes) :]
         if len(self.places) != len(later):
             came = [f"{SIDES[side]} in phase {phases[k].name!r}" for k, side in later]

@@ -91,11 +91,10 @@ class Limits:
     momentum_slack: float = 0.02  # ... or within this [kg m^2/s], for jumps with little L
 
     def of_clip(self) -> Limits:
-        """The same for a motion that follows another one: its feet, arms and load are its own."""
+        """The same for a motion that follows another one, whose legs and arms are its own."""
         return replace(
             self,
             straight_knee_rad=0.25,
-            foot_share=0.02,
             sides_share=0.3,
             hands_inward_m=1.0,
         )
@@ -148,8 +147,8 @@ class Weights:
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
-    # [1] / [m, rad]^2; with a tenth of it feet are shuffled instead of jumped
-    follow_foothold: float = 300.0
+    # [1] / [m, rad]^2; with a twentieth of it feet are shuffled instead of jumped
+    follow_foothold: float = 600.0
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""

@@ -199,7 +199,7 @@ FROM_NEIGHBOUR = (
 MET = WARM | {"acceptable_iter": 1, "mu_init": 1e-3}
 APART = (
     Start("links apart", from_neighbour, True, 80, MET),
-    Start("links apart", from_neighbour, False, 80, MET),
+    Start("links apart", from_neighbour, False, 120, MET),
 )
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})

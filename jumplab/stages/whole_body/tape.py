@@ -30,12 +30,13 @@ from jumplab.stages.whole_body.problem import Schedule
 
 SHORTEST_S = 0.05 / RATE_HZ  # a shorter last step is joined to the one before
 # over which a phase passes from where the one before ended on the tape to its own plan
-JOINING_S = 0.15
+JOINING_S = 0.25
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 LANDED_RAD = 1e-6  # [rad, rad/s] by which legs may miss their plan at the end of a flight
 LANDINGS = 60  # corrections of that end at most; a jump takes two or three
 TURNED_RAD = 1e-10  # by which the base's attitude in flight may still change from round to round
 TURNS = 100  # such rounds at most
+SLOPES = 20  # samples from one slope of those corrections to the next
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 # codes of a foot in the tape's ``contacts``
 AIR = 0
@@ -198,7 +199,11 @@ def _ground(
         holds = holds_of(phase, b)
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
-        motion = _balanced(legs, motion, pitch, holds, instants, robot, wrench.sum(axis=1))
+        leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
+        if len(instants) > 1 and (_on_a_line(holds, pitch) or leaves or schedule.follows):
+            given = pitch, holds, instants, robot, wrench.sum(axis=1)
+            motion = _balanced(legs, motion, *given, stays=not leaves)
+        motion = legs.held(motion, holds, pitch)
         parts.append((motion, wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
     motion = tuple(np.concatenate(x) for x in zip(*motions, strict=True))
@@ -222,6 +227,14 @@ def _planned(
     return wrench, codes
 
 
+def _on_a_line(holds: Mapping[int, np.ndarray], pitch: Mapping[int, Motion]) -> bool:
+    """Whether all feet that carry are on their toes, and their edges parts of one level line."""
+    edge = np.array(list(holds.values()))
+    ahead = edge[:, :2] @ [np.cos(edge[0, 3]), np.sin(edge[0, 3])]
+    level = np.ptp(edge[:, 2:], axis=0).max() < 1e-6 and np.ptp(ahead) < 1e-4
+    return len(pitch) == len(holds) and level
+
+
 def _balanced(
     legs: Legs,
     motion: Motion,
@@ -230,43 +243,56 @@ def _balanced(
     t: np.ndarray,
     robot: Robot,
     wrench: np.ndarray,
+    stays: bool,
 ) -> Motion:
-    """The motion with feet held, its base moved by some micrometres so that the ground's force
-    stays on the toes.
+    """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
-    Where all feet that carry are on their toes, no ground force but the planned ``wrench`` (n, 6)
-    has a moment about the line of their edges: what the motion between nodes needs of it besides
-    goes.
+    Where all feet that carry are on their toes, in one line, no ground force has a moment about
+    that line: what the motion between nodes needs of it goes. Elsewhere all that it needs besides
+    the planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. What
+    a phase moves the base by goes within the phase if it ``stays`` on the ground.
     """
     from scipy.integrate import cumulative_trapezoid  # slow to import
 
-    if len(pitch) < len(holds) or len(t) < 2:
-        return legs.held(motion, holds, pitch)
     q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
     ahead, across, _ = pin.rpy.rpyToMatrix(0.0, 0.0, edge[3]).T
+    line = _on_a_line(holds, pitch)
+    every = np.arange(len(t))
+    ways = np.array([[*ahead, 0.0, 0.0, 0.0]]) if line else np.eye(BASE)
+    seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)
     model = robot.model
     data = model.createData()
 
-    def moment(change: np.ndarray | float = 0.0) -> np.ndarray:
-        gain = a.copy()
-        gain[:, :3] += change
-        held = legs.body.model.to_pinocchio(*legs.held((q, v, gain), holds, pitch))
-        need = [needed(x[0], pin.rnea(model, data, *x)) for x in zip(*held, strict=True)]
-        force, about = np.split(np.array(need), 2, axis=1)
-        force -= wrench[:, :3]
-        about -= wrench[:, 3:]
-        return (about - np.cross(edge[:3], force)) @ across
+    def missing(change: np.ndarray | float = 0.0, rows: np.ndarray = every) -> np.ndarray:
+        gain = a[rows].copy()
+        gain[:, :BASE] += change
+        tipped = {side: [x[rows] for x in levels] for side, levels in pitch.items()}
+        held = legs.held((q[rows], v[rows], gain), holds, tipped)
+        states = zip(*legs.body.model.to_pinocchio(*held), strict=True)
+        need = [needed(x[0], pin.rnea(model, data, *x)) for x in states]
+        force, about = np.split(np.array(need) - wrench[rows], 2, axis=1)
+        return np.hstack([force, about - np.cross(edge[:3], force)]) @ seen.T
 
-    missing = moment()
-    slope = moment(ahead) - missing  # hardly changed by the corrections
-    for k in range(BALANCING):
-        more = -(moment() if k else missing) / slope
-        rate = cumulative_trapezoid(more, t, initial=0.0)
-        place = cumulative_trapezoid(rate, t, initial=0.0)
+    first = missing()
+    # slopes hardly change, neither by the corrections nor from one sample to the next
+    some = every if line else np.unique(np.append(every[::SLOPES], every[-1]))
+    slopes = np.stack([missing(way, some) - first[some] for way in ways], axis=-1)
+    back = np.linalg.pinv(slopes)[np.searchsorted(some, every)]
+    for k in range(BALANCING + (not line)):
+        more = -_times_each(back, missing() if k else first) @ ways
+        rate = cumulative_trapezoid(more, t, axis=0, initial=0.0)
+        place = cumulative_trapezoid(rate, t, axis=0, initial=0.0)
+        if stays and not line:
+            none = np.zeros(BASE)
+            ends = [(none, place[-1]), (none, rate[-1]), (none, none)]
+            back_again = quintic(ends, t[-1] - t[0], (t - t[0])[:, None])
+            place, rate, more = (
+                x - y for x, y in zip((place, rate, more), back_again, strict=True)
+            )
         for x, change in ((q, place), (v, rate), (a, more)):
-            x[:, :3] += np.outer(change, ahead)
-    return legs.held((q, v, a), holds, pitch)
+            x[:, :BASE] += change
+    return q, v, a
 
 
 def needed(q: np.ndarray, torques: np.ndarray) -> np.ndarray:

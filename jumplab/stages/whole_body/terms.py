@@ -581,8 +581,8 @@ def phase_terms(
         terms += reserve(m)
         if both_carry and (m.limits.least_push or not m.free.even):
             terms.append(loads(m))
-    if len(m.modes) == 1:
-        terms += [torsion(m, side) for side in m.modes]
+    if len(m.modes) == 1 or follows:
+        terms += [torsion(m, side) for side in m.sides]
     if m.flying:
         terms += flight_rows(m)
     if last:

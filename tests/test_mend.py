@@ -1,0 +1,56 @@
+"""Clips mended: the schedule that is read from them, and one public clip from file to a robot that stands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_judge import CLIPS, NO_ROBOTS, standing
+
+import jumplab as jl
+from jumplab.errors import InputError
+from jumplab.studies.mend import AROUND_S, TOES_S, planned_phases
+
+
+def seen(words):
+    """A report of a clip whose feet carry as ``words`` say: (feet, frames at 30 per second)."""
+    ground = np.concatenate([np.tile(["L" in feet, "R" in feet], (n, 1)) for feet, n in words])
+    report = jl.judge(standing())
+    clip = replace(report.clip, q=np.tile(report.clip.q[:1], (len(ground), 1)))
+    return replace(report, clip=clip, ground=ground, still=ground)
+
+
+def test_events_are_kept_around_a_jump_and_toes_put_before_it():
+    feet, begin, end = zip(*planned_phases(seen([("LR", 40), ("-", 12), ("LR", 40)])), strict=True)
+    assert feet == ("LR", "lr", "-", "LR")
+    assert np.subtract(end, begin) == pytest.approx([AROUND_S - TOES_S, TOES_S, 12 / 30, AROUND_S], abs=0.05)
+    assert begin[1:] == pytest.approx(end[:-1])
+
+
+@pytest.mark.parametrize(
+    "words, feet",
+    [
+        ([("LR", 30), ("R", 2), ("-", 12), ("L", 2), ("LR", 30)], "LR lr - LR"),  # feet that leave one after the other
+        ([("LR", 30), ("L", 4), ("LR", 30)], "LR"),  # a step in place
+        ([("LR", 30), ("L", 10), ("LR", 30)], "LR L LR"),
+        ([("-", 5), ("LR", 30), ("L", 10), ("-", 9), ("L", 10), ("LR", 30), ("-", 5)], "LR L l - L LR"),
+    ],
+)
+def test_short_events_are_one_and_a_motion_begins_and_ends_on_both_feet(words, feet):
+    assert " ".join(x for x, *_ in planned_phases(seen(words))) == feet
+
+
+def test_a_clip_that_never_stands_is_refused():
+    with pytest.raises(InputError, match="it never stands on both feet, and a motion has to begin so"):
+        planned_phases(seen([("L", 30), ("R", 30)]))
+
+
+@NO_ROBOTS
+@pytest.mark.slow
+def test_a_public_clip_is_mended_audited_and_stands():
+    mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
+    rows = {row["what"]: row for row in mended.changes}
+    assert jl.audit(mended.plan).passed and jl.judge(mended.plan).passed and not mended.before.passed
+    assert rows["joints, rms [rad]"]["change"] < 0.25 and rows["footholds, largest [m]"]["change"] < 0.07
+    assert abs(rows["rise 1 [m]"]["change"]) < 0.05
+    assert mended.binding and mended.factor == 1 and mended.jump.tape.t[-1] < mended.plan.tape.t[-1]
+    assert jl.simulate(mended.jump).landed
