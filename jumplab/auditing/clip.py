@@ -171,8 +171,8 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
     A foot stands where its sole is slow, and not far above the lowest one around: so far its height
     is that of the ground, and linear between. In the air it is while it is
-    ``METHOD.lifted_m`` higher than that, or fast while the other one stands. What is shorter than
-    ``METHOD.short_s`` is passed over.
+    ``METHOD.lifted_m`` higher than that, or fast while the other one stands, or faster than any
+    foot slides. What is shorter than ``METHOD.short_s`` is passed over.
     """
     from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
 
@@ -191,7 +191,8 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     level = np.column_stack(
         [np.interp(rows, rows[s], h[s]) for s, h in zip(still.T, height.T, strict=True)]
     )
-    low = height - level < METHOD.lifted_m
+    gliding = (speed > METHOD.flies_m_s).all(axis=1, keepdims=True)
+    low = (height - level < METHOD.lifted_m) & ~gliding
     carrying = still | (low & ~still.any(axis=1, keepdims=True))
     flying = ~carrying.any(axis=1)
     kept = flying.copy()

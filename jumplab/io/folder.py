@@ -250,6 +250,8 @@ def _read_summary(folder: Path) -> dict[str, Any]:
     known = isinstance(files, dict) and manifest.get("schema") == SCHEMA
     if not known or not all(isinstance(files.get(name), str) for name in HASHED):
         raise InputError(f"{path}: not a summary of schema {SCHEMA!r}; plan the jump again")
+    if not isinstance(summary.get("target"), dict):
+        raise InputError(f"{path}: lacks the 'target' of the jump; plan the jump again")
     return summary
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jumplab.errors import Shown
+from jumplab.errors import InputError, Shown
 from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
 from jumplab.ocp.nlp import Solution
@@ -89,10 +89,17 @@ class JumpPlan(Shown, Named):
 
     @classmethod
     def on_file(cls, tape: Tape, robot: Robot, summary: Mapping[str, Any]) -> JumpPlan:
-        """The plan of a result folder: its ``tape`` and its ``summary`` (a mapping)."""
-        target = summary["target"]
-        task = JumpTask(**{f.name: target[f.name] for f in fields(JumpTask) if f.name in target})
-        return cls(task, robot, summary["method"], tape, dict(summary))
+        """The plan of a result folder: its ``tape`` and its ``summary`` (a mapping); raises
+        :class:`InputError` for one without target or method.
+        """
+        target = summary.get("target", {})
+        given = {f.name: target[f.name] for f in fields(JumpTask) if f.name in target}
+        if not {"distance_m", "height_m"} <= given.keys() or "method" not in summary:
+            raise InputError(
+                "the summary of the plan lacks the target's distance_m and height_m, or the "
+                "method; plan the jump again"
+            )
+        return cls(JumpTask(**given), robot, summary["method"], tape, dict(summary))
 
     def line(self) -> str:
         """Robot, target and duration."""
