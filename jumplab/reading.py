@@ -39,6 +39,7 @@ KINDS = {
     "report": (100_000_000, "a report", "delete it, and make it again"),
     # packed; an atlas of 2500 nodes has some 30 MB
     "arrays": (200_000_000, "a file of arrays", "delete it, and make it again"),
+    "clip": (200_000_000, "a motion clip", "give one clip, cut to what is wanted"),
     "log": (1_000_000_000, "a log", "choose another folder"),
 }
 # how what others may have made is opened: no link is followed, no pipe is waited for

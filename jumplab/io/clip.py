@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib.numpy_pickle import NumpyUnpickler
+from joblib.numpy_pickle import NumpyArrayWrapper, NumpyUnpickler
 from scipy.spatial.transform import Rotation
 
+from jumplab import reading
 from jumplab.errors import InputError, Shown, as_path, quoted
 from jumplab.io.motion import Motion, steady
 from jumplab.io.whole import ORDERS, Whole, ordered
@@ -23,7 +24,6 @@ ENDINGS = (".pkl", ".npz", ".csv")
 USUAL_FPS = 30.0  # of files that do not say
 RECORD_FPS = 100.0  # at which plans and simulations are looked at
 LEAST_FRAMES = 10
-MOST_BYTES = 500_000_000
 TURN_RAD = 7.0  # no joint turns further
 BEYOND_RAD = 0.5  # of its range, by which a joint of the right robot is not most of the time
 STILL_RAD = 0.02  # by which a joint that the robot holds may move
@@ -106,8 +106,11 @@ class _Arrays(NumpyUnpickler):
 
     def load_build(self) -> None:
         """As joblib's, but arrays of objects, whose content it would unpickle freely."""
-        state = self.stack[-1]
-        if isinstance(state, Mapping) and getattr(state.get("dtype"), "hasobject", False):
+        state, made = self.stack[-1], self.stack[-2]
+        plain = isinstance(state, Mapping) or not isinstance(made, NumpyArrayWrapper)
+        if not plain or (
+            isinstance(state, Mapping) and getattr(state.get("dtype"), "hasobject", False)
+        ):
             raise pickle.UnpicklingError("it holds an array of objects, which could run code")
         super().load_build()
 
@@ -117,12 +120,9 @@ class _Arrays(NumpyUnpickler):
 def _content(path: Path) -> Mapping[str, Any]:
     """Arrays and numbers of a file by name; of a CSV file by column."""
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: larger than {MOST_BYTES / 1e6:.0f} MB; no motion clip")
-        raw = path.read_bytes()
+        raw = reading.content(path, "clip")
         if raw[:2] == b"PK":
-            with np.load(io.BytesIO(raw), allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+            return reading.arrays(raw)
         if raw[:1] == b"\x80":
             return _Arrays(str(path), io.BytesIO(raw), ensure_native_byte_order=True).load()
         return _columns(raw.decode())

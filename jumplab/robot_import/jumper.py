@@ -50,7 +50,7 @@ SOURCE_TABLES = TABLES | {
     "locked": (),
     "limits": (),
     "assumed": (),
-    "shapes": ("trunk_m", *(f"{part}_thickness_m" for part in THICKNESS)),
+    "shapes": ("trunk_m", "boxes_m", *(f"{part}_thickness_m" for part in THICKNESS)),
 }
 GAP = 0.14  # share of each limb's length, kept free at both ends
 ARM_REACH = 1.86  # length of an arm's box, in distances from the shoulder to the arm's CoM
