@@ -113,7 +113,7 @@ BROKEN = {
     "foot turn": lambda t: edit(t, q=put(STANDING, 7 + joint("left_hip_yaw"), 0.04)),
     "toe on the ground": lambda t: shifted(t, 2, 0.002, 0.1, 0.8 * t.takeoff_time),
     "penetration": lambda t: shifted(t, 2, -0.002, 0.1, 0.8 * t.takeoff_time),
-    "foot clearance": lambda t: shifted(t, 2, -0.3, t.takeoff_time + 0.01, t.t[-1] - 0.01),
+    "foot clearance": lambda t: shifted(t, 2, -0.45, t.takeoff_time + 0.01, t.t[-1] - 0.01),
     "CoP in the sole": lambda t: moved_cop(t, STANDING, 0.3),
     "CoP at the toe": lambda t: moved_cop(t, PUSHING, -0.02),
     "torsional friction": lambda t: edit(t, f=twist),

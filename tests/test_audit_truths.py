@@ -127,7 +127,7 @@ def test_interrupted_write_leaves_the_old_passport(good, tmp_path, monkeypatch):
         ("plan.npz", None, "no such plan"),
         ("plan.npz", "PK not a zip", "not a readable plan"),
         ("robot.urdf", None, "cannot be read"),
-        ("robot.urdf", "<robot", "the URDF is no well-formed XML"),
+        ("robot.urdf", "<robot", "ends before </robot>; it is cut short"),
         ("robot.toml", "name = ", "not a TOML file"),
         ("summary.json", "{", "not a readable JSON file"),
         ("summary.json", "[]", "not a JSON object"),

@@ -90,6 +90,18 @@ def jump_tracking(plan: JumpPlan) -> dict[str, dict[str, dict[str, float]]]:
     }
 
 
+def launch_followed(plan: JumpPlan) -> dict[str, float]:
+    """How far the launch is from stage 1's: rms of ``L`` and ``velocity`` as shares of their peaks, and of ``rho`` as a
+    share of its mean (Sec. V-A).
+    """
+    missed, asked = jump_tracking(plan)["launch"], plan.srmp.launch
+    return {
+        "L": missed["L"]["rms"] / float(np.abs(asked.L).max()),
+        "velocity": missed["velocity"]["rms"] / float(np.linalg.norm(asked.com_velocity, axis=1).max()),
+        "rho": missed["rho"]["relative_rms"],
+    }
+
+
 def _rho_rate(plan: JumpPlan) -> np.ndarray:
     model, data = plan.robot.model, plan.robot.model.createData()
     return np.array([pitch_inertia(model, data, q)[1] @ v for q, v in zip(plan.tape.q, plan.tape.v, strict=True)])
