@@ -222,7 +222,7 @@ def test_without_a_task_the_target_is_left_out(good):
 def test_audit_shares_no_code_with_the_planner():
     code = """
 import sys, jumplab.auditing
-ours = {"errors", "task", "robot", "io", "auditing"}
+ours = {"errors", "arguments", "reading", "task", "robot", "io", "auditing"}
 names = [m.split(".") for m in sys.modules]
 print([n for n in names if n[0] == "casadi" or n[0] == "jumplab" and len(n) > 1 and n[1] not in ours])
 """
