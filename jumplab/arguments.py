@@ -15,21 +15,23 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from jumplab.errors import InputError, as_path, quoted
 
+if TYPE_CHECKING:  # help of a command is there before NumPy is
+    import numpy as np
+
 F = TypeVar("F", bound=Callable)
+FLAGS = "bool", "bool_"
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
 def real(value: Any, what: str, unit: str = "") -> float:
     """A finite real number; raises :class:`InputError`, which calls it ``what``, in ``unit``."""
-    if isinstance(value, np.ndarray) and value.ndim == 0:
+    if _is(value, "ndarray") and value.ndim == 0:
         value = value[()]
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+    if _is(value, *FLAGS) or not isinstance(value, Real):
         raise InputError(
             f"{what} must be a number{f' in {unit}' * bool(unit)}, got {quoted(value)}"
         )
@@ -86,6 +88,8 @@ def fitting(value: Any, hint: Any, what: str) -> Any:
         return value
     if hint in SIMPLE:
         return SIMPLE[hint](value, what)
+    if getattr(hint, "__name__", "") == "ndarray":
+        return _array(value, what)
     if hint is None or hint is types.NoneType:
         return _of(value, types.NoneType, what, "None")
     origin = typing.get_origin(hint)
@@ -130,6 +134,11 @@ def _one_of(value: Any, hints: tuple, what: str) -> Any:
     raise InputError(next((w for w in wanted if "must be None" not in w), wanted[0]))
 
 
+def _is(value: Any, *names: str) -> bool:
+    """Whether a value is of one of these types, NumPy's among them."""
+    return type(value).__name__ in names
+
+
 def _of(value: Any, kind: type, what: str, words: str) -> Any:
     if not isinstance(value, kind):
         raise InputError(f"{what} must be {words}, got {quoted(value)}")
@@ -137,16 +146,20 @@ def _of(value: Any, kind: type, what: str, words: str) -> Any:
 
 
 def _whole(value: Any, what: str) -> int:
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
+    if _is(value, *FLAGS) or not isinstance(value, Integral):
         raise InputError(f"{what} must be a whole number, got {quoted(value)}")
     return int(value)
 
 
 def _flag(value: Any, what: str) -> bool:
-    return bool(_of(value, bool | np.bool_, what, "True or False"))
+    if not _is(value, *FLAGS):
+        raise InputError(f"{what} must be True or False, got {quoted(value)}")
+    return bool(value)
 
 
 def _array(value: Any, what: str) -> np.ndarray:
+    import numpy as np
+
     try:
         array = np.asarray(value)
     except ValueError:
@@ -160,7 +173,7 @@ def _items(value: Any, what: str) -> Iterable:
     """Entries of what is a sequence; a text or a mapping is none."""
     if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
         raise InputError(f"{what} must be a sequence, got {quoted(value)}")
-    if isinstance(value, np.ndarray) and value.ndim == 0:
+    if _is(value, "ndarray") and value.ndim == 0:
         raise InputError(f"{what} must be a sequence, got {quoted(value)}")
     return value
 
@@ -171,5 +184,4 @@ SIMPLE = {
     bool: _flag,
     str: lambda value, what: _of(value, str, what, "a text"),
     Path: as_path,
-    np.ndarray: _array,
 }

@@ -17,12 +17,13 @@ import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 from xml.etree import ElementTree
 
-import numpy as np
-
 from jumplab.errors import InputError
+
+if TYPE_CHECKING:  # help of a command is there before NumPy is
+    import numpy as np
 
 LINE_BYTES = 20_000_000  # of a log, which is read line by line
 MOST_UNPACKED_BYTES = 800_000_000  # of all arrays of a file together
@@ -181,6 +182,8 @@ def arrays(raw: bytes) -> dict[str, np.ndarray]:
 
 def _array(raw: bytes) -> np.ndarray:
     """One array of a ``.npy`` file whose header says as much as follows it."""
+    import numpy as np
+
     file = io.BytesIO(raw)
     version = np.lib.format.read_magic(file)
     read = {

@@ -60,17 +60,18 @@ def test_every_number_of_the_joint_table():
     motion, lines = short(), export.joint_table(WHOLE, frames(1000.0), 1000.0).splitlines()
     kinds = {"position_rad": motion.q[:, 7:], "velocity_rad_s": motion.v[:, 6:], "torque_N_m": motion.tau}
     head = [f"{name}_{kind}" for kind in kinds for name in WHOLE.joints]
+    base = [f"base_{x}" for x in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
+    kinds["base"] = motion.q[:, :7] * np.where(np.arange(7) > 2, np.sign(motion.q[:, 6:7]), 1.0)  # w is positive
     assert lines[0].split(",") == [
-        "time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right", *head]  # fmt: skip
+        "time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right", *head, *base]  # fmt: skip
     assert len(lines) == 23  # the last whole millisecond, and the end half a one later
     for k, (line, row) in enumerate(zip(lines[1:], [*ROWS, LAST], strict=True)):
         said = line.split(",")
         assert said[0] == ("0.020500" if row == LAST else f"{k / 1000:.6f}")
         assert said[1] == {"launch": "0", "flight": "1", "landing": "2"}[motion.phase[row]]
         assert said[2:4] == ["0" if motion.phase[row] == "flight" else "1"] * 2
-        np.testing.assert_allclose(
-            np.array(said[4:], float), np.concatenate([x[row][AT] for x in kinds.values()]), rtol=6e-9
-        )
+        rows = [x[row] if name == "base" else x[row][AT] for name, x in kinds.items()]
+        np.testing.assert_allclose(np.array(said[4:], float), np.concatenate(rows), rtol=6e-9, atol=1e-12)
     assert max(len(x) for x in lines[1].split(",")[4:]) >= 10  # nine digits
 
 
@@ -286,7 +287,9 @@ def test_grids():
     assert len(motion.every(2000.0, end=True).t) == 42  # once
     rounded = replace(motion, t=np.append(motion.t[:-1], 0.5205 - 1e-10))
     assert rounded.every(2000.0).t[-1] == rounded.t[-1]
-    for rate in (0.0, -1.0, 10_000.1, np.nan, np.inf):
+    for rate in (np.nan, np.inf):
+        assert refused(lambda rate=rate: motion.every(rate)) == f"rate_hz must be finite, got {rate:g}"
+    for rate in (0.0, -1.0, 10_000.1):
         assert refused(lambda rate=rate: motion.every(rate)) == (
             f"rate = {rate:g} per second must lie above 0 and not above 10000"
         )

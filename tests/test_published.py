@@ -188,7 +188,7 @@ def test_stored_maps_are_of_robots_that_ship():
     from paper import shipped
 
     table = shipped.rows()
-    assert set(table) == set(SHIPPED)
+    assert set(table) == set(SHIPPED) - {"g1_23", "g1_29"}  # of clips: the G1 with other joints held
     for name, row in table.items():
         found = shipped.mapped(name)
         assert len(found.cells) == len(found.distances) * len(found.heights)

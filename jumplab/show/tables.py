@@ -40,7 +40,7 @@ class Table:
 
 def table(
     rows: Iterable[Mapping],
-    columns: Iterable[str] | None = None,
+    columns: Iterable[str] | Mapping[str, str] | None = None,
     *,
     digits: int = 4,
     decimals: int | None = None,

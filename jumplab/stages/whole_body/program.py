@@ -51,6 +51,9 @@ FINER = 1.5  # times as many intervals, where a motion passes limits between the
 # to 40 s
 PATIENCE_S = 60.0
 USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have more time
+# [s] an iteration in a program of that size may take on average, three times as long as on a quiet
+# core
+ITERATION_S = 0.12
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -148,7 +151,9 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        limit = {"max_iter": start.patience, "max_cpu_time": max(LEAST_S, self.left_s(asked))}
+        most = start.patience * ITERATION_S * self.nlp.assembled.size / USUAL_SIZE
+        left = max(LEAST_S, min(most, self.left_s(asked)))
+        limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
         began = time.process_time()
