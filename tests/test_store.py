@@ -274,14 +274,18 @@ def test_damaged_summary_is_refused(bhr, tmp_path, how):
 
 
 def test_nothing_in_the_package_unpickles():
-    """Nothing of pickle but ``dumps`` is used, nothing of its relatives, and no array file may hold objects."""
+    """Nothing of pickle but ``dumps`` is used, nothing of its relatives, and no array file may hold objects.
+
+    The reader of other people's clips names what an unpickler may do, and tests of clips hold it to that.
+    """
     kin = {"_pickle", "dill", "cloudpickle", "shelve", "marshal"}
     sources = sorted((ROOT / "jumplab").rglob("*.py"))
     assert len(sources) > 50
     for path in sources:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).startswith("pickle"):
-                assert ast.unparse(node) in ("pickle", "pickle.dumps"), path
+                narrow = {"pickle.UnpicklingError", "pickle.BUILD"} if path.match("io/clip.py") else set()
+                assert ast.unparse(node) in {"pickle", "pickle.dumps"} | narrow, path
             if isinstance(node, ast.Import):
                 assert all(a.asname is None for a in node.names if a.name == "pickle"), path
                 assert not kin & {a.name.split(".")[0] for a in node.names}, path
