@@ -748,7 +748,8 @@ def test_every_weight_is_the_setting_of_its_name(body, programs, rod):
         costs = [(owner, t) for owner, t in programs[name].terms() if t.is_cost]
         for owner, t in costs:
             key = "track_flight_inertia_rate" if (owner, t.name) == ("flight", "track inertia rate") else None
-            want = w[key or t.name.replace(" ", "_")] / (stood**2 if t.name.split()[1:2] in (["inertia"], ["momentum"]) else 1.0)
+            share = {"inertia", "momentum"} & set(t.name.split())
+            want = w[key or t.name.replace(" ", "_")] / (stood**2 if share else 1.0)
             assert t.weight == pytest.approx(want, rel=1e-9), (owner, t.name)
     assert set(w) == {"mirror", "track_flight_inertia_rate", "track_duration"} | {
         t.name.replace(" ", "_") for _, t in programs["whole body"].terms() if t.is_cost
