@@ -1,7 +1,6 @@
 """Beginning with a known solution: multipliers from mesh to mesh, a warm solve, and a neighbouring target."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,7 +104,8 @@ def test_a_neighbouring_target(bhr, method):
 
 
 def test_of_another_robot():
-    other = SimpleNamespace(robot=SimpleNamespace(name="other", hash="another"))
+    stronger = jump(1.0, 0.5).robot.with_limits(effort=1.1)
     with pytest.raises(InputError) as e:
-        planner().replan(other, JumpTask(0.9, 0.5))
-    assert str(e.value) == "the previous plan is for the robot other, not for bhr"
+        planner().replan(replace(jump(1.0, 0.5), robot=stronger), JumpTask(0.9, 0.5))
+    own = planner().robot.hash
+    assert str(e.value) == f"the previous plan is for the robot bhr ({stronger.hash}), not for bhr ({own})"

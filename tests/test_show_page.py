@@ -232,7 +232,7 @@ def test_ground_of_the_scene(bhr, scene, tops):
 def test_robot_whose_shapes_are_lost_keeps_its_limbs(bhr):
     """A mesh file does not travel with the robot's text; thighs and shanks stand between the joints all the same."""
     mesh = '<mesh filename="package://elsewhere/thigh.stl"/>'
-    robot = Robot.from_text(re.sub(r"<box [^>]*/>", mesh, bhr.urdf), bhr.config_text)
+    robot = Robot(re.sub(r"<box [^>]*/>", mesh, bhr.urdf), bhr.config_text)
     parts = facts_of(viewer.page(robot, plan=jump(1.0, 0.5).tape))["parts"]
     legs = [bhr.joints[role] for role in ("hip_pitch", "knee")]
     limbs = {bhr.model.getJointId(name) - 1 for pair in legs for name in pair}
@@ -286,7 +286,7 @@ def test_refusals(capsys, plan, tmp_path, monkeypatch, out, sentence):
 def test_damaged_simulation_is_told(capsys, plan):
     (plan / "simulation.npz").write_bytes(b"half")
     said = one_sentence(*run(capsys, "view", plan))
-    assert said.endswith("simulation.npz: not a readable simulation (ValueError); simulate the plan again")
+    assert said.endswith("simulation.npz: not a readable simulation (BadZipFile); simulate the plan again")
     assert not (plan / "jump.html").exists()
 
 

@@ -41,6 +41,7 @@ TABLES = {
         "damping",
     ),
     "published": ("trunk", "xyz_m", "rpy_rad", "urdf", "held"),
+    "source": (),  # where the URDF came from; only the importer reads it
 }
 _REQUIRED = object()
 DEEPEST = 100  # the parser takes memory by the square of the parts of a key

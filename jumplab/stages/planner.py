@@ -382,8 +382,8 @@ class Planner:
         """
         if previous.robot.hash != self.robot.hash:
             raise InputError(
-                f"the previous plan is for the robot {previous.robot.name}, not for "
-                f"{self.robot.name}"
+                f"the previous plan is for the robot {previous.robot.name} "
+                f"({previous.robot.hash}), not for {self.robot.name} ({self.robot.hash})"
             )
         anew = task.rotation_rad or previous.contacts is not None or previous.whole_body is None
         near = None if anew else previous
