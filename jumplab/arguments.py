@@ -165,7 +165,7 @@ def _array(value: Any, what: str) -> np.ndarray:
     except ValueError:
         array = np.array(None)
     texts = array is value and array.dtype.kind == "U"  # names, of phases or joints
-    if not texts and array.dtype.kind not in "fiu" or array.ndim == 0:
+    if (not texts and array.dtype.kind not in "fiu") or array.ndim == 0:
         raise InputError(f"{what} must be an array of numbers, got {quoted(value)}")
     return array
 

@@ -94,7 +94,7 @@ def test_a_body_without_mass_is_refused(bhr):
     """A dummy link without <inertial> weighs nothing to Pinocchio and 1 kg to PyBullet, and MuJoCo will not have it."""
     first = bhr.urdf.index("<inertial>", bhr.urdf.index('name="left_ankle_link"'))
     last = bhr.urdf.index("</inertial>", first) + len("</inertial>")
-    robot = Robot.from_text(bhr.urdf[:first] + bhr.urdf[last:], bhr.config_text)
+    robot = Robot(bhr.urdf[:first] + bhr.urdf[last:], bhr.config_text)
     if "bullet" in INSTALLED:
         with pytest.raises(JumplabError, match=r"PyBullet's robot weighs 42\.9990 kg, Pinocchio's 41\.9990 kg"):
             engine_class("bullet")(robot, pin.neutral(robot.model))
