@@ -92,7 +92,7 @@ class Tape(Shown):
         path = as_path(path, "a plan's file")
         try:
             raw = reading.content(path, "arrays", link=False)
-        except FileNotFoundError:
+        except (FileNotFoundError, IsADirectoryError):
             raise InputError(
                 f"{path}: no such plan; write one with 'jumplab plan --out {path.parent}'"
             ) from None
