@@ -39,7 +39,9 @@ MANY = settings(FEW, max_examples=40)
 SEEDS, FACTORS = st.integers(0, 99), st.floats(0.5, 2.0)
 HEIGHTS, FINITE = st.floats(0.1, 1.0), st.floats(-1e6, 1e6)
 ALONG_X = {"left/right posture", "left/right effort", "penetration", "foot clearance", "body clearance"}
-ALONG_X |= {"CoP in the sole", "CoP at the toe"}  # taken at the height of the surface below a foot
+COP = {"CoP in the sole", "CoP at the toe"}  # at the height of the surface below a foot, so along x as well ...
+ALONG_X |= COP
+FAR_M = 1e3  # ... unless the other surface begins out of reach
 
 
 @cache
@@ -132,6 +134,12 @@ def test_the_world_turned(seed, yaw):
     place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
     found = audit(placed(random_tape(seed), place), ROBOT)
     same(found, judged(seed), but=ALONG_X)
+    # one of both grounds alone, at the height of the start or of the end, whichever way is ahead
+    tapes = random_tape(seed), placed(random_tape(seed), place)
+    both = [[audit(x, ROBOT, edge_m=edge) for edge in (-FAR_M, FAR_M)] for x in tapes]
+    for name in COP:
+        one, other = (sorted(report[name].value for report in reports) for reports in both)
+        assert one == pytest.approx(other, rel=1e-6, abs=1e-8), name
 
 
 def mirror_image(x: Tape) -> Tape:

@@ -106,11 +106,9 @@ class _Arrays(NumpyUnpickler):
 
     def load_build(self) -> None:
         """As joblib's, but arrays of objects, whose content it would unpickle freely."""
-        state, made = self.stack[-1], self.stack[-2]
-        plain = isinstance(state, Mapping) or not isinstance(made, NumpyArrayWrapper)
-        if not plain or (
-            isinstance(state, Mapping) and getattr(state.get("dtype"), "hasobject", False)
-        ):
+        made, state = self.stack[-2:]
+        said = state if isinstance(state, Mapping) else {}
+        if isinstance(made, NumpyArrayWrapper) and getattr(said.get("dtype"), "hasobject", True):
             raise pickle.UnpicklingError("it holds an array of objects, which could run code")
         super().load_build()
 

@@ -88,8 +88,8 @@ class Start:
     name : of what it begins with.
     begin : what that is, in a program and for what is asked.
     held : whether the Hessian is the Gauss-Newton one, held; else the exact one.
-    patience : iterations after which it is given up, in whatever time: a busy machine finds the
-        same plan.
+    patience : iterations after which it is given up, so that a busy machine finds the same plan;
+        their processor time has a bound as well, see :meth:`.Program.solve`.
     options : of ipopt besides the usual ones.
     """
 
