@@ -169,7 +169,10 @@ def from_solved(program: Program, solved: Solved) -> Beginning:
 NEIGHBOUR = "neighbour"
 STANCE = "stance"
 MENDED = "given motion, feet in place"
-STRAIGHT = Start("straight ahead", from_schedule, True, 80, {"acceptable_iter": 1})
+# first multipliers by how far each limit is: where all begin alike, the barrier wanders for up to
+# thirty steps
+QUICK = {"acceptable_iter": 1, "bound_mult_init_method": "mu-based"}
+STRAIGHT = Start("straight ahead", from_schedule, True, 80, QUICK)
 COLD = (
     Start("schedule", from_schedule, True, 150),
     Start("schedule", from_schedule, False, 150),
