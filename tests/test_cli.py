@@ -6,7 +6,6 @@ import random
 import string
 import subprocess
 import sys
-import time
 import types
 from pathlib import Path
 
@@ -125,10 +124,8 @@ def test_seeded_random_bad_inputs(capsys, here):
             8: [rng.choice(["plan", "run", "simulate", "audit", "trials"]), f"--{junk}", "x"],
             9: [f"{junk}!"],
         }[rng.randrange(10)]
-        began = time.monotonic()
-        code, out, err = run(capsys, *argv)
-        one_sentence(code, out, err)
-        assert names(here) == [] and time.monotonic() - began < 10.0, argv
+        one_sentence(*run(capsys, *argv))
+        assert names(here) == [], argv
 
 
 # ------------------------------------------------------------------------------------------ commands that go through
