@@ -176,12 +176,8 @@ def chain(args: Namespace) -> None:
         raise InfeasibleError(f"the chain failed: {result.reason}; see chain.json in {args.out!r}")
 
 
-CHAIN_COLUMNS = {"jump": "jump"} | {
-    f"{name}_m": f"{name} [m]" for name in ("asked", "planned", "travel", "error")
-}
-CHAIN_COLUMNS |= {"heading_error_rad": "heading error [rad]"} | {
-    f"{name}_s": f"{name} [s]" for name in ("air", "solve", "ready", "needed")
-}
+CHAIN_COLUMNS = ("jump", "asked_m", "planned_m", "travel_m", "error_m", "heading_error_rad")
+CHAIN_COLUMNS += ("air_s", "solve_s", "ready_s", "needed_s")
 SERIES_COLUMNS = {
     "runs": "robots",
     "stood": "stand to the end",

@@ -256,8 +256,7 @@ def read_clips(
         where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
         try:
             raw = reader(x)
-            raw = replace(raw, fps=_rate(x) if raw.fps is None else raw.fps)
-            raw = replace(raw, names=raw.names or _names(x))
+            raw = replace(raw, fps=_rate(x), names=raw.names or _names(x))
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         found.append(_clip(where, name, raw, robot, fps, order))
