@@ -67,13 +67,16 @@ def robot_name(rng, folder):
 
 def plan_options(rng, folder):
     task, bad = JumpTask(1.0, 0.5), rng.choice(SILLY)
-    return rng.choice([
+    quick = [
         lambda: Planner(ROBOT).plan(task, bad),
         lambda: Planner(ROBOT).plan(bad),
         lambda: Planner(bad).plan(task),
         lambda: Planner("bhr" if bad is None else bad),
         lambda: map_to_joints(bad, ROBOT),
         lambda: map_to_joints(pendulum(0.3, 0.2), ROBOT, step_s=bad),
+    ]
+    return rng.choice([
+        *6 * quick,
         lambda: planner().plan(JumpTask(rng.choice([-1, 1]) * rng.uniform(2.8, 3.0), rng.uniform(0.02, 0.1))),
         lambda: planner().plan(JumpTask(0.5, rng.uniform(1.2, 1.5)), rng.choice(METHODS)),
     ])  # fmt: skip
