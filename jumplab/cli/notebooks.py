@@ -8,7 +8,6 @@ notebook that failed in ``OUT/failed``.
 """
 
 import itertools
-import math
 import os
 import re
 import shutil
@@ -28,6 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from jumplab import errors, reading, sim
+from jumplab.arguments import fitting
 from jumplab.cli.common import robots, store
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
@@ -74,19 +74,12 @@ def check_value(name: str, value: Any, kind: type | range | None) -> None:
     """
     if kind is None:
         return
-    type_ = int if isinstance(kind, range) else kind
-    wanted = int | float if type_ is float else type_
-    if not isinstance(value, wanted) or (isinstance(value, bool) and type_ is not bool):
-        must = f"be of type {type_.__name__}, got {quoted(value)}"
-    elif isinstance(kind, range) and value not in kind:
-        must = f"be {kind.start} ... {kind.stop - 1}, got {value}"
-    elif type_ is float and not math.isfinite(value):
-        must = f"be finite, got {value}"
-    elif type_ is str and (not value or "\0" in value):
-        must = f"be a name or a path, got {quoted(value)}"
-    else:
-        return
-    raise InputError(f"parameter {name} must {must}")
+    fitting(value, int if isinstance(kind, range) else kind, f"parameter {name}")
+    if isinstance(kind, range) and value not in kind:
+        words = f"{kind.start} ... {kind.stop - 1}, got {value}"
+        raise InputError(f"parameter {name} must be {words}")
+    if kind is str and (not value or "\0" in value):
+        raise InputError(f"parameter {name} must be a name or a path, got {quoted(value)}")
 
 
 def declared_parameters(notebook: Path) -> Kinds:
