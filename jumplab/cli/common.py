@@ -235,8 +235,10 @@ def judge(audit: Any, folder: str) -> None:
     count = len(audit.checks)
     failed = [check.name for check in audit.checks if not check.passed]
     if failed:
-        words = f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)})"
-        raise InfeasibleError(f"{words}; see passport.json in {folder!r}")
+        raise InfeasibleError(
+            f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)}); "
+            f"see passport.json in {folder!r}"
+        )
     print(f"audit: all {count} checks passed")
 
 

@@ -58,8 +58,10 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
         if injected.startswith("# Parameters\n"):  # papermill's own cell
             for name in re.findall(r"^(\w+) = ", injected, re.M):
                 if name not in known:
-                    words = f"unknown notebook parameter {name!r}; this notebook knows "
-                    raise InputError(words + ", ".join(known))
+                    raise InputError(
+                        f"unknown notebook parameter {name!r}; this notebook knows "
+                        f"{', '.join(known)}"
+                    )
         for name, kind in known.items():
             check_value(name, namespace[name], kind)
     if "engine" in namespace:
@@ -76,8 +78,7 @@ def check_value(name: str, value: Any, kind: type | range | None) -> None:
         return
     fitting(value, int if isinstance(kind, range) else kind, f"parameter {name}")
     if isinstance(kind, range) and value not in kind:
-        words = f"{kind.start} ... {kind.stop - 1}, got {value}"
-        raise InputError(f"parameter {name} must be {words}")
+        raise InputError(f"parameter {name} must be {kind.start} ... {kind.stop - 1}, got {value}")
     if kind is str and (not value or "\0" in value):
         raise InputError(f"parameter {name} must be a name or a path, got {quoted(value)}")
 
@@ -226,11 +227,13 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
     known = sorted(set().union(*declared))
     for name, value in values.items():
         if name in ("out", "figures"):
-            words = f"the parameter {name!r} is set by the runner; use its own argument {name}"
-            raise InputError(words)
+            raise InputError(
+                f"the parameter {name!r} is set by the runner; use its own argument {name}"
+            )
         if name not in known:
-            words = f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
-            raise InputError(words)
+            raise InputError(
+                f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
+            )
         for kinds in declared:
             check_value(name, value, kinds.get(name))
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
@@ -269,8 +272,9 @@ def _execute(
             place = shutil.copy(executed, failed)
             raise _explained(notebook.name, e, place) from e
         except DeadKernelError as e:
-            words = f"notebook {notebook.name}: its Python process died; is there enough memory?"
-            raise JumplabError(words) from e
+            raise JumplabError(
+                f"notebook {notebook.name}: its Python process died; is there enough memory?"
+            ) from e
 
 
 def _side_by_side(tasks: Sequence[Callable[[], None]], jobs: int, groups: Sequence[int]) -> None:

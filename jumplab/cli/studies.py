@@ -106,8 +106,10 @@ def certify(args: Namespace) -> None:
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
     for engine, trial in certificate.usual.items():
         print(f"usual contact, {engine}: {trial.reason}")
-    earlier = f"{certificate.resumed} simulations from an earlier run"
-    print(f"certificate.json and certificate.html in {args.dir}, {earlier}")
+    print(
+        f"certificate.json and certificate.html in {args.dir}, {certificate.resumed} simulations "
+        f"from an earlier run"
+    )
     if failures := certificate.failures:
         more = f"; and {len(failures) - 1} more" if len(failures) > 1 else ""
         raise InfeasibleError(
