@@ -17,7 +17,7 @@ from jumplab.robot_import.urdf import have_published
 from jumplab.studies import advice
 from jumplab.task import JumpTask
 
-REFUSALS = int(os.environ.get("JUMPLAB_REFUSALS", "4"))
+REFUSALS = int(os.environ.get("JUMPLAB_REFUSALS", "2"))
 ASKED = re.compile(r"; ask for (.+), which has a plan$")
 
 

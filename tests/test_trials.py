@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,12 +29,27 @@ from jumplab.studies.trials import PlanOnFile, Trial, TrialKey, TrialSettings, r
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture
-def folder(bhr, tmp_path):
+def planned(place):
     """A small real plan on file."""
     plan = jump(0.6, 0.3, method="direct")
-    store.write_plan(tmp_path / "plan", plan.tape, bhr, plan.summary)
-    return tmp_path / "plan"
+    store.write_plan(place / "plan", plan.tape, plan.robot, plan.summary)
+    return place / "plan"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return planned(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory):
+    """One trial for real: its folder, its report, and the simulation that it was."""
+    folder, runs = planned(tmp_path_factory.mktemp("real")), []
+    simulate = monte_carlo.simulate_jump
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(monte_carlo, "simulate_jump", lambda *a, **k: runs.append(simulate(*a, **k)) or runs[-1])
+        report = run_trials(folder, 1, 3, TrialSettings("pd"), jobs=1)
+    return folder, report, runs[0]
 
 
 def play(plan, settings, key):
@@ -57,12 +74,13 @@ def content(folder):
 # ------------------------------------------------------------------------------------------ one trial
 
 
-def test_a_trial_is_the_simulation_it_says(folder, bhr):
-    plan, settings = PlanOnFile.read(folder), TrialSettings("pd", True, SensorNoise.typical())
-    key, robot = TrialKey(3, 5, settings.hash, plan.hash), plan.robot
-    trial = monte_carlo.run_trial(plan, settings, key)
-    drawn = Perturbation.draw(robot, key.robot_seed, settings.ranges, settings.noise)
-    assert trial.perturbation == drawn.to_json()
+def test_a_trial_is_the_simulation_it_says(real):
+    folder, report, run = real
+    plan, settings, (trial,) = PlanOnFile.read(folder), report.settings, report.trials
+    key, robot = TrialKey(3, 0, settings.hash, plan.hash), plan.robot
+    drawn = Perturbation.draw(robot, key.robot_seed, Ranges(), SensorNoise.typical())
+    assert trial.key == key
+    assert trial.perturbation == json.loads(json.dumps(drawn.to_json())) and trial.metrics == run.metrics
     assert trial.metrics.landed == trial.landed and trial.metrics.com_rise_m == pytest.approx(0.3, abs=0.05)
     kept = json.dumps(trial.to_json())
     assert json.dumps(Trial.from_json(json.loads(kept)).to_json()) == kept
@@ -92,12 +110,10 @@ def test_a_lost_robot_is_a_failure(folder, monkeypatch):
     assert store.read_json(folder / "trials.json")["landed_metrics"]["com_rise_m"] is None
 
 
-def test_a_run_that_fails_a_check_is_a_failure(folder, monkeypatch):
+def test_a_run_that_fails_a_check_is_a_failure(folder, real, monkeypatch):
     """However well it stands; the log says which check it failed."""
-    checks, real = (Finding("extra force", 20.0, 15.0, "N", "a carried base"),), monte_carlo.simulate_jump
-    monkeypatch.setattr(
-        monte_carlo, "simulate_jump", lambda *args, **options: replace(real(*args, **options), checks=checks)
-    )
+    doubtful = replace(real[2], checks=(Finding("extra force", 20.0, 15.0, "N", "a carried base"),))
+    monkeypatch.setattr(monte_carlo, "simulate_jump", lambda *args, **options: doubtful)
     trial = run_trials(folder, 1, jobs=1).trials[0]
     assert trial.metrics.landed and not trial.landed
     doubt = "extra force: 20 N (at most 15; a carried base)"
@@ -275,9 +291,19 @@ def test_failures_are_counted_by_their_first_sign(folder, monkeypatch):
 
 def test_falls_are_kept_whole(folder, monkeypatch):
     """The very run of the trial, in a folder that everything else can read, on the ground that it had."""
-    settings = TrialSettings(ranges=Ranges.none(shove_launch_n_s=(25, 25), ground_m=0.02))
+    settings, runs, simulate = TrialSettings(ranges=Ranges.none(shove_launch_n_s=(25, 25), ground_m=0.02)), [], None
+
+    def once(*given, **options):
+        """The same question is the same simulation."""
+        runs.append((options, runs[0][1] if runs else simulate(*given, **options)))
+        return runs[-1][1]
+
+    simulate = monte_carlo.simulate_jump
+    monkeypatch.setattr(monte_carlo, "simulate_jump", once)
     report = run_trials(folder, 1, 2, settings, jobs=1, keep_falls=1)
     (trial,) = report.trials
+    first, second = (options for options, _ in runs)
+    assert second == {name: value for name, value in first.items() if value is not None}
     assert not trial.landed and trial.signs and trial.reason == trial.metrics.reason
     own = folder / "falls" / "0"
     _, robot, summary = store.read_plan(own)
@@ -308,7 +334,8 @@ def test_margins_are_bisected_and_resumed(folder, monkeypatch, most, shares):
     assert [found["payload_kg", on].share for on in (False, True)] == list(shares)
     plain = found["payload_kg", False]
     assert plain.sizes == {"payload_kg": 5 * shares[0]} and plain.interval == wilson(plain.landed, plain.tried)
-    assert plain.probes[0][0] == 1.0 and plain.probes[0][2] == 2  # two of twenty that fall are too many
+    assert [share for share, *_ in plain.probes[:2]] == [1.0, 0.0]
+    assert plain.probes[0][2] == 2  # two of twenty that fall are too many
     assert found["payload_kg+friction", True].sizes["friction"] == pytest.approx(0.8 - 0.5 * shares[1])
     again, count = margins.margins(folder, ("payload_kg", "payload_kg+friction"), 20, steps=4, jobs=1), len(tried)
     assert again.margins == report.margins and len(tried) == count
@@ -362,36 +389,51 @@ def test_margins_of_what_is_not_there(folder):
 # ------------------------------------------------------------------------------------------ the real thing
 
 
-def whole_lines(folder):
-    """Lines of the log, in any order, without what the kill has torn."""
-    with PlanOnFile.read(folder).study() as study:
-        return {json.dumps(trial.to_json()) for trial in study.done.values()}
+LANDED = """
+import sys, time
+from jumplab.cli.main import main
+from jumplab.studies import trials
+def fall(plan, settings, key):
+    time.sleep(0.2)
+    return trials.Trial(key, {}, {}, False, f"{key.robot_seed}", None)
+trials.run_trial = fall
+sys.exit(main())
+"""
+
+
+def start(code, *argv):
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # background jobs ignore Ctrl-C
+    how = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=heed)
+    return subprocess.Popen([sys.executable, *code, *argv], env=os.environ | {"PYTHONPATH": str(ROOT)}, **how)
 
 
 @pytest.mark.slow
 def test_killed_in_parallel_and_resumed_equals_serial(folder, tmp_path):
-    """Ctrl-C, then a kill, of real runs on two workers; what remains is what one process finds undisturbed."""
-    serial = run_trials(folder, 4, jobs=1)
-    other = tmp_path / "other"
-    other.mkdir()
-    for name in (*store.HASHED, store.SUMMARY):
-        (other / name).write_bytes((folder / name).read_bytes())
-    command = [sys.executable, "-m", "jumplab", "trials", str(other), "--n", "4", "--jobs", "2"]
-    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # background jobs ignore Ctrl-C
-    for number, lines in ((signal.SIGINT, 1), (signal.SIGKILL, 2)):
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-                                   env=os.environ | {"PYTHONPATH": str(ROOT)}, preexec_fn=heed)  # fmt: skip
-        deadline = time.monotonic() + 900  # a process that hangs, not one that is slow on a busy machine
+    """Ctrl-C, then a kill, of two workers; what remains is what one process finds undisturbed."""
+    other, n = tmp_path / "other", 12
+    shutil.copytree(folder, other)
+    assert start(["-c", LANDED], "trials", folder, "--n", str(n), "--jobs", "1").wait() == 0
+    for number, lines in ((signal.SIGINT, 1), (signal.SIGKILL, 3)):
+        process = start(["-c", LANDED], "trials", other, "--n", str(n), "--jobs", "2")
         log = other / "trials.jsonl"
         while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= lines):
-            assert time.monotonic() < deadline
             time.sleep(0.02)
         process.send_signal(number)
         said = process.communicate(timeout=60)[1]
         if number == signal.SIGINT and process.returncode:
             assert process.returncode == 130
             assert said == "jumplab: interrupted; finished trials are kept, and the same command goes on from there\n"
-    last = run_trials(other, 4, jobs=2)
-    assert last.resumed >= 1
-    assert last.trials == serial.trials and content(other) == content(folder)
-    assert whole_lines(other) == whole_lines(folder)
+    process = start(["-c", LANDED], "trials", other, "--n", str(n), "--jobs", "2")
+    told = process.communicate()[0]
+    assert 1 <= int(re.search(r"(\d+) trials from an earlier run", told)[1]) and content(other) == content(folder)
+    with PlanOnFile.read(other).study() as study, PlanOnFile.read(folder).study() as serial:
+        assert study.done == serial.done
+
+
+@pytest.mark.slow
+def test_a_trial_of_another_process_is_the_same(folder, real):
+    process = start(["-m", "jumplab"], "trials", folder, "--n", "1", "--seed", "3", "--mode", "pd", "--jobs", "1")
+    assert process.wait() == 0
+    assert store.read_json(folder / "trials.json") == store.read_json(real[0] / "trials.json")
+    with PlanOnFile.read(folder).study() as study:
+        assert tuple(study.done.values()) == real[1].trials

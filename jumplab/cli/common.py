@@ -3,6 +3,7 @@ printed of a result.
 """
 
 import argparse
+import inspect
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -87,17 +88,14 @@ def values_of(option: str, text: str) -> list[float]:
     return [round(first + (last - first) * k / max(count - 1, 1), 9) for k in range(count)]
 
 
-def number_or_never(option: str, text: str) -> float | None:
-    """The number that an option was given, or None for "never"."""
-    return None if text == "never" else number(option, text)
-
-
 VALUES = "FROM:TO:COUNT or A,B,..."
 KINDS = {
     "number": number,
-    "number or never": number_or_never,
+    "number or never": lambda option, text: None if text == "never" else number(option, text),
+    "degrees": lambda option, text: math.radians(number(option, text)),
     "whole": whole,
     "values": values_of,
+    "values in degrees": lambda option, text: [math.radians(x) for x in values_of(option, text)],
     "folder": needing("name a folder", str.strip),
     "file": needing(
         "name a file in a folder that exists",
@@ -171,7 +169,7 @@ def add_option(
             {"least": settings.pop("from"), "most": settings.pop("to")} if kind == "whole" else {}
         )
         settings["type"] = partial(KINDS[kind], (names or [placeholder])[-1], **ends)
-    if kind == "values":
+    if kind and kind.startswith("values"):
         settings["help"] += f": {VALUES}" + (f" (default {default})" if default else "")
     parser.add_argument(*(names or [placeholder.lower()]), default=default, **settings)
 
@@ -209,9 +207,14 @@ def without(args: argparse.Namespace, why: str, **options: Any) -> None:
             raise InputError(f"--{name.replace('_', '-')} {why}; leave it away")
 
 
-def shared(args: argparse.Namespace) -> dict[str, Any]:
-    """Processes, and whether bars are shown: on a terminal, and not with --quiet."""
-    return {"jobs": args.jobs, "progress": False if "quiet" in args else None}
+def given(function: Callable, args: argparse.Namespace, **more: Any) -> dict[str, Any]:
+    """Arguments of a ``function``: ``more``, and the options that are called as its parameters.
+
+    Its bars are shown on a terminal, and not with --quiet.
+    """
+    options = vars(args) | {"progress": False if "quiet" in args else None}
+    names = inspect.signature(function).parameters
+    return {name: options[name] for name in names if name in options} | more
 
 
 @contextmanager
@@ -232,8 +235,10 @@ def judge(audit: Any, folder: str) -> None:
     count = len(audit.checks)
     failed = [check.name for check in audit.checks if not check.passed]
     if failed:
-        words = f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)})"
-        raise InfeasibleError(f"{words}; see passport.json in {folder!r}")
+        raise InfeasibleError(
+            f"the plan fails {len(failed)} of {count} checks of its audit ({', '.join(failed)}); "
+            f"see passport.json in {folder!r}"
+        )
     print(f"audit: all {count} checks passed")
 
 

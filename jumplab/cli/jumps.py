@@ -2,7 +2,6 @@
 
 import ast
 import json
-import math
 import time
 from argparse import Namespace
 from pathlib import Path
@@ -13,6 +12,7 @@ from jumplab.cli import notebooks
 from jumplab.cli.common import (
     Late,
     disturbances,
+    given,
     judge,
     pages,
     print_simulation,
@@ -47,14 +47,9 @@ def run(args: Namespace) -> None:
             values[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             values[name] = text
-    report = notebooks.run_notebooks(
-        values,
-        notebooks=notebooks.find_notebooks(args.notebook),
-        out=args.out,
-        figures=args.figures,
-        progress="quiet" not in args,
-        jobs=args.jobs,
-    )
+    options = given(notebooks.run_notebooks, args, progress="quiet" not in args)
+    chosen = notebooks.find_notebooks(args.notebook)
+    report = notebooks.run_notebooks(values, notebooks=chosen, **options)
     args.found |= vars(report)
     if (report.out / "plan.npz").is_file():
         args.found["plan"] = store.read_plan(report.out)[2]
@@ -71,8 +66,7 @@ def run(args: Namespace) -> None:
 def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
     start = time.perf_counter()
-    turns = {"rotation_rad": math.radians(args.rotation_deg), "yaw_rad": math.radians(args.yaw_deg)}
-    task = JumpTask(args.distance_m, args.height_m, args.platform_m, side_m=args.side_m, **turns)
+    task = JumpTask(**given(JumpTask, args))
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
@@ -81,14 +75,8 @@ def plan(args: Namespace) -> None:
         ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     else:
         without(args, "says what --robust allows for, which is not given", disturb=[])
-    plan = api.plan(
-        task,
-        robot,
-        method=args.method,
-        robust=ranges,
-        atlas=atlas,
-        patience_s=args.patience,
-    )
+    options = given(api.plan, args, task=task, robot=robot, robust=ranges)
+    plan = api.plan(**options, atlas=atlas)
     parts = (plan.tape, plan.robot, plan.summary)
     report = store.write_plan(args.out, *parts, complete=auditing.write_audit)
     args.found |= {"out": args.out, "plan": plan.summary, "audit": _audited(report)}
@@ -119,19 +107,16 @@ def simulate(args: Namespace) -> None:
         if len(size) == 1 and sim.is_pair(name):
             sizes[name] = size * 2
     ranges = sim.ranges_of(sizes)
+    drawn = None
     if not sizes:
         without(args, "says where --disturb acts, which is not given", seed=None)
     tape, robot, summary = store.read_plan(args.dir)
     store.ensure_writable(args.dir)
-    result = sim.simulate_jump(
-        tape,
-        robot,
-        mode=args.mode,
-        scene=sim.Scene.of_plan(summary, robot),
-        engine=args.engine,
-        contact=args.contact,
-        perturbation=sim.Perturbation.draw(robot, args.seed or 0, ranges) if sizes else None,
-    )
+    if sizes:
+        drawn = sim.Perturbation.draw(robot, args.seed or 0, ranges)
+    scene = sim.Scene.of_plan(summary, robot)
+    options = given(sim.simulate_jump, args, scene=scene, perturbation=drawn)
+    result = sim.simulate_jump(tape, robot, **options)
     store.write_simulation(args.dir, result, summary)
     metrics = result.to_json()
     args.found |= metrics

@@ -1,6 +1,8 @@
 """The commands about motion clips: judge, mend."""
 
+import json
 from argparse import Namespace
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -23,26 +25,18 @@ def judge(args: Namespace) -> None:
     reports = found if isinstance(found, list) else [found]
     passed = sum(report.passed for report in reports)
     rows = [report.row() for report in reports]
-    causes = {c.name: 0 for c in reports[0].checks}
-    for report in reports:
-        for check in report.failed:
-            causes[check.name] += 1
+    failed = Counter(check.name for report in reports for check in report.failed)
+    causes = {check.name: failed[check.name] for check in reports[0].checks}
     args.found |= {"clips": rows, "physical": passed, "causes": causes}
-    args.found["reports"] = [store.json.loads(report.to_json()) for report in reports]
+    args.found["reports"] = [json.loads(report.to_json()) for report in reports]
     if args.out:
         _write(Path(store.ensure_writable(args.out)), reports, args.found)
     if len(reports) > 1:
-        print(
-            tables.table(
-                [{**row, "failed": len(r.failed)} for row, r in zip(rows, reports, strict=True)],
-                digits=3,
-            )
-        )
+        counts = [row | {"failed": len(r.failed)} for row, r in zip(rows, reports, strict=True)]
+        print(tables.table(counts, digits=3))
         listed = ", ".join(f"{name} {n}" for name, n in causes.items() if n)
-        print(
-            f"physical: {passed} of {len(reports)} clips"
-            + (f"; not for: {listed}" if listed else "")
-        )
+        reasons = f"; not for: {listed}" if listed else ""
+        print(f"physical: {passed} of {len(reports)} clips{reasons}")
         return
     (report,) = reports
     print(report.clip.line())

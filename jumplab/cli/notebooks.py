@@ -8,7 +8,6 @@ notebook that failed in ``OUT/failed``.
 """
 
 import itertools
-import math
 import os
 import re
 import shutil
@@ -28,6 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from jumplab import errors, reading, sim
+from jumplab.arguments import fitting
 from jumplab.cli.common import robots, store
 from jumplab.errors import InputError, JumplabError, as_path, quoted, require_type
 from jumplab.task import JumpTask
@@ -58,8 +58,10 @@ def check_parameters(namespace: Mapping[str, Any]) -> None:
         if injected.startswith("# Parameters\n"):  # papermill's own cell
             for name in re.findall(r"^(\w+) = ", injected, re.M):
                 if name not in known:
-                    words = f"unknown notebook parameter {name!r}; this notebook knows "
-                    raise InputError(words + ", ".join(known))
+                    raise InputError(
+                        f"unknown notebook parameter {name!r}; this notebook knows "
+                        f"{', '.join(known)}"
+                    )
         for name, kind in known.items():
             check_value(name, namespace[name], kind)
     if "engine" in namespace:
@@ -74,19 +76,11 @@ def check_value(name: str, value: Any, kind: type | range | None) -> None:
     """
     if kind is None:
         return
-    type_ = int if isinstance(kind, range) else kind
-    wanted = int | float if type_ is float else type_
-    if not isinstance(value, wanted) or (isinstance(value, bool) and type_ is not bool):
-        must = f"be of type {type_.__name__}, got {quoted(value)}"
-    elif isinstance(kind, range) and value not in kind:
-        must = f"be {kind.start} ... {kind.stop - 1}, got {value}"
-    elif type_ is float and not math.isfinite(value):
-        must = f"be finite, got {value}"
-    elif type_ is str and (not value or "\0" in value):
-        must = f"be a name or a path, got {quoted(value)}"
-    else:
-        return
-    raise InputError(f"parameter {name} must {must}")
+    fitting(value, int if isinstance(kind, range) else kind, f"parameter {name}")
+    if isinstance(kind, range) and value not in kind:
+        raise InputError(f"parameter {name} must be {kind.start} ... {kind.stop - 1}, got {value}")
+    if kind is str and (not value or "\0" in value):
+        raise InputError(f"parameter {name} must be a name or a path, got {quoted(value)}")
 
 
 def declared_parameters(notebook: Path) -> Kinds:
@@ -233,11 +227,13 @@ def _checked(values: dict[str, Any], declared: Iterable[Kinds]) -> dict[str, Any
     known = sorted(set().union(*declared))
     for name, value in values.items():
         if name in ("out", "figures"):
-            words = f"the parameter {name!r} is set by the runner; use its own argument {name}"
-            raise InputError(words)
+            raise InputError(
+                f"the parameter {name!r} is set by the runner; use its own argument {name}"
+            )
         if name not in known:
-            words = f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
-            raise InputError(words)
+            raise InputError(
+                f"unknown notebook parameter {name!r}; the notebooks know {', '.join(known)}"
+            )
         for kinds in declared:
             check_value(name, value, kinds.get(name))
     JumpTask(values.get("distance_m", 0.0), values.get("height_m", 0.5))
@@ -276,8 +272,9 @@ def _execute(
             place = shutil.copy(executed, failed)
             raise _explained(notebook.name, e, place) from e
         except DeadKernelError as e:
-            words = f"notebook {notebook.name}: its Python process died; is there enough memory?"
-            raise JumplabError(words) from e
+            raise JumplabError(
+                f"notebook {notebook.name}: its Python process died; is there enough memory?"
+            ) from e
 
 
 def _side_by_side(tasks: Sequence[Callable[[], None]], jobs: int, groups: Sequence[int]) -> None:

@@ -22,8 +22,9 @@ def list_(args: Namespace) -> None:
         row = {"name": name, "kg": None, "joints": None, "arms": "", "note": ""}
         try:
             if urdfs.DESCRIPTIONS in file.read_text(encoding="utf-8"):  # a list downloads nothing
-                needs = "is downloaded when it is first loaded, with jumplab[descriptions]"
-                raise RobotError(f"{name}: {needs}")
+                raise RobotError(
+                    f"{name}: is downloaded when it is first loaded, with jumplab[descriptions]"
+                )
             robot = robots.Robot.load(name)
             row |= {"kg": robot.total_mass, "joints": len(robot.joint_names)}
             row["arms"] = "swing" if robot.joints["shoulder_pitch"] else "held"
@@ -38,8 +39,9 @@ def check(args: Namespace) -> None:
     """Find hips, knees, ankles, shoulders and soles of a URDF, and judge it."""
     urdf = args.urdf
     if (urdf is None) == (args.robot_description is None):
-        words = "name a URDF, or a robot by --robot-description; one of the two"
-        raise InputError(f"jumplab robot check: {words}")
+        raise InputError(
+            "jumplab robot check: name a URDF, or a robot by --robot-description; one of the two"
+        )
     if urdf is None:
         urdf = str(urdfs.described(args.robot_description))
         print(f"robot description: {urdf}")
@@ -48,14 +50,17 @@ def check(args: Namespace) -> None:
             raise InputError(f"--repair knows {', '.join(jumper.REPAIRS)}, got {word!r}")
     shipped = files.SHIPPED.get(urdf)
     if args.repair and (args.config is not None or shipped):
-        words = "a configuration says itself what is repaired, so leave it away"
-        raise InputError(f"--repair is for a bare URDF; {words}")
+        raise InputError(
+            "--repair is for a bare URDF; a configuration says itself what is repaired, so leave "
+            "it away"
+        )
     if args.config is not None:
         try:
             text = files.toml_text(Path(args.config).read_bytes(), f"--config {args.config}")
         except (OSError, ValueError) as e:
-            words = f"cannot be read as text ({type(e).__name__})"
-            raise InputError(f"--config {args.config}: {words}") from e
+            raise InputError(
+                f"--config {args.config}: cannot be read as text ({type(e).__name__})"
+            ) from e
         result = checkup.check(urdf, text)
     elif not shipped:
         whole = urdfs.read_urdf(urdf)
@@ -64,8 +69,10 @@ def check(args: Namespace) -> None:
     elif "[source]" in shipped.read_text(encoding="utf-8"):
         result = checkup.examine(urdf)
     else:
-        words = "is the default robot, described as jumplab wants it; there is nothing to check"
-        raise InputError(f"{urdf!r} {words}")
+        raise InputError(
+            f"{urdf!r} is the default robot, described as jumplab wants it; there is nothing to "
+            f"check"
+        )
     robot = result.robot
     args.found |= {"robot": robot.name, "notes": result.lines(), "roles": result.rows()}
     print(*result.lines(), sep="\n")
@@ -79,8 +86,10 @@ def check(args: Namespace) -> None:
 
 def robot(args: Namespace) -> None:
     """The robots that are there, and whether a URDF can jump."""
-    words = "choose an action: check or list; 'jumplab robot --help' shows what is possible"
-    raise InputError(f"jumplab robot: {words}")
+    raise InputError(
+        "jumplab robot: choose an action: check or list; 'jumplab robot --help' shows what is "
+        "possible"
+    )
 
 
 def _draft(urdf: str, text: str, repair: tuple[str, ...], out: str | None, force: bool) -> str:
@@ -113,8 +122,9 @@ def _write(folder: Path, text: str, force: bool) -> Path:
     """Write a starter configuration, but not over one that somebody has edited; its path."""
     path = folder / f"{files.read_toml(text, 'starter')['name']}.toml"
     if path.exists() and not force and path.read_bytes() != _marked(path.read_bytes()):
-        words = "has been edited; choose another --out, or overwrite it with --force"
-        raise InputError(f"{path}: {words}")
+        raise InputError(
+            f"{path}: has been edited; choose another --out, or overwrite it with --force"
+        )
     try:
         store.write_file(path, _marked(text.encode()))
     except InputError as e:

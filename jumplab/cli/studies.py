@@ -13,11 +13,11 @@ from jumplab import sim, studies
 from jumplab.cli.common import (
     Late,
     disturbances,
+    given,
     named,
     pages,
     resumable,
     robots,
-    shared,
     store,
     style,
     tables,
@@ -51,18 +51,13 @@ def trials(args: Namespace) -> None:
         )
     ranges = sim.ranges_of(disturbances("--disturb", args.disturb), sim.Ranges())
     noise = sim.SensorNoise.typical() if args.noise else sim.SensorNoise()
-    ways = dict(step=args.step, feedback=args.feedback, contact=args.contact)
-    settings = studies.trials.TrialSettings(
-        args.mode, args.reaim, noise, ranges, args.engine, **ways
-    )
+    settings = _settings(args, noise=noise, ranges=ranges)
+    work = paper("basin").landing_basin if args.basin else studies.trials.run_trials
+    options = given(work, args, settings=settings)
+    if not args.basin:  # 200: a success rate near 95 % is then known to 3 % on either side
+        options |= {"n": args.n or 200, "seed": args.seed or 0}
     with resumable():
-        if args.basin:
-            report = paper("basin").landing_basin(args.dir, args.n, settings, **shared(args))
-        else:  # 200: a success rate near 95 % is then known to 3 % on either side
-            options = shared(args) | {"keep_falls": args.keep_falls}
-            report = studies.trials.run_trials(
-                args.dir, args.n or 200, args.seed or 0, settings, **options
-            )
+        report = work(args.dir, **options)
     data = report.to_json()
     args.found |= data | {"resumed": report.resumed}
     for what, condition in report.conditions.items():
@@ -78,16 +73,17 @@ def trials(args: Namespace) -> None:
     print(f"{name}.json in {args.dir}, {report.resumed} trials from an earlier run")
 
 
+def _settings(args: Namespace, **more: Any) -> Any:
+    return studies.trials.TrialSettings(**given(studies.trials.TrialSettings, args, **more))
+
+
 def margins(args: Namespace) -> None:
     """How much of each disturbance a plan bears."""
-    ways = dict(step=args.step, feedback=args.feedback, contact=args.contact)
-    settings = studies.trials.TrialSettings(args.mode, engine=args.engine, **ways)
     names = args.disturb or (*studies.margins.SINGLE, *studies.margins.PAIRS)
-    options = shared(args) | {"steps": args.steps}
+    work = studies.margins.margins
+    options = given(work, args, names=names, seed=args.seed or 0, settings=_settings(args))
     with resumable():
-        report = studies.margins.margins(
-            args.dir, names, args.n, args.seed or 0, settings, **options
-        )
+        report = work(args.dir, **options)
     args.found |= report.to_json()
     print(tables.table([margin.row() for margin in report.margins], digits=3))
     print(f"{report.line()}; margins.json in {args.dir}")
@@ -99,10 +95,9 @@ def certify(args: Namespace) -> None:
     def page(certificate: Any) -> str:
         return certificate_pages.certificate_page(certificate).html
 
+    options = given(studies.certify.certify, args, seed=args.seed or 0, page=page)
     with resumable():
-        certificate = studies.certify.certify(
-            args.dir, args.n, args.seed or 0, page=page, **shared(args)
-        )
+        certificate = studies.certify.certify(args.dir, **options)
     args.found |= certificate.to_json()
     for mode in certificate.modes:
         print(f"{mode.mode} mode")
@@ -111,8 +106,10 @@ def certify(args: Namespace) -> None:
         print(f"perturbed robots: {landed} of {len(mode.pairs)} land, {mode.same} fare alike")
     for engine, trial in certificate.usual.items():
         print(f"usual contact, {engine}: {trial.reason}")
-    earlier = f"{certificate.resumed} simulations from an earlier run"
-    print(f"certificate.json and certificate.html in {args.dir}, {earlier}")
+    print(
+        f"certificate.json and certificate.html in {args.dir}, {certificate.resumed} simulations "
+        f"from an earlier run"
+    )
     if failures := certificate.failures:
         more = f"; and {len(failures) - 1} more" if len(failures) > 1 else ""
         raise InfeasibleError(
@@ -127,9 +124,9 @@ def certify(args: Namespace) -> None:
 def clips(args: Namespace) -> None:
     """Thirty jumps to all sides, planned, audited, landed alike in both engines, as clips."""
     robot = robots.Robot.load(args.robot)
-    options = dict(fps=args.fps, only=args.only, jobs=args.jobs, say=print)
+    options = given(studies.clips.make_clips, args, robot=robot, format_name=args.format, say=print)
     with resumable("clips"):
-        library = studies.clips.make_clips(robot, args.out, args.format, **options)
+        library = studies.clips.make_clips(**options)
     args.found |= {"out": args.out} | library
     passed = len(library["clips"])
     count = passed + len(library["left_out"])
@@ -149,12 +146,8 @@ def chain(args: Namespace) -> None:
                 "says how perturbed robots differ, and neither --seed nor --runs asks for one",
                 ranges=None,
             )
-    names = ("look_s", "revise_s", "landing", "solve_s", "method", "engine")
-    options = {name: getattr(args, name) for name in names}
-    turns = args.yaw_deg and [math.radians(x) for x in args.yaw_deg]
-    course = studies.chain.Course.of(
-        args.distance_m, args.height_m, args.platform_m, args.side_m, turns
-    )
+    axes = (args.distance_m, args.height_m, args.platform_m, args.side_m, args.yaw_rad)
+    course = studies.chain.Course.of(*axes)
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     ranges = studies.chain.RANGES[args.ranges or "slight"]
@@ -162,11 +155,12 @@ def chain(args: Namespace) -> None:
     drawn = None
     if args.seed is not None or args.runs > 1:
         drawn = sim.Perturbation.draw(robot, seed, ranges)
-    result = studies.chain.run_chain(course, robot, perturbation=drawn, **options)
+    options = given(studies.chain.run_chain, args, course=course, robot=robot)
+    result = studies.chain.run_chain(**options, perturbation=drawn)
     series = None
     if args.runs > 1:
-        options |= {"ranges": ranges, "jobs": args.jobs}
-        series = studies.chain.run_chains(course, robot, args.runs, seed, **options)
+        options |= {"n": args.runs, "seed": seed, "ranges": ranges, "jobs": args.jobs}
+        series = studies.chain.run_chains(**options)
     where = {"scene": result.scene, "marks_m": course.goals_m}
     page = pages.page(result.robot, simulation=result, title="A chain of jumps", **where)
     audits = studies.chain.write_chain(args.out, result, {"chain.html": page.html}, series=series)
@@ -184,12 +178,8 @@ def chain(args: Namespace) -> None:
         raise InfeasibleError(f"the chain failed: {result.reason}; see chain.json in {args.out!r}")
 
 
-CHAIN_COLUMNS = {"jump": "jump"} | {
-    f"{name}_m": f"{name} [m]" for name in ("asked", "planned", "travel", "error")
-}
-CHAIN_COLUMNS |= {"heading_error_rad": "heading error [rad]"} | {
-    f"{name}_s": f"{name} [s]" for name in ("air", "solve", "ready", "needed")
-}
+CHAIN_COLUMNS = ("jump", "asked_m", "planned_m", "travel_m", "error_m", "heading_error_rad")
+CHAIN_COLUMNS += ("air_s", "solve_s", "ready_s", "needed_s")
 SERIES_COLUMNS = {
     "runs": "robots",
     "stood": "stand to the end",
@@ -220,7 +210,7 @@ def _print_chain(result: Any, series: dict[str, Any] | None) -> None:
 
 def envelope(args: Namespace) -> None:
     """Map of the jumps that a robot can do."""
-    if args.side_m is not None and args.yaw_deg is not None:
+    if args.side_m is not None and args.yaw_rad is not None:
         raise InputError("--side-m and --yaw-deg are two maps; leave one of them away")
     if args.side_m is not None and len(args.height_m) != 1:
         raise InputError(
@@ -228,19 +218,20 @@ def envelope(args: Namespace) -> None:
         )
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    grid = args.distance_m, args.height_m
-    options: dict[str, Any] = {}
+    axes = "distance_m", "height_m"
+    fixed = None
     if args.side_m is not None:
-        grid = args.side_m, args.distance_m
-        options = {"axes": ("side_m", "distance_m"), "fixed": JumpTask(0.0, args.height_m[0])}
-    elif args.yaw_deg is not None:
-        grid = [math.radians(x) for x in args.yaw_deg], args.height_m
-        options = {"axes": ("yaw_rad", "height_m")}
-    if options:
+        axes = "side_m", "distance_m"
+        fixed = JumpTask(0.0, args.height_m[0])
+    elif args.yaw_rad is not None:
+        axes = "yaw_rad", "height_m"
+    across, up = (getattr(args, name) for name in axes)
+    if across is not args.distance_m:
         without(args, "holds jumps straight ahead", atlas=None)
-    options["atlas"] = args.atlas and studies.atlas.Atlas.load(args.atlas)
-    options |= shared(args)
-    envelope = studies.envelope.envelope(robot, *grid, folder=args.out, **options)
+    atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)
+    options = given(studies.envelope.envelope, args, robot=robot, folder=args.out, atlas=atlas)
+    options |= {"distances": across, "heights": up, "axes": axes, "fixed": fixed}
+    envelope = studies.envelope.envelope(**options)
     figure = pictures.envelope_map(envelope)
     args.found["map"] = asdict(envelope) | {"hash": robot.hash}
     store.settle()
@@ -261,10 +252,13 @@ def atlas(args: Namespace) -> None:
     """Plan a grid once: any target between its nodes is then a few steps away."""
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
-    axes = (args.distance_m, args.height_m)
+    axes = {"distances": args.distance_m, "heights": args.height_m}
+    build = studies.atlas.Atlas.build
+    options = given(build, args, robot=robot, folder=args.out, **axes)
     with resumable("nodes"):
-        built = studies.atlas.Atlas.build(robot, *axes, folder=args.out, **shared(args))
-    args.found |= {"out": args.out, "planned": len(built.nodes), "of": math.prod(map(len, axes))}
+        built = build(**options)
+    count = math.prod(map(len, axes.values()))
+    args.found |= {"out": args.out, "planned": len(built.nodes), "of": count}
     if not built.nodes:
         raise InfeasibleError(f"{robot.name} can do none of these jumps; see 'jumplab envelope'")
     print(f"{built} in {args.out}; 'jumplab plan --atlas {args.out}' begins with it")
@@ -294,9 +288,8 @@ def sweep(args: Namespace) -> None:
         args.robot or ["bhr"], choices_of("--vary must be WHAT", args.vary)
     )
     cases = studies.sweep.grid(*axes, robots=names, weights=weights, method=args.method)
-    options = shared(args) | {"cluster": args.cluster, "atlas": args.atlas, "tapes_hz": args.tapes}
     with resumable("cases"):
-        rows = studies.sweep.run(cases, args.out, **options)
+        rows = studies.sweep.run(cases, **given(studies.sweep.run, args))
     table = Path(args.out, studies.sweep.TABLE)
     args.found |= {"table": table, "rows": rows}
     planned, clean = (sum(row[key] for row in rows) for key in ("planned", "clean"))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jumplab import reading
 from jumplab.errors import InputError, Shown, as_path, quoted
+from jumplab.io.columns import BASE
 from jumplab.io.motion import Motion, steady
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
@@ -177,11 +178,9 @@ def _of_tracker(x: Mapping[str, Any]) -> _Raw:
 
 
 def _of_table(x: Mapping[str, Any]) -> _Raw:
-    base = [f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
     ending = "_position_rad"
     names = tuple(name.removesuffix(ending) for name in x if name.endswith(ending))
-    columns = [x[name] for name in (*base, *(name + ending for name in names))]
-    q = np.column_stack(columns)
+    q = np.column_stack([x[name] for name in (*BASE, *(name + ending for name in names))])
     return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], "a table of joints by name", names=names)
 
 
@@ -256,8 +255,7 @@ def read_clips(
         where = f"{path}" if name == path.stem else f"{path}, clip {name!r}"
         try:
             raw = reader(x)
-            raw = replace(raw, fps=_rate(x) if raw.fps is None else raw.fps)
-            raw = replace(raw, names=raw.names or _names(x))
+            raw = replace(raw, fps=_rate(x), names=raw.names or _names(x))
         except (KeyError, IndexError, TypeError, ValueError) as e:
             raise InputError(f"{where}: its arrays do not fit each other ({e})") from e
         found.append(_clip(where, name, raw, robot, fps, order))

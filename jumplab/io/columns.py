@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,22 @@ if TYPE_CHECKING:
 
 # short names of a robot's roles
 ROLES = {"hip": "hip_pitch", "ankle": "ankle_pitch", "shoulder": "shoulder_pitch"}
+
+
+# columns of tables: of the base, and of each joint, with their first column in a record
+BASE = tuple(f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"))
+OF_JOINTS = {"position_rad": ("q", 7), "velocity_rad_s": ("v", 6), "torque_N_m": ("tau", 0)}
+
+
+def table_of(record: Record, joints: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns (N,) of a record by name: position, velocity and torque of every joint, in the
+    record's order of ``joints``, then the base's place and quaternion.
+    """
+    table = {}
+    for kind, (name, first) in OF_JOINTS.items():
+        columns = getattr(record, name)[:, first:].T
+        table |= {f"{joint}_{kind}": x for joint, x in zip(joints, columns, strict=True)}
+    return table | dict(zip(BASE, record.q[:, :7].T, strict=True))
 
 
 class Columns(Mapping[str, np.ndarray]):
@@ -86,8 +102,7 @@ class Named:
         return Shown.pictures().Plots(self)
 
     def to_frame(self) -> Any:
-        """A ``pandas.DataFrame`` over time [s]: phase, base, then position, velocity and torque of
-        every joint.
+        """A ``pandas.DataFrame`` over time [s]: phase, and the columns of :func:`table_of`.
 
         Raises :class:`InputError` where pandas is not installed.
         """
@@ -96,13 +111,5 @@ class Named:
         except ImportError:
             raise InputError("a frame needs pandas: pip install pandas") from None
         x = self._record
-        base = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-        table = {f"base_{name}": x.q[:, k] for k, name in enumerate(base)}
-        kinds = {
-            "position_rad": self.angle,
-            "velocity_rad_s": self.speed,
-            "torque_N_m": self.torque,
-        }
-        for kind, columns in kinds.items():
-            table |= {f"{name}_{kind}": column for name, column in columns.items()}
-        return pandas.DataFrame({"phase": x.phase, **table}, index=pandas.Index(x.t, name="time_s"))
+        table = {"phase": x.phase} | table_of(x, list(self.angle))
+        return pandas.DataFrame(table, index=pandas.Index(x.t, name="time_s"))

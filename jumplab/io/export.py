@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jumplab.arguments import checked
 from jumplab.errors import InputError
+from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
 from jumplab.io.whole import ORDERS, Whole, ordered
@@ -88,14 +89,16 @@ def joint_table(whole: Whole, x: Motion, fps: float) -> str:
 
     One header line with units, one line per frame; take-off, which a tape holds twice, stands once.
     """
-    kinds = {"position_rad": x.q[:, 7:], "velocity_rad_s": x.v[:, 6:], "torque_N_m": x.tau}
-    head = ["time_s", "phase_0_launch_1_flight_2_landing", "contact_left", "contact_right"]
-    head += [f"{name}_{kind}" for kind in kinds for name in whole.joints]
-    codes = [PHASE_CODES[str(phase)] for phase in x.phase]
-    head += [f"base_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
-    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * (3 * len(whole.joints) + 7)]
-    table = np.column_stack([x.t, codes, x.contact, *kinds.values(), x.q[:, :7]])
-    return _rows(table, ",".join(head), digits)
+    left, right = x.contact.T
+    head = {
+        "time_s": x.t,
+        "phase_0_launch_1_flight_2_landing": [PHASE_CODES[str(phase)] for phase in x.phase],
+        "contact_left": left,
+        "contact_right": right,
+    }
+    rest = table_of(x, whole.joints)
+    digits = ["%.6f", *["%d"] * 3, *["%.9g"] * len(rest)]
+    return _rows(np.column_stack([*head.values(), *rest.values()]), ",".join(head | rest), digits)
 
 
 def bare_states(whole: Whole, x: Motion, fps: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from xml.etree import ElementTree
 
 import numpy as np
@@ -50,8 +51,13 @@ class Whole:
         for name in (*robot.joint_names, *held):
             if name not in self.joints:
                 raise RobotError(f"robot {robot.name}: [published] lacks the joint {name!r}")
-        ids = [self.model.getJointId(name) for name in self.joints]
-        self._order = np.array(self.model.idx_vs)[ids] - 6  # of Pinocchio's, where ours are
+        self._order = self._columns(self.joints)
+        self._jumping = self._columns(robot.joint_names)
+
+    def _columns(self, names: Iterable[str]) -> np.ndarray:
+        """Where joints are in Pinocchio's order, behind the base."""
+        columns = [self.model.idx_vs[self.model.getJointId(name)] - 6 for name in names]
+        return np.array(columns, int)
 
     def _frame(self, link: str) -> int:
         if not self.model.existFrame(link, pin.FrameType.BODY):
@@ -60,11 +66,13 @@ class Whole:
 
     def states(self, x: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Configurations (F, nq) and velocities (F, nv) of :meth:`frames` in Pinocchio's order."""
-        place = np.argsort(self._order)
-        return tuple(
-            np.hstack([values[:, :base], values[:, base:][:, place]])
-            for values, base in ((x.q, 7), (x.v, 6))
-        )
+        return self._in_order(x.q, 7), self._in_order(x.v, 6)
+
+    def _in_order(self, values: np.ndarray, base: int) -> np.ndarray:
+        """Rows (F, ``base`` + J) in Pinocchio's order, of such with joints depth-first."""
+        out = values.copy()
+        out[:, base + self._order] = values[:, base:]
+        return out
 
     def frames(self, motion: Motion, fps: float) -> Motion:
         """A motion at ``fps`` [1/s] and at its end, as one of the published robot from time 0 [s],
@@ -78,13 +86,11 @@ class Whole:
         x = motion.every(fps, end=True)
         model = self.model
         data = model.createData()
-        columns = self._order[[self.joints.index(name) for name in self.robot.joint_names]]
         q = np.tile(pin.neutral(model), (len(x.t), 1))
         v = np.zeros((len(x.t), model.nv))
-        for name, angle in self._held.items():
-            q[:, 7 + self._order[self.joints.index(name)]] = angle
-        q[:, 7 + columns] = x.q[:, 7:]
-        v[:, 6 + columns] = x.v[:, 6:]
+        q[:, 7 + self._columns(self._held)] = [*self._held.values()]
+        q[:, 7 + self._jumping] = x.q[:, 7:]
+        v[:, 6 + self._jumping] = x.v[:, 6:]
         for k, (qk, vk) in enumerate(zip(q, v, strict=True)):
             # the root's state is that which gives the trunk its own
             pin.forwardKinematics(model, data, qk, vk)
@@ -98,7 +104,7 @@ class Whole:
         self._check_places(q[0], x.q[0])
         change = np.gradient(v, x.t, axis=0) if len(x.t) > 1 else np.zeros_like(v)
         tau = np.array([pin.rnea(model, data, *row)[6:] for row in zip(q, v, change, strict=True)])
-        tau[:, columns] = x.tau
+        tau[:, self._jumping] = x.tau
         order = self._order
         q = np.hstack([q[:, :7], q[:, 7 + order]])
         v = np.hstack([v[:, :6], v[:, 6 + order]])
@@ -111,8 +117,7 @@ class Whole:
         off where they are held [rad].
         """
         data = self.model.createData()
-        own = [7 + self.joints.index(name) for name in self.robot.joint_names]
-        state = np.hstack([q[:, :7], q[:, 7:][:, np.argsort(self._order)]])
+        state = self._in_order(q, 7)
         places = []
         for row in state:
             pin.forwardKinematics(self.model, data, row)
@@ -123,7 +128,7 @@ class Whole:
             for k, name in enumerate(self.joints)
             if name not in self.robot.joint_names
         }
-        return np.hstack([places, q[:, own]]), moved
+        return np.hstack([places, state[:, 7 + self._jumping]]), moved
 
     def _check_places(self, q: np.ndarray, own: np.ndarray) -> None:
         """The joints of the two robots are in the same places, but for what was evened out."""

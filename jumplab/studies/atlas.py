@@ -122,20 +122,19 @@ class Atlas:
         planner = Planner(robot, **{"keep": True} | how)
         atlas = cls(robot.name, distances, heights, {}, key_of_plans(planner.stage("direct")))
         if folder is not None and (Path(folder) / FILE).exists():
-            known = cls.load(folder)
-            known._require_grid(atlas, Path(folder) / FILE)
-            return known
+            there = cls.load(folder)
+            there._require_grid(atlas, Path(folder) / FILE)
+            return there
 
         grid = [[JumpTask(distance, height) for distance in distances] for height in heights]
         options = {"jobs": jobs, "progress": progress}
         work = partial(node_row, planner)
-        rows = plan_rows(grid, work, ("node", atlas.key), "planned", folder, "atlas", **options)
-        for tasks, row in zip(grid, rows, strict=True):
-            for task, x in zip(tasks, row, strict=False):
-                if x["planned"]:
-                    place = task.distance_m, task.height_m
-                    used = x["cost"], x["limiting"], x["share"]
-                    atlas.nodes[place] = Node(*place, *used, np.array(x["x"]))
+        known = "node", atlas.key
+        for task, row in plan_rows(grid, work, known, "planned", folder, "atlas", **options):
+            if row and row["planned"]:
+                place = task.distance_m, task.height_m
+                used = row["cost"], row["limiting"], row["share"]
+                atlas.nodes[place] = Node(*place, *used, np.array(row["x"]))
         if folder is not None:
             atlas.save(folder)
         return atlas

@@ -95,11 +95,15 @@ class Difference:
         if self.apart is None:
             sentences.append(f"{q.name} was not measured in every engine")
         elif not self.within:
-            apart = f"the engines are {q.with_unit(self.apart)} apart in {q.name}"
-            sentences.append(f"{apart}, at most {q.with_unit(self.limit)}")
+            sentences.append(
+                f"the engines are {q.with_unit(self.apart)} apart in {q.name}, at most "
+                f"{q.with_unit(self.limit)}"
+            )
         if self.spread and (middle := self.spread["median"]) > self.limit:
-            apart = f"perturbed robots are {q.with_unit(middle)} apart in {q.name} (median)"
-            sentences.append(f"{apart}, at most {self.limit:.3g}")
+            sentences.append(
+                f"perturbed robots are {q.with_unit(middle)} apart in {q.name} (median), at most "
+                f"{self.limit:.3g}"
+            )
         return sentences
 
     def row(self) -> Plain:
@@ -141,13 +145,11 @@ class ModeReport:
         differences = []
         for q in (*QUANTITIES, *(() if self.in_plane else AWAY)):
             values = {engine: q.of(trial) for engine, trial in self.planned.items()}
-            others = [q.apart(pair.values()) for pair in self.pairs]
-            others = [x for x in others if x is not None]
-            spread = (
-                {"median": float(np.median(others)), "largest": max(others)} if others else None
-            )
+            every = (q.apart(pair.values()) for pair in self.pairs)
+            others = [x for x in every if x is not None]
+            spread = others and {"median": float(np.median(others)), "largest": max(others)}
             apart = q.apart(self.planned.values())
-            differences.append(Difference(q, values, apart, LIMITS[q.limit], spread))
+            differences.append(Difference(q, values, apart, LIMITS[q.limit], spread or None))
         return differences
 
     @property
@@ -180,9 +182,9 @@ class ModeReport:
         for difference in self.differences:
             sentences += difference.failures
         if self.same < LIMITS["verdict_share"] * len(self.pairs):
-            least = f"at least {100 * LIMITS['verdict_share']:g} % are asked for"
             sentences.append(
-                f"{self.same} of {len(self.pairs)} perturbed robots fare alike, {least}"
+                f"{self.same} of {len(self.pairs)} perturbed robots fare alike, at least "
+                f"{100 * LIMITS['verdict_share']:g} % are asked for"
             )
         return [f"{self.mode} mode: {sentence}" for sentence in sentences]
 

@@ -134,11 +134,8 @@ def envelope(
     options = {"jobs": jobs, "progress": progress}
     work = partial(cell_row, planner)
     results = plan_rows(rows, work, known, "clean", folder, "envelope", **options)
-    cells = []
-    for tasks, tried in zip(rows, results, strict=True):
-        untried = [None] * (len(tasks) - len(tried))
-        cells += map(Cell.of, tasks, tried + untried)
-    return Envelope(robot.name, tuple(distances), tuple(heights), tuple(cells), tuple(axes))
+    cells = tuple(Cell.of(*result) for result in results)
+    return Envelope(robot.name, tuple(distances), tuple(heights), cells, tuple(axes))
 
 
 def cell_row(planner: Planner, task: JumpTask) -> Plain:

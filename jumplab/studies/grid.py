@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -115,12 +116,13 @@ def plan_rows(
     folder: str | Path | None,
     command: str,
     **options: Any,
-) -> list[list[Plain]]:
-    """Results of rows of targets, each from near to far, rows side by side.
+) -> list[tuple[JumpTask, Plain | None]]:
+    """Every target of some rows, each from near to far, with its result; rows side by side.
 
     ``work`` gives the row of a target, decided by that and by what is ``known`` of it (plain data).
-    A row ends after :data:`GIVE_UP` results that are not ``good`` (a column). Results are kept in
-    ``folder``; ``command`` and ``options`` are those of :func:`.study.open_study`.
+    A row ends after :data:`GIVE_UP` results that are not ``good`` (a column); beyond, results are
+    None. They are kept in ``folder``; ``command`` and ``options`` are those of
+    :func:`.study.open_study`.
     """
     rows: list[list[Plain]] = [[] for _ in tasks]
     path = None if folder is None else Path(folder) / CELLS
@@ -135,4 +137,4 @@ def plan_rows(
             now = {key_of(*known, asdict(task)): joblib.delayed(work)(task) for task in cells}
             for k, result in zip(alive, study.results(now), strict=True):
                 rows[k].append(result)
-    return rows
+    return [pair for both in zip(tasks, rows, strict=True) for pair in zip_longest(*both)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -161,26 +162,23 @@ def margins(
         ranges_at(name, 0.0)
     plan = PlanOnFile.read(folder)
     at_once = jobs or joblib.cpu_count()
+
+    def probe(names: str, reaim: bool, share: float) -> Probe:
+        disturbed = replace(settings, ranges=ranges_at(names, share), reaim=reaim)
+        landed = 0
+        tried = 0
+        while tried < n and enough(landed + n - tried, n):
+            numbers = range(tried, min(tried + at_once, n))
+            trials = study.results(plan.trials(disturbed, seed, numbers))
+            landed += sum(trial.landed for trial in trials)
+            tried += len(trials)
+        return share, landed, tried
+
     margins = []
     with plan.study(jobs=jobs, progress=progress) as study:
         for number, (name, reaim) in enumerate(product(names, (False, True))):
             tell(f"margin of {name}", number, 2 * len(names))
-            probes: list[Probe] = []
-
-            def good(share: float, name=name, reaim=reaim, probes=probes) -> bool:
-                disturbed = replace(settings, ranges=ranges_at(name, share), reaim=reaim)
-                landed = 0
-                tried = 0
-                while tried < n and enough(landed + n - tried, n):
-                    numbers = range(tried, min(tried + at_once, n))
-                    trials = study.results(plan.trials(disturbed, seed, numbers))
-                    landed += sum(trial.landed for trial in trials)
-                    tried += len(trials)
-                probes.append((share, landed, tried))
-                return tried == n and enough(landed, n)
-
-            share = _largest(good, steps)
-            best = next(probe for probe in probes if probe[0] == share)
+            best, probes = _largest(partial(probe, name, reaim), n, steps)
             margins.append(Margin(name, reaim, *best, tuple(probes)))
     target = dict(plan.summary["target"])
     ways = settings.step, settings.feedback
@@ -194,15 +192,21 @@ def enough(landed: int, tried: int) -> bool:
     return landed >= math.ceil(WANTED * tried - 1e-9)
 
 
-def _largest(good: Callable[[float], bool], steps: int) -> float:
-    """The largest share found ``good``: the limit is tried, then nothing, then ``steps`` shares
-    between.
+def _largest(probe: Callable[[float], Probe], n: int, steps: int) -> tuple[Probe, list[Probe]]:
+    """The probe of the largest share at which enough of ``n`` robots land (of nothing, if they do
+    not even there), and all: the limit, then nothing, then ``steps`` shares between.
     """
-    if good(1.0):
-        return 1.0
-    low = 0.0
+    probes = [probe(1.0)]
+    best = probes[0]
     high = 1.0
-    for _ in range(steps if good(0.0) else 0):
-        middle = (low + high) / 2
-        low, high = (middle, high) if good(middle) else (low, middle)
-    return low
+    if enough(best[1], n):
+        return best, probes
+    best = probe(0.0)
+    probes.append(best)
+    for _ in range(steps if enough(best[1], n) else 0):
+        probes.append(probe((best[0] + high) / 2))
+        if enough(probes[-1][1], n):
+            best = probes[-1]
+        else:
+            high = probes[-1][0]
+    return best, probes

@@ -7,6 +7,8 @@ floor from the soles that stand, and how long phases last is free.
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -89,10 +91,10 @@ class Mended(Shown):
         tape = self.plan.tape
         carrying = tape.extra["contacts"] > 0
         flying = ~carrying.any(axis=1)
-        edges = np.flatnonzero(np.diff(flying.astype(int), append=0))
-        if len(edges) != 2 or not carrying[~flying].all():
+        flights = spans(flying)
+        if len(flights) != 1 or flying[0] or not carrying[~flying].all():
             return None
-        end = int(edges[1]) + 1
+        end = flights[0][1]
         rows = ("t", "q", "v", "a", "tau", "phase", "f")
         cut = {name: getattr(tape, name)[:end] for name in rows}
         long = {k: x[:end] for k, x in tape.extra.items() if np.shape(x)[:1] == tape.t.shape}
@@ -170,6 +172,12 @@ def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended
     return Mended(plan, before, rows, _binding(plan), factor, draft.span_s)
 
 
+def spans(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First row, and the row after the last one, of each run of true ``flags`` (n,)."""
+    edges = np.flatnonzero(np.diff(np.asarray(flags, int), prepend=0, append=0))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 # the schedule
 # ----------------------------------------------------------------------------------------------
 def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
@@ -180,28 +188,10 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     """
     fps = before.clip.fps
     ground = before.ground.copy()
-    fast = np.diff((~before.still.any(axis=1)).astype(int), prepend=0, append=0)
-    for a, b in np.flatnonzero(fast).reshape(-1, 2):
+    for a, b in spans(~before.still.any(axis=1)):
         if b - a > MERGED_S * fps and ground[a:b].any(axis=1).all():
             ground[a:b] = False
-    rows = [[feet, a, b] for feet, a, b in phases_of(ground, fps)]
-    k = 0
-    while k < len(rows):
-        feet, a, b = rows[k]
-        if k and feet == rows[k - 1][0]:
-            rows[k - 1][2] = b
-            rows.pop(k)
-            k = 0
-        elif len(rows) > 1 and b - a < _shortest(rows, k):
-            middle = (a + b) / 2 if 0 < k < len(rows) - 1 else (a, b)[k == 0]
-            if k:
-                rows[k - 1][2] = middle
-            if k < len(rows) - 1:
-                rows[k + 1][1] = middle
-            rows.pop(k)
-            k = 0
-        else:
-            k += 1
+    rows = _merged(phases_of(ground, fps))
     standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
     if not standing or rows[standing[-1]][0] == FLIGHT:
         raise InputError(
@@ -209,15 +199,34 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             f"so; give more of it"
         )
     rows = rows[standing[0] : standing[-1] + 1]
-    rows[0][1] = max(rows[0][1], rows[0][2] - AROUND_S) if len(rows) > 1 else rows[0][1]
-    rows[-1][2] = min(rows[-1][2], rows[-1][1] + AROUND_S) if len(rows) > 1 else rows[-1][2]
-    out = []
-    for (feet, a, b), after in zip(rows, [*(row[0] for row in rows[1:]), ""], strict=True):
-        if after == FLIGHT and b - a > ROLLING_S:
-            out += [(feet, a, b - TOES_S), (feet.lower(), b - TOES_S, b)]
-        else:
-            out.append((feet, a, b))
-    return out
+    if len(rows) > 1:
+        rows[0][1] = max(rows[0][1], rows[0][2] - AROUND_S)
+        rows[-1][2] = min(rows[-1][2], rows[-1][1] + AROUND_S)
+    for k in range(len(rows) - 1, 0, -1):
+        feet, a, b = rows[k - 1]
+        if rows[k][0] == FLIGHT and b - a > ROLLING_S:
+            rows[k - 1][2] = b - TOES_S
+            rows.insert(k, [feet.lower(), b - TOES_S, b])
+    return [(feet, a, b) for feet, a, b in rows]
+
+
+def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:
+    """Phases without those too short to count, whose time goes to those beside them."""
+    rows = [list(row) for row in phases]
+    k = 0
+    while k < len(rows):
+        feet, a, b = rows[k]
+        again = k > 0 and rows[k - 1][0] == feet
+        if not again and (len(rows) == 1 or b - a >= _shortest(rows, k)):
+            k += 1
+            continue
+        del rows[k]
+        if again:
+            rows[k - 1][2] = b
+        elif 0 < k < len(rows):
+            rows[k - 1][2] = rows[k][1] = (a + b) / 2
+        k = 0
+    return rows
 
 
 def _shortest(rows: list[list], k: int) -> float:
@@ -275,20 +284,13 @@ class Draft:
 
     def _holds(self) -> list[dict[int, np.ndarray]]:
         """Of each phase, side -> x, y, z, yaw of the feet that carry: medians over the contact."""
-        modes = [modes_of(feet) for feet, _, _ in self.phases]
-        holds: list[dict[int, np.ndarray]] = [{} for _ in modes]
+        holds: list[dict[int, np.ndarray]] = [{} for _ in self.phases]
         for side in (0, 1):
-            k = 0
-            while k < len(modes):
-                end = k
-                while end < len(modes) and side in modes[end]:
-                    end += 1
-                if end > k:
-                    rows = slice(self._rows(k).start, self._rows(end - 1).stop)
-                    x, y, _, yaw = np.median(self.feet[rows, side], axis=0)
-                    for i in range(k, end):
-                        holds[i][side] = np.array([x, y, 0.0, yaw])
-                k = max(end, k + 1)
+            for first, end in spans([side in modes_of(feet) for feet, _, _ in self.phases]):
+                rows = slice(self._rows(first).start, self._rows(end - 1).stop)
+                x, y, _, yaw = np.median(self.feet[rows, side], axis=0)
+                for hold in holds[first:end]:
+                    hold[side] = np.array([x, y, 0.0, yaw])
         return holds
 
     def _contacts(self, factor: float) -> Contacts:
@@ -307,9 +309,9 @@ class Draft:
                 if k and side in self.holds[k - 1]:
                     continue
                 ahead, left = hold[:2] - self.body.places[side][:2]
-                place = Place(float(ahead), float(left), float(hold[3]), 0.0, FREE_M, FREE_RAD)
-                fixed = replace(place, free_m=(0.0, 0.0), free_rad=0.0)
-                (places if k else first).append(place if k else fixed)
+                free = (FREE_M, FREE_RAD) if k else ((0.0, 0.0), 0.0)
+                place = Place(float(ahead), float(left), float(hold[3]), 0.0, *free)
+                (places if k else first).append(place)
         return Contacts(tuple(phases), tuple(places), first=tuple(first))
 
     def _along(self) -> Motion:
@@ -318,10 +320,7 @@ class Draft:
         """
         from scipy.ndimage import gaussian_filter1d  # slow to import
 
-        drawn = []
-        for (_, a, b), phase in zip(self.phases, self.contacts.phases, strict=True):
-            at = np.linspace(a, b, phase.intervals + 1)
-            drawn.append(np.array([np.interp(at, self.clip.t, x) for x in self.charts.T]).T)
+        drawn = [self.sampled(k, p.intervals + 1) for k, p in enumerate(self.contacts.phases)]
         nodes = [(k, i) for k, rows in enumerate(drawn) for i in range(len(rows))]
         down = np.array([self._lower(drawn[k][i], k, i) for k, i in nodes])
         smooth = gaussian_filter1d(np.nan_to_num(down), SMOOTH_FRAMES)
@@ -335,6 +334,16 @@ class Draft:
         durations = np.array([p.guess_s for p in self.contacts.phases])
         return Motion(durations, drawn, missed)
 
+    def sampled(self, k: int, count: int) -> np.ndarray:
+        """Charts (``count``, 6 + joints) of the clip, evenly over phase ``k``."""
+        _, a, b = self.phases[k]
+        at = np.linspace(a, b, count)
+        return np.stack([np.interp(at, self.clip.t, x) for x in self.charts.T], axis=-1)
+
+    def _bends(self, chart: np.ndarray) -> list[float]:
+        """How far the knees of a chart are bent, left and right [rad]."""
+        return [sign * chart[BASE + k] + angle for k, sign, angle in self.body.knees]
+
     def _lower(self, chart: np.ndarray, k: int, i: int) -> float:
         """By how much the base has to come down for the legs to reach their places with bent knees
         [m]; nan in flight.
@@ -345,7 +354,7 @@ class Draft:
             lower = chart.copy()
             lower[2] -= down
             moved, left = self._placed(lower, k, i)
-            bends = [sign * moved[BASE + j] + angle for j, sign, angle in self.body.knees]
+            bends = self._bends(moved)
             if left < OFF_M and all(bends[side] > BENT_RAD for side in sides):
                 break
             down += LOWER_M
@@ -365,8 +374,7 @@ class Draft:
             com = pin.centerOfMass(self.body.model.model, self.reach.data, q)
             chart[:2] += middle - com[:2]
             chart, left = self._placed(chart, 0, 0)
-            bends = [sign * chart[BASE + k] + angle for k, sign, angle in self.body.knees]
-            if min(bends) < BENT_RAD or left > OFF_M:
+            if min(self._bends(chart)) < BENT_RAD or left > OFF_M:
                 chart[2] -= LOWER_M
         return chart
 
@@ -420,62 +428,47 @@ def _scaled(charts: np.ndarray, first: slice, factor: float) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------
 def _changes(before: ClipReport, draft: Draft, plan: JumpPlan) -> list[dict[str, Any]]:
     """Rows of what the clip and the plan have, and by how much they differ."""
-    phases = plan.whole_body.phases
-    joints = []
-    base = []
-    for k, x in enumerate(phases.values()):
-        _, a, b = draft.phases[k]
-        at = np.linspace(a, b, len(x.q))
-        clip = np.array([np.interp(at, draft.clip.t, column) for column in draft.charts.T]).T
-        joints.append(x.q[:, BASE : clip.shape[1]] - clip[:, BASE:])
-        base.append(x.q[:, :3] - clip[:, :3])
-    joints = np.concatenate(joints)
-    base = np.concatenate(base)
+    phases = list(plan.whole_body.phases.values())
+    pairs = [(x.q, draft.sampled(k, len(x.q))) for k, x in enumerate(phases)]
+    off = np.concatenate([q[:, : clip.shape[1]] - clip for q, clip in pairs])
+    joints = np.abs(off[:, BASE:])
     moved = [0.0]
-    schedule = plan.whole_body.schedule
     for contact, (k, side) in enumerate(plan.contacts.landings):
-        wanted = np.mean(schedule.foothold(contact), axis=1)
-        constants = list(phases.values())[k].constants
+        wanted = np.mean(plan.whole_body.schedule.foothold(contact), axis=1)
         name = ("left", "right")[side]
-        moved.append(
-            float(
-                np.hypot(*(constants[f"{name}_{x}"] - wanted[i] for i, x in ((0, "x"), (1, "y"))))
-            )
-        )
-    flown = [(a, b) for feet, a, b in draft.phases if feet == FLIGHT]
-    times = [
-        x.duration for x, p in zip(phases.values(), plan.contacts.phases, strict=True) if p.flying
-    ]
-    rises = [x["rise_m"] for x in before.manifest["flights"]]
-    worst = int(np.abs(joints).max(axis=0).argmax())
-    rows = [
-        dict(what="joints, rms [rad]", change=float(np.sqrt((joints**2).mean()))),
-        dict(
-            what=f"joints, largest [rad]: {draft.clip.robot.joint_names[worst]}",
-            change=float(np.abs(joints).max()),
-        ),
-        dict(what="base, rms [m]", change=float(np.sqrt((base**2).sum(axis=1).mean()))),
-        dict(what="footholds, largest [m]", change=max(moved)),
-    ]
-    for i, ((a, b), s) in enumerate(zip(flown, times, strict=True), 1):
-        rows.append(dict(what=f"flight {i} [s]", clip=b - a, mended=s, change=s - (b - a)))
+        place = [phases[k].constants[f"{name}_{axis}"] for axis in "xy"]
+        moved.append(math.dist(place, wanted[:2]))
+    worst = draft.clip.robot.joint_names[int(joints.max(axis=0).argmax())]
+    changes = {
+        "joints, rms [rad]": np.sqrt((joints**2).mean()),
+        f"joints, largest [rad]: {worst}": joints.max(),
+        "base, rms [m]": np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()),
+        "footholds, largest [m]": max(moved),
+    }
+    rows = [{"what": name, "change": float(x)} for name, x in changes.items()]
+    flown_s = [b - a for feet, a, b in draft.phases if feet == FLIGHT]
+    pairs = zip(phases, plan.contacts.phases, strict=True)
+    times_s = [x.duration for x, contact in pairs if contact.flying]
     com = plan.tape.extra["com"][:, 2]
-    flying = ~(plan.tape.extra["contacts"] > 0).any(axis=1)
-    edges = np.flatnonzero(np.diff(flying.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    for i, (up, (a, b)) in enumerate(zip(rises, edges.tolist(), strict=False), 1):
-        mended = float(com[a:b].max() - com[a])
-        rows.append(dict(what=f"rise {i} [m]", clip=up, mended=mended, change=mended - up))
+    flights = spans(~(plan.tape.extra["contacts"] > 0).any(axis=1))
+    rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
+    both = {
+        "flight {} [s]": zip(flown_s, times_s, strict=True),
+        "rise {} [m]": zip(rises_m, (com[a:b].max() - com[a] for a, b in flights), strict=False),
+    }
+    for what, values in both.items():
+        for i, (clip, mended) in enumerate(values, 1):
+            row = {"what": what.format(i), "clip": clip, "mended": float(mended)}
+            rows.append(row | {"change": row["mended"] - clip})
     return rows
 
 
 def _binding(plan: JumpPlan) -> tuple[str, ...]:
     """Limits that bind, by what they are worth: the sum of their multipliers."""
-    worth: dict[str, float] = {}
+    worth: Counter[str] = Counter()
     solution = plan.whole_body.solution
-    limits = {
-        (r["phase"], r["name"]) for r in solution.constraint_report if r["kind"] == "inequality"
-    }
+    kinds = {(r["phase"], r["name"]): r["kind"] for r in solution.constraint_report}
     for (owner, name), (_, values) in solution.multipliers.rows.items():
-        if (owner, name) in limits:
-            worth[name] = worth.get(name, 0.0) + float(np.abs(values).sum())
-    return tuple(sorted((n for n in worth if worth[n] > NEAR), key=worth.get, reverse=True)[:5])
+        if kinds.get((owner, name)) == "inequality":
+            worth[name] += float(np.abs(values).sum())
+    return tuple(name for name, x in worth.most_common(5) if x > NEAR)

@@ -72,10 +72,8 @@ def deciding() -> dict[str, str]:
 
 
 def check_numbers(n: int, seed: int, jobs: int | None) -> None:
-    """Raise :class:`InputError` unless these numbers (cases, seed, processes) can be meant."""
+    """Raise :class:`InputError` if one of these numbers (cases, seed, processes) is too small."""
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("jobs", jobs or 1, 1)):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise InputError(f"{name} must be a whole number, got {value!r}")
         if value < least:
             raise InputError(f"{name} = {value} is too small; it must be at least {least}")
 

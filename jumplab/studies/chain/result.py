@@ -186,7 +186,6 @@ class ChainResult:
         rows = []
         for jump in self.jumps:
             ahead = jump.ahead
-            first = jump.plans[0] if jump.plans else None
             task = self.course.tasks[jump.number]
             row = {
                 "jump": jump.number + 1,
@@ -198,8 +197,6 @@ class ChainResult:
                 "air_s": jump.air_s,
                 "planned_m": ahead and ahead.plan.task.distance_m,
                 **{name: ahead and getattr(ahead, name) for name in PLAN_NAMES},
-                "first_solve_s": first and first.solve_s,
-                "first_ready_s": first and first.ready_s,
                 "in_time": ahead.in_time if jump.number and ahead else None,
                 "on_feet": jump.on_feet(self.robot),
                 "checks_passed": jump.simulation.checks_passed,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.control import STEP_S
 from jumplab.control.controller import LANDINGS
-from jumplab.errors import InputError, quoted, require_type
+from jumplab.errors import InputError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import DEFAULT_ENGINE, Perturbation
@@ -28,6 +28,7 @@ REVISE_S = 0.1  # the impact is over, the feet lie flat and still
 TIMES_S = {"solve_s": (0.0, 60.0), "look_s": (-1.0, 2.0), "revise_s": (0.0, 2.0)}
 
 
+@checked
 def run_chain(
     course: Course,
     robot: Robot,
@@ -66,7 +67,7 @@ def run_chain(
     method : as of :meth:`jumplab.Planner.plan`.
     """
     times_s = dict(solve_s=solve_s or 0.0, look_s=look_s, revise_s=revise_s or 0.0)
-    _check(course, robot, perturbation, landing, **times_s)
+    _check(robot, landing, times_s)
     waiting = crouched(robot)
     planner = planner or Planner(waiting, keep=True)
     if planner.robot.hash != waiting.hash:
@@ -119,19 +120,14 @@ def _jumps(run: Run, chain: ChainPilot, course: Course) -> tuple[ChainedJump, ..
     return tuple(jumps)
 
 
-def _check(course: Any, robot: Any, perturbation: Any, landing: Any, **times_s: Any) -> None:
-    require_type(course, Course, "the course")
-    require_type(robot, Robot, "the robot")
+def _check(robot: Robot, landing: str, times_s: Mapping[str, float]) -> None:
     if not robot.planar:
         raise InputError(
             f"robot {robot.name}: chains wait in a crouch of five links, which do not describe it"
         )
-    if perturbation is not None:
-        require_type(perturbation, Perturbation, "the perturbation")
-    if not isinstance(landing, str) or landing not in LANDINGS:
+    if landing not in LANDINGS:
         raise InputError(f"landing {quoted(landing)}: choose one of {', '.join(LANDINGS)}")
     for name, value in times_s.items():
         low, high = TIMES_S[name]
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not low <= value <= high:
-            raise InputError(f"{name} = {quoted(value)} s is outside {low:g} ... {high:g} s")
+        if not low <= value <= high:
+            raise InputError(f"{name} = {value:g} s is outside {low:g} ... {high:g} s")

@@ -8,6 +8,7 @@ from typing import Any
 
 import joblib
 
+from jumplab.arguments import checked
 from jumplab.errors import SolverError
 from jumplab.robot import Robot
 from jumplab.sim import SLIGHT, Perturbation, Ranges, SensorNoise
@@ -24,6 +25,7 @@ RANGES = {"slight": SLIGHT, "wide": Ranges()}  # by the names of the command lin
 PER_JUMP = "errors_m", "heading_errors_rad", "travels_m", "air_s", "waits_s", "plans"
 
 
+@checked
 def run_chains(
     course: Course,
     robot: Robot,
