@@ -157,8 +157,9 @@ def planner(bhr, monkeypatch):
 def test_plan_and_audit(capsys, odd_folder, planner):
     out = odd_folder / "plan"
     arguments = ("--distance-m", "-0.2", "--height-m", "3e-1", "--rotation-deg", "-360", "--method", "direct")
-    code, said, err = run(capsys, "plan", "--out", out, *arguments)
+    code, said, err = run(capsys, "plan", "--out", out, *arguments, "--gravity", "3.7")
     assert (code, err) == (0, "")
+    assert planner.task.gravity == 3.7
     assert planner.task.distance_m == -0.2 and planner.task.height_m == 0.3 and planner.method == "direct"
     assert planner.task.rotation_rad == pytest.approx(-2 * 3.141592653589793)
     assert said.splitlines()[:3] == [
@@ -293,6 +294,7 @@ def test_real_plan_is_self_contained(planned):
         ("--height-m 1.4", 3, "whole body: no plan ("),
         ("--distance-m -1.0 --method three-step", 3, "stage 2: at t = 0."),
         ("--distance-m 9", 2, "distance = 9 m is outside -3 ... 3 m"),
+        ("--gravity 0", 2, "gravity = 0 m/s^2 is outside 0.5 ... 30 m/s^2"),
     ],
 )
 def test_real_refusals_and_their_exit_codes(capsys, here, arguments, code, sentence):
