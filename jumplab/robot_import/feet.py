@@ -26,8 +26,8 @@ SOLE_M = 0.012
 GUESS_X = (-0.143, 0.2)
 GUESS_Y = (-0.071, 0.071)
 GUESS_Z = -0.107
-SAME_WAY = 0.95  # of a wheel: cosine of its axis, and of its radius what belongs to the rim
-SECTORS = 12  # of the rim, all of which a wheel has
+SAME_WAY = 0.8  # of a wheel, turned any way: how far it reaches, of how far it reaches at most
+TURN_RAD = np.pi / 6
 
 
 @dataclass(frozen=True)
@@ -133,34 +133,24 @@ def refuse_wheel(tree: Tree, ankle: Joint) -> None:
     stops = [ankle.limits.get(end, np.inf) for end in ("lower", "upper")]
     if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
         return
-    place = tree.pose[ankle.child]
     for part in tree.bodies[tree.carrier[ankle.child]]:
-        for kind in ("collision", "visual"):
-            for at, shape in tree.shapes(part, kind):
-                to_joint = place.inverse() * tree.pose[part] * at
-                if _round(tree, shape, to_joint, ankle.axis):
-                    raise tree.error(
-                        f"the legs end in wheels: joint {ankle.name!r} turns without stops, and "
-                        f"its body {part!r} is round about it; jumps are planned for feet with "
-                        f"soles"
-                    )
+        for place, shape in (
+            x for kind in ("collision", "visual") for x in tree.shapes(part, kind)
+        ):
+            to_joint = tree.pose[ankle.child].inverse() * tree.pose[part] * place
+            if _round(tree, shape, to_joint, ankle.axis):
+                raise tree.error(
+                    f"the legs end in wheels: joint {ankle.name!r} turns without stops, and its "
+                    f"body {part!r} is round about it; jumps are planned for feet with soles"
+                )
 
 
 def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> bool:
-    """Whether a shape, at its ``place`` in the frame of a joint, is round about the joint's axis
-    (3,).
+    """Whether a shape, at its ``place`` in the frame of a joint, reaches as far below the joint's
+    axis (3,) however it is turned about that.
     """
-    if shape.tag in ROUND:
-        centre = place.translation - (place.translation @ axis) * axis
-        radius = float(shape.get("radius"))
-        along = shape.tag == "sphere" or abs(place.rotation[:, 2] @ axis) > SAME_WAY
-        return along and np.linalg.norm(centre) < radius / 2
-    if shape.tag != "mesh":
-        return False
-    points = tree.corners(shape) @ place.rotation.T + place.translation
-    across = points - np.outer(points @ axis, axis)
-    far = np.linalg.norm(across, axis=1)
-    rim = across[far > SAME_WAY * far.max(initial=0.0)]
-    side = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
-    sectors = np.floor((np.arctan2(*(rim @ side.T).T) + np.pi) / (2 * np.pi) * SECTORS)
-    return len(set(sectors[sectors < SECTORS])) == SECTORS
+    level = pin.Quaternion.FromTwoVectors(axis, np.array([0.0, 1.0, 0.0])).toRotationMatrix()
+    turns = [pin.rpy.rpyToMatrix(0.0, turn, 0.0) for turn in np.arange(0.0, 2 * np.pi, TURN_RAD)]
+    ways = [_lowest(tree, shape, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
+    deep = [-way[:, 2].min(initial=0.0) for way in ways]
+    return min(deep) > SAME_WAY * max(deep)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
@@ -209,6 +209,12 @@ def numbers(text: str | None, count: int) -> np.ndarray | None:
     return values if len(values) == count and np.all(np.isfinite(values)) else None
 
 
+def finite(element: ET.Element | None, keys: Iterable[str]) -> dict[str, float]:
+    """Those attributes of an element that are finite numbers."""
+    values = {key: numbers(element.get(key), 1) for key in keys} if element is not None else {}
+    return {key: float(value[0]) for key, value in values.items() if value is not None}
+
+
 def _place(element: ET.Element) -> pin.SE3:
     origin = element.find("origin")
     if origin is None:
@@ -291,20 +297,17 @@ class Joint:
         """The joint of an element that has passed the checks."""
         axis, limit, mimic, own = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
-        values = {key: numbers(limit.get(key), 1) for key in LIMITS} if limit is not None else {}
-        limits = {key: float(value[0]) for key, value in values.items() if value is not None}
-        given = {key: numbers(own.get(key), 1) for key in OWN} if own is not None else {}
-        losses = {key: float(x[0]) for key, x in given.items() if x is not None and x[0] > 0}
-        driven = e.get("type") in ("revolute", "continuous") and limits.get("effort") != 0
+        limits = finite(limit, LIMITS)
+        losses = {key: x for key, x in finite(own, OWN).items() if x > 0}
+        kind = e.get("type")
+        driven = kind in ("revolute", "continuous") and limits.get("effort") != 0 and mimic is None
         follows = None
         if mimic is not None:
-            driven = False
-            factor, offset = (float(mimic.get(*x)) for x in (("multiplier", 1), ("offset", 0)))
-            follows = (mimic.get("joint"), factor, offset)
+            line = {"multiplier": 1.0, "offset": 0.0} | finite(mimic, ("multiplier", "offset"))
+            follows = (mimic.get("joint"), *line.values())
         ends = (e.find(end).get("link") for end in ("parent", "child"))
         axis = direction / max(np.linalg.norm(direction), 1e-12)
         place = _place(e)
-        kind = e.get("type")
         return cls(e.get("name"), kind, *ends, place, axis, limits, losses, follows, driven, e)
 
 
@@ -316,7 +319,8 @@ class Tree:
     where each is with all joints at 0, in the root's frame [m].
 
     ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are
-    looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible.
+    looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible,
+    else only those at most ``mended`` [kg m^2] from it.
     """
 
     def __init__(
@@ -331,7 +335,8 @@ class Tree:
         self.joints = {e.get("name"): Joint.read(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}
         self.root = next(link for link in self.elements if link not in self.above)
-        self._build(np.inf if repair_inertia else slight(root))
+        self.mended = np.inf if repair_inertia else slight(root)
+        self._build()
         for follower in [j for j in self.joints.values() if j.mimic]:
             leader = self.joints[follower.mimic[0]]
             if leader not in self.chain(follower.child) and follower not in self.chain(
@@ -339,7 +344,7 @@ class Tree:
             ):
                 leader.driven = False  # a joint on another limb follows it
 
-    def _build(self, most: float) -> None:
+    def _build(self) -> None:
         """Pinocchio's model, outwards; inertias repaired as :func:`_inertia` says."""
         self.model = pin.Model()
         self.carrier = {}
@@ -353,7 +358,7 @@ class Tree:
                 place = HERE
             self.carrier[link] = carrier
             self.bodies.setdefault(carrier, []).append(link)
-            self.model.appendBodyToJoint(carrier, _inertia(self.elements[link], most), place)
+            self.model.appendBodyToJoint(carrier, _inertia(self.elements[link], self.mended), place)
             self.model.addFrame(pin.Frame(link, carrier, 0, place, pin.FrameType.BODY))
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
