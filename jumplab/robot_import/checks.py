@@ -211,40 +211,32 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
         for key in ("multiplier", "offset"):
             if numbers(mimic.get(key, "0"), 1) is None:
                 yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
-    parents = [joint.find("parent").get("link") for joint in joints]
-    children = [joint.find("child").get("link") for joint in joints]
-    for link, times in Counter(children).items():
-        if times > 1:
-            above = [
-                j.get("name") for j, child in zip(joints, children, strict=True) if child == link
-            ]
-            above = ", ".join(map(repr, above))
+    above = {}  # child -> its joints and their parents
+    for joint in joints:
+        child, parent = (joint.find(end).get("link") for end in ("child", "parent"))
+        above.setdefault(child, {})[joint.get("name")] = parent
+    for link, hanging in above.items():
+        if len(hanging) > 1:
             yield (
-                f"{where}: link {link!r} hangs on {times} joints ({above}): a closed loop; cut "
-                f"it to leave a tree"
+                f"{where}: link {link!r} hangs on {len(hanging)} joints "
+                f"({', '.join(map(repr, hanging))}): a closed loop; cut it to leave a tree"
             )
             return
-    roots = sorted(names - set(children))
-    if not roots:
+    roots = sorted(names - set(above))
+    if len(roots) > 1:
         yield (
-            f"{where}: no link is the root: the joints form a cycle; each robot needs one link "
-            f"without a parent"
+            f"{where}: {len(roots)} links have no parent ({listed(map(repr, roots))}), Pinocchio "
+            f"keeps one tree and drops the rest; connect them"
         )
-    elif len(roots) > 1:
-        named = listed(map(repr, roots))
-        yield (
-            f"{where}: {len(roots)} links have no parent ({named}), Pinocchio keeps one tree and "
-            f"drops the rest; connect them"
-        )
-    else:
-        below = list(roots)
-        for link in below:
-            below += [
-                child for child, above in zip(children, parents, strict=True) if above == link
-            ]
-        if lost := sorted(names - set(below)):
-            named = listed(map(repr, lost))
-            yield f"{where}: the links {named} form a cycle apart from the root {roots[0]!r}"
+        return
+    below = list(roots)
+    for link in below:
+        below += [child for child, hanging in above.items() if link in hanging.values()]
+    if lost := listed(map(repr, sorted(names - set(below)))):
+        end = ": each robot needs one link without a parent"
+        if roots:
+            end = f" apart from the root {roots[0]!r}"
+        yield f"{where}: the links {lost} form a cycle{end}"
 
 
 # inertials

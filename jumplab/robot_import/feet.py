@@ -47,21 +47,18 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
     to ankle, a sole is guessed if the link ``foot`` has no shape.
     """
-    touching, around = sole_points(tree, foot, turn, thickness(leg_m))
-    if not len(around):
+    touching, around, kinds = sole_points(tree, foot, turn, thickness(leg_m))
+    if not kinds:
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
         files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
         lost = listed(sorted({repr(file) for file in files if file}))
         source = "GUESSED from the leg's length: the foot has no shape that is at hand"
         source += f", the mesh {lost} is not there" if lost else ""
         return Sole(x, y, leg_m * GUESS_Z, source)
-    parts = tree.below(foot)
-    drawn = "visual" if not any(len(tree.points(part)) for part in parts) else "collision"
-    kinds = {shape.tag for part in parts for _, shape in tree.shapes(part, drawn)}
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
     if max(np.ptp(touching[:, :2], axis=0)) < least:
-        _, whole = sole_points(tree, foot, turn, np.inf)
+        _, whole, _ = sole_points(tree, foot, turn, np.inf)
         if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
             raise tree.error(
                 f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
@@ -88,25 +85,29 @@ def thickness(leg_m: float) -> float:
 
 def sole_points(
     tree: Tree, foot: str, turn: np.ndarray, thick_m: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, set[str]]:
     """Points of a foot and its toes at most ``thick_m`` [m] above the lowest, (n, 3) from its
     origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
-    its shapes, which are farther out where these are round.
+    its shapes, which are farther out where these are round; and the kinds of shapes.
 
     What is drawn counts where nothing collides.
     """
     axes = pin.SE3(turn, -turn @ tree.pose[foot].translation)
-    parts = tree.below(foot)
-    touching = np.zeros((0, 3))
-    around = touching
+    touching = [np.zeros((0, 3))]
+    around = [np.zeros((0, 3))]
+    kinds = set()
     for kind in ("collision", "visual"):
-        for part in parts if not len(around) else ():
+        for part in tree.below(foot) if not kinds else ():
             for place, shape in tree.shapes(part, kind):
                 at = axes * tree.pose[part] * place
-                around = np.concatenate([around, placed(at, tree.corners(shape))])
-                touching = np.concatenate([touching, _lowest(tree, shape, at)])
-    level = touching[:, 2].min(initial=np.inf) + thick_m
-    return touching[touching[:, 2] < level], around[around[:, 2] < level]
+                if len(corners := tree.corners(shape)):
+                    around.append(placed(at, corners))
+                    touching.append(_lowest(tree, shape, at))
+                    kinds.add(shape.tag)
+    ends = np.concatenate(touching)
+    level = ends[:, 2].min(initial=np.inf) + thick_m
+    low = [points[points[:, 2] < level] for points in (ends, np.concatenate(around))]
+    return *low, kinds
 
 
 def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:

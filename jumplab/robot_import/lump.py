@@ -390,16 +390,12 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
 
 def _opposite(left: Body, right: Body) -> Body:
     """The right body with its origin, which may lie anywhere on its axis, opposite to the left
-    one's; one in the middle with its origin there.
+    one's.
     """
-    gap = left.place - MIRROR * right.place
-    along = float(gap @ left.axis)
-    if abs(along) <= CAD_M:  # which is evened out
+    along = float((left.place - MIRROR * right.place) @ left.axis)
+    if abs(along) <= CAD_M or left is right:  # which is evened out
         return right
-    if left is right:
-        place = right.place - along / 2 * right.axis
-    else:
-        place = right.place + MIRROR * (along * left.axis)
+    place = right.place + MIRROR * (along * left.axis)
     inertia = shifted(right.place - place).act(right.inertia)
     return replace(right, place=place, inertia=inertia)
 

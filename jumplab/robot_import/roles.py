@@ -213,7 +213,7 @@ class _Finder:
         for three, chain in self.legs:
             foot = self.foot(three, chain)
             axes = np.stack([forward, np.cross(self.up, forward), self.up])
-            _, around = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
+            _, around, _ = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
             x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]

@@ -95,33 +95,29 @@ def described(name: str, file: str | None = None) -> Path:
     keeps it. Raises :class:`RobotError` if it is not installed, knows no such robot, has it as a
     xacro template only, or cannot fetch it.
     """
+
+    def error(text: str) -> RobotError:
+        return RobotError(f"robot description {name!r}: {text}")
+
     try:
         known = import_module("robot_descriptions._descriptions").DESCRIPTIONS
     except ModuleNotFoundError:
-        reason = (
-            "the package robot_descriptions is not installed; pip install 'jumplab[descriptions]'"
-        )
-        raise RobotError(f"robot description {name!r}: {reason}") from None
+        reason = "is not installed; pip install 'jumplab[descriptions]'"
+        raise error(f"the package robot_descriptions {reason}") from None
     if name not in known:
         near = get_close_matches(name, known, 3, 0.5)
         hint = f"; did you mean {', '.join(near)}?" if near else ""
-        raise RobotError(
-            f"robot description {name!r}: robot_descriptions has no robot of that name{hint}"
-        )
+        raise error(f"robot_descriptions has no robot of that name{hint}")
     try:
         module = import_module(f"robot_descriptions.{name}")
     except Exception as e:  # git and the net fail in many ways
         why = (str(e).strip().splitlines() or [type(e).__name__])[-1].strip()
-        raise RobotError(
-            f"robot description {name!r}: robot_descriptions cannot fetch it ({why})"
-        ) from e
+        raise error(f"robot_descriptions cannot fetch it ({why})") from e
     if file is not None:
         return Path(module.REPOSITORY_PATH, file)
     path = getattr(module, "URDF_PATH", getattr(module, "MJCF_PATH", None))
     if path is None:
-        raise RobotError(
-            f"robot description {name!r}: is a xacro template only; expand it, and check the URDF"
-        )
+        raise error("is a xacro template only; expand it, and check the URDF")
     return Path(path)
 
 
@@ -417,12 +413,6 @@ class Tree:
             for shape in e.findall("geometry/*")
             if shape.tag == "mesh" or faultless(shape)
         ]
-
-    def points(self, link: str, kind: str = "collision") -> np.ndarray:
-        """(n, 3) points of a link, in its frame, whose hull holds its shapes of a kind."""
-        out = [np.zeros((0, 3))]
-        out += [placed(place, self.corners(shape)) for place, shape in self.shapes(link, kind)]
-        return np.concatenate(out)
 
     def corners(self, shape: ET.Element) -> np.ndarray:
         """(n, 3) points of a shape, in its own frame [m], none of a mesh that is not there."""
