@@ -101,11 +101,9 @@ def notes(tree: Tree) -> Iterator[str]:
     notice.
     """
     for element in tree.xml:
-        if "xacro" in str(element.tag):
-            yield (
-                f"the call "
-                f"<{element.tag.rpartition('}')[2]}> of a xacro macro is left over, and passed over"
-            )
+        if "xacro" in element.tag:
+            name = element.tag.rpartition("}")[2]
+            yield f"the call <{name}> of a xacro macro is left over, and passed over"
     yield from (note.get("text") for note in tree.xml.findall("note"))
     for name, link in tree.elements.items():
         if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):

@@ -157,17 +157,12 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     y = np.array(entry(config, "feet", "sole_y_m", count=2)) + left
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
-    if z < 0 and half > 0 and x[0] < x[1] and (x[0] >= 0 or x[1] <= 0):
-        side, end = ("ahead of", "toes") if x[0] >= 0 else ("behind", "heel")
-        raise RobotError(
-            f"{where}: the sole, {x[0]:.3f} ... {x[1]:.3f} m from the ankle, lies {side} it: the "
-            f"foot stands on its {end} with all joints at 0, or [feet] is wrong; tell there the "
-            f"sole along the level axes"
-        )
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
         raise RobotError(
             f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
-            f"must lie below it and reach to both sides of it; correct [feet]"
+            f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
+            f"toes with all joints at 0, or [feet] is wrong; tell there the sole along the level "
+            f"axes"
         )
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
 

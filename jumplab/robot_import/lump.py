@@ -17,7 +17,7 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
-from jumplab.robot_import.roles import robot_axes
+from jumplab.robot_import.roles import leg_joints, robot_axes
 from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
 from jumplab.robot_import.write import key, shifted
 
@@ -144,7 +144,6 @@ def _moving_joints(
     free = table(config, "joints").get("free")
     if isinstance(free, list) and free:
         moving += entry(config, "joints", "free", kind=str, count=len(free))
-    moving = list(dict.fromkeys(moving))
     for name in moving:
         if name not in tree.joints:
             raise tree.error(f"a role names the joint {name!r}, which the {tree.format} lacks")
@@ -169,8 +168,7 @@ def _moving_joints(
                 f"between {trunk!r} and {foot!r} come {', '.join(ordered)}; hip, "
                 f"knee and ankle must follow in this order; correct [joints]"
             )
-        moving += [name for name in names if tree.joints[name].driven and name not in moving]
-    return moving
+        return list(dict.fromkeys(moving + leg_joints(tree, trunk, feet)))
 
 
 def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str, float]:

@@ -162,12 +162,10 @@ def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: lis
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
     """The body at the world that carries the robot: the one with the most hinges."""
     tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
-    hinges = {top: 0 for top in tops}
-    for body, kind in zip(model.jnt_bodyid, model.jnt_type, strict=True):
-        turns = kind == JOINT.mjJNT_HINGE or kind == JOINT.mjJNT_BALL
-        if model.body_parentid[body] and turns:
-            hinges[model.body_rootid[body]] += 1
-    most = max(hinges.values(), default=0)
+    turns = (model.jnt_type == JOINT.mjJNT_HINGE) | (model.jnt_type == JOINT.mjJNT_BALL)
+    below = model.jnt_bodyid[turns & (model.body_parentid[model.jnt_bodyid] > 0)]
+    hinges = np.bincount(model.body_rootid[below], minlength=model.nbody)
+    most = int(hinges.max())
     robots = [top for top in tops if hinges[top] == most]
     names = listed([repr(model.body(top).name) for top in robots])
     if not most:

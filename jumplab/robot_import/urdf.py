@@ -167,27 +167,21 @@ def parse(text: str, where: str) -> ET.Element:
         reason = str(e).partition(":")[0]
         if "unbound prefix" in reason and "xacro:" in text:
             raise RobotError(xacro) from None
-        ends = text.rstrip().endswith("</robot>")
-        kind = (
-            "is not well-formed XML"
-            if ends
-            else "ends before </robot>; it is cut short or is no URDF"
-        )
+        kind = "ends before </robot>; it is cut short or is no URDF"
+        if text.rstrip().endswith("</robot>"):
+            kind = "is not well-formed XML"
         raise RobotError(f"{where}: line {line}, column {column}: {kind} ({reason})") from None
+    for element in root.iter():
+        if "xacro" not in element.tag:  # of a default namespace
+            element.tag = element.tag.rpartition("}")[2]
     # a "${...}" in a simulator's plug-in or a call left over beside whole links does no harm
     parts = [e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter()]
-    left = [e for e in (parts or root.iter()) if "xacro" in str(e.tag)]
+    left = any("xacro" in e.tag for e in parts or root.iter())
     if left or any("${" in v for e in parts for v in e.attrib.values()):
         raise RobotError(xacro)
-    tag = str(root.tag).rpartition("}")[2]
-    if tag != "robot":
-        raise RobotError(
-            f"{where}: the root element is <{tag}>, {ROOTS.get(tag, 'a URDF begins with <robot>')}"
-        )
-    for element in root.iter():  # of a default namespace
-        element.tag = (
-            str(element.tag).rpartition("}")[2] if "xacro" not in str(element.tag) else element.tag
-        )
+    if root.tag != "robot":
+        what = ROOTS.get(root.tag, "a URDF begins with <robot>")
+        raise RobotError(f"{where}: the root element is <{root.tag}>, {what}")
     if late:
         words = "the XML declaration stands behind a comment or a space, and is passed over"
         ET.SubElement(root, "note", text=words)
