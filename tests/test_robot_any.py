@@ -151,8 +151,10 @@ def test_mirrored_axes_give_the_same_plan(tmp_path):
 
 # configurations that cannot be meant ----------------------------------------------------------------------------
 def heavier_left() -> str:
+    """By 10 g, and 2 mm ahead of the right leg."""
     robot = root()
     link(robot, "left_shank").find("inertial/mass").set("value", "3.01")
+    joint(robot, "left_hip_yaw").find("origin").set("xyz", "0.002 0.1 -0.43")
     return text(robot)
 
 
@@ -229,5 +231,7 @@ def test_small_differences_of_the_sides_are_evened_out():
     robot = Robot.from_text(jumper.urdf, jumper.config_text)
     masses = [robot.model.inertias[robot.model.getJointId(f"{side}_knee")].mass for side in ("left", "right")]
     assert masses == pytest.approx([3.005, 3.005], abs=1e-12)
+    hips = [robot.model.jointPlacements[robot.model.getJointId(f"{side}_hip_yaw")] for side in ("left", "right")]
+    np.testing.assert_allclose([hip.translation[:2] for hip in hips], [[0.001, 0.1], [0.001, -0.1]], atol=1e-12)
     assert robot.total_mass == pytest.approx(42.01, abs=1e-9)
     assert jumper.lumped.changed["left and right evened out, masses"][0] == pytest.approx(0.333, abs=1e-3)
