@@ -165,6 +165,10 @@ def test_a_mesh_that_is_not_there_costs_a_picture_but_never_mass(put):
     shown = ("<freejoint/>", '<freejoint/><geom type="mesh" mesh="m" {}/>')
     path = put(changed(MJCF, asset, (shown[0], shown[1].format(""))), "a.xml")
     assert "the mesh 'lost.stl' of 'pelvis' is not there" in notes(path)
+    for name in ("lost.stl", "lost.obj"):
+        put("version https://git-lfs.github.com/spec/v1\n", name)
+        pointer = put(path.read_text().replace("lost.stl", name), "b.xml")
+        assert f"the mesh {name!r} of 'pelvis' is not there or cannot be read: left out" in notes(pointer)
     for weight in ('mass="8"', 'density="600"', ""):
         path = put(changed(MJCF, asset, (inertial, ""), (shown[0], shown[1].format(weight))), "a.xml")
         sentence = refused(lambda path=path: draft(path))
@@ -219,6 +223,7 @@ def test_losses_of_the_file_are_those_of_the_motors(put):
     urdf = put(changed(URDF, (limits, limits.replace("</", '<dynamics damping="0.5" friction="-1"/></'))))
     assert examine(urdf).robot.actuators["left_knee"]["damping"] == 0.5
     assert "friction = '-1' of 'left_hip_pitch', 'left_knee', 'right_hip_pitch', 'right_knee' must be" in notes(urdf)
+    assert "armature = " not in notes(urdf)
 
 
 def test_a_scene_is_called_after_its_robot(put):
