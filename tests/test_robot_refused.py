@@ -68,6 +68,11 @@ def test_files_that_cannot_be_read(bhr, tmp_path):
     (tmp_path / "bhr.urdf").write_text("<robot")
     with pytest.raises(RobotError, match=r"^bhr.urdf: line 1, column 0: ends before </robot>; "):
         Robot.load(str(config))
+    (tmp_path / "bhr.urdf").write_text(bhr.urdf.replace('velocity="20"', 'velocity="400"', 1))
+    with pytest.raises(RobotError, match=r"^bhr\.urdf: joint '\w+': velocity = 400 rad/s is above 60: "):
+        Robot.load(str(config))
+    with pytest.raises(RobotError, match=r"^robot bhr: joint '\w+': the limit 'velocity' must be a number, got 'fast'"):
+        Robot.from_text(bhr.urdf.replace('velocity="20"', 'velocity="fast"', 1), bhr.config_text)
     (tmp_path / "bhr.urdf").write_text(bhr.urdf)
     assert Robot.load(str(config)).hash == bhr.hash
 
