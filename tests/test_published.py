@@ -20,7 +20,6 @@ from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
-from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
@@ -63,76 +62,50 @@ def test_a_published_robot_is_what_its_configuration_says(name):
 
 @here
 def test_motors_of_the_g1_are_the_makers():
-    joints = Robot.load("g1").actuators
-    told = {name: (joints[f"left_{name}_joint"]["effort"], joints[f"left_{name}_joint"]["corner_speed"])
-            for name in ("hip_pitch", "hip_yaw", "knee", "hip_roll", "ankle_pitch")}  # fmt: skip
-    assert told == {"hip_pitch": (71.0, pytest.approx(22.63)), "hip_yaw": (71.0, pytest.approx(22.63)),
-                    "knee": (111.0, pytest.approx(14.5)), "hip_roll": (111.0, pytest.approx(14.5)),
-                    "ankle_pitch": (35.0, pytest.approx(30.86))}  # fmt: skip
-    own = {name: [joints[f"left_{name}_joint"][key] for key in ("no_load_speed", "armature", "friction", "damping")]
-           for name in ("hip_pitch", "knee", "ankle_roll")}  # fmt: skip
-    assert own == {"hip_pitch": pytest.approx([35.52, 0.01017752, 1.6, 0.16]),
-                   "knee": pytest.approx([22.7, 0.025101925, 2.4, 0.24]),
-                   "ankle_roll": pytest.approx([40.13, 2 * 0.003609725, 1.2, 0.12])}  # fmt: skip
-    assert joints["left_knee_joint"]["speed"] == 20.0 and joints["left_ankle_pitch_joint"]["speed"] == 30.0
+    knee, hip = (Robot.load("g1").actuators[f"left_{name}_joint"] for name in ("knee", "hip_yaw"))
+    told = ("effort", "speed", "corner_speed", "no_load_speed", "armature", "friction", "damping")
+    assert [knee[key] for key in told] == pytest.approx([111.0, 20.0, 14.5, 22.7, 0.025101925, 2.4, 0.24])
+    assert [hip[key] for key in told[2:4]] == pytest.approx([22.63, 35.52])
 
 
 @here
 @pytest.mark.slow
-@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05)), ("alexander", (0.2, 0.05))])
-def test_planned_clean_and_landed(name, target):
-    robot = Robot.load(name)
-    plan = Planner(robot).plan(JumpTask(*target))
+def test_planned_clean_and_landed():
+    robot = Robot.load("talos")
+    plan = Planner(robot).plan(JumpTask(0.2, 0.05))
     report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
-    # drives that do not know the base let a G1 that stands on its toes fall back by 1.2 cm of travel
-    for mode, place_m in (("whole-body", 0.01), ("position", 0.02)):
+    for mode in ("whole-body", "position"):
         scene = Scene.of_plan(plan.summary, plan.robot)
         result = simulate_jump(plan.tape, plan.robot, scene=scene, mode=mode).to_json()
         assert result["landed"], result["reason"]
-        assert result["foot_distance_m"] == pytest.approx(target[0], abs=place_m)
-        assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
+        assert result["foot_distance_m"] == pytest.approx(0.2, abs=0.02)
+        assert result["com_rise_m"] == pytest.approx(0.05, abs=0.01)
 
 
 @here
-@pytest.mark.parametrize("name", ["romeo", "talos", "g1"])
-def test_too_much_is_refused_in_words(name):
+def test_too_much_is_refused_in_words():
     with pytest.raises(SolverError, match="take-off speed"):
-        Planner(Robot.load(name)).plan(JumpTask(0.3, 1.2))
+        Planner(Robot.load("talos")).plan(JumpTask(0.3, 1.2))
 
 
+ALLOWED = ("inertia", "massless")
 REFUSED = [
     ("bolt_description/robots/bolt.urdf", (), r"no pair of mirrored legs with three revolute pitch joints"),
-    ("alex_description/urdf/alex_nub_hands.urdf", (), r"no pair of mirrored legs"),
-    ("simple_humanoid_description/urdf/simple_humanoid.urdf", (), r"'LARM_LINK2': moment of inertia 1 kg m\^2"),
+    ("simple_humanoid_description/urdf/simple_humanoid.urdf", ALLOWED,
+     r"'LARM_LINK2': moment of inertia 1 kg m\^2 on 0\.6 kg is a radius of gyration of 1\.29 m"),
     ("human_description/robots/human.urdf", (), r"link 'left_upperleg_virtual': has no <inertial>"),
     ("cassie_description/robots/cassie.sdf", (), r"the root element is <sdf>, an SDF file, not a URDF$"),
-    ("panda_description/urdf/panda.urdf", (), r"no pair of mirrored legs"),
-]
+    ("icub_description/robots/icub.urdf", ALLOWED,
+     r"joint 'l_hip_pitch': velocity = 100 rad/s is above 60: deg/s or a placeholder; .* \[limits\.hip_pitch\]"),
+]  # fmt: skip
 
 
 @here
 @pytest.mark.parametrize(("name", "repair", "words"), REFUSED, ids=[x[0].split("/")[-1] for x in REFUSED])
 def test_no_jumper_and_why(name, repair, words):
     with pytest.raises(RobotError, match=words):
-        draft(urdf(name), repair)
-
-
-ALLOWED = ("inertia", "massless")
-NO_ROBOT = [
-    ("icub_description/robots/icub.urdf",
-     r"joint 'l_hip_pitch': velocity = 100 rad/s is above 60: deg/s or a placeholder; .* \[limits\.hip_pitch\]"),
-    ("simple_humanoid_description/urdf/simple_humanoid.urdf",
-     r"'LARM_LINK2': moment of inertia 1 kg m\^2 on 0\.6 kg is a radius of gyration of 1\.29 m"),
-]  # fmt: skip
-
-
-@here
-@pytest.mark.parametrize(("name", "words"), NO_ROBOT, ids=[x[0].split("/")[-1] for x in NO_ROBOT])
-def test_faults_that_no_repair_covers(name, words):
-    path = urdf(name)
-    with pytest.raises(RobotError, match=words):
-        check(path, draft(path, ALLOWED).text)
+        check(urdf(name), draft(urdf(name), repair).text)
 
 
 # robots that are downloaded one by one -----------------------------------------------------------------------------
@@ -207,13 +180,3 @@ def test_the_book_has_the_stored_jumps():
     for line in shipped.verdicts():
         name, *cells = map(str, line.values())
         assert re.search(rf"^\| `{name}`, [^|]+ \| {re.escape(' | '.join(cells))} \|$", page, re.M), line
-
-
-@here
-@pytest.mark.slow
-def test_the_g1_runs_up_and_leaves_from_one_foot():
-    robot = Robot.load("g1_arms")
-    plan = Planner(robot).follow(Contacts.run_up(robot))
-    report = audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
-    assert report.passed, report.table()
-    assert plan.tape.extra["contacts"][plan.tape.takeoff_index - 1].tolist() == [0, 1]  # the right one, on its toes

@@ -25,7 +25,7 @@ FACTORS = st.floats(0.05, 20.0)
 
 
 # limits ---------------------------------------------------------------------------------------------------------
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(deadline=None, derandomize=True, max_examples=10)
 @given(effort=FACTORS | st.dictionaries(KEYS, FACTORS, max_size=4), speed=FACTORS | st.dictionaries(KEYS, FACTORS))
 def test_factors_reach_the_joints_that_are_named_and_no_other(effort, speed):
     robot = BHR.with_limits(effort=effort, speed=speed)
@@ -86,7 +86,7 @@ def body_of(model: pin.Model, link: str) -> pin.Inertia:
 
 
 # masses ---------------------------------------------------------------------------------------------------------
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(deadline=None, derandomize=True, max_examples=10)
 @given(links=st.lists(st.sampled_from(LINKS), min_size=1, max_size=4), factor=st.floats(0.5, 2.0))
 def test_inertia_scales_with_mass_and_nothing_else_moves(links, factor):
     robot = BHR.with_mass(links, factor=factor)
@@ -221,7 +221,7 @@ ANYTHING = st.recursive(
 )
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(deadline=None, derandomize=True, max_examples=20)
 @given(effort=ANYTHING, joints=ANYTHING, link=ANYTHING, mass=ANYTHING)
 def test_any_input_gives_a_sound_robot_or_one_sentence(effort, joints, link, mass):
     for change in (

@@ -46,22 +46,20 @@ def wrench_rows(
         [m].
     spin : the largest moment about the vertical over the force down [m].
     """
-    rows = {"F_z >= 0": np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])}
-
-    def limit(name: str, share: float | None, column: int, sign: float) -> None:
+    limits = {f"friction {way}": (friction, axis, sign) for way, axis, sign in WAYS}
+    limits |= {
+        "CoP behind toe": (ahead, 4, -1.0),
+        "CoP ahead of heel": (behind, 4, 1.0),
+        "CoP left of right edge": (half_width, 3, -1.0),
+        "CoP right of left edge": (half_width, 3, 1.0),
+        "torsion +": (spin, 5, 1.0),
+        "torsion -": (spin, 5, -1.0),
+    }
+    unit = np.eye(6)
+    rows = {"F_z >= 0": unit[2]}
+    for name, (share, column, sign) in limits.items():
         if share is not None:
-            rows[name] = np.zeros(6)
-            rows[name][2] = share
-            rows[name][column] = -sign
-
-    for way, axis, sign in WAYS:
-        limit(f"friction {way}", friction, axis, sign)
-    limit("CoP behind toe", ahead, 4, -1.0)
-    limit("CoP ahead of heel", behind, 4, 1.0)
-    limit("CoP left of right edge", half_width, 3, -1.0)
-    limit("CoP right of left edge", half_width, 3, 1.0)
-    limit("torsion +", spin, 5, 1.0)
-    limit("torsion -", spin, 5, -1.0)
+            rows[name] = share * unit[2] - sign * unit[column]
     return rows
 
 

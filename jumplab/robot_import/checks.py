@@ -8,8 +8,9 @@ file can be listed; :func:`read_tree` raises on the first.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,7 +23,9 @@ from jumplab.robot_import.urdf import (
     MOVING,
     OWN,
     SIZES,
+    Joint,
     Tree,
+    finite,
     mass_of,
     numbers,
     parse,
@@ -43,6 +46,11 @@ MOST_NM = 2000.0  # five times the strongest published electric humanoid joint
 # twice the fastest published humanoid pitch joint; above it, deg/s or a placeholder
 MOST_RAD_S = 60.0
 MOST_RAD = 4 * np.pi  # two turns; beyond them, degrees or a placeholder
+# of a motor: unit, the most that is meant, what more of it is, what to give
+MOTOR_LIMITS = {
+    "effort": ("N m", MOST_NM, "a placeholder", "peak torque"),
+    "velocity": ("rad/s", MOST_RAD_S, "deg/s or a placeholder", "speed limit in rad/s"),
+}
 # why a joint of an MJCF has none
 IN_MJCF = {
     "lower": "has no range",
@@ -88,51 +96,46 @@ def faults(root: ET.Element, where: str, repair: Collection[str] = ()) -> list[s
     return out or list(_unit_faults(tree))
 
 
-def notes(root: ET.Element, repair: Collection[str] = ()) -> Iterator[str]:
+def notes(tree: Tree) -> Iterator[str]:
     """What is left over in a URDF without faults, passed over or mended because no jump would
-    notice; ``repair`` as of :func:`faults` (file, repairs).
+    notice.
     """
-    for element in root:
-        if "xacro" in str(element.tag):
-            yield (
-                f"the call "
-                f"<{element.tag.rpartition('}')[2]}> of a xacro macro is left over, and passed over"
-            )
-    yield from (note.get("text") for note in root.findall("note"))
-    most = np.inf if "inertia" in repair else slight(root)
-    for link in root.findall("link"):
-        name = link.get("name")
+    for element in tree.xml:
+        if "xacro" in element.tag:
+            name = element.tag.rpartition("}")[2]
+            yield f"the call <{name}> of a xacro macro is left over, and passed over"
+    yield from (note.get("text") for note in tree.xml.findall("note"))
+    for name, link in tree.elements.items():
         if any(numbers(x.get("radius"), 1) == 0 for x in link.findall("collision/geometry/sphere")):
             yield f"link {name!r}: a sphere of radius 0 is taken as a point"
-        if mass_of(link) >= FRAME_KG and 0 < (gap := unsolid(tensor_of(link))) <= most:
+        if mass_of(link) >= FRAME_KG and 0 < (gap := unsolid(tensor_of(link))) <= tree.mended:
             yield (
                 f"link {name!r}: its inertia, which no solid has, is replaced by the nearest, "
                 f"{gap:.2g} kg m^2 apart"
             )
-    for joint in root.findall("joint/mimic/.."):
-        yield f"joint {joint.get('name')!r} follows {joint.find('mimic').get('joint')!r}: held"
-    for joint in root.findall("joint/limit[@effort]/.."):
-        if joint.get("type") in MOVING and numbers(joint.find("limit").get("effort"), 1) == 0:
-            yield f"joint {joint.get('name')!r} has no motor (effort = 0): held"
-    yield from _losses(root)
+    moving = [joint for joint in tree.joints.values() if joint.kind in MOVING]
+    for joint in tree.joints.values():
+        if joint.mimic:
+            yield f"joint {joint.name!r} follows {joint.mimic[0]!r}: held"
+    for joint in moving:
+        if joint.limits.get("effort") == 0:
+            yield f"joint {joint.name!r} has no motor (effort = 0): held"
+    yield from _losses(moving)
 
 
-def _losses(root: ET.Element) -> Iterator[str]:
+def _losses(moving: list[Joint]) -> Iterator[str]:
     """Which of armature, friction and damping the file has, and which cannot be."""
-    used = {key: 0 for key in OWN}
     wrong = {}  # (key, text) -> joints
-    for joint in root.findall("joint/dynamics/.."):
-        for key in OWN if joint.get("type") in MOVING else ():
-            text = joint.find("dynamics").get(key, "0")
-            value = numbers(text, 1)
-            if value is None or value[0] < 0:
-                wrong.setdefault((key, text), []).append(repr(joint.get("name")))
-            elif value[0] > 0:
-                used[key] += 1
+    for joint in moving:
+        told = joint.element.find("dynamics")
+        for key in OWN if told is not None else ():
+            if key in told.attrib and finite(told, (key,)).get(key, -1.0) < 0:
+                wrong.setdefault((key, told.get(key)), []).append(repr(joint.name))
     for (key, text), joints in wrong.items():
         yield f"{key} = {text!r} of {listed(joints)} must be a number from 0 on: not used"
-    if any(used.values()):
-        counts = ", ".join(f"{key} of {count} joints" for key, count in used.items() if count)
+    used = Counter(key for joint in moving for key in joint.losses)
+    if used:
+        counts = ", ".join(f"{key} of {used[key]} joints" for key in OWN if used[key])
         yield f"the file has losses of the motors: {counts}"
 
 
@@ -206,40 +209,32 @@ def _tree_faults(names: set, joints: list[ET.Element], where: str) -> Iterator[s
         for key in ("multiplier", "offset"):
             if numbers(mimic.get(key, "0"), 1) is None:
                 yield f"{at}: mimic {key} = {mimic.get(key)!r} must be a finite number"
-    parents = [joint.find("parent").get("link") for joint in joints]
-    children = [joint.find("child").get("link") for joint in joints]
-    for link, times in Counter(children).items():
-        if times > 1:
-            above = [
-                j.get("name") for j, child in zip(joints, children, strict=True) if child == link
-            ]
-            above = ", ".join(map(repr, above))
+    above = {}  # child -> its joints and their parents
+    for joint in joints:
+        child, parent = (joint.find(end).get("link") for end in ("child", "parent"))
+        above.setdefault(child, {})[joint.get("name")] = parent
+    for link, hanging in above.items():
+        if len(hanging) > 1:
             yield (
-                f"{where}: link {link!r} hangs on {times} joints ({above}): a closed loop; cut "
-                f"it to leave a tree"
+                f"{where}: link {link!r} hangs on {len(hanging)} joints "
+                f"({', '.join(map(repr, hanging))}): a closed loop; cut it to leave a tree"
             )
             return
-    roots = sorted(names - set(children))
-    if not roots:
+    roots = sorted(names - set(above))
+    if len(roots) > 1:
         yield (
-            f"{where}: no link is the root: the joints form a cycle; each robot needs one link "
-            f"without a parent"
+            f"{where}: {len(roots)} links have no parent ({listed(map(repr, roots))}), Pinocchio "
+            f"keeps one tree and drops the rest; connect them"
         )
-    elif len(roots) > 1:
-        named = listed(map(repr, roots))
-        yield (
-            f"{where}: {len(roots)} links have no parent ({named}), Pinocchio keeps one tree and "
-            f"drops the rest; connect them"
-        )
-    else:
-        below = list(roots)
-        for link in below:
-            below += [
-                child for child, above in zip(children, parents, strict=True) if above == link
-            ]
-        if lost := sorted(names - set(below)):
-            named = listed(map(repr, lost))
-            yield f"{where}: the links {named} form a cycle apart from the root {roots[0]!r}"
+        return
+    below = list(roots)
+    for link in below:
+        below += [child for child, hanging in above.items() if link in hanging.values()]
+    if lost := listed(map(repr, sorted(names - set(below)))):
+        end = ": each robot needs one link without a parent"
+        if roots:
+            end = f" apart from the root {roots[0]!r}"
+        yield f"{where}: the links {lost} form a cycle{end}"
 
 
 # inertials
@@ -371,23 +366,18 @@ def _shape_faults(link: ET.Element, at: str) -> Iterator[str]:
 # limits
 # --------------------------------------------------------------------------------------------------
 def limit_faults(
-    joint: ET.Element,
-    where: str,
-    given: dict[str, float] | None = None,
-    *,
-    form: str = "URDF",
-    table: str = "",
+    tree: Tree, joint: str, given: Mapping[str, float] = MappingProxyType({}), table: str = ""
 ) -> Iterator[str]:
     """The faults of the limits of one joint that the jump uses, in one sentence, if there are any.
 
-    ``given`` and ``form`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the
-    configuration that can tell them.
+    ``given`` as of :func:`wrong_limits`; the sentence advises the ``table`` of the configuration
+    that can tell them.
     """
-    if wrong := wrong_limits(joint, given, form):
+    if wrong := wrong_limits(tree, joint, given):
         keys = ", ".join(keys_of(wrong))
-        advice = f", or tell {keys} in [{table}] of the configuration" if table else ""
-        advice = advice.replace(", or", ";") if form == "MJCF" else advice
-        yield f"{where}: joint {joint.get('name')!r}: {'; '.join(wrong.values())}{advice}"
+        link = ";" if tree.format == "MJCF" else ", or"
+        advice = f"{link} tell {keys} in [{table}] of the configuration" if table else ""
+        yield f"{tree.where}: joint {joint!r}: {'; '.join(wrong.values())}{advice}"
 
 
 def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
@@ -396,70 +386,45 @@ def keys_of(wrong: dict[tuple[str, ...], str]) -> list[str]:
 
 
 def wrong_limits(
-    joint: ET.Element, given: dict[str, float] | None = None, form: str = "URDF"
+    tree: Tree, joint: str, given: Mapping[str, float] = MappingProxyType({})
 ) -> dict[tuple[str, ...], str]:
     """Limits of a joint that cannot be meant, or are missing, and what is wrong with them.
 
-    ``given`` values [rad, N m, rad/s] go before those of the file, of the format ``form``.
+    ``given`` values [rad, N m, rad/s] go before those of the file.
     """
-    limit = joint.find("limit")
-    values = dict(given or {})
-    missing = [key for key in LIMITS if key not in values]
-    texts = {key: None if limit is None else limit.get(key) for key in missing}
-    absent = tuple(key for key, text in texts.items() if text is None)
+    limit = tree.joints[joint].element.find("limit")
+    texts = {} if limit is None else limit.attrib
+    values = tree.joints[joint].limits | given
+    absent = tuple(key for key in LIMITS if key not in values and key not in texts)
     wrong = {}
-    if absent and form == "MJCF":
+    if absent and tree.format == "MJCF":
         wrong[absent] = "; ".join(dict.fromkeys(IN_MJCF[key] for key in absent))
-    elif limit is None and missing:
-        wrong[absent] = f"has no <limit>; add {', '.join(missing)}"
+    elif absent and limit is None:
+        wrong[absent] = f"has no <limit>; add {', '.join(absent)}"
     elif absent:
         them = "it" if len(absent) == 1 else "them"
-        which = f"{', '.join(absent)}, which Pinocchio reads as 0; add {them}"
-        wrong[absent] = f"<limit> has no {which}"
-    for key in missing:
-        if (text := texts[key]) is not None:
-            if (value := numbers(text, 1)) is None:
-                wrong[key,] = f"{key} = {text!r} must be a finite number"
-            else:
-                values[key] = float(value[0])
-    return wrong | _range_faults(values) | _motor_faults(values)
-
-
-def _range_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
-    """What is wrong with a range [rad], if both of its ends are there."""
-    if not {"lower", "upper"} <= set(values):
-        return {}
-    low, high = values["lower"], values["upper"]
-    span = f"range {low:g} ... {high:g} rad is"
-    if max(abs(low), abs(high)) > MOST_RAD:
-        wrong = (
-            f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+        wrong[absent] = (
+            f"<limit> has no {', '.join(absent)}, which Pinocchio reads as 0; add {them}"
         )
-    elif low > high:
-        wrong = f"lower = {low:g} rad is above upper = {high:g} rad; swap them"
-    elif low == high:
-        wrong = f"{span} empty; give the real range"
-    else:
-        return {}
-    return {("lower", "upper"): wrong}
+    for key in LIMITS:
+        if key not in values and key in texts:
+            wrong[key,] = f"{key} = {texts[key]!r} must be a finite number"
+    if sentence := {"lower", "upper"} <= set(values) and _range_fault(**values):
+        wrong["lower", "upper"] = sentence
+    for key, (unit, most, what, remedy) in MOTOR_LIMITS.items():
+        value = values.get(key, 1.0)
+        if value <= 0:
+            wrong[key,] = f"{key} = {value:g} {unit} must be positive; give the {remedy}"
+        elif value > most:
+            wrong[key,] = f"{key} = {value:g} {unit} is above {most:g}: {what}; give the {remedy}"
+    return wrong
 
 
-def _motor_faults(values: dict[str, float]) -> dict[tuple[str, ...], str]:
-    """What is wrong with a torque [N m] and a speed [rad/s], those that are there."""
-    out = {}
-    effort = values.get("effort", 1.0)
-    speed = values.get("velocity", 1.0)
-    if effort <= 0:
-        out["effort",] = f"effort = {effort:g} N m must be positive; give the peak torque"
-    elif effort > MOST_NM:
-        out["effort",] = (
-            f"effort = {effort:g} N m is above {MOST_NM:g}: a placeholder; give the peak torque"
-        )
-    if speed <= 0:
-        out["velocity",] = f"velocity = {speed:g} rad/s must be positive; give the speed limit"
-    elif speed > MOST_RAD_S:
-        out["velocity",] = (
-            f"velocity = {speed:g} rad/s is above {MOST_RAD_S:g}: deg/s or a placeholder; give the "
-            f"speed limit in rad/s"
-        )
-    return out
+def _range_fault(lower: float, upper: float, **_: float) -> str:
+    """What is wrong with a range [rad]; "" if nothing is."""
+    span = f"range {lower:g} ... {upper:g} rad is"
+    if max(abs(lower), abs(upper)) > MOST_RAD:
+        return f"{span} beyond {MOST_RAD:.1f}: degrees or a placeholder; give the real range in rad"
+    if lower > upper:
+        return f"lower = {lower:g} rad is above upper = {upper:g} rad; swap them"
+    return f"{span} empty; give the real range" if lower == upper else ""

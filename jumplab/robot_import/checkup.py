@@ -112,23 +112,18 @@ def check_texts(urdf: str, config_text: str, where: str) -> None:
     motors may be stronger and faster than any.
     Engines and viewers read these texts, and would open the meshes that they name.
     """
-    from_file = bool(where)
-    where = where or "robot.urdf"
-    root = parse(urdf, where)
-    for link in root.iterfind("link"):
+    tree = urdf_checks.read_tree(urdf, where or "robot.urdf")
+    for name, link in tree.elements.items():
         for mesh in link.iterfind("*/geometry/mesh"):
-            raise RobotError(
-                f"{where}: link {link.get('name')!r}: the mesh {quoted(mesh.get('filename'))} is "
-                f"not opened; make it a box, or describe the robot by a TOML with [source]"
+            raise tree.error(
+                f"link {name!r}: the mesh {quoted(mesh.get('filename'))} is not opened; make it a "
+                f"box, or describe the robot by a TOML with [source]"
             )
-    faults = urdf_checks.faults(root, where)
-    joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
     for pair in roles_table(read_toml(config_text, "robot configuration")).values():
-        for name in pair if from_file and not faults else ():
-            if name in joints:  # one that is missing is refused by the robot itself
-                faults += urdf_checks.limit_faults(joints[name], where)
-    if faults:
-        raise RobotError(faults[0])
+        for name in pair if where else ():
+            # one that is missing is refused by the robot itself
+            for sentence in urdf_checks.limit_faults(tree, name) if name in tree.joints else ():
+                raise RobotError(sentence)
 
 
 def examine(robot: str | Path, repair: tuple[str, ...] = ()) -> Checkup:

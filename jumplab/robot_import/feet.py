@@ -26,8 +26,8 @@ SOLE_M = 0.012
 GUESS_X = (-0.143, 0.2)
 GUESS_Y = (-0.071, 0.071)
 GUESS_Z = -0.107
-SAME_WAY = 0.95  # of a wheel: cosine of its axis, and of its radius what belongs to the rim
-SECTORS = 12  # of the rim, all of which a wheel has
+SAME_WAY = 0.8  # of a wheel, turned any way: how far it reaches, of how far it reaches at most
+TURN_RAD = np.pi / 6
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,18 @@ def find_sole(tree: Tree, foot: str, turn: np.ndarray, leg_m: float) -> Sole:
     ``turn`` (3, 3) leads from the root's axes to the robot's; from ``leg_m``, the length from hip
     to ankle, a sole is guessed if the link ``foot`` has no shape.
     """
-    touching, around = sole_points(tree, foot, turn, thickness(leg_m))
-    if not len(around):
+    touching, around, kinds = sole_points(tree, foot, turn, thickness(leg_m))
+    if not kinds:
         x, y = (tuple(leg_m * share for share in shares) for shares in (GUESS_X, GUESS_Y))
         files = [shape.get("filename") for x in tree.below(foot) for _, shape in tree.shapes(x)]
         lost = listed(sorted({repr(file) for file in files if file}))
         source = "GUESSED from the leg's length: the foot has no shape that is at hand"
         source += f", the mesh {lost} is not there" if lost else ""
         return Sole(x, y, leg_m * GUESS_Z, source)
-    parts = tree.below(foot)
-    drawn = "visual" if not any(len(tree.points(part)) for part in parts) else "collision"
-    kinds = {shape.tag for part in parts for _, shape in tree.shapes(part, drawn)}
     source = f"from its {' and '.join(sorted(kinds))}"
     least = SMALLEST * leg_m
     if max(np.ptp(touching[:, :2], axis=0)) < least:
-        _, whole = sole_points(tree, foot, turn, np.inf)
+        _, whole, _ = sole_points(tree, foot, turn, np.inf)
         if max(np.ptp(whole[:, :2], axis=0)) > 3 * least:
             raise tree.error(
                 f"with all joints at 0 the foot {foot!r} leans, and touches level ground in a "
@@ -88,25 +85,29 @@ def thickness(leg_m: float) -> float:
 
 def sole_points(
     tree: Tree, foot: str, turn: np.ndarray, thick_m: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, set[str]]:
     """Points of a foot and its toes at most ``thick_m`` [m] above the lowest, (n, 3) from its
     origin along the axes ``turn`` (3, 3): those that touch level ground, and corners around
-    its shapes, which are farther out where these are round.
+    its shapes, which are farther out where these are round; and the kinds of shapes.
 
     What is drawn counts where nothing collides.
     """
     axes = pin.SE3(turn, -turn @ tree.pose[foot].translation)
-    parts = tree.below(foot)
-    touching = np.zeros((0, 3))
-    around = touching
+    touching = [np.zeros((0, 3))]
+    around = [np.zeros((0, 3))]
+    kinds = set()
     for kind in ("collision", "visual"):
-        for part in parts if not len(around) else ():
+        for part in tree.below(foot) if not kinds else ():
             for place, shape in tree.shapes(part, kind):
                 at = axes * tree.pose[part] * place
-                around = np.concatenate([around, placed(at, tree.corners(shape))])
-                touching = np.concatenate([touching, _lowest(tree, shape, at)])
-    level = touching[:, 2].min(initial=np.inf) + thick_m
-    return touching[touching[:, 2] < level], around[around[:, 2] < level]
+                if len(corners := tree.corners(shape)):
+                    around.append(placed(at, corners))
+                    touching.append(_lowest(tree, shape, at))
+                    kinds.add(shape.tag)
+    ends = np.concatenate(touching)
+    level = ends[:, 2].min(initial=np.inf) + thick_m
+    low = [points[points[:, 2] < level] for points in (ends, np.concatenate(around))]
+    return *low, kinds
 
 
 def _lowest(tree: Tree, shape: ET.Element, place: pin.SE3) -> np.ndarray:
@@ -133,34 +134,24 @@ def refuse_wheel(tree: Tree, ankle: Joint) -> None:
     stops = [ankle.limits.get(end, np.inf) for end in ("lower", "upper")]
     if ankle.kind != "continuous" and np.abs(stops).max() <= MOST_RAD:
         return
-    place = tree.pose[ankle.child]
     for part in tree.bodies[tree.carrier[ankle.child]]:
-        for kind in ("collision", "visual"):
-            for at, shape in tree.shapes(part, kind):
-                to_joint = place.inverse() * tree.pose[part] * at
-                if _round(tree, shape, to_joint, ankle.axis):
-                    raise tree.error(
-                        f"the legs end in wheels: joint {ankle.name!r} turns without stops, and "
-                        f"its body {part!r} is round about it; jumps are planned for feet with "
-                        f"soles"
-                    )
+        for place, shape in (
+            x for kind in ("collision", "visual") for x in tree.shapes(part, kind)
+        ):
+            to_joint = tree.pose[ankle.child].inverse() * tree.pose[part] * place
+            if _round(tree, shape, to_joint, ankle.axis):
+                raise tree.error(
+                    f"the legs end in wheels: joint {ankle.name!r} turns without stops, and its "
+                    f"body {part!r} is round about it; jumps are planned for feet with soles"
+                )
 
 
 def _round(tree: Tree, shape: ET.Element, place: pin.SE3, axis: np.ndarray) -> bool:
-    """Whether a shape, at its ``place`` in the frame of a joint, is round about the joint's axis
-    (3,).
+    """Whether a shape, at its ``place`` in the frame of a joint, reaches as far below the joint's
+    axis (3,) however it is turned about that.
     """
-    if shape.tag in ROUND:
-        centre = place.translation - (place.translation @ axis) * axis
-        radius = float(shape.get("radius"))
-        along = shape.tag == "sphere" or abs(place.rotation[:, 2] @ axis) > SAME_WAY
-        return along and np.linalg.norm(centre) < radius / 2
-    if shape.tag != "mesh":
-        return False
-    points = tree.corners(shape) @ place.rotation.T + place.translation
-    across = points - np.outer(points @ axis, axis)
-    far = np.linalg.norm(across, axis=1)
-    rim = across[far > SAME_WAY * far.max(initial=0.0)]
-    side = np.linalg.svd(axis[None])[2][1:]  # two directions across the axis
-    sectors = np.floor((np.arctan2(*(rim @ side.T).T) + np.pi) / (2 * np.pi) * SECTORS)
-    return len(set(sectors[sectors < SECTORS])) == SECTORS
+    level = pin.Quaternion.FromTwoVectors(axis, np.array([0.0, 1.0, 0.0])).toRotationMatrix()
+    turns = [pin.rpy.rpyToMatrix(0.0, turn, 0.0) for turn in np.arange(0.0, 2 * np.pi, TURN_RAD)]
+    ways = [_lowest(tree, shape, pin.SE3(turn @ level, np.zeros(3)) * place) for turn in turns]
+    deep = [-way[:, 2].min(initial=0.0) for way in ways]
+    return min(deep) > SAME_WAY * max(deep)

@@ -23,7 +23,7 @@ from jumplab.errors import RobotError
 from jumplab.robot.description import STANCE
 from jumplab.robot.files import LEG, TABLES, check_entries, entry, roles_table, table
 from jumplab.robot_import.checks import read_tree
-from jumplab.robot_import.lump import CORNER, NO_LOAD, Body, Lumped, RoleJoints, lump
+from jumplab.robot_import.lump import CORNER, MOTOR, NO_LOAD, Body, Lumped, RoleJoints, lump
 from jumplab.robot_import.roles import AXES
 from jumplab.robot_import.urdf import LIMITS, MOVING, OWN, Tree
 from jumplab.robot_import.write import (
@@ -34,6 +34,7 @@ from jumplab.robot_import.write import (
     filled,
     quote,
     rows,
+    shifted,
     titled,
 )
 
@@ -54,6 +55,7 @@ SOURCE_TABLES = TABLES | {
 }
 GAP = 0.14  # share of each limb's length, kept free at both ends
 ARM_REACH = 1.86  # length of an arm's box, in distances from the shoulder to the arm's CoM
+RATIOS = {CORNER: "corner_speed_ratios", NO_LOAD: "no_load_ratios"}  # in [actuators]
 DIAGONAL = 1e-9  # [kg m^2] below, a product of inertia is rounding
 STEP_RAD = 0.02  # of the sweep for collisions; the range is cut one step early
 FREE_M = 0.008  # distance kept between thigh and trunk
@@ -109,12 +111,13 @@ def _source(config: dict) -> dict:
             f"axes"
         )
     repair = table(config, "source").get("repair", [])
-    for word in repair if isinstance(repair, list) else [repair]:
+    out["repair"] = tuple(repair if isinstance(repair, list) else [repair])
+    for word in out["repair"]:
         if word not in REPAIRS:
             raise RobotError(
                 f"robot configuration: 'source.repair' knows {', '.join(REPAIRS)}, got {word!r}"
             )
-    return out | {"repair": tuple(repair)}
+    return out
 
 
 def _facing(config: dict) -> dict:
@@ -154,38 +157,33 @@ def _sole(config: dict, offset: np.ndarray, where: str) -> dict[str, float]:
     y = np.array(entry(config, "feet", "sole_y_m", count=2)) + left
     z = entry(config, "feet", "sole_z_m") + up
     half = (y[1] - y[0]) / 2 - abs(y[0] + y[1]) / 2  # the part that is symmetric about the ankle
-    if z < 0 and half > 0 and x[0] < x[1] and (x[0] >= 0 or x[1] <= 0):
-        side, end = ("ahead of", "toes") if x[0] >= 0 else ("behind", "heel")
-        raise RobotError(
-            f"{where}: the sole, {x[0]:.3f} ... {x[1]:.3f} m from the ankle, lies {side} it: the "
-            f"foot stands on its {end} with all joints at 0, or [feet] is wrong; tell there the "
-            f"sole along the level axes"
-        )
     if not (x[0] < 0.0 < x[1] and half > 0 and z < 0):
         raise RobotError(
             f"{where}: the sole {np.round(x, 3)} x {np.round(y, 3)} m, {z:.3f} m from the ankle, "
-            f"must lie below it and reach to both sides of it; correct [feet]"
+            f"must lie below it and reach to both sides of it: the foot stands on its heel or its "
+            f"toes with all joints at 0, or [feet] is wrong; tell there the sole along the level "
+            f"axes"
         )
     return {"heel": float(x[0]), "toe": float(x[1]), "half": float(half), "z": float(z)}
 
 
 def _cut_hips(lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> Lumped:
     """Hip ranges cut to where boxes of thigh and trunk meet; canted hips keep theirs."""
-    new = {}
+    bodies = dict(lumped.bodies)
     cut = 0.0
-    for hip, knee in zip(*(map(lumped.body, roles[role]) for role in LEG[:2]), strict=True):
+    for hip, knee in zip(*(lumped.moved_by(roles[role]) for role in LEG[:2]), strict=True):
         limits = dict(hip.limits)
-        thigh = lumped.named(knee.parent)
-        trunk = _solids(lumped.bodies[0], boxes, hip, 0.0)
+        thigh = lumped.bodies[knee.parent]
+        trunk = _solids(lumped.trunk, boxes, hip, 0.0)
         for end in ("lower", "upper") if abs(hip.axis[1]) == 1 else ():
             grid = np.linspace(0.0, limits[end], max(int(abs(limits[end]) / STEP_RAD), 1) + 1)
             gaps = [_gap(trunk, _solids(thigh, boxes, hip, angle)) for angle in grid]
             if min(gaps) <= FREE_M:
                 limits[end] = float(grid[max(np.argmax(np.array(gaps) <= FREE_M) - 1, 0)])
             cut = max(cut, abs(limits[end] - hip.limits[end]))
-        new[hip.name] = replace(hip, limits=limits)
+        bodies[hip.name] = replace(hip, limits=limits)
     changed = lumped.changed | ({"hip range cut, thigh meets trunk": (cut, "rad")} if cut else {})
-    return replace(lumped, bodies=tuple(new.get(b.name, b) for b in lumped.bodies), changed=changed)
+    return replace(lumped, bodies=bodies, changed=changed)
 
 
 def _solids(body: Body, boxes: dict[str, Boxes], joint: Body, angle: float) -> list[tuple]:
@@ -208,12 +206,12 @@ def _gap(one: list[tuple], other: list[tuple]) -> float:
 # --------------------------------------------------------------------------------------------------
 def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes]) -> str:
     robot = ET.Element("robot", name=name)
-    trunk, *others = lumped.bodies
-    hip = np.mean([lumped.body(joint).place for joint in roles["hip_pitch"]], axis=0)
+    trunk, *others = lumped.bodies.values()
+    hip = np.mean([body.place for body in lumped.moved_by(roles["hip_pitch"])], axis=0)
     _add_trunk(robot, trunk, boxes[trunk.name], hip - trunk.place)
     for body in others:
         _add_body(robot, body.name, body.inertia, boxes.get(body.name, []))
-        place = pin.SE3(np.eye(3), body.place - lumped.named(body.parent).place)
+        place = shifted(body.place - lumped.bodies[body.parent].place)
         limits = {key: body.limits[key] for key in LIMITS}
         ends = body.parent, body.name
         add_joint(robot, body.joint, "revolute", ends, place, body.axis, limits)
@@ -223,34 +221,30 @@ def _urdf(name: str, lumped: Lumped, roles: RoleJoints, boxes: dict[str, Boxes])
 
 def _published(tree: Tree, lumped: Lumped, boxes: dict[str, Boxes]) -> str:
     """The table [published]: the robot with all its joints, fixed links as one."""
-    trunk, *_ = lumped.bodies
-    bodies = {body.name: body for body in lumped.bodies}
+    trunk = lumped.trunk
     model = tree.model
-    kinds = {
-        name: joint.kind.replace("continuous", "revolute") for name, joint in tree.joints.items()
-    }
-    root = tree.carrier[trunk.name]
-    while kinds.get(model.names[root]) in MOVING:
-        root = model.parents[root]
-    robot = ET.Element("robot", name="published")
-    todo = [root]
-    for carrier in todo:
-        parts = tree.bodies[carrier]
-        link = parts[0]
-        for name, k in ((model.names[k], k) for k in model.children[carrier]):
-            if kinds[name] in MOVING:
-                joint = tree.joints[name]
-                ends = link, joint.child
-                place = model.jointPlacements[k]
-                add_joint(robot, name, kinds[name], ends, place, joint.axis, ANY | joint.limits)
-                todo.append(k)
-        body = next((bodies[part] for part in parts if part in bodies), trunk)
-        axes = lumped.placed[link].inverse() * pin.SE3(np.eye(3), body.place)
-        shapes = boxes.get(body.name, []) if body.name in parts else []
-        _add_body(robot, link, model.inertias[carrier], shapes, axes=axes)
+    joints = {k: tree.joints.get(name) for k, name in enumerate(model.names)}
+    moving = {k: joint for k, joint in joints.items() if joint and joint.kind in MOVING}
+    # what floats, and carries the trunk
+    todo = [k for k in model.supports[tree.carrier[trunk.name]] if k not in moving][-1:]
     root = tree.bodies[tree.carrier[trunk.name]][0]
+    robot = ET.Element("robot", name="published")
+    for carrier in todo:
+        link, *_ = tree.bodies[carrier]
+        below = [k for k in model.children[carrier] if k in moving]
+        for k in below:
+            joint = moving[k]
+            kind = joint.kind.replace("continuous", "revolute")
+            ends = link, joint.child
+            limits = ANY | joint.limits
+            add_joint(robot, joint.name, kind, ends, model.jointPlacements[k], joint.axis, limits)
+        todo += below
+        name = next((part for part in tree.bodies[carrier] if part in lumped.bodies), trunk.name)
+        axes = lumped.placed[link].inverse() * shifted(lumped.bodies[name].place)
+        shapes = boxes.get(name, []) if name in tree.bodies[carrier] else []
+        _add_body(robot, link, model.inertias[carrier], shapes, axes=axes)
     ET.indent(robot)
-    place = pin.SE3(np.eye(3), -trunk.place) * lumped.placed[root]
+    place = shifted(-trunk.place) * lumped.placed[root]
     return filled(
         "published.toml.in",
         trunk=quote(root),
@@ -281,16 +275,18 @@ def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> 
     """
     centre, size = min(boxes, key=lambda b: b[0][2] - b[1][2] / 2)
     bottom = centre[2] - size[2] / 2
-    middle = np.array([hip[0], 0.0, (bottom + hip[2]) / 2])
-    spine = [(middle, np.array([size[0] / 2, size[1] / 2, bottom - hip[2]]))]
-    spine = spine if bottom > hip[2] else []
-    matrix = body.inertia.inertia
+    spine = []
+    if bottom > hip[2]:
+        middle = np.array([hip[0], 0.0, (bottom + hip[2]) / 2])
+        spine.append((middle, np.array([size[0] / 2, size[1] / 2, bottom - hip[2]])))
+    inertia = body.inertia
+    matrix = inertia.inertia
     if np.abs(matrix - np.diag(np.diag(matrix))).max() <= DIAGONAL:
-        _add_body(robot, body.name, body.inertia, boxes, spine)
+        _add_body(robot, body.name, inertia, boxes, spine)
         return
     low, middle, high = np.linalg.eigvalsh(matrix)
-    even = 0.5 * min(low, low + middle - high) * np.eye(3)  # what is left is still a solid's
-    if even[0, 0] <= 0:
+    even = 0.5 * min(low, low + middle - high)  # what is left is still a solid's
+    if even <= 0:
         raise RobotError(
             f"link {body.name!r} and what is fixed to it: principal moments {low:.3g}, "
             f"{middle:.3g}, {high:.3g} "
@@ -298,11 +294,10 @@ def _add_trunk(robot: ET.Element, body: Body, boxes: Boxes, hip: np.ndarray) -> 
             f'repair = ["inertia"]'
         )
     rest = f"{body.name}_rest"
-    halves = [
-        pin.Inertia(body.inertia.mass / 2, body.inertia.lever, x) for x in (even, matrix - even)
-    ]
-    _add_body(robot, body.name, halves[0], boxes, spine)
-    add_link(robot, rest, halves[1])
+    upright = even * np.eye(3)
+    half = pin.Inertia(inertia.mass / 2, inertia.lever, upright)
+    _add_body(robot, body.name, half, boxes, spine)
+    add_link(robot, rest, pin.Inertia(inertia.mass / 2, inertia.lever, matrix - upright))
     add_joint(robot, f"{rest}_fixed", "fixed", (body.name, rest))
 
 
@@ -312,7 +307,7 @@ def _boxes(
     config: dict, roles: RoleJoints, lumped: Lumped, sole: dict[str, float]
 ) -> dict[str, Boxes]:
     """Boxes of trunk, and of left and right thigh, shank, foot and arm, by the name of the body."""
-    legs = list(zip(*([lumped.body(name) for name in roles[role]] for role in LEG), strict=True))
+    legs = list(zip(*(lumped.moved_by(roles[role]) for role in LEG), strict=True))
     leg = float(np.linalg.norm((legs[0][0].place - legs[0][2].place)[[0, 2]]))
     width = {}
     for part, share in THICKNESS.items():
@@ -322,22 +317,22 @@ def _boxes(
                 f"robot configuration: 'shapes.{part}_thickness_m' = {width[part]:g} must be "
                 f"positive"
             )
-    trunk = lumped.bodies[0]
+    trunk = lumped.trunk
     middle = np.mean([hip.place for hip, _, _ in legs], axis=0) - trunk.place
     out = {trunk.name: _trunk_boxes(config, leg, middle)}
     long = sole["toe"] - sole["heel"]
     centre = np.array([(sole["toe"] + sole["heel"]) / 2, 0.0, sole["z"] + width["foot"] / 2])
     for hip, knee, ankle in legs:
-        thigh = lumped.named(knee.parent)
+        thigh = lumped.bodies[knee.parent]
         foot = [ankle, *lumped.beyond(ankle)][-1]
         out[thigh.name] = _limb(thigh, hip.place, knee.place, width["thigh"])
         out[knee.name] = _limb(knee, knee.place, ankle.place, width["shank"])
         out[foot.name] = [(centre, np.array([long, 2 * sole["half"], width["foot"]]))]
         while foot.parent:
-            foot = lumped.named(foot.parent)
+            foot = lumped.bodies[foot.parent]
             out.setdefault(foot.name, [])
-    out |= _given_boxes(config, {body.name for body in lumped.bodies})
-    for body in lumped.bodies:
+    out |= _given_boxes(config, set(lumped.bodies))
+    for body in lumped.bodies.values():
         if body.name not in out:
             out[body.name] = _arm(lumped, body, width["arm"])
     return out
@@ -347,17 +342,21 @@ def _given_boxes(config: dict, links: set[str]) -> dict[str, Boxes]:
     """Boxes of links that the configuration gives as [rear, front, right, left, bottom, top] from
     the link's joint, in the robot's axes [m]: of a waist that moves, and of what it carries.
     """
-    given = table(table(config, "shapes"), "boxes_m")
     out = {}
-    for name in given:
+    for name in table(table(config, "shapes"), "boxes_m"):
         ends = np.reshape(entry(config, "shapes", "boxes_m", name, count=6), (3, 2))
         if name not in links or np.any(ends[:, 0] >= ends[:, 1]):
             raise RobotError(
                 f"robot configuration: 'shapes.boxes_m.{name}' must be of a link that moves, each "
                 f"first number below the second"
             )
-        out[name] = [(ends.mean(axis=1), np.ptp(ends, axis=1))]
+        out[name] = [_box(ends)]
     return out
+
+
+def _box(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and size (3,) [m] of a box from its lower and upper ends (3, 2)."""
+    return ends.mean(axis=1), np.ptp(ends, axis=1)
 
 
 def _arm(lumped: Lumped, body: Body, width: float) -> Boxes:
@@ -367,7 +366,7 @@ def _arm(lumped: Lumped, body: Body, width: float) -> Boxes:
     if not further:
         return [(lever, np.maximum(ARM_REACH * np.abs(lever), width))]
     way = further[0].place - body.place
-    if body.parent == lumped.bodies[0].name or np.linalg.norm(way) < 2 * width:
+    if body.parent == lumped.trunk.name or np.linalg.norm(way) < 2 * width:
         return []
     return [(way / 2, np.maximum((1 - 2 * GAP) * np.abs(way), width))]
 
@@ -382,18 +381,16 @@ def _limb(body: Body, start: np.ndarray, end: np.ndarray, width: float) -> Boxes
 def _trunk_boxes(config: dict, leg: float, hip: np.ndarray) -> Boxes:
     given = table(config, "shapes").get("trunk_m", [[leg * share for share in TRUNK_BOX]])
     try:
-        rear, front, half, bottom, top = np.array(given, float).T
-        good = np.isfinite([rear, front, half, bottom, top]).all() and len(rear)
-        good = good and np.all([rear < front, half > 0, bottom < top])
-    except (TypeError, ValueError):
+        ends = [np.reshape([x[0], x[1], -x[2], x[2], x[3], x[4]], (3, 2)) for x in given]
+        good = bool(ends) and np.all([np.isfinite(x) & (x[:, :1] < x[:, 1:]) for x in ends])
+    except (TypeError, ValueError, IndexError):
         good = False
     if not good:
         raise RobotError(
             f"robot configuration: 'shapes.trunk_m' = {given!r} must be a list of [rear, front, "
             f"half width, bottom, top]"
         )
-    ends = [np.array([[x[0], -x[2], x[3]], [x[1], x[2], x[4]]]) for x in given]
-    return [(hip + low_high.mean(axis=0), np.ptp(low_high, axis=0)) for low_high in ends]
+    return [(hip + centre, size) for centre, size in map(_box, ends)]
 
 
 # the configuration
@@ -402,23 +399,18 @@ def _toml(
     config: dict, roles: RoleJoints, feet: tuple, sole: dict[str, float], urdf: str, lumped: Lumped
 ) -> str:
     rest = {name: entry(config, "rest", name) for name in table(config, "rest")}
-    if unknown := sorted(rest.keys() - {b.joint for b in lumped.bodies}):
+    if unknown := sorted(rest.keys() - {b.joint for b in lumped.bodies.values()}):
         raise RobotError(
             f"robot configuration: [rest] names the joint {unknown[0]!r}, which does not move"
         )
     motors = ""
-    # speeds as shares of the speed limit
-    for key, title in (
-        (CORNER, "corner_speed_ratios"),
-        (NO_LOAD, "no_load_ratios"),
-        *zip(OWN, OWN, strict=True),
-    ):
-        values = {
-            b.joint: b.limits[key] / (1.0 if key in OWN else b.limits["velocity"])
-            for b in lumped.bodies
-            if key in b.limits
+    for key in MOTOR:
+        told = {b.joint: b.limits for b in lumped.bodies.values() if key in b.limits}
+        # speeds as shares of the speed limit
+        shares = {
+            joint: x[key] / (1.0 if key in OWN else x["velocity"]) for joint, x in told.items()
         }
-        motors += titled(f"actuators.{title}", values)
+        motors += titled(f"actuators.{RATIOS.get(key, key)}", shares)
     return filled(
         "jumper.toml.in",
         name=entry(config, "name", kind=str),

@@ -7,8 +7,9 @@ and directions of the moving joints are kept.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 import pinocchio as pin
@@ -16,9 +17,9 @@ import pinocchio as pin
 from jumplab.errors import RobotError
 from jumplab.robot.files import LEG, entry, table
 from jumplab.robot_import.checks import limit_faults
-from jumplab.robot_import.roles import robot_axes
+from jumplab.robot_import.roles import leg_joints, robot_axes
 from jumplab.robot_import.urdf import FRAME_KG, LIMITS, OWN, Tree, link_poses, links_of
-from jumplab.robot_import.write import key
+from jumplab.robot_import.write import key, shifted
 
 RoleJoints = dict[str, tuple[str, ...]]
 MIRROR = np.array([1.0, -1.0, 1.0])  # times a vector: its mirror image
@@ -59,7 +60,7 @@ class Body:
 class Lumped:
     """The jumper."""
 
-    bodies: tuple[Body, ...]  # trunk first, each after the one that carries it
+    bodies: dict[str, Body]  # by name, trunk first, each after the one that carries it
     # what evening out and repairs changed: name -> (amount, unit)
     changed: dict[str, tuple[float, str]]
     held: dict[str, float]  # joint -> angle [rad] of the joints that no longer move
@@ -67,21 +68,23 @@ class Lumped:
     # link -> its place in the robot's axes, those joints held and all others at 0
     placed: dict[str, pin.SE3]
 
-    def body(self, joint: str) -> Body:
-        """The body that a joint (by name) moves."""
-        return next(b for b in self.bodies if b.joint == joint)
+    @property
+    def trunk(self) -> Body:
+        """The body that carries all others."""
+        return next(iter(self.bodies.values()))
 
-    def named(self, name: str) -> Body:
-        """The body of that name (its link's)."""
-        return next(b for b in self.bodies if b.name == name)
+    def moved_by(self, joints: Iterable[str]) -> list[Body]:
+        """The bodies that joints (by name) move."""
+        of = {body.joint: body for body in self.bodies.values()}
+        return [of[joint] for joint in joints]
 
     def place(self, link: str) -> pin.SE3:
         """Place of a link in the frame of its body [m]."""
-        return pin.SE3(np.eye(3), -self.named(self.links[link]).place) * self.placed[link]
+        return shifted(-self.bodies[self.links[link]].place) * self.placed[link]
 
     def beyond(self, body: Body) -> list[Body]:
         """The bodies that hang on a body, one on the other (the first of several)."""
-        child = next((b for b in self.bodies if b.parent == body.name), None)
+        child = next((b for b in self.bodies.values() if b.parent == body.name), None)
         return [] if child is None else [child, *self.beyond(child)]
 
 
@@ -118,7 +121,8 @@ def lump(
     placed = link_poses(model)
     edges = entry(config, "feet", "sole_y_m", count=2)
     changed = {}
-    limits = {name: _limits(tree, config, roles, name, changed) for name in moving}
+    told = _told_limits(tree, config, roles)
+    limits = {name: _limits(tree, told, roles, name, changed) for name in moving}
     bodies, links = _bodies(tree, model, placed, trunk, feet, limits, sum(edges) / 2)
     if bodies[0].inertia.mass < FRAME_KG:
         raise tree.error(
@@ -127,7 +131,7 @@ def lump(
         )
     bodies = _with_mass(bodies, changed)
     bodies = _mirrored(bodies, changed)
-    return Lumped(tuple(bodies), changed, held, links, placed)
+    return Lumped({b.name: b for b in bodies}, changed, held, links, placed)
 
 
 # what moves, and how far
@@ -140,7 +144,6 @@ def _moving_joints(
     free = table(config, "joints").get("free")
     if isinstance(free, list) and free:
         moving += entry(config, "joints", "free", kind=str, count=len(free))
-    moving = list(dict.fromkeys(moving))
     for name in moving:
         if name not in tree.joints:
             raise tree.error(f"a role names the joint {name!r}, which the {tree.format} lacks")
@@ -165,8 +168,7 @@ def _moving_joints(
                 f"between {trunk!r} and {foot!r} come {', '.join(ordered)}; hip, "
                 f"knee and ankle must follow in this order; correct [joints]"
             )
-        moving += [name for name in names if tree.joints[name].driven and name not in moving]
-    return moving
+        return list(dict.fromkeys(moving + leg_joints(tree, trunk, feet)))
 
 
 def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str, float]:
@@ -188,13 +190,9 @@ def _held_angles(tree: Tree, config: dict, moving: Collection[str]) -> dict[str,
     return {name: angle for name, angle in out.items() if angle and name not in moving}
 
 
-def _limits(
-    tree: Tree, config: dict, roles: RoleJoints, joint: str, changed: dict
-) -> dict[str, float]:
-    """The limits of a joint; those of [limits], by joint or role, come first, those of [assumed]
-    next; its losses as the file has them, if its motor can bear them.
-    """
-    given = {}
+def _told_limits(tree: Tree, config: dict, roles: RoleJoints) -> dict[str, dict[str, float]]:
+    """The numbers of [limits], and where it has none those of [assumed], by joint or role."""
+    told = {}
     may = (*LIMITS, *MOTOR, SOURCE)
     for title in ("assumed", "limits"):
         for name, values in table(config, title).items():
@@ -210,25 +208,33 @@ def _limits(
                     f"robot configuration: '{title}.{name}' may hold {', '.join(may)}, got "
                     f"{values!r}"
                 )
-            told = {part: entry(config, title, name, part) for part in values if part != SOURCE}
-            given[name] = given.get(name, {}) | told
             entry(config, title, name, SOURCE, kind=str, default="")
+            numbers = {part: entry(config, title, name, part) for part in values if part != SOURCE}
+            told[name] = told.get(name, {}) | numbers
+    return told
+
+
+def _limits(
+    tree: Tree, told: dict[str, dict], roles: RoleJoints, joint: str, changed: dict
+) -> dict[str, float]:
+    """The limits of a joint; those that are ``told`` come first; its losses as the file has them,
+    if its motor can bear them.
+    """
     # a joint that is called like a role goes before it
     role = next((r for r, pair in roles.items() if joint in pair and r not in tree.joints), "")
-    values = given.get(role, {}) | given.get(joint, {})
-    element = tree.joints[joint].element
+    values = told.get(role, {}) | told.get(joint, {})
     where = f"limits.{key(role or joint)}"
-    for sentence in limit_faults(element, tree.where, values, form=tree.format, table=where):
+    for sentence in limit_faults(tree, joint, values, where):
         raise RobotError(sentence)
-    limits = {part: values.get(part, tree.joints[joint].limits.get(part)) for part in LIMITS}
-    limits |= values
-    own = {part: x for part, x in tree.joints[joint].losses.items() if part not in limits}
-    if own and not _motor_fault(limits) and (sentence := _motor_fault(limits | own)):
-        changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (len(own), "numbers")
-        own = {}
+    limits = tree.joints[joint].limits | values
     if sentence := _motor_fault(limits):
         raise tree.error(f"joint {joint!r}: {sentence}; correct [{where}]")
-    return limits | own
+    own = tree.joints[joint].losses | limits
+    if sentence := _motor_fault(own):
+        used = len(own) - len(limits)
+        changed[f"joint {joint!r}: losses of the file not used, {sentence}"] = (used, "numbers")
+        return limits
+    return own
 
 
 def _motor_fault(limits: dict[str, float]) -> str:
@@ -284,8 +290,8 @@ def _bodies(
     carriers = {link: model.frames[i].parentJoint for link, i in links_of(model).items()}
     bodies = []
     names = {}
-    todo = [(trunk, "", "", 1.0)]
-    for link, parent, joint, sign in todo:
+    todo = [(trunk, "", "")]
+    for link, parent, joint in todo:
         carrier = carriers[link]
         name = next((foot for foot in feet if carriers[foot] == carrier), link)
         place = placed[trunk].translation * [1.0, 0.0, 1.0]
@@ -293,21 +299,21 @@ def _bodies(
         if joint:
             turning = model.getJointId(joint)
             place = data.oMi[turning].translation
+            # from its far end it turns the other way
+            sign = 1.0 if tree.joints[joint].child == link else -1.0
             axis = _snapped(sign * axes[model.idx_vs[turning]])
         # an origin may lie anywhere on its axis: in the middle of the sole
         if name in feet and abs(axis[1]) == 1:
             middle = placed[name].translation[1] + (beside if name == feet[0] else -beside)
             place = np.array([place[0], middle, place[2]])
-        axes_of_body = pin.SE3(np.eye(3), -place) * data.oMi[carrier]
+        axes_of_body = shifted(-place) * data.oMi[carrier]
         inertia = axes_of_body.act(model.inertias[carrier])
         bodies.append(Body(name, parent, joint, place, axis, limits.get(joint, {}), inertia))
         names[carrier] = name
-        for further in tree.joints.values():
-            if further.name in limits and further.name != joint:
-                if carriers[further.parent] == carrier:
-                    todo.append((further.child, name, further.name, 1.0))
-                elif carriers[further.child] == carrier:  # from its far end it turns the other way
-                    todo.append((further.parent, name, further.name, -1.0))
+        for further in (j for j in tree.joints.values() if j.name in limits and j.name != joint):
+            for near, far in permutations((further.parent, further.child)):
+                if carriers[near] == carrier:
+                    todo.append((far, name, further.name))
     missing = tree.mass - sum(b.inertia.mass for b in bodies)
     if abs(missing) > 1e-9 * tree.mass:
         lost = sorted(link for link, carrier in carriers.items() if carrier not in names)[:4]
@@ -343,32 +349,33 @@ def _with_mass(bodies: list[Body], changed: dict) -> list[Body]:
 # -------------------------------------------------------------------------------------------------
 def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
     """Left and right as mirror images, their means, if they differ as a CAD export does."""
-    out = {}
-    moved = {}
+    moved = {body.name: body for body in bodies}
+    images = _images(bodies)
+    for name, image in images.items():
+        if moved[name].place[1] >= moved[image].place[1]:
+            moved[image] = _opposite(moved[name], moved[image])
+    evened = dict(moved)
     gaps = []  # [m]
-    shares = [0.0]  # [1]
-    for left, right in _pairs(bodies):
-        right = _opposite(left, right)
-        left = right if left.joint == right.joint else left
-        moved[right.joint] = right
-        gaps.append(left.place - MIRROR * right.place)
-        place = (left.place + MIRROR * right.place) / 2
-        inertias = left.inertia, right.inertia
-        if left.inertia.mass > 0:
-            one, other = (x.toPseudoInertia().toMatrix() for x in inertias)
-            apart = np.abs(one - IMAGE * other)
-            mean = (one + IMAGE * other) / 2
-            if min(x.mass for x in inertias) > 10 * DUMMY.mass:
-                gaps.append(left.inertia.lever - MIRROR * right.inertia.lever)
-            shares += [apart[3, 3] / mean[3, 3]]
-            shares += [apart[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12)]
-            inertias = [pin.PseudoInertia.FromMatrix(x).toInertia() for x in (mean, IMAGE * mean)]
-        axis = MIRROR * left.axis
-        axis = axis if axis @ right.axis > 0 else -axis
-        if np.linalg.norm(axis - right.axis) >= 10 * AXIS_RAD:
-            axis = right.axis
-        out[right.joint] = replace(right, place=MIRROR * place, inertia=inertias[1], axis=axis)
-        out[left.joint] = replace(left, place=place, inertia=inertias[0])
+    shares = []  # [1]
+    for name, image in images.items():
+        body = moved[name]
+        other = moved[image]
+        gaps.append(body.place - MIRROR * other.place)
+        if min(body.inertia.mass, other.inertia.mass) > 10 * DUMMY.mass:
+            gaps.append(body.inertia.lever - MIRROR * other.inertia.lever)
+        one, two = (x.inertia.toPseudoInertia().toMatrix() for x in (body, other))
+        mean = (one + IMAGE * two) / 2
+        apart = np.abs(one - IMAGE * two)
+        shares.append(apart[3, 3] / mean[3, 3])
+        shares.append(apart[:3, :3].max() / max(np.trace(mean[:3, :3]), 1e-12))
+        axis = MIRROR * other.axis * np.sign(MIRROR * other.axis @ body.axis)
+        left = body.place[1] >= other.place[1]
+        evened[name] = replace(
+            body,
+            place=(body.place + MIRROR * other.place) / 2,
+            inertia=pin.PseudoInertia.FromMatrix(mean).toInertia(),
+            axis=body.axis if left or np.linalg.norm(axis - body.axis) >= 10 * AXIS_RAD else axis,
+        )
     gap = float(np.abs(gaps).max())
     share = float(max(shares))
     even = gap <= CAD_M and share <= CAD_SHARE
@@ -376,44 +383,36 @@ def _mirrored(bodies: list[Body], changed: dict) -> list[Body]:
     if max(gap, share) > ALIKE:
         changed[f"left and right {done}, places"] = (1e3 * gap, "mm")
         changed[f"left and right {done}, masses"] = (100 * share, "%")
-    return [(out if even else moved).get(b.joint, b) for b in bodies]
+    return list((evened if even else moved).values())
 
 
 def _opposite(left: Body, right: Body) -> Body:
     """The right body with its origin, which may lie anywhere on its axis, opposite to the left
-    one's; one in the middle with its origin there.
+    one's.
     """
-    gap = left.place - MIRROR * right.place
-    along = float(gap @ left.axis)
-    if abs(along) <= CAD_M:  # which is evened out
+    along = float((left.place - MIRROR * right.place) @ left.axis)
+    if abs(along) <= CAD_M or left is right:  # which is evened out
         return right
-    if left.joint == right.joint:
-        place = right.place - along / 2 * right.axis
-    else:
-        place = right.place + MIRROR * (along * left.axis)
-    inertia = pin.SE3(np.eye(3), right.place - place).act(right.inertia)
+    place = right.place + MIRROR * (along * left.axis)
+    inertia = shifted(right.place - place).act(right.inertia)
     return replace(right, place=place, inertia=inertia)
 
 
-def _pairs(bodies: list[Body]) -> list[tuple[Body, Body]]:
-    """(left, right) bodies that mirror each other; one in the middle is its own image."""
-    image = {bodies[0].name: bodies[0].name}
-    out = [(bodies[0], bodies[0])]
-    for body in bodies[1:]:
-        if body.name in image:
-            continue
-        parent = image.get(body.parent)
+def _images(bodies: list[Body]) -> dict[str, str]:
+    """The body that mirrors each one, by their names; one in the middle is its own image."""
+    trunk, *others = bodies
+    images = {trunk.name: trunk.name}
+    for body in others:
         like = []
-        for b in bodies[1:]:
-            way = MIRROR * b.place - body.place
+        for other in others if body.name not in images else ():
+            way = MIRROR * other.place - body.place
             # an origin may lie anywhere on its axis, but no body is its own counterpart by that
-            along = 0.0 if b is body else way @ body.axis
-            across = way - along * body.axis
-            alike = b.parent == parent and abs(MIRROR * body.axis @ b.axis) > SAME
-            if alike and np.abs(across).max() < PAIR_M:
-                like.append((float(np.abs(way).max()), b.name, b))
+            along = 0.0 if other is body else way @ body.axis
+            across = np.abs(way - along * body.axis).max()
+            alike = abs(MIRROR * body.axis @ other.axis) > SAME and across < PAIR_M
+            if alike and other.parent == images.get(body.parent):
+                like.append((np.abs(way).max(), other.name))
         if like:
-            _, _, other = min(like)
-            image |= {body.name: other.name, other.name: body.name}
-            out.append((body, other) if body.place[1] >= other.place[1] else (other, body))
-    return out
+            _, image = min(like)
+            images |= {body.name: image, image: body.name}
+    return images

@@ -11,37 +11,28 @@ import logging
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pinocchio as pin
+from mujoco import mjtBias as BIAS
+from mujoco import mjtDyn as DYNAMICS
+from mujoco import mjtEq as EQUALITY
+from mujoco import mjtGain as GAIN
+from mujoco import mjtGeom as GEOM
+from mujoco import mjtJoint as JOINT
+from mujoco import mjtTrn as TRANSMISSION
 
 from jumplab.errors import RobotError
 from jumplab.robot_import.write import HERE, add, add_joint, add_link, add_origin, listed
 
-
-def _numbers(kinds: Any) -> SimpleNamespace:
-    """The members of one of MuJoCo's enumerations as numbers, which arrays hold."""
-    return SimpleNamespace(**{name: int(kind) for name, kind in kinds.__members__.items()})
-
-
-JOINT = _numbers(mujoco.mjtJoint)
-GEOM = _numbers(mujoco.mjtGeom)
-TRANSMISSION = _numbers(mujoco.mjtTrn)
-EQUALITY = _numbers(mujoco.mjtEq)
-GAIN = _numbers(mujoco.mjtGain)
-BIAS = _numbers(mujoco.mjtBias)
-DYNAMICS = _numbers(mujoco.mjtDyn)
-ON_JOINT = (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT)
+ON_JOINT = [*map(int, (TRANSMISSION.mjTRN_JOINT, TRANSMISSION.mjTRN_JOINTINPARENT))]
 # an activation of these is no larger than the control
-PLAIN = (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT)
+PLAIN = [*map(int, (DYNAMICS.mjDYN_NONE, DYNAMICS.mjDYN_FILTER, DYNAMICS.mjDYN_FILTEREXACT))]
 UNNAMED = "MuJoCo Model"
 # names of files that say nothing of the robot in them
 GENERIC = re.compile(r"(?i)[ _-]*\b(scene|robot|model|main|mjcf|mjx)\b[ _-]*|^scene[ _-]")
-POINTER = b"version https://git-lfs"
 
 
 def as_description(path: Path, text: str) -> str:
@@ -123,8 +114,6 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
     for part in [*pictures, *terrain, *spec.hfields]:
         spec.delete(part)
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
-    for mesh in [m for m in spec.meshes if _missing(m, spec, path.parent)]:
-        _leave_out(spec, mesh, path, notes)
     while True:
         try:
             return spec.compile()
@@ -138,23 +127,13 @@ def _compiled(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> mujoco.MjMod
             _leave_out(spec, mesh, path, notes)
 
 
-def _missing(mesh: mujoco.MjsMesh, spec: mujoco.MjSpec, folder: Path) -> bool:
-    """Whether the file of a mesh is a pointer that Git LFS has not replaced."""
-    if not mesh.file:
-        return False
-    places = (folder / spec.compiler.meshdir / mesh.file, folder / mesh.file)
-    found = next((file for file in places if file.is_file()), None)
-    if found is None:
-        return False
-    with found.open("rb") as file:
-        return file.read(len(POINTER)) == POINTER
-
-
 def _blamed(mesh: mujoco.MjsMesh, sentence: str) -> bool:
-    """Whether MuJoCo complains of the file of a mesh."""
+    """Whether MuJoCo complains of the file of a mesh: not there, or no mesh, such as a pointer that
+    Git LFS has not replaced.
+    """
     opening = "Error opening file" in sentence and f"{Path(mesh.file).name}'" in sentence
-    reading = re.search(r"decoder|\b(STL|OBJ|MSH) file", sentence)
-    return bool(mesh.file) and (opening or bool(reading and Path(mesh.file).name in sentence))
+    reading = re.search(r"decoder|MSH file|vertices required", sentence)
+    return bool(mesh.file) and (opening or bool(reading and f"name '{mesh.name}'" in sentence))
 
 
 def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: list[str]) -> None:
@@ -183,11 +162,10 @@ def _leave_out(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path, notes: lis
 def _robot_of(model: mujoco.MjModel, where: str, notes: list[str]) -> int:
     """The body at the world that carries the robot: the one with the most hinges."""
     tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
-    hinges = {top: 0 for top in tops}
-    for body, kind in zip(model.jnt_bodyid, model.jnt_type, strict=True):
-        if model.body_parentid[body] and kind in (JOINT.mjJNT_HINGE, JOINT.mjJNT_BALL):
-            hinges[model.body_rootid[body]] += 1
-    most = max(hinges.values(), default=0)
+    turns = (model.jnt_type == JOINT.mjJNT_HINGE) | (model.jnt_type == JOINT.mjJNT_BALL)
+    below = model.jnt_bodyid[turns & (model.body_parentid[model.jnt_bodyid] > 0)]
+    hinges = np.bincount(model.body_rootid[below], minlength=model.nbody)
+    most = int(hinges.max())
     robots = [top for top in tops if hinges[top] == most]
     names = listed([repr(model.body(top).name) for top in robots])
     if not most:
@@ -211,13 +189,11 @@ def _force(model: mujoco.MjModel, a: int) -> np.ndarray:
     if model.actuator_forcelimited[a]:
         ends = model.actuator_forcerange[a].copy()
     fixed = model.actuator_gaintype[a] == GAIN.mjGAIN_FIXED
+    plain = model.actuator_ctrllimited[a] and model.actuator_dyntype[a] in PLAIN
     if fixed and model.actuator_biastype[a] == BIAS.mjBIAS_NONE:
-        if model.actuator_dyntype[a] in PLAIN and model.actuator_ctrllimited[a]:
-            given = model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a]
-            ends = np.clip(np.sort(given), *ends)
-        elif model.actuator_actlimited[a]:
-            given = model.actuator_gainprm[a, 0] * model.actuator_actrange[a]
-            ends = np.clip(np.sort(given), *ends)
+        if plain or model.actuator_actlimited[a]:
+            given = model.actuator_ctrlrange[a] if plain else model.actuator_actrange[a]
+            ends = np.clip(np.sort(model.actuator_gainprm[a, 0] * given), *ends)
     return ends
 
 
@@ -248,7 +224,7 @@ class _Motors:
             if kind == TRANSMISSION.mjTRN_TENDON:
                 first = model.tendon_adr[k]
                 parts = range(first, first + model.tendon_num[k])
-                fixed = model.wrap_type[first] == int(mujoco.mjtWrap.mjWRAP_JOINT)
+                fixed = model.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT
                 joints = [model.wrap_objid[i] for i in parts] if fixed else range(model.njnt)
                 self.pulled[model.jnt_dofadr[np.array(joints, int)]] = True
             elif kind != TRANSMISSION.mjTRN_BODY:
@@ -349,8 +325,8 @@ class _Writer:
 
     def _ref(self, k: int) -> float:
         """Where a joint counts from [rad, m]: there bodies are as the file places them."""
-        hinge = self.model.jnt_type[k] in (JOINT.mjJNT_HINGE, JOINT.mjJNT_SLIDE)
-        return float(self.model.qpos0[self.model.jnt_qposadr[k]]) if hinge else 0.0
+        ball = self.model.jnt_type[k] == JOINT.mjJNT_BALL
+        return 0.0 if ball else float(self.model.qpos0[self.model.jnt_qposadr[k]])
 
     def _between(self, name: str) -> str:
         """A link without mass, of a name that no body has; its name."""
@@ -387,7 +363,7 @@ class _Writer:
         hull = model.mesh_graphadr[model.geom_dataid[g]] if kind == GEOM.mjGEOM_MESH else -1
         if kind == GEOM.mjGEOM_SPHERE:
             tag, sizes = "sphere", {"radius": radius}
-        elif kind in (GEOM.mjGEOM_CAPSULE, GEOM.mjGEOM_CYLINDER):
+        elif kind == GEOM.mjGEOM_CAPSULE or kind == GEOM.mjGEOM_CYLINDER:
             tag = "capsule" if kind == GEOM.mjGEOM_CAPSULE else "cylinder"
             sizes = {"radius": radius, "length": 2 * half}
         elif hull >= 0:
@@ -409,7 +385,7 @@ class _Writer:
         return listed(names)
 
     def add_equalities(self) -> None:
-        """Joints that follow others, as mimics; loops are named."""
+        """Joints that follow others, as mimics; what ties bodies is named."""
         model = self.model
         for e in np.flatnonzero(model.eq_active0):
             one, other = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
@@ -418,35 +394,16 @@ class _Writer:
             if kind == EQUALITY.mjEQ_JOINT:
                 if one in self.joints:
                     self._follow(name, one, other, model.eq_data[e, :5])
-            elif kind in (EQUALITY.mjEQ_CONNECT, EQUALITY.mjEQ_WELD):
-                sites = model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE)
+            elif kind == EQUALITY.mjEQ_CONNECT or kind == EQUALITY.mjEQ_WELD:
+                sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
                 ends = [int(model.site_bodyid[x]) if sites else x for x in (one, other)]
-                loop = self._loop(*ends)
-                if loop is None:
-                    continue
-                closes = f"closes a loop of the joints {self._joints(loop)}"
-                ties = "ties the robot to the world or to another body"
-                self.notes.append(
-                    f"{name} {closes if min(ends) and loop else ties}: left out, the joints move "
-                    f"as if it were cut"
-                )
+                tied = " to ".join(repr(model.body(x).name) for x in ends)
+                if set(ends) & set(self.bodies):
+                    self.notes.append(
+                        f"{name} ties {tied}: left out, the joints move as if it were cut"
+                    )
             else:
                 self.notes.append(f"{name} of tendons or flexes is left out")
-
-    def _loop(self, one: int, other: int) -> list[int] | None:
-        """Joints between two bodies, one of which is the robot's; None if neither is."""
-        model = self.model
-        if not {one, other} & set(self.bodies):
-            return None
-        ways = []
-        for body in (one, other):
-            way = []
-            while body:
-                way.append(body)
-                body = int(model.body_parentid[body])
-            ways.append(way)
-        apart = set(ways[0]) ^ set(ways[1])
-        return [k for k in self.joints if model.jnt_bodyid[k] in apart]
 
     def _follow(self, name: str, one: int, other: int, curve: np.ndarray) -> None:
         """The mimic of a joint that follows another, the one with a motor, along a line."""

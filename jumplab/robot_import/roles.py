@@ -14,10 +14,18 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+from numpy.linalg import norm
 
 from jumplab.robot.files import LEG, ROLES
-from jumplab.robot_import import checks as urdf_checks
-from jumplab.robot_import.checks import MOST_RAD, MOST_RAD_S, keys_of, wrong_limits
+from jumplab.robot_import.checks import (
+    MOST_RAD,
+    MOST_RAD_S,
+    keys_of,
+    limit_faults,
+    notes,
+    read_tree,
+    wrong_limits,
+)
 from jumplab.robot_import.feet import Sole, find_sole, refuse_wheel, sole_points, thickness
 from jumplab.robot_import.urdf import MOVING, Joint, Tree, read_urdf
 from jumplab.robot_import.write import filled, key, listed, quote
@@ -124,7 +132,7 @@ class _Finder:
             axis = self.axis[b[-1].name]  # an origin may lie anywhere on its axis
             across = gap - side * self.lateral
             across = across - (across @ axis) * axis
-            mirrored = abs(side) >= SAME_M >= np.linalg.norm(across)
+            mirrored = abs(side) >= SAME_M >= norm(across)
             shared = sum(x is y for x, y in zip(a, b, strict=False))
             if mirrored and shared < len(a) == len(b):
                 pair = (a[shared:], b[shared:])
@@ -148,7 +156,7 @@ class _Finder:
         def shorter(three: tuple[Joint, ...]) -> float:
             flat = np.array([self.at[j.name] for j in three]) * (1 - np.abs(self.lateral))
             turning = np.prod([self.turning(j) for j in three])
-            return turning * min(np.linalg.norm(np.diff(flat, axis=0), axis=1))
+            return turning * min(norm(np.diff(flat, axis=0), axis=1))
 
         best = max(combinations(pitch, 3), key=shorter, default=())
         if not best or shorter(best) <= 1e-3:
@@ -156,17 +164,17 @@ class _Finder:
         hip, knee, ankle = best
         at = self.at
         for joint in pitch[pitch.index(knee) + 1 : pitch.index(ankle)]:
-            shank = np.linalg.norm(at[joint.name] - at[knee.name])
+            shank = norm(at[joint.name] - at[knee.name])
             foot = at[ankle.name] - at[joint.name]
-            flat = abs(foot @ self.up) < np.linalg.norm(foot - (foot @ self.up) * self.up)
-            if flat and 0 < np.linalg.norm(foot) < FOOT_LIKE * shank:
+            flat = abs(foot @ self.up) < norm(foot - (foot @ self.up) * self.up)
+            if flat and 0 < norm(foot) < FOOT_LIKE * shank:
                 return hip, knee, joint
         return best
 
     def leg_m(self) -> float:
         """Length of a leg from hip to ankle [m]."""
         hip, _, ankle = (self.at[joint.name] for joint in self.legs[0][0])
-        return float(np.linalg.norm(hip - ankle))
+        return float(norm(hip - ankle))
 
     def along(self, three: tuple[Joint, ...]) -> bool:
         """True if the leg hangs (from hip to ankle), and ends where the robot does."""
@@ -176,8 +184,8 @@ class _Finder:
         heights = np.array([*self.at.values()]) @ self.up
         tall = np.ptp(heights)
         low = ankle @ self.up < heights.min() + LOWEST * tall
-        low = low and np.linalg.norm(hip - ankle) > SHORTEST_LEG * tall
-        return low and (hip - ankle) @ self.up > STEEP * np.linalg.norm(hip - ankle)
+        low = low and norm(hip - ankle) > SHORTEST_LEG * tall
+        return low and (hip - ankle) @ self.up > STEEP * norm(hip - ankle)
 
     def _legs(self) -> list[tuple[tuple[Joint, ...], Chain]]:
         """(hip, knee, ankle) and chain of both legs: the lowest mirrored pair; [] without any."""
@@ -188,10 +196,10 @@ class _Finder:
     def foot(self, three: tuple[Joint, ...], chain: Chain) -> str:
         """The link that stands: behind the ankle, before any toe joint (a further pitch joint)."""
         _, knee, ankle = (self.at[joint.name] for joint in three)
-        near = TOES * np.linalg.norm(ankle - knee)
+        near = TOES * norm(ankle - knee)
 
         def of_ankle(joint: Joint) -> bool:
-            close = np.linalg.norm(self.at[joint.name] - ankle) < near
+            close = norm(self.at[joint.name] - ankle) < near
             return close and self.turning(joint) < SWINGS
 
         still = takewhile(of_ankle, chain[chain.index(three[2]) + 1 :])
@@ -205,7 +213,7 @@ class _Finder:
         for three, chain in self.legs:
             foot = self.foot(three, chain)
             axes = np.stack([forward, np.cross(self.up, forward), self.up])
-            _, around = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
+            _, around, _ = sole_points(self.tree, foot, axes, thickness(self.leg_m()))
             x = around[:, 0]
             if not len(x):
                 x = [self.tree.pose[foot].rotation @ self.tree.body_of(foot).lever @ forward]
@@ -396,45 +404,60 @@ def _explain(tree: Tree) -> NoReturn:
 
 # the first description
 # ------------------------------------------------------------------------------------------
-def starter(
-    tree: Tree, urdf: str, name: str, repair: tuple[str, ...] = ()
-) -> tuple[str, Roles, Sole]:
-    """Text of a first TOML file, from ``starter.toml.in``, and the roles and the sole that are
-    written into it; numbers that it lacks are asked for in comments.
+@dataclass(frozen=True)
+class Draft:
+    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found.
 
-    ``urdf`` is the path as the file shall name it, ``name`` the robot's, ``repair`` what the person
-    allows to be repaired. Raises :class:`RobotError` if the URDF has no two legs.
+    ``faults`` are those of the limits of the joints that were found, one sentence each.
     """
+
+    text: str
+    roles: Roles
+    sole: Sole
+    faults: tuple[str, ...]
+
+
+def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
+    """Find the roles in a URDF and write the first TOML file for it, from ``starter.toml.in``;
+    numbers that it lacks are asked for in comments. Raises :class:`RobotError`.
+
+    ``repair`` is what the person allows to be repaired, ``text`` what :func:`.urdf.read_urdf` has
+    read of the file, if it was read before.
+    """
+    path = Path(path)
+    tree = read_tree(read_urdf(path) if text is None else text, path.name, path, repair)
     roles = find_roles(tree)
-    other = roles.forward.translate(str.maketrans("+-", "-+"))
     turn = robot_axes(tree.pose[roles.trunk].rotation, roles.forward, roles.up)
     hip, _, ankle = (tree.pose[tree.joints[roles.joints[r][0]].child].translation for r in LEG)
-    leg_m = float(np.linalg.norm((turn @ (hip - ankle))[[0, 2]]))
+    leg_m = float(norm((turn @ (hip - ankle))[[0, 2]]))
     sole = find_sole(tree, roles.feet[0], turn, leg_m)
     assumed = "".join(
         f"\n[assumed.{key(joint)}]  # holds where [limits] has no number\n"
         + "".join(f"{part} = {x:g}\n" for part, x in limits.items())
         for joint, limits in roles.assumed.items()
     )
-    asked = "".join(
-        f"# [limits.{key(joint)}]\n" + "".join(f"# {part} =\n" for part in keys_of(wrong))
-        for joint in jumping_joints(tree, roles)
-        if (
-            wrong := wrong_limits(tree.joints[joint].element, roles.assumed.get(joint), tree.format)
-        )
-    )
-    text = filled(
+    asked = ""
+    faults = []
+    for joint in jumping_joints(tree, roles):
+        given = roles.assumed.get(joint, {})
+        title = f"limits.{key(joint)}"
+        if parts := keys_of(wrong_limits(tree, joint, given)):
+            asked += f"# [{title}]\n" + "".join(f"# {part} =\n" for part in parts)
+        faults += limit_faults(tree, joint, given, title)
+    # a short name of letters, digits, - and _
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
+    config = filled(
         "starter.toml.in",
         notes="".join(f"# note: {note}\n" for note in roles.notes),
-        name=name,
-        urdf=quote(Path(urdf).as_posix()),
+        name=name or "robot",
+        urdf=quote(path.resolve().as_posix()),
         roles=roles,
         repair=quote(repair),
         joints="\n".join(f"{role} = {quote(roles.joints[role])}" for role in ROLES),
         feet=quote(roles.feet),
         sole=sole,
         trunk_link=quote(roles.trunk),
-        other=other,
+        other=roles.forward.translate(str.maketrans("+-", "-+")),
         knee=_inside(tree, turn[1], roles.joints["knee"], STANCE_KNEE_RAD),
         trunk=STANCE_TRUNK_RAD,
         assumed=assumed,
@@ -442,7 +465,8 @@ def starter(
         and f"\n# NEEDED: take away the # and put in the numbers [N m, rad/s, rad]\n{asked}",
         shoulder=_inside(tree, turn[1], roles.joints["shoulder_pitch"], 0.0),
     )
-    return text, roles, sole
+    roles = replace(roles, notes=(*notes(tree), *tree.notes, *roles.notes))
+    return Draft(config, roles, sole, tuple(faults))
 
 
 def jumping_joints(tree: Tree, roles: Roles) -> list[str]:
@@ -462,43 +486,3 @@ def _inside(tree: Tree, left: np.ndarray, pair: tuple[str, ...], wish: float) ->
         high = min(high, max(sign * np.array(ends)))
     room = min(STANCE_ROOM_RAD, (high - low) / 3)
     return float(np.clip(wish, low + room, high - room)) if low < high else wish
-
-
-@dataclass(frozen=True)
-class Draft:
-    """A URDF with a first description: ``text`` is the TOML, ``roles`` and ``sole`` what was found.
-
-    ``faults`` are those of the limits of the joints that were found, one sentence each.
-    """
-
-    text: str
-    roles: Roles
-    sole: Sole
-    faults: tuple[str, ...]
-
-
-def draft(path: str | Path, repair: tuple[str, ...] = (), text: str | None = None) -> Draft:
-    """Find the roles in a URDF and write the first TOML file for it; raises :class:`RobotError`.
-
-    ``text`` is what :func:`.urdf.read_urdf` has read of it, if it was read before.
-    """
-    path = Path(path)
-    text = read_urdf(path) if text is None else text
-    tree = urdf_checks.read_tree(text, path.name, path, repair)
-    # a short name of letters, digits, - and _
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", tree.xml.get("name") or path.stem).strip("_")[:40]
-    config, roles, sole = starter(tree, str(path.resolve()), name or "robot", repair)
-    found = (*urdf_checks.notes(tree.xml, repair), *tree.notes)
-    roles = replace(roles, notes=(*found, *roles.notes))
-    wrong = [
-        sentence
-        for name in jumping_joints(tree, roles)
-        for sentence in urdf_checks.limit_faults(
-            tree.joints[name].element,
-            path.name,
-            roles.assumed.get(name),
-            form=tree.format,
-            table=f"limits.{key(name)}",
-        )
-    ]
-    return Draft(config, roles, sole, tuple(wrong))

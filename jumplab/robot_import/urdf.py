@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
@@ -95,33 +95,29 @@ def described(name: str, file: str | None = None) -> Path:
     keeps it. Raises :class:`RobotError` if it is not installed, knows no such robot, has it as a
     xacro template only, or cannot fetch it.
     """
+
+    def error(text: str) -> RobotError:
+        return RobotError(f"robot description {name!r}: {text}")
+
     try:
         known = import_module("robot_descriptions._descriptions").DESCRIPTIONS
     except ModuleNotFoundError:
-        reason = (
-            "the package robot_descriptions is not installed; pip install 'jumplab[descriptions]'"
-        )
-        raise RobotError(f"robot description {name!r}: {reason}") from None
+        reason = "is not installed; pip install 'jumplab[descriptions]'"
+        raise error(f"the package robot_descriptions {reason}") from None
     if name not in known:
         near = get_close_matches(name, known, 3, 0.5)
         hint = f"; did you mean {', '.join(near)}?" if near else ""
-        raise RobotError(
-            f"robot description {name!r}: robot_descriptions has no robot of that name{hint}"
-        )
+        raise error(f"robot_descriptions has no robot of that name{hint}")
     try:
         module = import_module(f"robot_descriptions.{name}")
     except Exception as e:  # git and the net fail in many ways
         why = (str(e).strip().splitlines() or [type(e).__name__])[-1].strip()
-        raise RobotError(
-            f"robot description {name!r}: robot_descriptions cannot fetch it ({why})"
-        ) from e
+        raise error(f"robot_descriptions cannot fetch it ({why})") from e
     if file is not None:
         return Path(module.REPOSITORY_PATH, file)
     path = getattr(module, "URDF_PATH", getattr(module, "MJCF_PATH", None))
     if path is None:
-        raise RobotError(
-            f"robot description {name!r}: is a xacro template only; expand it, and check the URDF"
-        )
+        raise error("is a xacro template only; expand it, and check the URDF")
     return Path(path)
 
 
@@ -171,27 +167,21 @@ def parse(text: str, where: str) -> ET.Element:
         reason = str(e).partition(":")[0]
         if "unbound prefix" in reason and "xacro:" in text:
             raise RobotError(xacro) from None
-        ends = text.rstrip().endswith("</robot>")
-        kind = (
-            "is not well-formed XML"
-            if ends
-            else "ends before </robot>; it is cut short or is no URDF"
-        )
+        kind = "ends before </robot>; it is cut short or is no URDF"
+        if text.rstrip().endswith("</robot>"):
+            kind = "is not well-formed XML"
         raise RobotError(f"{where}: line {line}, column {column}: {kind} ({reason})") from None
+    for element in root.iter():
+        if "xacro" not in element.tag:  # of a default namespace
+            element.tag = element.tag.rpartition("}")[2]
     # a "${...}" in a simulator's plug-in or a call left over beside whole links does no harm
     parts = [e for kind in ("link", "joint") for part in root.findall(kind) for e in part.iter()]
-    left = [e for e in (parts or root.iter()) if "xacro" in str(e.tag)]
+    left = any("xacro" in e.tag for e in parts or root.iter())
     if left or any("${" in v for e in parts for v in e.attrib.values()):
         raise RobotError(xacro)
-    tag = str(root.tag).rpartition("}")[2]
-    if tag != "robot":
-        raise RobotError(
-            f"{where}: the root element is <{tag}>, {ROOTS.get(tag, 'a URDF begins with <robot>')}"
-        )
-    for element in root.iter():  # of a default namespace
-        element.tag = (
-            str(element.tag).rpartition("}")[2] if "xacro" not in str(element.tag) else element.tag
-        )
+    if root.tag != "robot":
+        what = ROOTS.get(root.tag, "a URDF begins with <robot>")
+        raise RobotError(f"{where}: the root element is <{root.tag}>, {what}")
     if late:
         words = "the XML declaration stands behind a comment or a space, and is passed over"
         ET.SubElement(root, "note", text=words)
@@ -207,6 +197,12 @@ def numbers(text: str | None, count: int) -> np.ndarray | None:
     except ValueError:
         return None
     return values if len(values) == count and np.all(np.isfinite(values)) else None
+
+
+def finite(element: ET.Element | None, keys: Iterable[str]) -> dict[str, float]:
+    """Those attributes of an element that are finite numbers."""
+    values = {key: numbers(element.get(key), 1) for key in keys} if element is not None else {}
+    return {key: float(value[0]) for key, value in values.items() if value is not None}
 
 
 def _place(element: ET.Element) -> pin.SE3:
@@ -291,20 +287,17 @@ class Joint:
         """The joint of an element that has passed the checks."""
         axis, limit, mimic, own = (e.find(x) for x in ("axis", "limit", "mimic", "dynamics"))
         direction = np.array([1.0, 0.0, 0.0]) if axis is None else numbers(axis.get("xyz"), 3)
-        values = {key: numbers(limit.get(key), 1) for key in LIMITS} if limit is not None else {}
-        limits = {key: float(value[0]) for key, value in values.items() if value is not None}
-        given = {key: numbers(own.get(key), 1) for key in OWN} if own is not None else {}
-        losses = {key: float(x[0]) for key, x in given.items() if x is not None and x[0] > 0}
-        driven = e.get("type") in ("revolute", "continuous") and limits.get("effort") != 0
+        limits = finite(limit, LIMITS)
+        losses = {key: x for key, x in finite(own, OWN).items() if x > 0}
+        kind = e.get("type")
+        driven = kind in ("revolute", "continuous") and limits.get("effort") != 0 and mimic is None
         follows = None
         if mimic is not None:
-            driven = False
-            factor, offset = (float(mimic.get(*x)) for x in (("multiplier", 1), ("offset", 0)))
-            follows = (mimic.get("joint"), factor, offset)
+            line = {"multiplier": 1.0, "offset": 0.0} | finite(mimic, ("multiplier", "offset"))
+            follows = (mimic.get("joint"), *line.values())
         ends = (e.find(end).get("link") for end in ("parent", "child"))
         axis = direction / max(np.linalg.norm(direction), 1e-12)
         place = _place(e)
-        kind = e.get("type")
         return cls(e.get("name"), kind, *ends, place, axis, limits, losses, follows, driven, e)
 
 
@@ -316,7 +309,8 @@ class Tree:
     where each is with all joints at 0, in the root's frame [m].
 
     ``where`` is the name of the file for messages, ``path`` the file itself, near which meshes are
-    looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible.
+    looked for; ``repair_inertia`` replaces inertias that no solid has by the nearest possible,
+    else only those at most ``mended`` [kg m^2] from it.
     """
 
     def __init__(
@@ -331,7 +325,8 @@ class Tree:
         self.joints = {e.get("name"): Joint.read(e) for e in root.findall("joint")}
         self.above = {j.child: j for j in self.joints.values()}
         self.root = next(link for link in self.elements if link not in self.above)
-        self._build(np.inf if repair_inertia else slight(root))
+        self.mended = np.inf if repair_inertia else slight(root)
+        self._build()
         for follower in [j for j in self.joints.values() if j.mimic]:
             leader = self.joints[follower.mimic[0]]
             if leader not in self.chain(follower.child) and follower not in self.chain(
@@ -339,7 +334,7 @@ class Tree:
             ):
                 leader.driven = False  # a joint on another limb follows it
 
-    def _build(self, most: float) -> None:
+    def _build(self) -> None:
         """Pinocchio's model, outwards; inertias repaired as :func:`_inertia` says."""
         self.model = pin.Model()
         self.carrier = {}
@@ -353,7 +348,7 @@ class Tree:
                 place = HERE
             self.carrier[link] = carrier
             self.bodies.setdefault(carrier, []).append(link)
-            self.model.appendBodyToJoint(carrier, _inertia(self.elements[link], most), place)
+            self.model.appendBodyToJoint(carrier, _inertia(self.elements[link], self.mended), place)
             self.model.addFrame(pin.Frame(link, carrier, 0, place, pin.FrameType.BODY))
             below = [j for j in self.joints.values() if j.parent == link]
             todo += [(j.child, carrier, place * j.place, j.name, j.kind, j.axis) for j in below]
@@ -412,12 +407,6 @@ class Tree:
             for shape in e.findall("geometry/*")
             if shape.tag == "mesh" or faultless(shape)
         ]
-
-    def points(self, link: str, kind: str = "collision") -> np.ndarray:
-        """(n, 3) points of a link, in its frame, whose hull holds its shapes of a kind."""
-        out = [np.zeros((0, 3))]
-        out += [placed(place, self.corners(shape)) for place, shape in self.shapes(link, kind)]
-        return np.concatenate(out)
 
     def corners(self, shape: ET.Element) -> np.ndarray:
         """(n, 3) points of a shape, in its own frame [m], none of a mesh that is not there."""

@@ -18,6 +18,11 @@ MOST_NAMES = 6  # that a sentence lists
 HERE = pin.SE3.Identity()
 
 
+def shifted(place: np.ndarray) -> pin.SE3:
+    """Axes that are not turned, at ``place`` (3,) [m]."""
+    return pin.SE3(np.eye(3), np.array(place, float))
+
+
 def add(parent: ET.Element, tag: str, **values: Any) -> ET.Element:
     """An element below ``parent``; attributes are texts, numbers, or arrays (n,)."""
     for key, value in values.items():
@@ -58,7 +63,7 @@ def add_link(robot: ET.Element, name: str, inertia: pin.Inertia) -> ET.Element:
     """A link with its inertia, in its own frame [kg, m, kg m^2]."""
     link = add(robot, "link", name=name)
     inertial = add(link, "inertial")
-    add_origin(inertial, pin.SE3(np.eye(3), inertia.lever))
+    add_origin(inertial, shifted(inertia.lever))
     add(inertial, "mass", value=inertia.mass)
     m = np.where(np.abs(inertia.inertia) < 1e-15, 0.0, inertia.inertia)
     ends = zip(*np.triu_indices(3), strict=True)
@@ -75,7 +80,7 @@ def add_boxes(
     """Boxes (centre, size) [m] along ``axes`` in the link; ``kind`` is "visual" or "collision"."""
     for centre, size in boxes:
         shape = add(link, kind)
-        add_origin(shape, axes * pin.SE3(np.eye(3), np.array(centre, float)))
+        add_origin(shape, axes * shifted(centre))
         add(add(shape, "geometry"), "box", size=size)
 
 
