@@ -70,17 +70,19 @@ def test_motors_of_the_g1_are_the_makers():
 
 @here
 @pytest.mark.slow
-def test_planned_clean_and_landed():
-    robot = Robot.load("talos")
-    plan = Planner(robot).plan(JumpTask(0.2, 0.05))
+@pytest.mark.parametrize("name, target", [("g1", (0.4, 0.2)), ("talos", (0.2, 0.05))])
+def test_planned_clean_and_landed(name, target):
+    robot = Robot.load(name)
+    plan = Planner(robot).plan(JumpTask(*target))
     report = audit(plan.tape, plan.robot, plan.task)
     assert [c.name for c in report.checks if not c.passed] == []
-    for mode in ("whole-body", "position"):
+    # drives that do not know the base let a G1 that stands on its toes fall back by 1.2 cm of travel
+    for mode, place_m in (("whole-body", 0.01), ("position", 0.02)):
         scene = Scene.of_plan(plan.summary, plan.robot)
         result = simulate_jump(plan.tape, plan.robot, scene=scene, mode=mode).to_json()
         assert result["landed"], result["reason"]
-        assert result["foot_distance_m"] == pytest.approx(0.2, abs=0.02)
-        assert result["com_rise_m"] == pytest.approx(0.05, abs=0.01)
+        assert result["foot_distance_m"] == pytest.approx(target[0], abs=place_m)
+        assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
 
 
 @here
