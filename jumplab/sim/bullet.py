@@ -18,7 +18,7 @@ from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.armature import Armature, Friction
-from jumplab.sim.engine import Engine, Kept, Presses, inertial
+from jumplab.sim.engine import Engine, Kept, inertial, moment
 from jumplab.sim.scene import REACH_M, Contacts
 
 
@@ -288,26 +288,30 @@ class BulletEngine(Engine):
 
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
+        wrench = np.zeros((2, 6))
         rows = self._bullet.getContactPoints(bodyA=self._body)
-        places = [self._bullet.getLinkState(self._body, link)[4:6] for link in self._feet]
-        # bodies and links, place, normal, pressure, both frictions and their ways
+        # on which link, body and place, normal, pressure, both frictions and their ways
         acting = [
-            (*row[2:5], *row[5], *row[7], *row[9:11], *row[11], row[12], *row[13])
+            (row[3], row[2], *row[5], *row[7], *row[9:11], *row[11], row[12], *row[13])
             for row in rows
             if row[9] > 0
         ]
         if not acting:
-            return Contacts(np.zeros((2, 6)), frozenset(), frozenset())
+            return Contacts(wrench, frozenset(), False)
         table = np.array(acting)
-        body, link, other = table[:, :3].astype(int).T
-        link = link + 1
-        other = np.where(body == self._body, other + 1, -1)
-        place = table[:, 3:6]
-        pressure, first, second = table[:, 9:10], table[:, 10:11], table[:, 14:15]
-        force = pressure * table[:, 6:9] + first * table[:, 11:14] + second * table[:, 15:18]
-        surface = place.copy()
-        for foot, (origin, turn) in zip(self._feet, places, strict=True):
-            here = link == foot + 1
-            surface[here] = (place[here] - origin) @ rotation(turn)
-        origins = np.array([origin for origin, _ in places])
-        return self._contacts(Presses(link, other, place, force, surface), origins)
+        itself = table[:, 1] == self._body
+        table = table[~itself]
+        link = table[:, 0].astype(int)
+        place = table[:, 2:5]
+        pressure, first, second = table[:, 8:9], table[:, 9:10], table[:, 13:14]
+        force = pressure * table[:, 5:8] + first * table[:, 10:13] + second * table[:, 14:17]
+        for foot, on_foot in zip(self._feet, wrench, strict=True):
+            here = link == foot
+            if here.any():
+                origin, turn = self._bullet.getLinkState(self._body, foot)[4:6]
+                arm = place[here] - origin
+                on_foot[:3] = force[here].sum(axis=0)
+                on_foot[3:] = moment(arm, force[here])
+                self._note_sole(arm @ rotation(turn))
+        touching = frozenset(self.links[k + 1] for k in set(link.tolist()))
+        return Contacts(wrench, touching, bool(itself.any()))

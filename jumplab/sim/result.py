@@ -285,7 +285,7 @@ def record(
         L=np.array([motion.momentum[1] for motion in motions]),
         rho=np.array([motion.inertia[1, 1] for motion in motions]),
         touching=np.array([[name in c.touching for name in links] for c in contacts]),
-        colliding=np.array([bool(c.colliding) for c in contacts]),
+        colliding=np.array([c.colliding for c in contacts]),
     )
     for array in log.values():
         array.setflags(write=False)

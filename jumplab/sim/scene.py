@@ -32,7 +32,7 @@ class Contacts:
     # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
     wrench: np.ndarray
     touching: frozenset[str]  # the robot's links that press on the ground
-    colliding: frozenset[tuple[str, str]]  # pairs of the robot's links that press on each other
+    colliding: bool  # whether links of the robot press on each other
 
 
 @dataclass(frozen=True)
