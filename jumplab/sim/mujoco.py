@@ -273,15 +273,11 @@ class MujocoEngine(Engine):
         contact = self._data.contact
         pairs = self._model.geom_bodyid[contact.geom]
         body = pairs.max(axis=1)
-        here = np.flatnonzero(
-            ((body[:, None] == self._feet) & (pairs == 0).any(axis=1)[:, None]).any(axis=1)
-        )
+        here = np.flatnonzero(np.isin(body, self._feet) & (pairs.min(axis=1) == 0))
         if len(here):
             body = body[here]
             # a contact's place is in the middle of its depth, its axis leads to the second body
             half = np.where(pairs[here, 1] == body, 0.5, -0.5) * contact.dist[here]
-            arm = (
-                contact.pos[here] + half[:, None] * contact.frame[here, :3] - self._data.xpos[body]
-            )
-            turn = self._data.xmat[body].reshape(-1, 3, 3)
-            self._note_sole((arm[:, None, :] @ turn)[:, 0])
+            place = contact.pos[here] + half[:, None] * contact.frame[here, :3]
+            arm = (place - self._data.xpos[body])[:, None, :]
+            self._note_sole((arm @ self._data.xmat[body].reshape(-1, 3, 3))[:, 0])
