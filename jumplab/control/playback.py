@@ -12,7 +12,7 @@ from numpy.polynomial import Polynomial
 from scipy.interpolate import PPoly
 
 from jumplab.control import STEP_S
-from jumplab.control.kinematics import Gauge, rotation
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -36,7 +36,6 @@ class Command:
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
-    change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
     # (2, 6) of the plan on them, as on a tape; None: both carry alike
     wrench: np.ndarray | None = None
@@ -71,10 +70,7 @@ class Playback:
             resampled(self._grid, tape.t, x) for x in (tape.q, tape.v, tape.tau, tape.f)
         )
         self._q = q[:, 7:]
-        self._attitude = q[:, 3:7]
         self._rate = self._v[:, 6:]
-        self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
-        self._change[self.takeoff - 1] = 0.0  # what the ground held ends there at once
         left, right = tape.f[: tape.takeoff_index, :, 2].T
         self._wrench = wrench if np.abs(left - right).max() > ALIKE_N else None
         tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
@@ -108,9 +104,10 @@ class Playback:
         rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
         on_ground = at < self.takeoff and self._wrench is not None
         moves = dict(q=angles, rate=rate, acceleration=acceleration)
-        moves |= dict(tau=between(self.tau, at), change=between(self._change, at))
         wrench = between(self._wrench, at) if on_ground else None
-        return Command(**moves, feet=self.stands(at), wrench=wrench, state=(q, v))
+        return Command(
+            **moves, tau=between(self.tau, at), feet=self.stands(at), wrench=wrench, state=(q, v)
+        )
 
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the
@@ -154,13 +151,6 @@ class Playback:
         gained = between(self._v, due) - between(self._v, now)
         base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
         return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
-
-    def attitude_error(self, step: int, q: np.ndarray) -> np.ndarray:
-        """How far the trunk is turned away from the plan: rotation vector (3,) in the axes of ``q``
-        (nq,) and tape [rad].
-        """
-        planned = self._attitude[min(step, self.steps)]
-        return pin.log3(rotation(q[3:7]) @ rotation(planned / np.linalg.norm(planned)).T)
 
 
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:

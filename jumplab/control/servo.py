@@ -99,10 +99,9 @@ class PositionServo:
 
     told = "target angles and rates; a drive measures its own joint"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
+    def __init__(self, robot: Robot, late_s: float = 0.0):
         motors = robot.limits
         self._motors = motors
-        self._late = (1 - 1 / substeps) / 2
         mass = pin.crba(robot.model, robot.model.createData(), stance_configuration(robot))
         inertia = 1 / np.diag(np.linalg.inv(mass))[6:]
         self.kp = np.minimum(STIFFNESS * motors.effort, MOST_KP * inertia / STEP_S**2)
@@ -111,10 +110,9 @@ class PositionServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command``; the measured (q, v) are not used."""
-        tau = command.tau + self._late * command.change
         if command.q is None:
-            return Drive(tau)
-        ahead = command.q + tau / self.kp
+            return Drive(command.tau)
+        ahead = command.q + command.tau / self.kp
         target = np.minimum(np.maximum(ahead, self._motors.lower), self._motors.upper)
         return Drive(self._none, target, command.rate, self.kp, self.kd)
 
@@ -131,8 +129,7 @@ class TorqueServo:
 
     told = "planned torques, angles and rates; it measures all joints"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
-        self._late = (1 - 1 / substeps) / 2
+    def __init__(self, robot: Robot, late_s: float = 0.0):
         self._model = robot.model
         self._data = robot.model.createData()
         role = {name: role for role, pair in robot.joints.items() for name in pair}
@@ -141,7 +138,7 @@ class TorqueServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command`` at the measured (q, v)."""
-        tau = command.tau + self._late * command.change
+        tau = command.tau
         if command.q is None:
             return Drive(tau)
         error = command.q - q[7:]
@@ -158,18 +155,13 @@ class TorqueServo:
 class WholeBodyServo:
     """Torques for commands, from the measured state; see the module's docstring.
 
-    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. They act for a whole
-    step, which a simulator takes in ``substeps`` semi-implicit ones: they are felt at the
-    beginnings of these, on average (1 - 1/substeps) / 2 of the step late, and planned ones change
-    meanwhile. Joints whose rates are right run ahead by half a substep.
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late.
     """
 
     told = "angles, rates and accelerations; it measures base and joints, and knows how feet stand"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
+    def __init__(self, robot: Robot, late_s: float = 0.0):
         self._step_s = STEP_S + late_s
-        self._late = (1 - 1 / substeps) / 2
-        self._ahead_s = STEP_S / substeps / 2
         self._robot = robot
         self._model = robot.model
         self._data = self._model.createData()
@@ -187,13 +179,13 @@ class WholeBodyServo:
         it has any.
         """
         if command.q is None:
-            return command.tau + self._late * command.change
+            return command.tau
         pin.computeAllTerms(self._model, self._data, q, v)
         pin.forwardKinematics(self._model, self._data, q, v, np.zeros(len(v)))
         feet, drift, units, shared = self._feet(command)
         push = feet.T * units
         tau, carried = self._feed_forward(command.acceleration, feet, drift, push, shared / units)
-        error = command.q + self._ahead_s * command.rate - q[7:]
+        error = command.q - q[7:]
         wish = command.rate + self._step_s * command.acceleration + CORNER * error
         tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
         if self._robot.limits.lossy:  # at the due rate: a measured one would swing with its noise
