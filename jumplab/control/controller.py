@@ -43,11 +43,12 @@ YIELD_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Hardware:
-    """What a controller knows of the drives and sensors that it works with."""
+    """What a controller knows of the drives, sensors and time steps that it works with."""
 
     # torques are known to arrive so late; until touchdown, they are sent ahead
     delay_s: float = 0.0
     force_noise_n: float = 0.0  # standard deviation of the feet's forces
+    substeps: int = 1  # in which a simulator takes one step, see :class:`.servo.WholeBodyServo`
 
 
 def level(x: float) -> float:
@@ -116,7 +117,7 @@ class Controller:
         self.mode = mode
         self.playback = Playback(tape, robot, hardware.delay_s)
         kind = servo_of(mode)
-        self._servo = kind(robot, hardware.delay_s)
+        self._servo = kind(robot, hardware.delay_s, hardware.substeps)
         if feedback:
             check_mode(mode)
         self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None

@@ -22,7 +22,6 @@ FLAT = "flat"
 TOE = "toe"
 AIR = "air"
 HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
-ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
 # a start farther off than sensors err is led back until the heels rise; sooner, the robot tips
 WRONG_RAD = 0.02
 WAY_BACK = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])  # of time, smooth at 0 and at 1
@@ -37,7 +36,7 @@ class Command:
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
     feet: str = AIR  # how they stand by the plan
-    # (2, 6) of the plan on them, as on a tape; None: both carry alike
+    # (2, 6) of the plan on them, as on a tape; None: none
     wrench: np.ndarray | None = None
     share: float = 1.0  # of the torque limit, for the servo
     # (q, v) that it is expected to arrive in; as measured if None
@@ -47,8 +46,7 @@ class Command:
 class Playback:
     """The tape on the 1 ms grid of control, as commands. After its end the last posture is held.
 
-    Of a jump whose feet carry unlike loads, commands say what each of them carries. Raises
-    :class:`InputError` if the tape is another robot's.
+    Raises :class:`InputError` if the tape is another robot's.
 
     Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot
     is expected to be as far off the tape then as it is measured to be now: the plan is sent ahead,
@@ -66,13 +64,11 @@ class Playback:
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
         self._grid = np.arange(self.steps + 1) * STEP_S
-        q, self._v, self.tau, wrench = (
+        q, self._v, self.tau, self._wrench = (
             resampled(self._grid, tape.t, x) for x in (tape.q, tape.v, tape.tau, tape.f)
         )
         self._q = q[:, 7:]
         self._rate = self._v[:, 6:]
-        left, right = tape.f[: tape.takeoff_index, :, 2].T
-        self._wrench = wrench if np.abs(left - right).max() > ALIKE_N else None
         tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
         tilted = (t for t, x in zip(tape.t, tilts, strict=True) if abs(x) > HEEL_RAD)
         self._heel_off = round(float(next(tilted, tape.t[-1])) / STEP_S)
@@ -102,12 +98,9 @@ class Playback:
         rate = between(self._rate, at)
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
-        on_ground = at < self.takeoff and self._wrench is not None
         moves = dict(q=angles, rate=rate, acceleration=acceleration)
-        wrench = between(self._wrench, at) if on_ground else None
-        return Command(
-            **moves, tau=between(self.tau, at), feet=self.stands(at), wrench=wrench, state=(q, v)
-        )
+        moves |= dict(tau=between(self.tau, at), wrench=between(self._wrench, at))
+        return Command(**moves, feet=self.stands(at), state=(q, v))
 
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the

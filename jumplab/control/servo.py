@@ -9,8 +9,7 @@ a_b and the wrenches f on the feet go with it,
     min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f - f_p|^2   so that   M a + h = J^T f   in
     the rows of the base,
 
-where f_p is the plan's, none where both feet carry alike: what they push against each other no
-joint's motion tells.
+where f_p is the plan's: what feet push against each other no joint's motion tells.
 
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may
 be far stiffer than what is computed from the velocity before the step,
@@ -99,7 +98,7 @@ class PositionServo:
 
     told = "target angles and rates; a drive measures its own joint"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0):
+    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         motors = robot.limits
         self._motors = motors
         mass = pin.crba(robot.model, robot.model.createData(), stance_configuration(robot))
@@ -129,7 +128,7 @@ class TorqueServo:
 
     told = "planned torques, angles and rates; it measures all joints"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0):
+    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         self._model = robot.model
         self._data = robot.model.createData()
         role = {name: role for role, pair in robot.joints.items() for name in pair}
@@ -155,13 +154,15 @@ class TorqueServo:
 class WholeBodyServo:
     """Torques for commands, from the measured state; see the module's docstring.
 
-    ``robot`` is as planned, and torques are known to arrive ``late_s`` late.
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. A simulator may take a
+    step in ``substeps`` semi-implicit ones: joints whose rates are right run ahead by half of one.
     """
 
     told = "angles, rates and accelerations; it measures base and joints, and knows how feet stand"
 
-    def __init__(self, robot: Robot, late_s: float = 0.0):
+    def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         self._step_s = STEP_S + late_s
+        self._ahead_s = STEP_S / substeps / 2
         self._robot = robot
         self._model = robot.model
         self._data = self._model.createData()
@@ -185,7 +186,7 @@ class WholeBodyServo:
         feet, drift, units, shared = self._feet(command)
         push = feet.T * units
         tau, carried = self._feed_forward(command.acceleration, feet, drift, push, shared / units)
-        error = command.q - q[7:]
+        error = command.q + self._ahead_s * command.rate - q[7:]
         wish = command.rate + self._step_s * command.acceleration + CORNER * error
         tau = tau + self._damping * (wish - self._rates_after(tau, carried, wish, v, push))
         if self._robot.limits.lossy:  # at the due rate: a measured one would swing with its noise

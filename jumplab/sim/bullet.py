@@ -312,6 +312,9 @@ class BulletEngine(Engine):
                 arm = place[here] - origin
                 on_foot[:3] = force[here].sum(axis=0)
                 on_foot[3:] = moment(arm, force[here])
-                self._note_sole(arm @ rotation(turn))
+                self._pressed.append((arm @ rotation(turn),))
         touching = frozenset(self.links[k + 1] for k in set(link.tolist()))
         return Contacts(wrench, touching, bool(itself.any()))
+
+    def _sole_points(self) -> np.ndarray:
+        return np.concatenate([points for (points,) in self._pressed])

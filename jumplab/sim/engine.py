@@ -86,7 +86,8 @@ class Engine(ABC):
         self.contact = self.contact_of(contact)
         self._contact_name = contact if isinstance(contact, str) else str(contact)
         self.scene = scene or Scene.flat()
-        self.beyond_sole_m = 0.0
+        # where ground has pressed on feet: what each step noted for :meth:`_sole_points`
+        self._pressed: list[tuple[np.ndarray, ...]] = []
         try:
             self._build(friction)
             self._compare(friction)
@@ -166,6 +167,12 @@ class Engine(ABC):
     def contacts(self) -> Contacts:
         """What touched, and how hard, in the last step."""
 
+    @abstractmethod
+    def _sole_points(self) -> np.ndarray:
+        """Places (k, 3) in the feet's frames where ground has pressed on them so far, from what
+        was noted; at least one step has noted something.
+        """
+
     def spring(self, soft_m: float) -> tuple[float, float]:
         """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles,
         four points each, sink by ``soft_m`` under the weight; the whole robot on it is critically
@@ -201,7 +208,7 @@ class Engine(ABC):
             damping=kept.damping,
             gravity=kept.gravity,
             self_collision=self._solid,
-            beyond_sole_m=self.beyond_sole_m,
+            beyond_sole_m=self._beyond_sole(),
         ) | ({"late_armature": True} if self.late_armature else {})
 
     def _compare(self, friction: float) -> None:
@@ -215,14 +222,14 @@ class Engine(ABC):
             weight = f"{self.title}'s robot weighs {kept.mass_kg:.4f} kg"
             raise JumplabError(f"{weight}, Pinocchio's {self.robot.total_mass:.4f} kg")
 
-    def _note_sole(self, points: np.ndarray) -> None:
-        """Remember how far contact points (k, 3) in the foot's frame lay beyond the stated sole."""
+    def _beyond_sole(self) -> float:
+        """How far beyond the stated sole a contact of a foot ever lay [m]."""
+        if not self._pressed:
+            return 0.0
         foot = self.robot.foot
-        least = points.min(axis=0)
-        most = points.max(axis=0)
-        side = max(most[1] - foot.center[1], foot.center[1] - least[1]) - foot.half_width
-        beyond = max(foot.heel - least[0], most[0] - foot.toe, side)
-        self.beyond_sole_m = max(self.beyond_sole_m, float(beyond))
+        x, y, _ = self._sole_points().T
+        side = np.abs(y - foot.center[1]) - foot.half_width
+        return float(np.max([foot.heel - x, x - foot.toe, side], initial=0.0))
 
 
 def moment(arms: np.ndarray, forces: np.ndarray) -> np.ndarray:

@@ -263,21 +263,21 @@ class MujocoEngine(Engine):
             force, turning, place = ground[:, foot - 1].swapaxes(0, 1)
             on_foot[:3] = -force.sum(axis=0) / len(ground)
             on_foot[3:] = -(turning.sum(axis=0) + moment(place - origin, force)) / len(ground)
-        self._note_soles()
+        has = self._data.contact
+        pairs = self._model.geom_bodyid[has.geom]
+        body = pairs.max(axis=1)
+        bodies = pairs, self._data.xpos[body], self._data.xmat[body]
+        self._pressed.append((*bodies, has.pos.copy(), has.frame.copy(), has.dist.copy()))
         touching = np.flatnonzero(ground[:, :, 0].any(axis=(0, 2)))
         colliding = bool(self._felt[:, :3].any())
         return Contacts(wrench, frozenset(self.links[k] for k in touching), colliding)
 
-    def _note_soles(self) -> None:
-        """Note where on the feet their contacts with the ground are in the engine's last step."""
-        contact = self._data.contact
-        pairs = self._model.geom_bodyid[contact.geom]
-        body = pairs.max(axis=1)
-        here = np.flatnonzero(np.isin(body, self._feet) & (pairs.min(axis=1) == 0))
-        if len(here):
-            body = body[here]
-            # a contact's place is in the middle of its depth, its axis leads to the second body
-            half = np.where(pairs[here, 1] == body, 0.5, -0.5) * contact.dist[here]
-            place = contact.pos[here] + half[:, None] * contact.frame[here, :3]
-            arm = (place - self._data.xpos[body])[:, None, :]
-            self._note_sole((arm @ self._data.xmat[body].reshape(-1, 3, 3))[:, 0])
+    def _sole_points(self) -> np.ndarray:
+        pairs, origin, turn, place, frame, depth = map(
+            np.concatenate, zip(*self._pressed, strict=True)
+        )
+        # a contact's place is in the middle of its depth, its axis leads to the second body
+        half = np.where(pairs[:, 0] < pairs[:, 1], 0.5, -0.5) * depth
+        arm = place + half[:, None] * frame[:, :3] - origin
+        on_foot = np.isin(pairs.max(axis=1), self._feet) & (pairs.min(axis=1) == 0)
+        return (arm[:, None, :] @ turn.reshape(-1, 3, 3))[on_foot, 0]
