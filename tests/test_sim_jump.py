@@ -8,13 +8,12 @@ import sys
 
 import fixtures_core
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from jumplab.control.controller import level
+from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, pitch_of
 from jumplab.control.playback import Playback
-from jumplab.control.reference import Forecast
 from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -234,13 +233,14 @@ def test_without_a_planned_landing_it_springs_and_says_so(bhr, tape, monkeypatch
 def test_the_touchdown_is_foreseen(bhr, tape):
     """From 0.15 s before it, in a jump that differs from the plan: CoM, velocity and momentum at the first contact."""
     run = simulate(tape, bhr, perturbation=Perturbation(delay_s=0.001), stand_s=SHORT_S)
-    forecast, gauge = Forecast(bhr, tape, level), Gauge(bhr)
+    forecast, gauge = Flight(bhr, tape, level), Gauge(bhr)
     touch = int(np.argmax(run.phase == "landing"))
     early = touch - 150
     now = gauge.motion(run.q[early], run.v[early])
-    assert forecast.time_left(now) == pytest.approx(0.15, abs=0.003)
-    error = pin.rpy.rpyToMatrix(0.0, Playback(tape, bhr).attitude_error(early, run.q[early])[1], 0.0)
-    there = touchdown_of_state(bhr, *forecast.state(now, error), impact=False)
+    left = forecast.time_left(now)
+    assert left == pytest.approx(0.15, abs=0.003)
+    turn = forecast.turn_ahead(early, now, left)
+    there = touchdown_of_state(bhr, *forecast.state(now, turn, left), impact=False)
     real = touchdown_of_state(bhr, run.q[touch], run.v[touch], impact=False)
     assert there.com == pytest.approx(real.com, abs=0.01)
     assert there.com_velocity == pytest.approx(real.com_velocity, abs=0.03)
@@ -343,7 +343,7 @@ def test_a_jump_on_the_moon_is_measured_from_its_take_off(bhr, engine):
 
 
 def test_an_exploded_engine_is_an_error(bhr, tape):
-    nothing = Contacts(np.zeros((2, 6)), frozenset(), frozenset())
+    nothing = Contacts(np.zeros((2, 6)), frozenset(), False)
     row = (np.full(21, np.nan), np.zeros(20), np.zeros(14), nothing)
     with pytest.raises(SolverError, match="the engine lost the robot"):
         record(bhr, [row], ("trunk", *bhr.foot.frames), tape.q[-1])
