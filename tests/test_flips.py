@@ -13,9 +13,9 @@ from paper.planar import planar_quantities
 
 from jumplab import auditing as passport
 from jumplab import plan as planned
-from jumplab.control.kinematics import Gauge, rotation, turned
 from jumplab.control.controller import level
 from jumplab.control.flight import LATER_S, SOONER_S, Flight, is_flip
+from jumplab.control.kinematics import Gauge, rotation, turned
 from jumplab.errors import InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
@@ -201,7 +201,8 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / plan.robot.limits.speed
     assert share.max() < robust.OPENING_SHARE + 0.05
-    assert Flight(plan.robot, plan.tape, level)._later > 1.3 * Flight(plan.robot, backflip().tape, level)._later > LATER_S
+    later, usual = (Flight(plan.robot, tape, level)._later for tape in (plan.tape, backflip().tape))
+    assert later > 1.3 * usual > LATER_S
     drawn = Perturbation.draw(plan.robot, TrialKey(1, 5, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, mode="whole-body", perturbation=drawn, reaim=True)
     assert result.landed and result.checks_passed, result.reason

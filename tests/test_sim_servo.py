@@ -126,6 +126,19 @@ def test_a_joint_beyond_its_no_load_speed_is_braked_with_all_its_motor_has(bhr, 
     assert WholeBodyServo(bhr).torque(on, q, v)[hip] == 0.0  # it cannot be driven any faster
 
 
+def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
+    """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
+    q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
+    takeoff = round(tape.takeoff_time / STEP_S)
+    player, none = Playback(tape, bhr), np.zeros(14)
+    told, last = (player.command(step, q, v, none) for step in (100, takeoff - 1))
+    assert told.change == pytest.approx(change, abs=1e-6) and not np.any(last.change)  # the ground lets go at once
+    for servo in (PositionServo, TorqueServo):
+        for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
+            given = servo(bhr, substeps=substeps).drive(told, q, v).torque(q[7:], v[6:])
+            assert given == pytest.approx(tau + share * change, abs=1e-6)
+
+
 def test_joints_whose_rates_are_right_are_where_substeps_bring_them(bhr, tape):
     """Semi-implicit steps end half a step ahead: there no error is left, and so the damper is all that is felt."""
     q, rate = stance_configuration(bhr), np.linspace(-2, 2, 14)

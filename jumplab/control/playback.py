@@ -35,6 +35,7 @@ class Command:
     rate: np.ndarray | None = None  # (nv - 6,) [rad/s]
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
+    change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
     # (2, 6) of the plan on them, as on a tape; None: none
     wrench: np.ndarray | None = None
@@ -69,6 +70,8 @@ class Playback:
         )
         self._q = q[:, 7:]
         self._rate = self._v[:, 6:]
+        self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
+        self._change[self.takeoff - 1] = 0.0  # what the ground held ends there at once
         tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
         tilted = (t for t, x in zip(tape.t, tilts, strict=True) if abs(x) > HEEL_RAD)
         self._heel_off = round(float(next(tilted, tape.t[-1])) / STEP_S)
@@ -99,7 +102,8 @@ class Playback:
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
         moves = dict(q=angles, rate=rate, acceleration=acceleration)
-        moves |= dict(tau=between(self.tau, at), wrench=between(self._wrench, at))
+        moves |= dict(tau=between(self.tau, at), change=between(self._change, at))
+        moves |= dict(wrench=between(self._wrench, at))
         return Command(**moves, feet=self.stands(at), state=(q, v))
 
     def approach(self, q: np.ndarray) -> None:

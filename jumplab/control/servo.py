@@ -93,7 +93,9 @@ class PositionServo:
     planned one by the planned torque over the stiffness, as far as the joint's range allows.
     Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
     1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
-    free. ``late_s`` makes no difference here: the loop is closed in the drive.
+    free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
+    step that a simulator takes in ``substeps`` semi-implicit ones is felt (1 - 1/substeps) / 2 of it
+    late on average, and planned torques change meanwhile.
     """
 
     told = "target angles and rates; a drive measures its own joint"
@@ -101,6 +103,7 @@ class PositionServo:
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         motors = robot.limits
         self._motors = motors
+        self._late = (1 - 1 / substeps) / 2
         mass = pin.crba(robot.model, robot.model.createData(), stance_configuration(robot))
         inertia = 1 / np.diag(np.linalg.inv(mass))[6:]
         self.kp = np.minimum(STIFFNESS * motors.effort, MOST_KP * inertia / STEP_S**2)
@@ -111,7 +114,7 @@ class PositionServo:
         """What is sent for ``command``; the measured (q, v) are not used."""
         if command.q is None:
             return Drive(command.tau)
-        ahead = command.q + command.tau / self.kp
+        ahead = command.q + (command.tau + self._late * command.change) / self.kp
         target = np.minimum(np.maximum(ahead, self._motors.lower), self._motors.upper)
         return Drive(self._none, target, command.rate, self.kp, self.kd)
 
@@ -129,6 +132,7 @@ class TorqueServo:
     told = "planned torques, angles and rates; it measures all joints"
 
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
+        self._late = (1 - 1 / substeps) / 2
         self._model = robot.model
         self._data = robot.model.createData()
         role = {name: role for role, pair in robot.joints.items() for name in pair}
@@ -137,9 +141,9 @@ class TorqueServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command`` at the measured (q, v)."""
-        tau = command.tau
         if command.q is None:
-            return Drive(tau)
+            return Drive(command.tau)
+        tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
         if command.feet != AIR:
