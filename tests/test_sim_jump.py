@@ -40,7 +40,7 @@ SHORT_S = 0.3  # enough to compare launches and flights
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return Planner(bhr).plan(JumpTask(DISTANCE, HEIGHT), "direct").tape
+    return fixtures_core.jump(DISTANCE, HEIGHT, method="direct").tape
 
 
 @pytest.fixture(scope="module", params=[("position", INSTALLED[0]), ("pd", INSTALLED[-1])])
@@ -57,7 +57,7 @@ def look(bhr, tape):
 
 def test_reaches_the_target_and_stands(jump):
     m = jump.metrics
-    assert jump.landed, jump.reason
+    assert jump.landed and jump.checks_passed, jump.reason
     assert m.foot_distance_m == pytest.approx(DISTANCE, abs=0.02)
     assert m.foot_distance_touchdown_m == pytest.approx(m.foot_distance_m, abs=0.01)
     assert m.com_rise_m == pytest.approx(HEIGHT, abs=0.01)
@@ -209,17 +209,6 @@ def test_late_commands_make_no_joint_swing(bhr, tape):
     assert np.abs(run.v[:, 6:] - planned)[air].max() < 0.5  # [rad/s]; 45 with the gains of the launch
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["position", "pd"])
-def test_the_impact_turns_no_knee_faster_than_its_motor(bhr, mode):
-    """Straighter knees were; a light foot whose edge comes down first may still be, for a step or two."""
-    m = simulate(fixtures_core.jump(1.0, 0.5).tape, bhr, mode=mode, stand_s=SHORT_S).metrics
-    late = {name for name, time in m.overspeed_s.items() if time > 0}
-    assert late <= {"left_ankle_pitch", "right_ankle_pitch"} and max(m.overspeed_s.values()) <= 0.002
-    assert m.max_speed_ratio_before_touchdown <= 1 and m.max_torque_ratio <= 1
-    assert m.foot_distance_touchdown_m == pytest.approx(1.0, abs=0.02) and m.com_rise_m == pytest.approx(0.5, abs=0.01)
-
-
 def test_without_a_planned_landing_it_springs_and_says_so(bhr, tape, monkeypatch):
     def refuse(planner, touchdown):
         raise SolverError("no landing: the CoP would have to leave the sole", stage="landing")
@@ -249,9 +238,10 @@ def test_the_touchdown_is_foreseen(bhr, tape):
 
 
 def test_a_ditch_swallows_a_short_jump_alone(bhr, tape):
-    wide, narrow = (simulate(tape, bhr, scene=Scene.level("ditch", {0.2: -1.0, x: 0.0})) for x in (1.4, 0.4))
+    ditches = (Scene.level("ditch", {0.2: -1.0, x: 0.0}) for x in (1.4, 0.4))
+    wide, narrow = (simulate(tape, bhr, scene=scene, stand_s=SHORT_S) for scene in ditches)
     assert not wide.landed and "watched" not in wide.reason
-    assert narrow.landed and narrow.metrics.foot_distance_m > 0.58
+    assert "watched" in narrow.reason and narrow.metrics.foot_distance_m > 0.58
 
 
 def test_a_fall_is_called_a_fall(bhr, tape):
@@ -328,7 +318,7 @@ def test_a_crouch_that_unloads_the_feet_is_no_flight():
     assert events(force, lambda row: np.zeros(3)) == (None, None)
 
 
-@pytest.mark.parametrize("engine", INSTALLED)
+@pytest.mark.parametrize("engine", INSTALLED[-1:])
 def test_a_jump_on_the_moon_is_measured_from_its_take_off(bhr, engine):
     """The crouch falls as fast as the ground could push, so the feet carry nothing for 0.2 s."""
     task = JumpTask(1.0, 0.5, gravity=1.62)

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import jump
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
@@ -14,8 +15,6 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.urdf import have_published
 from jumplab.sim import STEP_S, Perturbation, simulate_jump
 from jumplab.sim.motors import Motors
-from jumplab.stages.planner import Planner
-from jumplab.task import JumpTask
 
 G1 = pytest.param(
     "g1_arms", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
@@ -24,7 +23,7 @@ G1 = pytest.param(
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
+    return jump(0.6, 0.3, method="direct").tape
 
 
 def told(robot, posture, **changed) -> Command:
@@ -166,8 +165,8 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
     that is known is led by: no difference is left that anyone would see."""
     weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
     late, known = Perturbation(delay_s=0.004), Perturbation(delay_s=0.004, known_delay_s=0.004)
-    jumps = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
-    asked, weakly, late, known = (jump.metrics for jump in jumps)
+    runs = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
+    asked, weakly, late, known = (run.metrics for run in runs)
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
     assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
@@ -176,8 +175,8 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
 
 def test_late_targets_merely_begin_the_jump_later(bhr, tape):
     """Position drives close their own loop: the same jump begins so many milliseconds on."""
-    jumps = [simulate_jump(tape, bhr, perturbation=Perturbation(delay_s=s), stand_s=0.01) for s in (0.0, 0.004)]
-    asked, late = (jump.metrics for jump in jumps)
+    runs = [simulate_jump(tape, bhr, perturbation=Perturbation(delay_s=s), stand_s=0.01) for s in (0.0, 0.004)]
+    asked, late = (run.metrics for run in runs)
     assert late.touchdown_s - asked.touchdown_s == pytest.approx(0.004, abs=0.0011)
     assert late.foot_distance_touchdown_m == pytest.approx(asked.foot_distance_touchdown_m, abs=2e-3)
     assert late.com_rise_m == pytest.approx(asked.com_rise_m, abs=2e-3)

@@ -94,8 +94,8 @@ class PositionServo:
     Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
     1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
     free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
-    step that a simulator takes in ``substeps`` semi-implicit ones is felt (1 - 1/substeps) / 2 of it
-    late on average, and planned torques change meanwhile.
+    step, which a simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2
+    of it late on average, and planned torques change meanwhile.
     """
 
     told = "target angles and rates; a drive measures its own joint"
