@@ -33,6 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control import STEP_S
+from jumplab.control.kinematics import about_vertical
 from jumplab.control.playback import AIR, FLAT, TOE, Command
 from jumplab.errors import InputError, quoted
 from jumplab.robot import Robot
@@ -266,9 +267,8 @@ class WholeBodyServo:
             load = wrench.copy()
             load[3:] -= pin.skew(foot.turn @ self._pivots[command.feet]) @ wrench[:3]
             # in axes that are turned about the vertical as the foot is
-            c, s = foot.turn[:2, 0] / np.hypot(*foot.turn[:2, 0])
-            along = np.zeros((6, 6))
-            along[:3, :3] = along[3:, 3:] = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+            yaw = np.arctan2(foot.turn[1, 0], foot.turn[0, 0])
+            along = np.kron(np.eye(2), about_vertical(-yaw))
             columns = np.concatenate([foot.jacobian.T, [foot.drift, load]])
             rows.append((along @ columns.T)[held])
         rows = np.concatenate(rows)

@@ -289,32 +289,30 @@ class BulletEngine(Engine):
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
         wrench = np.zeros((2, 6))
-        rows = self._bullet.getContactPoints(bodyA=self._body)
-        # on which link, body and place, normal, pressure, both frictions and their ways
-        acting = [
-            (row[3], row[2], *row[5], *row[7], *row[9:11], *row[11], row[12], *row[13])
-            for row in rows
-            if row[9] > 0
-        ]
-        if not acting:
-            return Contacts(wrench, frozenset(), False)
-        table = np.array(acting)
-        itself = table[:, 1] == self._body
-        table = table[~itself]
-        link = table[:, 0].astype(int)
-        place = table[:, 2:5]
-        pressure, first, second = table[:, 8:9], table[:, 9:10], table[:, 13:14]
-        force = pressure * table[:, 5:8] + first * table[:, 10:13] + second * table[:, 14:17]
-        for foot, on_foot in zip(self._feet, wrench, strict=True):
-            here = link == foot
-            if here.any():
+        touching = set()
+        colliding = False
+        feet = {foot: [] for foot in self._feet}
+        for row in self._bullet.getContactPoints(bodyA=self._body):
+            _, _, other, link, _, place, _, normal, _, pressure, *friction = row
+            if pressure <= 0:
+                continue
+            if other == self._body:
+                colliding = True
+                continue
+            touching.add(self.links[link + 1])
+            if link in feet:
+                first, along, second, across = friction
+                sizes = [pressure, first, second]
+                feet[link].append([place, np.dot(sizes, [normal, along, across])])
+        for (foot, presses), on_foot in zip(feet.items(), wrench, strict=True):
+            if presses:
+                place, force = np.array(presses).swapaxes(0, 1)
                 origin, turn = self._bullet.getLinkState(self._body, foot)[4:6]
-                arm = place[here] - origin
-                on_foot[:3] = force[here].sum(axis=0)
-                on_foot[3:] = moment(arm, force[here])
+                arm = place - origin
+                on_foot[:3] = force.sum(axis=0)
+                on_foot[3:] = moment(arm, force)
                 self._pressed.append((arm @ rotation(turn),))
-        touching = frozenset(self.links[k + 1] for k in set(link.tolist()))
-        return Contacts(wrench, touching, bool(itself.any()))
+        return Contacts(wrench, frozenset(touching), colliding)
 
     def _sole_points(self) -> np.ndarray:
         return np.concatenate([points for (points,) in self._pressed])
