@@ -64,7 +64,7 @@ def test_a_body_turns_on_as_fast_as_it_does_beyond_the_plan(bhr, flight, spin):
     row = int(np.searchsorted(t.t, 1e-3 * (last - 5)))
     q, v, left = t.q[row], t.v[row], 5e-3
     plain = flight.turn_ahead(last - 5, Gauge(bhr).motion(q, v), left)
-    assert np.abs(pin.log3(plain)).max() < 1e-4
+    assert np.abs(pin.log3(plain)).max() < 1e-3
     for speed, push in ((spin, (0.3, -0.4, 0.1)), ((0.0, 0.0, 0.0), (0.3, -0.4, 0.1))):
         turn = flight.turn_ahead(last - 5, Gauge(bhr).motion(q, spinning(bhr, q, v, speed, push)), left)
         assert pin.log3(turn @ plain.T) / left == pytest.approx(speed, abs=0.02)
