@@ -244,15 +244,11 @@ def test_a_ditch_swallows_a_short_jump_alone(bhr, tape):
     assert "watched" in narrow.reason and narrow.metrics.foot_distance_m > 0.58
 
 
-def test_a_fall_is_called_a_fall(bhr, tape):
+def test_a_fall_is_called_a_fall_and_a_short_look_no_landing(bhr, tape, look):
     run = simulate(tape, bhr, disturbance=Disturbance(pitch_rad=0.6))
-    assert not run.landed
-    assert "touched the ground" in run.reason
-    assert run.metrics.standing_s < 3
+    assert not run.landed and "touched the ground" in run.reason and run.metrics.standing_s < 3
     assert run.t[-1] < 2.5  # not simulated for longer than it is worth
-
-
-def test_a_short_look_is_no_landing(look):
+    assert run.checks_passed
     assert not look.landed and look.reason == "watched for 0.35 s only, not 3 s"
 
 
