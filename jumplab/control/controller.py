@@ -12,7 +12,7 @@ import numpy as np
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
-from jumplab.control.flight import FROM_SHARE, Flight, is_flip
+from jumplab.control.flight import Flight, is_flip
 from jumplab.control.kinematics import Gauge, Motion, State, headed, turned_wrench, yaw_of
 from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
@@ -29,8 +29,6 @@ LANDINGS = ("planned", "spring")
 WAIT_S = 0.5
 TOUCHDOWN_FORCE_N = 30.0  # sum of both feet; 7 % of the weight, ten times the sensor noise
 HEADING_DIGITS = 9  # of headings [nrad]
-# share of the planned flight before which a graze of the ground is no landing
-EARLIEST_TOUCHDOWN = 0.5
 SETTLING_S = 0.5  # after touchdown; 40 robots shoved after it stand as often with a QP each ...
 CALM_STEPS = 10  # ... 10 ms as with one each 2 ms
 # so long before the ground is due (a flip's legs still have to be stopped then) ...
@@ -130,10 +128,7 @@ class Controller:
         self._shifts = reaim and flip
         self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + hardware.delay_s
         self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * hardware.force_noise_n)
-        flight = tape.takeoff_time, tape.t[-1]
-        shares = EARLIEST_TOUCHDOWN, FROM_SHARE if self._shifts else EARLIEST_TOUCHDOWN
-        steps = np.interp(shares, (0.0, 1.0), flight) / STEP_S
-        self._earliest, self._looks_from = map(round, steps.tolist())
+        self._looks_from = round(self.forecast.from_s / STEP_S)
         self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
 
     @property
@@ -175,7 +170,7 @@ class Controller:
         if self.touchdown is None:
             if step < self._looks_from:
                 return self._play(step, state)
-            if step < self._earliest or state.wrench[:, 2].sum() <= self._touches_n:
+            if state.wrench[:, 2].sum() <= self._touches_n:
                 return self._fly(step, *state[:2])
             state = self._touch(step, state)
         return self._land(step - self.touchdown, state)

@@ -29,7 +29,7 @@ from jumplab.control.playback import between
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
-# of the flight; before, legs and arms are still folding
+# of the flight; before, legs and arms are still folding, and a graze of the ground is no landing
 FROM_SHARE = 0.4
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
@@ -55,7 +55,8 @@ class Flight:
     """The rest of a measured flight, by the planned robot's inertia along the rest of the tape.
 
     The tape's last row is the posture to land in; ``ground`` is the height [m] at a place [m] along
-    the heading in which all this is seen.
+    the heading in which all this is seen. ``from_s`` is the time from which on anything is
+    foreseen.
 
     A flip's tape can be shifted in time during the second part of the flight; the joints' path
     stays as planned. A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at
@@ -74,7 +75,7 @@ class Flight:
         q = tape.q[flight]
         self._t = tape.t[flight]
         self._end = float(tape.t[-1])
-        self._from = tape.takeoff_time + FROM_SHARE * (self._end - tape.takeoff_time)
+        self.from_s = tape.takeoff_time + FROM_SHARE * (self._end - tape.takeoff_time)
         self._pitch = np.unwrap(pitch_of(q))
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])
@@ -82,10 +83,10 @@ class Flight:
         rows = [gauge.motion(*row) for row in zip(level, rates, strict=True)]
         self._inertias = np.array([row.inertia for row in rows])
         self._momenta = np.array([row.momentum for row in rows])
-        late = self._t >= self._from
+        late = self._t >= self.from_s
         self._tight = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
         self._later = self._longest_wait(robot, rates[self._t >= self._tight, 6:])
-        self._sooner = min(SOONER_S, FORWARD * (self._end - self._from) / STEEP)
+        self._sooner = min(SOONER_S, FORWARD * (self._end - self.from_s) / STEEP)
         self._size = 0.0
         self._shift = 0.0
 
@@ -200,7 +201,7 @@ class Flight:
         held up.
         """
         due = now + left_s
-        share = np.clip((t - self._from) / max(due - self._from, STEP_S), 0.0, 1.0)
+        share = np.clip((t - self.from_s) / max(due - self.from_s, STEP_S), 0.0, 1.0)
         at = t + share * (self._end - due)
         if size >= 0:
             return np.minimum(at + size * np.sin(np.pi * share**LATE) ** 2, self._end)
