@@ -223,7 +223,7 @@ class Controller:
         """
         self.touchdown = step
         now = self._gauge.motion(*state[:2])
-        yaw = yaw_of(self.forecast.turn_ahead(step, now, 0.0))
+        yaw = round(yaw_of(self.forecast.turn_ahead(step, now, 0.0)), HEADING_DIGITS)
         self.looks_rad += yaw
         state = state.along(yaw)
         if self.ahead.source == "planned" and self.ahead.followed is None:  # ground came early

@@ -263,21 +263,23 @@ class MujocoEngine(Engine):
             force, turning, place = ground[:, foot - 1].swapaxes(0, 1)
             on_foot[:3] = -force.sum(axis=0) / len(ground)
             on_foot[3:] = -(turning.sum(axis=0) + moment(place - origin, force)) / len(ground)
-        has = self._data.contact
-        pairs = self._model.geom_bodyid[has.geom]
-        body = pairs.max(axis=1)
-        bodies = pairs, self._data.xpos[body], self._data.xmat[body]
-        self._pressed.append((*bodies, has.pos.copy(), has.frame.copy(), has.dist.copy()))
+        data = self._data
+        has = data.contact
+        noted = has.geom, has.pos, has.frame, has.dist, data.xpos, data.xmat
+        self._pressed.append(tuple(x.copy() for x in noted))
         touching = np.flatnonzero(ground[:, :, 0].any(axis=(0, 2)))
         colliding = bool(self._felt[:, :3].any())
         return Contacts(wrench, frozenset(self.links[k] for k in touching), colliding)
 
     def _sole_points(self) -> np.ndarray:
-        pairs, origin, turn, place, frame, depth = map(
-            np.concatenate, zip(*self._pressed, strict=True)
-        )
+        *contacts, xpos, xmat = zip(*self._pressed, strict=True)
+        geoms, place, frame, depth = map(np.concatenate, contacts)
+        step = np.repeat(np.arange(len(xpos)), [len(x) for x in contacts[0]])
+        pairs = self._model.geom_bodyid[geoms]
+        body = pairs.max(axis=1)
         # a contact's place is in the middle of its depth, its axis leads to the second body
-        half = np.where(pairs[:, 0] < pairs[:, 1], 0.5, -0.5) * depth
-        arm = place + half[:, None] * frame[:, :3] - origin
-        on_foot = np.isin(pairs.max(axis=1), self._feet) & (pairs.min(axis=1) == 0)
-        return (arm[:, None, :] @ turn.reshape(-1, 3, 3))[on_foot, 0]
+        half = np.where(pairs[:, 1] == body, 0.5, -0.5) * depth
+        arm = place + half[:, None] * frame[:, :3] - np.array(xpos)[step, body]
+        turn = np.array(xmat)[step, body].reshape(-1, 3, 3)
+        on_foot = np.isin(body, self._feet) & (pairs.min(axis=1) == 0)
+        return (arm[:, None, :] @ turn)[on_foot, 0]
