@@ -15,7 +15,7 @@ import pinocchio as pin
 from jumplab.arguments import checked
 from jumplab.control import STAND_S
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
+from jumplab.control.kinematics import Gauge, State, about_vertical, rotation, turned
 from jumplab.control.servo import Drive
 from jumplab.errors import InputError
 from jumplab.io.progress import tell
@@ -169,17 +169,17 @@ class Disturbance:
             now = gauge.motion(tape.q[row], tape.v[row])
             if now.velocity[2] <= 0:
                 break
-        q = tape.q[row].copy()
         v = tape.v[row].copy()
         speed = now.velocity
         seen = about_vertical(gauge.heading(tape.q[-1]) + self.direction_rad)
         turn = seen @ pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0) @ seen.T
-        attitude = turn @ rotation(q[3:7])
+        q = turned(tape.q[row], turn)
         q[:3] = now.com + turn @ (q[:3] - now.com) + [0.0, 0.0, self.height_m]
-        q[3:7] = pin.Quaternion(attitude).coeffs()
         # the base twist is written in base axes and so has turned with the robot; the flight of its
         # CoM must not
-        v[:3] += attitude.T @ (speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed)
+        v[:3] += rotation(q[3:7]).T @ (
+            speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed
+        )
         return round(float(tape.t[row]) / STEP_S), q, v
 
 
