@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from fixtures_core import jump
 
-from jumplab.control.servo import SERVOS
 from jumplab.sim import INSTALLED, simulate_jump
-from jumplab.stages.planner import METHODS
 
 
 def within_limits(robot, run, slaps=0):
@@ -29,7 +27,12 @@ def within_limits(robot, run, slaps=0):
 
 
 # each mode and method, and each engine
-PLAYED = [(mode, METHODS[k % 2], INSTALLED[k % 2 - 1]) for k, mode in enumerate((*SERVOS, "position"))]
+PLAYED = [
+    ("position", "direct", INSTALLED[-1]),
+    ("position", "three-step", INSTALLED[-1]),
+    ("pd", "direct", INSTALLED[0]),
+    ("whole-body", "three-step", INSTALLED[-1]),
+]
 
 
 @pytest.mark.slow
