@@ -13,8 +13,9 @@ from paper.planar import planar_quantities
 
 from jumplab import auditing as passport
 from jumplab import plan as planned
+from jumplab.control.controller import level
+from jumplab.control.flight import LATER_S, SOONER_S, Flight, is_flip
 from jumplab.control.kinematics import Gauge, rotation, turned
-from jumplab.control.tuck import LATER_S, SOONER_S, Tuck, is_flip
 from jumplab.errors import InputError, SolverError
 from jumplab.robot import Robot
 from jumplab.sim import STEP_S, Perturbation, Ranges, simulate_jump
@@ -126,7 +127,7 @@ def test_launch_keeps_its_cop_off_the_edges():
 def test_tuck_forecasts_the_planned_turn_and_mends_a_wrong_one():
     """With the plan's own L the forecast, int (L - h) / I dt, ends where the tape does."""
     plan = backflip()
-    tape, tuck = plan.tape, Tuck(plan.robot, plan.tape)
+    tape, tuck = plan.tape, Flight(plan.robot, plan.tape, level)
     assert is_flip(tape)
     L = float(np.ravel(tape.extra["planar_L"])[-1])
     row = tape.takeoff_index + 1
@@ -146,8 +147,8 @@ def test_a_shifted_tape_never_runs_backwards(flight_s):
     plan = backflip()
     tape, last = plan.tape, plan.tape.t[-1] - plan.tape.takeoff_time
     t = tape.takeoff_time + (tape.t - tape.takeoff_time) * flight_s / last
-    tuck = Tuck(plan.robot, replace(tape, t=np.where(tape.t < tape.takeoff_time, tape.t, t)))
-    _, pace, _ = tuck._pieces(tuck._sooner, tape.takeoff_time, flight_s)
+    tuck = Flight(plan.robot, replace(tape, t=np.where(tape.t < tape.takeoff_time, tape.t, t)), level)
+    _, pace, _ = tuck._pieces(tuck._sooner, tape.takeoff_time, flight_s, 32)
     assert pace.min() > 0.03
     t = np.linspace(tape.takeoff_time, tuck._end, 400)
     there = tuck._place(-tuck._later, t, tape.takeoff_time, flight_s)
@@ -165,7 +166,7 @@ def test_a_shifted_tape_never_runs_backwards(flight_s):
 def test_tuck_forecasts_the_attitude_about_all_axes():
     """A body as planned ends as planned; one that is turned about the vertical, L with it, ends turned as much."""
     plan = backflip()
-    tape, tuck, yaw, gauge = plan.tape, Tuck(plan.robot, plan.tape), 0.3, Gauge(plan.robot)
+    tape, tuck, yaw, gauge = plan.tape, Flight(plan.robot, plan.tape, level), 0.3, Gauge(plan.robot)
     for at in (tape.takeoff_index + 280, tape.takeoff_index + 500):
         now, left = float(tape.t[at]), float(tape.t[-1] - tape.t[at])
         tuck.shift(step := round(now / STEP_S), gauge.motion(tape.q[at], tape.v[at]), left)
@@ -200,7 +201,8 @@ def test_a_robust_backflip_lands_a_robot_that_turns_too_slowly():
     opening = plan.tape.t > plan.tape.t[-1] - 0.9 * LATE_SHARE * (plan.tape.t[-1] - plan.tape.takeoff_time)
     share = np.abs(plan.tape.v[opening, 6:]) / plan.robot.limits.speed
     assert share.max() < robust.OPENING_SHARE + 0.05
-    assert Tuck(plan.robot, plan.tape)._later > 1.3 * Tuck(plan.robot, backflip().tape)._later > LATER_S
+    later, usual = (Flight(plan.robot, tape, level)._later for tape in (plan.tape, backflip().tape))
+    assert later > 1.3 * usual > LATER_S
     drawn = Perturbation.draw(plan.robot, TrialKey(1, 5, "", "").robot_seed)
     result = simulate_jump(plan.tape, plan.robot, mode="whole-body", perturbation=drawn, reaim=True)
     assert result.landed and result.checks_passed, result.reason

@@ -295,24 +295,16 @@ def test_a_robot_in_the_air_moves_as_with_armature(bhr, engine):
     assert np.abs(pin.difference(model, q, there))[3:].max() < close[0] and np.abs(speed - v)[3:].max() < close[1]
 
 
-@pytest.fixture(scope="module", params=zip(INSTALLED, ("position", "pd"), strict=False), ids=str)
-def run(request, plan):
-    engine, mode = request.param
-    return simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
-
-
-def test_a_jump_with_motors_lands(run):
+@pytest.mark.parametrize("engine, mode", [*zip(INSTALLED, ("position", "pd"), strict=False)])
+def test_a_jump_with_motors_lands(bhr, plan, engine, mode):
+    """And the findings know armature and friction: of a robot without, the same log has torques from nowhere."""
+    run = simulate_jump(plan.tape, plan.robot, engine=engine, mode=mode)
     assert run.landed, run.reason
     assert [f.name for f in run.checks if not f.passed] == []
     assert run.metrics.com_rise_m == pytest.approx(0.2, abs=0.01)
     assert run.metrics.foot_distance_m == pytest.approx(0.4, abs=0.01)
-    assert run.settings["engine"].get("late_armature", False) == (run.settings["engine"]["name"] == "bullet")
-
-
-def test_physics_without_the_motors_is_noticed(bhr, run):
-    """The findings know armature and friction: of a robot without, the same log has torques from nowhere."""
-    said = {f.name: f for f in check(run, bhr)}
-    assert not said["unexplained joint torque"].passed
+    assert run.settings["engine"].get("late_armature", False) == (engine == "bullet")
+    assert not {f.name: f for f in check(run, bhr)}["unexplained joint torque"].passed
 
 
 # exported -----------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from fixtures_core import jump as planned
 
 from jumplab.cli.common import print_simulation
 from jumplab.sim import Disturbance, MujocoEngine, Perturbation, simulate_jump
@@ -13,19 +14,23 @@ from jumplab.sim import loop as jump
 from jumplab.sim.checks import check
 from jumplab.sim.motors import Motors
 from jumplab.sim.result import STAND_S
-from jumplab.stages.planner import Planner
-from jumplab.task import JumpTask
 
 bullet = pytest.importorskip("pybullet", reason="PyBullet, behind whose back most of the cheats go, is not installed")
 engines = import_module("jumplab.sim.bullet")
 BulletEngine = engines.BulletEngine
-SHORT_S = 0.3
+SHORT_S = 0.05
 IN_FLIGHT = 1200  # step; the tape takes off a little after one second and flies for half of one
 
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
+    return planned(0.6, 0.3, method="direct").tape
+
+
+@pytest.fixture(scope="module")
+def short(bhr, tape):
+    """A sound run that is over just after the landing."""
+    return simulate_jump(tape, bhr, stand_s=SHORT_S)
 
 
 def failed(result) -> set[str]:
@@ -40,9 +45,8 @@ def test_the_flight_is_where_the_cheats_expect_it(tape):
 LATE = Perturbation(friction=0.5, delay_s=0.003)
 
 
-@pytest.mark.parametrize("options", [{}, {"mode": "pd"}, {"perturbation": LATE, "reaim": True}, {"engine": "mujoco"}])
-def test_a_jump_passes_its_checks(bhr, tape, options, capsys):
-    result = simulate_jump(tape, bhr, **options)
+def test_a_jump_passes_its_checks(bhr, tape, capsys):
+    result = simulate_jump(tape, bhr, perturbation=LATE, reaim=True)
     assert result.landed and result.checks_passed and failed(result) == set()
     said = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert said["checks_passed"] and all(row["passed"] for row in said["checks"])
@@ -53,16 +57,11 @@ def test_a_jump_passes_its_checks(bhr, tape, options, capsys):
 @pytest.mark.parametrize("engine, mode", [("bullet", "whole-body"), ("mujoco", "position")])
 def test_on_usual_contacts_mechanics_hold_to_rounding(bhr, tape, engine, mode):
     """One step in each millisecond leaves nothing unexplained: so the edges of MuJoCo's friction pyramids are read."""
-    result = simulate_jump(tape, bhr, engine=engine, mode=mode, contact="usual")
-    assert result.landed and failed(result) == set()
+    result = simulate_jump(tape, bhr, engine=engine, mode=mode, contact="usual", stand_s=0.3)
+    assert result.metrics.touchdown_s and failed(result) == set()
     assert result.settings["engine"]["contact"] == "usual" and result.settings["mode"] == mode
     for finding in result.checks[:3]:
         assert "unexplained" in finding.name and finding.value < 1e-4, finding
-
-
-def test_a_fall_passes_its_checks_too(bhr, tape):
-    result = simulate_jump(tape, bhr, disturbance=Disturbance(pitch_rad=0.6))
-    assert not result.landed and result.checks_passed
 
 
 def test_quick_legs_pass(bhr, tape):
@@ -71,9 +70,8 @@ def test_quick_legs_pass(bhr, tape):
     assert failed(result) == set()
 
 
-def test_without_findings_nothing_passes(bhr, tape):
-    result = simulate_jump(tape, bhr, stand_s=SHORT_S)
-    assert result.checks_passed and not replace(result, checks=()).checks_passed
+def test_without_findings_nothing_passes(short):
+    assert short.checks_passed and not replace(short, checks=()).checks_passed
 
 
 def client(world):
@@ -175,12 +173,11 @@ def test_oversized_feet(bhr, tape, monkeypatch):
     assert result.settings["engine"]["beyond_sole_m"] == pytest.approx(0.015, abs=0.001)
 
 
-def test_feet_that_press_beyond_their_sole(bhr, tape):
+def test_feet_that_press_beyond_their_sole(bhr, short):
     """The same from the forces alone: wrenches of a robot with longer feet, judged by the stated ones."""
-    result = simulate_jump(tape, bhr, stand_s=SHORT_S)
     small = replace(bhr, config_text=bhr.config_text.replace("[-0.10, 0.14]", "[-0.10, 0.13]"))
     assert small.foot.toe == bhr.foot.toe - 0.01
-    names = {finding.name for finding in check(result, small) if not finding.passed}
+    names = {finding.name for finding in check(short, small) if not finding.passed}
     assert "CoP outside the sole" in names
 
 
@@ -225,10 +222,9 @@ def test_what_the_engine_has_is_read_back(bhr, tape, monkeypatch, engine, cheat,
     assert failed(simulate_jump(tape, bhr, engine=engine.name, stand_s=0.01)) == {found}
 
 
-def test_a_landing_shorter_than_three_seconds(bhr, tape):
-    result = simulate_jump(tape, bhr, stand_s=1.0)
-    assert not result.landed and result.checks_passed
-    claimed = replace(result, metrics=replace(result.metrics, landed=True))
+def test_a_landing_shorter_than_three_seconds(bhr, short):
+    assert not short.landed and short.checks_passed
+    claimed = replace(short, metrics=replace(short.metrics, landed=True))
     found = {finding.name: finding for finding in check(claimed, bhr)}
-    short = found["claimed landing, short of 3 s by"]
-    assert not short.passed and short.value == pytest.approx(STAND_S - 1.05, abs=0.002)
+    lacking = found["claimed landing, short of 3 s by"]
+    assert not lacking.passed and lacking.value == pytest.approx(STAND_S - SHORT_S - 0.05, abs=0.002)

@@ -53,7 +53,7 @@ def test_the_robots_of_the_usual_ranges_stay_the_same(bhr):
 def test_draws_stay_within_their_ranges(bhr):
     most = {f.name: (f.metadata["least"], f.metadata["most"]) if isinstance(f.default, tuple) else f.metadata["most"]
             for f in fields(Ranges)}  # fmt: skip
-    drawn = [Perturbation.draw(bhr, seed, Ranges(**most), SensorNoise.typical()) for seed in range(40)]
+    drawn = [Perturbation.draw(bhr, seed, Ranges(**most), SensorNoise.typical()) for seed in range(12)]
     low, high = np.array([-0.08, -0.14, -0.33]), np.array([0.08, 0.14, 0.0])
     for one in drawn:
         assert 0 <= one.payload_kg <= 5 and all(0 <= x <= 0.2 for x in one.torque_loss.values())
@@ -65,7 +65,7 @@ def test_draws_stay_within_their_ranges(bhr):
         assert all(0 <= x <= 0.05 for x in one.armature.values()) and all(0 <= x <= 3 for x in one.damping.values())
         assert 0 <= one.noise.gyro <= 4 * SensorNoise.typical().gyro
         assert (np.array(one.payload_m)[:2] >= low[:2]).all() and (np.array(one.payload_m)[:2] <= high[:2]).all()
-    assert len({one.payload_m for one in drawn}) == 40 and max(one.payload_kg for one in drawn) > 4
+    assert len({one.payload_m for one in drawn}) == 12 and max(one.payload_kg for one in drawn) > 4
 
 
 @pytest.mark.parametrize(

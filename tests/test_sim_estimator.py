@@ -3,27 +3,26 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import jump as planned
 
 from jumplab.control.estimator import Estimator
 from jumplab.control.kinematics import State
 from jumplab.robot.stance import stance_configuration
 from jumplab.sim import Perturbation, SensorNoise, simulate_jump
 from jumplab.sim.sensors import LEVER_M, Perception, Sensors, estimation_error
-from jumplab.stages.planner import Planner
-from jumplab.task import JumpTask
 
 STILL = np.zeros((2, 6))
 
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
+    return planned(0.6, 0.3, method="direct").tape
 
 
 @pytest.fixture(scope="module")
 def jump(bhr, tape):
     """A jump that slips, bounces and stands askew a little: the truth to be found again."""
-    return simulate_jump(tape, bhr, perturbation=Perturbation.draw(bhr, 3), reaim=True, stand_s=1.5)
+    return simulate_jump(tape, bhr, perturbation=Perturbation.draw(bhr, 3), reaim=True, stand_s=0.5)
 
 
 def errors(bhr, jump, noise, seed=0):
@@ -44,7 +43,7 @@ def test_exact_sensors_find_the_truth(bhr, jump):
         assert (worst < [5e-5, 1e-3, 1e-3]).all(), worst
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_typical_sensors_are_good_enough_to_land(bhr, jump, seed):
     """One degree, 6 cm/s, and 3 cm of place at the end of the flight; the feet take the velocity's error away again."""
     worst = errors(bhr, jump, SensorNoise.typical(), seed)
@@ -54,7 +53,7 @@ def test_typical_sensors_are_good_enough_to_land(bhr, jump, seed):
 
 
 def test_standing_feet_stop_a_drift_that_the_inertial_unit_alone_would_have(bhr):
-    """Half a degree per second and 5 mg: five seconds of standing."""
+    """Half a degree per second and 5 mg: three seconds of standing."""
     noise = SensorNoise(gyro=0.01, gyro_bias=0.01, accel=0.1, accel_bias=0.05, joint_rad=5e-4)
     q, v = stance_configuration(bhr), np.zeros(20)
     loads = {"standing": np.tile([0.0, 0, 206, 0, 0, 0], (2, 1)), "hanging": STILL}
@@ -62,7 +61,7 @@ def test_standing_feet_stop_a_drift_that_the_inertial_unit_alone_would_have(bhr)
     for name, wrench in loads.items():
         perceived = Sensors(noise, 4)
         estimator = Estimator(bhr, q, v, noise)
-        for _ in range(5000):
+        for _ in range(3000):
             believed = estimator.update(perceived.read(q, v, wrench))
         error[name] = (*estimation_error(q, v, *believed), np.linalg.norm(believed[0][:3] - q[:3]))
     assert error["standing"][0] < 0.015 and error["standing"][1] < 0.02 and error["standing"][2] < 0.03
@@ -118,9 +117,8 @@ def test_perception_is_the_truth_until_a_sensor_errs(bhr):
 
 def test_a_jump_lands_on_estimates(bhr, tape):
     noisy = Perturbation(seed=1, noise=SensorNoise.typical())
-    run = simulate_jump(tape, bhr, perturbation=noisy, reaim=True)
-    assert run.landed and run.checks_passed
+    run = simulate_jump(tape, bhr, perturbation=noisy, reaim=True, stand_s=0.5)
+    assert run.checks_passed and "watched" in run.reason
     said = run.settings["perception"]
-    assert (
-        said["state"] == "estimated" and 0 < said["worst_tilt_error_rad"] < 0.03 and said["worst_velocity_error"] < 0.1
-    )
+    assert said["state"] == "estimated" and 0 < said["worst_tilt_error_rad"] < 0.03
+    assert said["worst_velocity_error"] < 0.1

@@ -107,24 +107,24 @@ def test_body_terms_obey_newton(bhr):
 
 
 def test_stands_quietly(bhr):
-    run = Catch(bhr, stance_configuration(bhr), seconds=3.0)
+    run = Catch(bhr, stance_configuration(bhr), seconds=1.2)
     assert run.stands and run.speed < 1e-3
     assert run.force == pytest.approx(42 * 9.8, rel=1e-3)
     assert run.worst_torque < 0.3
-    assert run.controller.solver.failures == 0 and run.controller.solver.solves > 1400
+    assert run.controller.solver.failures == 0 and run.controller.solver.solves > 550
 
 
 def test_catches_a_drop(bhr):
     q = stance_configuration(bhr)
     q[2] += 0.2
-    run = Catch(bhr, q, seconds=2.0)
+    run = Catch(bhr, q, seconds=1.2)
     assert run.stands and run.controller.solver.failures == 0
     assert run.com[:2] == pytest.approx([0, 0], abs=0.01)
 
 
-@pytest.mark.parametrize(("vx", "friction"), [(0.7, 0.5), (1.0, 0.8), (1.4, 1.0)])
+@pytest.mark.parametrize(("vx", "friction"), [(0.7, 0.5), (1.4, 1.0)])
 def test_catches_a_jump(bhr, vx, friction):
-    run = Catch(bhr, *crouched(bhr, vx), seconds=2.0, friction=friction)
+    run = Catch(bhr, *crouched(bhr, vx), seconds=1.6, friction=friction)
     assert run.stands and run.controller.solver.failures == 0
     assert run.worst_torque <= 1.0
 
@@ -141,7 +141,7 @@ def test_follows_a_reference(bhr):
         feed_forward=lambda t: (np.zeros(2), 0.0),
     )
     controller = LandingController(bhr, reference=plan)
-    run = Catch(bhr, q, seconds=1.5, controller=controller)
+    run = Catch(bhr, q, seconds=1.2, controller=controller)
     assert run.stands
     assert run.com[[0, 2]] == pytest.approx([0.02, start - 0.1], abs=0.005)
 
@@ -158,8 +158,8 @@ def test_survives_a_failing_solver(bhr):
     controller.solver.solve = flaky
     q = stance_configuration(bhr)
     q[2] += 0.05
-    run = Catch(bhr, q, seconds=1.5, controller=controller)
-    assert run.stands and len(calls) > 600
+    run = Catch(bhr, q, seconds=1.0, controller=controller)
+    assert run.stands and len(calls) > 400
 
 
 def test_reports_an_unsolvable_problem(bhr):

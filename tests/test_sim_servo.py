@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import jump
 
 from jumplab.control import servo as law
 from jumplab.control.body import WholeBody
@@ -14,8 +15,6 @@ from jumplab.robot.stance import stance_configuration
 from jumplab.robot_import.urdf import have_published
 from jumplab.sim import STEP_S, Perturbation, simulate_jump
 from jumplab.sim.motors import Motors
-from jumplab.stages.planner import Planner
-from jumplab.task import JumpTask
 
 G1 = pytest.param(
     "g1_arms", marks=pytest.mark.skipif(not have_published(), reason="the published robots are not installed")
@@ -24,7 +23,7 @@ G1 = pytest.param(
 
 @pytest.fixture(scope="module")
 def tape(bhr):
-    return Planner(bhr).plan(JumpTask(0.6, 0.3), "direct").tape
+    return jump(0.6, 0.3, method="direct").tape
 
 
 def told(robot, posture, **changed) -> Command:
@@ -71,40 +70,26 @@ def test_a_turned_world_changes_nothing(bhr, tape, stand):
         assert servo.torque(command, headed(q, yaw), v) == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
 
 
-def test_in_the_air_an_error_is_met_by_a_damper_of_the_free_body(bhr, tape):
-    """The stated damping, softened by what the rates change within the step: an implicit step, solved another way."""
-    q, v = tape.q[-200], np.zeros(bhr.model.nv)
-    servo, data, dt = WholeBodyServo(bhr), bhr.model.createData(), STEP_S
-    error = np.random.default_rng(0).normal(size=14) * 1e-3
-    free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e, feet=AIR), q, v) for e in (0 * error, error))
-    damping = law.DAMPING * bhr.limits.effort / bhr.limits.effort.max()
-    mass = pin.crba(bhr.model, data, q)
-    mass = np.triu(mass) + np.triu(mass, 1).T
-    answer = np.linalg.inv(mass)[6:, 6:]  # rates per impulse
-    stiff = np.diag(damping) @ np.linalg.inv(np.eye(14) + dt * answer @ np.diag(damping))
-    assert pulled - free == pytest.approx(stiff @ (law.CORNER * error), abs=1e-9)
-
-
-def test_on_the_ground_an_error_is_met_by_a_damper_of_a_robot_whose_feet_give_way(bhr):
-    """The same where the feet stand, on springs of no mass instead of rows that hold them."""
-    q, v, dt = stance_configuration(bhr), np.zeros(bhr.model.nv), STEP_S
+@pytest.mark.parametrize("stand", [AIR, FLAT])
+def test_an_error_is_met_by_a_damper_of_a_body_whose_feet_give_way(bhr, tape, stand):
+    """The stated damping, softened by what the rates change within the step: an implicit step, solved another way, with
+    feet on springs of no mass instead of rows that hold them."""
+    q, v, dt = tape.q[-200] if stand == AIR else stance_configuration(bhr), np.zeros(bhr.model.nv), STEP_S
     servo, data = WholeBodyServo(bhr), bhr.model.createData()
     error = np.random.default_rng(0).normal(size=14) * 1e-3
-    free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e), q, v) for e in (0 * error, error))
-    effort = bhr.limits.effort
-    damping = np.diag(np.r_[np.zeros(6), law.DAMPING * effort / effort.max()])
+    free, pulled = (servo.torque(told(bhr, q, q=q[7:] + e, feet=stand), q, v) for e in (0 * error, error))
+    damping = np.diag(np.r_[np.zeros(6), law.DAMPING * bhr.limits.effort / bhr.limits.effort.max()])
     mass = pin.crba(bhr.model, data, q)
-    mass = np.triu(mass) + np.triu(mass, 1).T
     pin.computeJointJacobians(bhr.model, data, q)
-    rows = []
-    for frame in map(bhr.model.getFrameId, bhr.foot.frames):
+    springs = np.zeros((20, 20))
+    for frame in map(bhr.model.getFrameId, bhr.foot.frames if stand == FLAT else ()):
         placed = pin.updateFramePlacement(bhr.model, data, frame)
         jacobian = pin.getFrameJacobian(bhr.model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         jacobian[:3] -= pin.skew(placed.rotation @ bhr.foot.center) @ jacobian[3:]
-        rows.append(jacobian * np.repeat([1.0, law.LEVER_M], 3)[:, None])
-    feet = np.vstack(rows)
+        rows = jacobian * np.repeat([1.0, law.LEVER_M], 3)[:, None]
+        springs += rows.T @ rows / law.GIVE
     wish = np.r_[np.zeros(6), law.CORNER * error]
-    after = np.linalg.solve(mass + dt * damping + feet.T @ feet / law.GIVE, dt * damping @ wish)
+    after = np.linalg.solve(mass + dt * damping + springs, dt * damping @ wish)
     assert pulled - free == pytest.approx((damping @ (wish - after))[6:], abs=1e-6)
 
 
@@ -129,13 +114,14 @@ def test_a_joint_beyond_its_no_load_speed_is_braked_with_all_its_motor_has(bhr, 
 def test_a_torque_that_is_held_for_a_step_is_that_of_its_middle(bhr, tape):
     """As far as an engine's substeps feel it late: one feels it at once, countless ones half a step late on average."""
     q, v, tau, change = tape.q[100], tape.v[100], tape.tau[100], tape.tau[101] - tape.tau[100]
-    for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
-        given = WholeBodyServo(bhr, substeps=substeps).torque(Command(tau=tau, change=change), q, v)
-        assert given == pytest.approx(tau + share * change, abs=1e-6)
     takeoff = round(tape.takeoff_time / STEP_S)
     player, none = Playback(tape, bhr), np.zeros(14)
-    changes = [player.command(step, q, v, none).change for step in (100, takeoff - 1)]
-    assert changes[0] == pytest.approx(change, abs=1e-6) and not np.any(changes[1])  # the ground lets go at once
+    told, last = (player.command(step, q, v, none) for step in (100, takeoff - 1))
+    assert told.change == pytest.approx(change, abs=1e-6) and not np.any(last.change)  # the ground lets go at once
+    for servo in (PositionServo, TorqueServo):
+        for substeps, share in ((1, 0.0), (4, 0.375), (10**9, 0.5)):
+            given = servo(bhr, substeps=substeps).drive(told, q, v).torque(q[7:], v[6:])
+            assert given == pytest.approx(tau + share * change, abs=1e-6)
 
 
 def test_joints_whose_rates_are_right_are_where_substeps_bring_them(bhr, tape):
@@ -165,8 +151,8 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
     that is known is led by: no difference is left that anyone would see."""
     weak = Perturbation(motor_gain={name: 0.9 for name in bhr.joint_names})
     late, known = Perturbation(delay_s=0.004), Perturbation(delay_s=0.004, known_delay_s=0.004)
-    jumps = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
-    asked, weakly, late, known = (jump.metrics for jump in jumps)
+    runs = [simulate_jump(tape, bhr, mode=mode, perturbation=p, stand_s=0.01) for p in (None, weak, late, known)]
+    asked, weakly, late, known = (run.metrics for run in runs)
     assert weakly.com_rise_m < asked.com_rise_m - 0.004
     assert abs(late.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) > 0.03
     assert abs(known.foot_distance_touchdown_m - asked.foot_distance_touchdown_m) < 0.01
@@ -175,8 +161,8 @@ def test_weak_motors_and_late_commands_are_felt(bhr, tape, mode):
 
 def test_late_targets_merely_begin_the_jump_later(bhr, tape):
     """Position drives close their own loop: the same jump begins so many milliseconds on."""
-    jumps = [simulate_jump(tape, bhr, perturbation=Perturbation(delay_s=s), stand_s=0.01) for s in (0.0, 0.004)]
-    asked, late = (jump.metrics for jump in jumps)
+    runs = [simulate_jump(tape, bhr, perturbation=Perturbation(delay_s=s), stand_s=0.01) for s in (0.0, 0.004)]
+    asked, late = (run.metrics for run in runs)
     assert late.touchdown_s - asked.touchdown_s == pytest.approx(0.004, abs=0.0011)
     assert late.foot_distance_touchdown_m == pytest.approx(asked.foot_distance_touchdown_m, abs=2e-3)
     assert late.com_rise_m == pytest.approx(asked.com_rise_m, abs=2e-3)

@@ -83,13 +83,13 @@ def test_a_step_ends_when_the_foot_stands_or_its_time_is_over_and_there_is_no_se
 
 
 def test_a_jump_that_needs_no_step_is_the_same_with_it(bhr):
-    plain, allowed = (simulate_jump(tape(), bhr, step=on) for on in (False, True))
+    plain, allowed = (simulate_jump(tape(), bhr, step=on, stand_s=0.5) for on in (False, True))
     assert allowed.metrics.recovery_step_s is None
     assert np.array_equal(plain.q, allowed.q)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", INSTALLED)
+@pytest.mark.parametrize("engine", INSTALLED[-1:])
 def test_a_shove_after_the_landing_is_caught_by_a_step(bhr, engine):
     held, caught = (simulate_jump(tape(), bhr, perturbation=AHEAD, step=on, engine=engine) for on in (False, True))
     assert not held.landed and held.metrics.recovery_step_s is None
@@ -107,7 +107,7 @@ def test_trials_count_the_steps(bhr, tmp_path):
 
     save(tmp_path, jump(1.0, 0.5))
     ranges = Ranges.none(shove_landing_n_s=(25.0, 25.0))
-    report = run_trials(tmp_path, 4, 0, TrialSettings(ranges=ranges, step=True), jobs=2)
+    report = run_trials(tmp_path, 2, 0, TrialSettings(ranges=ranges, step=True), jobs=1)
     assert 0 < report.stepped <= report.landed
     assert f"({report.stepped} with a recovery step)" in report.line()
     assert report.to_json()["counts"]["landed_with_a_step"] == report.stepped

@@ -223,8 +223,8 @@ def test_sagittal_postures_never_collide_but_crossed_legs_do(engine, bhr):
     """Self-collision is on, without exclusions beyond direct neighbours: the ranges of the joints are real."""
     rng, names = np.random.default_rng(0), bhr.joint_names
     role = {name: role for role, pair in bhr.joints.items() for name in pair}
-    for k in range(12):
-        share = dict(zip(bhr.joints, rng.integers(0, 2, 4) if k < 6 else rng.uniform(size=4), strict=True))
+    for k in range(8):
+        share = dict(zip(bhr.joints, rng.integers(0, 2, 4) if k < 4 else rng.uniform(size=4), strict=True))
         q = pin.neutral(bhr.model)
         q[2] = 3.0
         for i, name in enumerate(names):
@@ -313,30 +313,16 @@ def test_ranges_and_sensors_say_what_they_are():
     )
 
 
-def test_motors_follow_their_torque_speed_line(bhr):
-    motors = bhr.limits
-    corner = motors.speed / 2
-    for rate, share in ((0.0, 1.0), (1.0, 1.0), (1.5, 0.5), (2.0, 0.0), (3.0, 0.0)):
-        low, high = motors.range(rate * corner)
-        assert high == pytest.approx(share * motors.effort)
-        assert low == pytest.approx(-motors.effort)  # braking is free
-        assert motors.range(-rate * corner)[0] == pytest.approx(-high)
-
-
 def test_read_back_is_what_the_engine_has(engine, bhr):
-    with engine(bhr, stance_configuration(bhr), scene=Scene.level("platform", {0.5: 0.2}), friction=0.7) as world:
-        said = world.read_back()
-        assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
-        assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
-        assert said["gravity"] == [0, 0, -9.8] and said["inertia_error"] < 1e-12
-        q, v = world.state()  # the probe of the self-collision has left nothing behind
-    assert q == pytest.approx(stance_configuration(bhr), abs=1e-12) and not v.any()
-
-
-def test_the_moon_and_another_robot_are_read_back(engine, bhr):
     """Gravity is the robot's own; inertias are compared with its own, turned and shifted ones included."""
-    other = Perturbation.draw(bhr, 3).robot(bhr).under_gravity(1.62)
-    with engine(other, stance_configuration(bhr)) as world:
+    start = stance_configuration(bhr)
+    with engine(bhr, start, scene=Scene.level("platform", {0.5: 0.2}), friction=0.7) as world:
+        said, (q, v) = world.read_back(), world.state()
+    assert said["friction"] == [pytest.approx(0.7)] and said["self_collision"] and said["beyond_sole_m"] == 0
+    assert said["mass_kg"] == pytest.approx(42) and said["damping"] == 0 and said["name"] == engine.name
+    assert said["gravity"] == [0, 0, -9.8] and said["inertia_error"] < 1e-12
+    assert q == pytest.approx(start, abs=1e-12) and not v.any()  # the probe of the self-collision left nothing behind
+    with engine(Perturbation.draw(bhr, 3).robot(bhr).under_gravity(1.62), start) as world:
         said, has = world.read_back(), world.kept().inertials
     assert said["gravity"] == [0, 0, -1.62] and said["inertia_error"] < 1e-12
     planned = bhr.model.inertias[bhr.model.getJointId("left_knee")]

@@ -8,19 +8,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
+from jumplab.control.flight import Flight, is_flip
 from jumplab.control.kinematics import Gauge, Motion, State, headed, turned_wrench, yaw_of
 from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
 from jumplab.control.playback import Command, Playback
 from jumplab.control.reaim import Reaim
-from jumplab.control.reference import LEAD_S, Forecast, LandingAhead
+from jumplab.control.reference import LEAD_S, LandingAhead
 from jumplab.control.servo import Drive, servo_of
-from jumplab.control.tuck import FROM_SHARE, Tuck, is_flip
 from jumplab.errors import InputError, quoted
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -30,8 +29,6 @@ LANDINGS = ("planned", "spring")
 WAIT_S = 0.5
 TOUCHDOWN_FORCE_N = 30.0  # sum of both feet; 7 % of the weight, ten times the sensor noise
 HEADING_DIGITS = 9  # of headings [nrad]
-# share of the planned flight before which a graze of the ground is no landing
-EARLIEST_TOUCHDOWN = 0.5
 SETTLING_S = 0.5  # after touchdown; 40 robots shoved after it stand as often with a QP each ...
 CALM_STEPS = 10  # ... 10 ms as with one each 2 ms
 # so long before the ground is due (a flip's legs still have to be stopped then) ...
@@ -49,7 +46,7 @@ class Hardware:
     # torques are known to arrive so late; until touchdown, they are sent ahead
     delay_s: float = 0.0
     force_noise_n: float = 0.0  # standard deviation of the feet's forces
-    substeps: int = 1  # in which a simulator takes one step, see :class:`.servo.Servo`
+    substeps: int = 1  # in which a simulator takes one step, see :class:`.servo.WholeBodyServo`
 
 
 def level(x: float) -> float:
@@ -78,8 +75,8 @@ class Controller:
 
     Attributes
     ----------
-    looks_rad : heading in which the robot shall land, or has landed if its legs are re-aimed; all
-        that looks ahead sees it along that one.
+    looks_rad : heading in which the robot shall land, or has landed; all that looks ahead sees it
+        along that one.
     touchdown : step of the first contact after the flight, None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
@@ -118,23 +115,20 @@ class Controller:
         self.mode = mode
         self.playback = Playback(tape, robot, hardware.delay_s)
         kind = servo_of(mode)
-        self._servo = kind(robot, late_s=hardware.delay_s, substeps=hardware.substeps)
+        self._servo = kind(robot, hardware.delay_s, hardware.substeps)
         if feedback:
             check_mode(mode)
         self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None
-        self.forecast = Forecast(robot, tape, ground)
+        self.forecast = Flight(robot, tape, ground)
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
         # other jumps land flat, within a centimetre or two of what was planned for them
         self.ahead = LandingAhead(robot, landing, again=flip)
-        self._reaim = Reaim(robot, tape, ground) if reaim else None
-        self._tuck = Tuck(robot, tape) if reaim and flip else None
+        self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim else None
+        self._shifts = reaim and flip
         self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + hardware.delay_s
         self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * hardware.force_noise_n)
-        flight = tape.takeoff_time, tape.t[-1]
-        shares = EARLIEST_TOUCHDOWN, FROM_SHARE if self._tuck else EARLIEST_TOUCHDOWN
-        steps = np.interp(shares, (0.0, 1.0), flight) / STEP_S
-        self._earliest, self._looks_from = map(round, steps.tolist())
+        self._looks_from = round(self.forecast.from_s / STEP_S)
         self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
 
     @property
@@ -176,7 +170,7 @@ class Controller:
         if self.touchdown is None:
             if step < self._looks_from:
                 return self._play(step, state)
-            if step < self._earliest or state.wrench[:, 2].sum() <= self._touches_n:
+            if state.wrench[:, 2].sum() <= self._touches_n:
                 return self._fly(step, *state[:2])
             state = self._touch(step, state)
         return self._land(step - self.touchdown, state)
@@ -189,13 +183,13 @@ class Controller:
     def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
         now = self._gauge.motion(q, v)
         left = self.forecast.time_left(now)
-        shift = (0.0, 0.0) if self._tuck is None else self._tuck.shift(step, now, left)
+        shift = self.forecast.shift(step, now, left) if self._shifts else (0.0, 0.0)
         if left <= LEAD_S:
-            self._look_ahead(step, now, v, left)
+            self._look_ahead(step, now, left)
         aimed = self._none
         if self._reaim is not None:
-            turn = self._turn(step, now, left)
-            aimed = self._reaim.correction(now, turn, left, self._tuck is not None)
+            turn = self.forecast.turn_ahead(step, now, left)
+            aimed = self._reaim.correction(now, turn, left)
         command = self.playback.command(step, q, v, aimed, *shift)
         return replace(command, share=YIELD_SHARE) if left <= self._yield_s else command
 
@@ -211,44 +205,27 @@ class Controller:
             self._tau = landing.torque(time, q, v, wrench[:, 2])
         return Command(tau=self._tau)
 
-    def _look_ahead(self, step: int, now: Motion, v: np.ndarray, left: float) -> None:
+    def _look_ahead(self, step: int, now: Motion, left: float) -> None:
         """Plan the landing for the touchdown in ``left`` seconds, unless that is done."""
         if self.ahead.source != "planned" or self.ahead.followed is not None:
             return
-        there = now.q, v
-        if left > 0:
-            turn = self._turn(step, now, left)
-            correction = 0.0
-            if self._reaim is not None:
-                correction, turn = self._reaim.touchdown(now, turn)
-            there = self.forecast.state(now, turn, correction)
+        turn = self.forecast.turn_ahead(step, now, left)
+        correction = 0.0
+        if self._reaim is not None:
+            correction, turn = self._reaim.touchdown(now, turn, left)
+        there = self.forecast.state(now, turn, left, correction)
         self.landing.reference = self.ahead.plan(*there, step * STEP_S, left)
-
-    def _turn(self, step: int, now: Motion, left: float) -> np.ndarray:
-        """How far (3, 3) the trunk will be off its planned attitude at touchdown, in ``left``
-        seconds.
-
-        Without re-aim only the pitch is told, as it is now.
-        """
-        if self._tuck is not None:
-            return self._tuck.turn_ahead(step, now, left)
-        error = self.playback.attitude_error(step, now.q)
-        if self._reaim is None:
-            return pin.rpy.rpyToMatrix(0.0, float(error[1]), 0.0)
-        turn = pin.exp3(error)
-        return self._reaim.turn_ahead(now, turn, left) if 0 < left < np.inf else turn
 
     def _touch(self, step: int, state: State) -> State:
         """Begin the landing; the state comes back as it is seen from now on.
 
-        Re-aimed soles point where the trunk does, and along that heading the robot has to be
-        caught.
+        Soles point where the trunk does, and along that heading the robot has to be caught.
         """
         self.touchdown = step
-        if self._reaim is not None:
-            yaw = yaw_of(self._turn(step, self._gauge.motion(*state[:2]), 0.0))
-            self.looks_rad += yaw
-            state = state.along(yaw)
         now = self._gauge.motion(*state[:2])
-        self._look_ahead(step, now, state.v, 0.0)  # the ground came early
+        yaw = round(yaw_of(self.forecast.turn_ahead(step, now, 0.0)), HEADING_DIGITS)
+        self.looks_rad += yaw
+        state = state.along(yaw)
+        if self.ahead.source == "planned" and self.ahead.followed is None:  # ground came early
+            self.landing.reference = self.ahead.plan(*state[:2], step * STEP_S, 0.0)
         return state

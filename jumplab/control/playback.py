@@ -12,7 +12,7 @@ from numpy.polynomial import Polynomial
 from scipy.interpolate import PPoly
 
 from jumplab.control import STEP_S
-from jumplab.control.kinematics import Gauge, rotation
+from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -22,7 +22,6 @@ FLAT = "flat"
 TOE = "toe"
 AIR = "air"
 HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
-ALIKE_N = 0.1  # feet whose loads differ by no more carry alike
 # a start farther off than sensors err is led back until the heels rise; sooner, the robot tips
 WRONG_RAD = 0.02
 WAY_BACK = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])  # of time, smooth at 0 and at 1
@@ -38,7 +37,7 @@ class Command:
     tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
     change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
     feet: str = AIR  # how they stand by the plan
-    # (2, 6) of the plan on them, as on a tape; None: both carry alike
+    # (2, 6) of the plan on them, as on a tape; None: none
     wrench: np.ndarray | None = None
     share: float = 1.0  # of the torque limit, for the servo
     # (q, v) that it is expected to arrive in; as measured if None
@@ -48,8 +47,7 @@ class Command:
 class Playback:
     """The tape on the 1 ms grid of control, as commands. After its end the last posture is held.
 
-    Of a jump whose feet carry unlike loads, commands say what each of them carries. Raises
-    :class:`InputError` if the tape is another robot's.
+    Raises :class:`InputError` if the tape is another robot's.
 
     Commands that are known to arrive ``lead_s`` late are those of the tape so much later. The robot
     is expected to be as far off the tape then as it is measured to be now: the plan is sent ahead,
@@ -67,16 +65,13 @@ class Playback:
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
         self._grid = np.arange(self.steps + 1) * STEP_S
-        q, self._v, self.tau, wrench = (
+        q, self._v, self.tau, self._wrench = (
             resampled(self._grid, tape.t, x) for x in (tape.q, tape.v, tape.tau, tape.f)
         )
         self._q = q[:, 7:]
-        self._attitude = q[:, 3:7]
         self._rate = self._v[:, 6:]
         self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
         self._change[self.takeoff - 1] = 0.0  # what the ground held ends there at once
-        left, right = tape.f[: tape.takeoff_index, :, 2].T
-        self._wrench = wrench if np.abs(left - right).max() > ALIKE_N else None
         tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
         tilted = (t for t, x in zip(tape.t, tilts, strict=True) if abs(x) > HEEL_RAD)
         self._heel_off = round(float(next(tilted, tape.t[-1])) / STEP_S)
@@ -106,11 +101,10 @@ class Playback:
         rate = between(self._rate, at)
         acceleration = (1 + pace) ** 2 * (between(self._rate, at + 1.0) - rate) / STEP_S
         rate = (1 + pace) * rate if at < self.steps else np.zeros(len(rate))
-        on_ground = at < self.takeoff and self._wrench is not None
         moves = dict(q=angles, rate=rate, acceleration=acceleration)
         moves |= dict(tau=between(self.tau, at), change=between(self._change, at))
-        wrench = between(self._wrench, at) if on_ground else None
-        return Command(**moves, feet=self.stands(at), wrench=wrench, state=(q, v))
+        moves |= dict(wrench=between(self._wrench, at))
+        return Command(**moves, feet=self.stands(at), state=(q, v))
 
     def approach(self, q: np.ndarray) -> None:
         """Begin in the posture of ``q`` (nq,), if it is another one than planned, and come to the
@@ -154,13 +148,6 @@ class Playback:
         gained = between(self._v, due) - between(self._v, now)
         base = self.lead * STEP_S * (v[:6] + gained[:6] / 2)
         return pin.integrate(self._gauge.model, q, np.concatenate([base, moved])), v + gained
-
-    def attitude_error(self, step: int, q: np.ndarray) -> np.ndarray:
-        """How far the trunk is turned away from the plan: rotation vector (3,) in the axes of ``q``
-        (nq,) and tape [rad].
-        """
-        planned = self._attitude[min(step, self.steps)]
-        return pin.log3(rotation(q[3:7]) @ rotation(planned / np.linalg.norm(planned)).T)
 
 
 def resampled(grid: np.ndarray, t: np.ndarray, rows: np.ndarray) -> np.ndarray:

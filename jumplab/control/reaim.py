@@ -8,8 +8,6 @@ trunk will be far off its plan, both are reckoned with.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pinocchio as pin
 
@@ -21,13 +19,9 @@ from jumplab.robot.contact import WORLD, on_feet
 from jumplab.robot.legs import leg_columns
 from jumplab.robot.stance import knees
 
-# soles this far above the ground; earlier, the correction fights the swing itself
-START_HEIGHT_M = 0.30
+START_S = 0.12  # before touchdown; earlier, the correction fights the swing itself
 # [rad/s] 0.8 rad within the last 0.2 m at 3 m/s, two thirds of the speed limit of the hip
 RATE = 12.0
-# [s], [rad/s] a flip's legs open at their limits: sooner, and more gently
-FLIP_START_S = 0.12
-FLIP_RATE = 4.0
 LARGEST_RAD = 0.8  # beyond 45 degrees the planned landing posture is lost anyway
 FASTEST_FALL = 1.0  # [m/s] below it the foothold says little about the moment
 # [s], [rad/s] yaw and roll joints swing nothing, and move legs that are heavy
@@ -44,7 +38,6 @@ FAR_RAD = 0.15
 # a trunk far forward leaves the legs too short for all of it
 FAR_WEIGHTS = WEIGHTS * [1.0, 1.0, 0.5, 1.0, 1.0, 1.0]
 TRUNK_WEIGHT = 1.0  # [1/rad] on the trunk's pitch at touchdown, which the arms alone shall mend
-ARM_RATE = 12.0  # [rad/s] below the speed limit of the shoulders
 STOP_RAD = 0.02  # a joint is not asked nearer to its stop, unless the plan goes there
 
 
@@ -64,21 +57,20 @@ class Reaim:
     feet point where the trunk does.
 
     The posture at touchdown is predicted as the tape's last one, with the trunk off its planned
-    attitude by what it is now and by what it drifts until then, see :meth:`turn_ahead`, and of a
-    flip :meth:`Tuck.turn_ahead`. Without any error the correction is zero.
+    attitude as :meth:`.Flight.turn_ahead` says. Without any error the correction is zero.
 
-    Once it will be off by :data:`FAR_RAD`, the shoulders swing as well, so that it arrives upright,
-    and what the trunk turns while legs and arms are on their way is part of the prediction: with
-    all momentum kept, joints that move by x turn the body by -I^-1 A x, A being their part of the
-    centroidal momentum matrix.
+    Once it will be off by :data:`FAR_RAD`, the shoulders swing as well unless ``legs_alone``, so
+    that it arrives upright, and what the trunk turns while legs and arms are on their way is part
+    of the prediction: with all momentum kept, joints that move by x turn the body by -I^-1 A x, A
+    being their part of the centroidal momentum matrix.
 
     ``tape`` is seen along the heading in which the robot shall land, and so is all that is told
-    later; ``ground`` is the height [m] at a place [m] along it.
+    later.
     """
 
-    def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
+    def __init__(self, robot: Robot, tape: Tape, legs_alone: bool = False):
         self._gauge = Gauge(robot)
-        self._ground = ground
+        self._legs_alone = legs_alone
         self._anchors = on_feet(robot, robot.foot.center)
         names = robot.joint_names
         self._end = tape.q[-1].copy()
@@ -88,7 +80,7 @@ class Reaim:
         self._limbs = np.concatenate([self._legs, np.flatnonzero(self._is_arm)])
         self._low, self._high = self._range(robot)
         self._far = False
-        self._planned = end = self._gauge.motion(tape.q[-1], tape.v[-1])
+        end = self._gauge.motion(tape.q[-1], tape.v[-1])
         feet = self._gauge.places(self._end)
         self._attitudes = [foot.rotation for foot in feet]
         # of the soles' middles, from the CoM
@@ -112,53 +104,34 @@ class Reaim:
             np.minimum(np.maximum(high, planned), planned + most),
         )
 
-    def turn_ahead(self, now: Motion, turn: np.ndarray, left_s: float) -> np.ndarray:
-        """How far (3, 3) the body will be turned off the plan in ``left_s``, if it is by ``turn``
-        (3, 3) now.
-
-        With inertia I and angular momentum L_p of the plan, and the joints as planned, it turns by
-        ``turn`` I^-1 (turn^T L - L_p) [rad/s]. That is taken from halfway, with the mean of I now
-        and at touchdown.
-        """
-        inertia = turn.T @ now.inertia @ turn
-        there = turn
-        for part in (left_s / 2, left_s):
-            excess = there.T @ now.momentum - self._planned.momentum
-            there = pin.exp3(part * there @ np.linalg.solve(inertia, excess)) @ turn
-            inertia = (inertia + self._planned.inertia) / 2
-        return there
-
-    def correction(self, now: Motion, turn: np.ndarray, left_s: float, flip: bool) -> np.ndarray:
+    def correction(self, now: Motion, turn: np.ndarray, left_s: float) -> np.ndarray:
         """Angles (nv - 6,) to add to the tape [rad]; call it once per step, it moves at
         :data:`RATE` at most.
 
         ``turn`` (3, 3) is the trunk's attitude at touchdown, in ``left_s``, times that of the plan
         transposed.
         """
-        middle = self._gauge.soles(now.q)
-        near = middle[2] - self._ground(middle[0]) < START_HEIGHT_M
         tilt = pin.log3(turn)[:2]
-        self._far |= bool(not flip and tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD)
-        start_s = FLIP_START_S if flip else np.where(self._pitching, 0.0, SIDE_START_S)
-        swing = self._is_arm & self._far
-        moving = near | (left_s < start_s) | swing
+        ahead = tilt[1] > 0 and np.abs(tilt).max() > FAR_RAD
+        self._far |= bool(ahead and not self._legs_alone)
+        start_s = np.where(self._pitching, START_S, SIDE_START_S)
+        moving = (left_s < start_s) | (self._is_arm & self._far)
         if np.any(moving):
-            fastest = np.where(self._pitching, RATE if near else FLIP_RATE, SIDE_RATE)
-            most = np.where(swing, ARM_RATE, fastest) * STEP_S
-            step = np.clip(self.touchdown(now, turn)[0] - self._now, -most, most)
+            most = STEP_S * np.where(self._pitching, RATE, SIDE_RATE)
+            step = np.clip(self.touchdown(now, turn, left_s)[0] - self._now, -most, most)
             self._now = self._now + np.where(moving, step, 0.0)
         return self._now
 
-    def touchdown(self, now: Motion, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def touchdown(
+        self, now: Motion, turn: np.ndarray, left_s: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The correction (nv - 6,) with which the soles come down flat and well placed, and how far
         (3, 3) the body will be turned off the plan with it, where it would be by ``turn`` (3, 3).
         """
-        above = now.com[2] + self._middle[2] - self._ground(self._gauge.soles(now.q)[0])
-        squared = now.velocity[2] ** 2 + 2 * self._gauge.robot.gravity * above
+        fall = self._gauge.robot.gravity * left_s - now.velocity[2] if left_s < np.inf else 0.0
         back = about_vertical(-yaw_of(turn))  # seen along the robot's heading
-        fall = np.sqrt(max(squared, FASTEST_FALL**2))
-        goals = self._places + self._shifts(back @ now.velocity, back @ now.momentum, fall)
-        correction, level = self._reached(goals, back @ turn)
+        shifts = self._shifts(back @ now.velocity, back @ now.momentum, max(fall, FASTEST_FALL))
+        correction, level = self._reached(self._places + shifts, back @ turn)
         return correction, back.T @ level
 
     def _shifts(self, speed: np.ndarray, momentum: np.ndarray, fall: float) -> np.ndarray:

@@ -8,7 +8,6 @@ until the newer one is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from time import thread_time
@@ -16,9 +15,7 @@ from time import thread_time
 import numpy as np
 
 from jumplab.control import STEP_S
-from jumplab.control.kinematics import Gauge, Motion, about_vertical, rotation, turned, yaw_of
 from jumplab.errors import JumplabError
-from jumplab.io.tape import Tape
 from jumplab.ocp.cache import in_turn
 from jumplab.robot import Robot
 from jumplab.stages.srmp.landing import LandingPlan, LandingPlanner, Touchdown, touchdown_of_state
@@ -44,59 +41,6 @@ def _planner_of(urdf: str, config_text: str, gravity: float) -> LandingPlanner:
 def landing_planner(robot: Robot) -> LandingPlanner:
     """The landing planner of ``robot``, built once (0.3 s)."""
     return _planner_of(robot.urdf, robot.config_text, robot.gravity)
-
-
-class Forecast:
-    """The touchdown that a measured flight leads to; the last row of the planned ``tape`` is the
-    posture to land in. ``ground`` is the height [m] at a place [m] along the heading in which all
-    this is seen.
-    """
-
-    def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
-        self._gauge = Gauge(robot)
-        self._gravity = robot.gravity
-        self._ground = ground
-        self._q = tape.q[-1].copy()
-        self._v = tape.v[-1].copy()
-        self._ahead, _, self._below = self._gauge.soles(self._q) - self._gauge.com(self._q)
-
-    def time_left(self, now: Motion) -> float:
-        """Time until the soles meet the ground [s] in a flight that is measured ``now``; inf if
-        they never do.
-        """
-        x, _, z = now.com
-        vx, _, vz = now.velocity
-        left = 0.0
-        for _ in range(2):  # the ground's height depends on where, and so on when
-            drop = z + self._below - self._ground(x + vx * left + self._ahead)
-            root = vz**2 + 2 * self._gravity * drop
-            if root < 0:
-                return np.inf
-            left = (vz + np.sqrt(root)) / self._gravity
-        return float(left)
-
-    def state(
-        self, now: Motion, turn: np.ndarray, correction: np.ndarray | float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Configuration (nq,) and velocity (nv,) at touchdown, forecast from a measured flight.
-
-        The trunk will be off its planned attitude by ``turn`` (3, 3), and ``correction`` (nv - 6,)
-        will have been added to the tape by then. The forecast is seen along the heading that the
-        robot will have.
-        """
-        back = about_vertical(-yaw_of(turn))
-        end = turned(self._q, back @ turn)
-        end[7:] += correction
-        rates = self._v.copy()
-        # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM
-        # flies on
-        attitude = rotation(end[3:7])
-        tape = self._gauge.motion(end, rates)
-        missing = (back @ now.momentum - tape.momentum)[1] / tape.inertia[1, 1]
-        rates[3:6] += missing * attitude[1]
-        speed = back @ now.velocity - [0.0, 0.0, self._gravity * self.time_left(now)]
-        rates[:3] += attitude.T @ (speed - self._gauge.motion(end, rates).velocity)
-        return end, rates
 
 
 class LandingAhead:

@@ -9,8 +9,7 @@ a_b and the wrenches f on the feet go with it,
     min over a_b, f   1/2 |J a + J' v|^2 + epsilon/2 |f - f_p|^2   so that   M a + h = J^T f   in
     the rows of the base,
 
-where f_p is the plan's, none where both feet carry alike: what they push against each other no
-joint's motion tells.
+where f_p is the plan's: what feet push against each other no joint's motion tells.
 
 Errors are met by damping d, which acts on the velocity v+ that the step ends with, so that it may
 be far stiffer than what is computed from the velocity before the step,
@@ -34,6 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control import STEP_S
+from jumplab.control.kinematics import about_vertical
 from jumplab.control.playback import AIR, FLAT, TOE, Command
 from jumplab.errors import InputError, quoted
 from jumplab.robot import Robot
@@ -94,7 +94,9 @@ class PositionServo:
     planned one by the planned torque over the stiffness, as far as the joint's range allows.
     Stiffness is scaled by a motor's effort, damping by the stiffness, both within what a cycle of
     1 ms can hold on the joint's own inertia, that of the robot in its stance with all other joints
-    free. ``late_s`` makes no difference here: the loop is closed in the drive.
+    free. ``late_s`` makes no difference here: the loop is closed in the drive. What is held for a
+    step, which a simulator takes in ``substeps`` semi-implicit ones, is felt (1 - 1/substeps) / 2
+    of it late on average, and planned torques change meanwhile.
     """
 
     told = "target angles and rates; a drive measures its own joint"
@@ -111,10 +113,9 @@ class PositionServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command``; the measured (q, v) are not used."""
-        tau = command.tau + self._late * command.change
         if command.q is None:
-            return Drive(tau)
-        ahead = command.q + tau / self.kp
+            return Drive(command.tau)
+        ahead = command.q + (command.tau + self._late * command.change) / self.kp
         target = np.minimum(np.maximum(ahead, self._motors.lower), self._motors.upper)
         return Drive(self._none, target, command.rate, self.kp, self.kd)
 
@@ -141,9 +142,9 @@ class TorqueServo:
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command`` at the measured (q, v)."""
-        tau = command.tau + self._late * command.change
         if command.q is None:
-            return Drive(tau)
+            return Drive(command.tau)
+        tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
         if command.feet != AIR:
@@ -158,17 +159,14 @@ class TorqueServo:
 class WholeBodyServo:
     """Torques for commands, from the measured state; see the module's docstring.
 
-    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. They act for a whole
-    step, which a simulator takes in ``substeps`` semi-implicit ones: they are felt at the
-    beginnings of these, on average (1 - 1/substeps) / 2 of the step late, and planned ones change
-    meanwhile. Joints whose rates are right run ahead by half a substep.
+    ``robot`` is as planned, and torques are known to arrive ``late_s`` late. A simulator may take a
+    step in ``substeps`` semi-implicit ones: joints whose rates are right run ahead by half of one.
     """
 
     told = "angles, rates and accelerations; it measures base and joints, and knows how feet stand"
 
     def __init__(self, robot: Robot, late_s: float = 0.0, substeps: int = 1):
         self._step_s = STEP_S + late_s
-        self._late = (1 - 1 / substeps) / 2
         self._ahead_s = STEP_S / substeps / 2
         self._robot = robot
         self._model = robot.model
@@ -187,7 +185,7 @@ class WholeBodyServo:
         it has any.
         """
         if command.q is None:
-            return command.tau + self._late * command.change
+            return command.tau
         pin.computeAllTerms(self._model, self._data, q, v)
         pin.forwardKinematics(self._model, self._data, q, v, np.zeros(len(v)))
         feet, drift, units, shared = self._feet(command)
@@ -269,9 +267,8 @@ class WholeBodyServo:
             load = wrench.copy()
             load[3:] -= pin.skew(foot.turn @ self._pivots[command.feet]) @ wrench[:3]
             # in axes that are turned about the vertical as the foot is
-            c, s = foot.turn[:2, 0] / np.hypot(*foot.turn[:2, 0])
-            along = np.zeros((6, 6))
-            along[:3, :3] = along[3:, 3:] = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]
+            yaw = np.arctan2(foot.turn[1, 0], foot.turn[0, 0])
+            along = np.kron(np.eye(2), about_vertical(-yaw))
             columns = np.concatenate([foot.jacobian.T, [foot.drift, load]])
             rows.append((along @ columns.T)[held])
         rows = np.concatenate(rows)

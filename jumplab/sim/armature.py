@@ -10,8 +10,6 @@ converges for every J: the inertia with what is lent is at least half of the ine
 
 from __future__ import annotations
 
-from xml.etree import ElementTree as ET
-
 import numpy as np
 import pinocchio as pin
 
@@ -37,17 +35,20 @@ class Armature:
         self._motors = []
         self._joints = {}  # of links
         self.lent = {}
-        for joint in ET.fromstring(robot.urdf).iter("joint"):
-            name = joint.get("name")
-            armature = robot.actuators[name]["armature"] if name in robot.actuators else 0.0
+        first: dict[int, str] = {}  # link of each joint's body
+        for frame in model.frames:
+            if frame.type == pin.FrameType.BODY:
+                first.setdefault(frame.parentJoint, frame.name)
+        for name, armature in zip(robot.joint_names, self._armature, strict=True):
             if armature:
                 here = model.getJointId(name)
                 column = model.idx_vs[here]
                 slope = pin.computeJointJacobian(model, self._data, pin.neutral(model), here)
-                links = [joint.find(key).get("link") for key in ("child", "parent")]
-                for link, body in zip(links, (here, model.parents[here]), strict=True):
-                    self._joints[link] = body
-                    self.lent[link] = self.lent.get(link, 0.0) + armature
+                bodies = here, model.parents[here]
+                for body in bodies:
+                    self._joints[first[body]] = body
+                    self.lent[first[body]] = self.lent.get(first[body], 0.0) + armature
+                links = [first[body] for body in bodies]
                 self._motors.append((*links, armature * slope[3:, column], column))
 
     def returned(self, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:

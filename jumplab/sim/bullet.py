@@ -18,7 +18,7 @@ from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
 from jumplab.sim.armature import Armature, Friction
-from jumplab.sim.engine import Engine, Kept, Presses, inertial
+from jumplab.sim.engine import Engine, Kept, inertial, moment
 from jumplab.sim.scene import REACH_M, Contacts
 
 
@@ -288,26 +288,31 @@ class BulletEngine(Engine):
 
     def contacts(self) -> Contacts:
         """Ground forces on the feet and all touching links, from the last step."""
-        rows = self._bullet.getContactPoints(bodyA=self._body)
-        places = [self._bullet.getLinkState(self._body, link)[4:6] for link in self._feet]
-        # bodies and links, place, normal, pressure, both frictions and their ways
-        acting = [
-            (*row[2:5], *row[5], *row[7], *row[9:11], *row[11], row[12], *row[13])
-            for row in rows
-            if row[9] > 0
-        ]
-        if not acting:
-            return Contacts(np.zeros((2, 6)), frozenset(), frozenset())
-        table = np.array(acting)
-        body, link, other = table[:, :3].astype(int).T
-        link = link + 1
-        other = np.where(body == self._body, other + 1, -1)
-        place = table[:, 3:6]
-        pressure, first, second = table[:, 9:10], table[:, 10:11], table[:, 14:15]
-        force = pressure * table[:, 6:9] + first * table[:, 11:14] + second * table[:, 15:18]
-        surface = place.copy()
-        for foot, (origin, turn) in zip(self._feet, places, strict=True):
-            here = link == foot + 1
-            surface[here] = (place[here] - origin) @ rotation(turn)
-        origins = np.array([origin for origin, _ in places])
-        return self._contacts(Presses(link, other, place, force, surface), origins)
+        wrench = np.zeros((2, 6))
+        touching = set()
+        colliding = False
+        feet = {foot: [] for foot in self._feet}
+        for row in self._bullet.getContactPoints(bodyA=self._body):
+            _, _, other, link, _, place, _, normal, _, pressure, *friction = row
+            if pressure <= 0:
+                continue
+            if other == self._body:
+                colliding = True
+                continue
+            touching.add(self.links[link + 1])
+            if link in feet:
+                first, along, second, across = friction
+                sizes = [pressure, first, second]
+                feet[link].append([place, np.dot(sizes, [normal, along, across])])
+        for (foot, presses), on_foot in zip(feet.items(), wrench, strict=True):
+            if presses:
+                place, force = np.array(presses).swapaxes(0, 1)
+                origin, turn = self._bullet.getLinkState(self._body, foot)[4:6]
+                arm = place - origin
+                on_foot[:3] = force.sum(axis=0)
+                on_foot[3:] = moment(arm, force)
+                self._pressed.append((arm @ rotation(turn),))
+        return Contacts(wrench, frozenset(touching), colliding)
+
+    def _sole_points(self) -> np.ndarray:
+        return np.concatenate([points for (points,) in self._pressed])

@@ -76,14 +76,13 @@ def _lasting(flags: np.ndarray, time_s: float) -> int | None:
 
 def _slip(result: SimulationResult, until: int) -> int | None:
     gauge = Gauge(result.robot)
-    ground = ground_of(result)
     sliding = result.foot_wrench[:until, :, 2] > LOADED_N
-    most = SLIDING * result.settings["perturbation"]["friction"]
-    for k in np.flatnonzero(sliding.any(axis=1)):
-        for side, place in enumerate(gauge.places(result.q[k])):
-            if sliding[k, side]:
-                force = result.foot_wrench[k, side, :3]
-                sliding[k, side] = friction_used(force, place, ground) >= most
+    row, side = np.nonzero(sliding)
+    if len(row):
+        feet = np.array([[foot.translation for foot in gauge.places(q)] for q in result.q[:until]])
+        force = result.foot_wrench[row, side, :3]
+        used = friction_used(force, feet[row, side], ground_of(result))
+        sliding[row, side] = used >= SLIDING * result.settings["perturbation"]["friction"]
     return _lasting(sliding, SLIP_S)
 
 

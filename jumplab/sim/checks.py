@@ -246,25 +246,21 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     """From the measured wrenches, the most friction that a foot uses [1], and how far its CoP ever
     lies outside the sole [m].
     """
-    ground = ground_of(result)
     loaded, side = np.nonzero(result.foot_wrench[:-1, :, 2] > LOADED_N)
     if not len(loaded):
         return 0.0, 0.0
+    ground = ground_of(result)
+    hard = _hard(result)
     gauge = Gauge(robot)
     feet = np.array([[foot.homogeneous for foot in gauge.places(q)] for q in result.q])
     wrench = result.foot_wrench[loaded, side]
     # a foot may move within a step: where it is at both ends of it
     ends = feet[loaded, side], feet[loaded + 1, side]
     before, _ = ends
-    if ground is None:
-        slip = np.hypot(wrench[:, 0], wrench[:, 1]) / wrench[:, 2]
-    else:
-        pairs = zip(wrench[:, :3], before, strict=True)
-        slip = np.array([friction_used(force, pin.SE3(place), ground) for force, place in pairs])
+    slip = friction_used(wrench[:, :3], before[:, :3, 3], ground)
     sunk = np.zeros((1, len(wrench)))
     least = 0.0
-    if ground is not None:
-        hard = _hard(result)
+    if not (hard and ground.plain):
         corners = before[:, None, :3, 3] + robot.foot.corners @ before[:, :3, :3].swapaxes(1, 2)
         sunk = np.array([sunk[0], [ground.depth_of(points, soft=hard) for points in corners]])
         # usual contacts act in the middle of the depth, beyond the tip of a tilted sole
@@ -277,26 +273,25 @@ def _feet(result: SimulationResult, robot: Robot) -> tuple[float, float]:
     return float(slip.max()), float(np.min(beyond, axis=0)[flat].max(initial=0.0))
 
 
-def ground_of(result: SimulationResult) -> Scene | None:
-    """The ground of a run; None if it is hard and level."""
+def ground_of(result: SimulationResult) -> Scene:
+    """The ground of a run."""
     ground = result.settings.get("ground")
-    if ground is not None:
-        return Scene.from_json(ground)
-    return None if _hard(result) else Scene.flat()
+    return Scene.flat() if ground is None else Scene.from_json(ground)
 
 
 def _hard(result: SimulationResult) -> bool:
     return result.settings["engine"].get("contact", CONTACTS[0]) == CONTACTS[0]
 
 
-def friction_used(force: np.ndarray, place: pin.SE3, ground: Scene | None) -> float:
-    """Friction that a force (3,) on a foot at ``place`` uses, along the ground there over across it
-    [1].
+def friction_used(force: np.ndarray, place: np.ndarray, ground: Scene) -> np.ndarray:
+    """Friction (k,) that forces (k, 3) on feet at places (k, 3) use, along the ground there over
+    across it [1].
     """
-    if ground is None:
-        return float(np.hypot(*force[:2]) / force[2])
-    up = ground.normal_at(place.translation)
-    return float(np.linalg.norm(force - up @ force * up) / (up @ force))
+    up = np.array([[0.0, 0.0, 1.0]])
+    if not ground.plain:
+        up = np.array([ground.normal_at(point) for point in place])
+    across = (force * up).sum(axis=1)
+    return np.linalg.norm(force - across[:, None] * up, axis=1) / across
 
 
 def _outside(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from functools import cached_property
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -26,9 +25,6 @@ from jumplab.sim.scene import Contacts, Scene
 MASS_KG = 1e-6
 ROUNDING = 1e-9
 SOLE_POINTS = 8  # contact points of two flat rectangular soles
-# a x b = a[YZX] b[ZXY] - a[ZXY] b[YZX]
-YZX = np.array([1, 2, 0])
-ZXY = np.array([2, 0, 1])
 TANGLES = 20  # postures tried until links are in each other; for a humanoid the first one does
 
 
@@ -48,16 +44,6 @@ class Kept(NamedTuple):
     def mass_kg(self) -> float:
         """Mass of the robot."""
         return float(sum(link.mass for link in self.inertials.values()))
-
-
-class Presses(NamedTuple):
-    """What pressed on the robot in one step, one row a contact."""
-
-    link: np.ndarray  # (k,) which of the links
-    other: np.ndarray  # (k,) on which of them it pressed; -1 is the ground
-    place: np.ndarray  # (k, 3) world axes [m]
-    force: np.ndarray  # (k, 3) on the link, world axes [N]
-    surface: np.ndarray  # (k, 3) place on the link's own surface, in its frame [m]
 
 
 class Engine(ABC):
@@ -100,7 +86,8 @@ class Engine(ABC):
         self.contact = self.contact_of(contact)
         self._contact_name = contact if isinstance(contact, str) else str(contact)
         self.scene = scene or Scene.flat()
-        self.beyond_sole_m = 0.0
+        # where ground has pressed on feet: what each step noted for :meth:`_sole_points`
+        self._pressed: list[tuple[np.ndarray, ...]] = []
         try:
             self._build(friction)
             self._compare(friction)
@@ -180,6 +167,12 @@ class Engine(ABC):
     def contacts(self) -> Contacts:
         """What touched, and how hard, in the last step."""
 
+    @abstractmethod
+    def _sole_points(self) -> np.ndarray:
+        """Places (k, 3) in the feet's frames where ground has pressed on them so far, from what
+        was noted; at least one step has noted something.
+        """
+
     def spring(self, soft_m: float) -> tuple[float, float]:
         """Stiffness [N/m] and damping [N s/m] of one contact point of ground into which flat soles,
         four points each, sink by ``soft_m`` under the weight; the whole robot on it is critically
@@ -215,7 +208,7 @@ class Engine(ABC):
             damping=kept.damping,
             gravity=kept.gravity,
             self_collision=self._solid,
-            beyond_sole_m=self.beyond_sole_m,
+            beyond_sole_m=self._beyond_sole(),
         ) | ({"late_armature": True} if self.late_armature else {})
 
     def _compare(self, friction: float) -> None:
@@ -229,43 +222,22 @@ class Engine(ABC):
             weight = f"{self.title}'s robot weighs {kept.mass_kg:.4f} kg"
             raise JumplabError(f"{weight}, Pinocchio's {self.robot.total_mass:.4f} kg")
 
-    def _contacts(self, presses: Presses, origins: np.ndarray, times: int = 1) -> Contacts:
-        """Mean of what pressed, gathered ``times`` times; moments are about the feet's ``origins``
-        (2, 3) [m].
-        """
-        link, other, place, force, surface = presses
-        ground = other < 0
-        on_foot = (link == self._foot_links) & ground
-        wrench = np.zeros((2, 6))
-        share = on_foot / times
-        wrench[:, :3] = share @ force
-        wrench[:, 3:] = share @ _cross(place, force) - _cross(origins, wrench[:, :3])
-        bearing = on_foot[0] | on_foot[1]
-        if bearing.any():
-            self._note_sole(surface[bearing])
-        touching = frozenset(self.links[k] for k in set(link[ground].tolist()))
-        pairs = zip(link[~ground].tolist(), other[~ground].tolist(), strict=True)
-        return Contacts(
-            wrench, touching, frozenset((self.links[k], self.links[o]) for k, o in pairs)
-        )
-
-    @cached_property
-    def _foot_links(self) -> np.ndarray:
-        return np.array([[self.links.index(name)] for name in self.robot.foot.frames])
-
-    def _note_sole(self, points: np.ndarray) -> None:
-        """Remember how far contact points (k, 3) in the foot's frame lay beyond the stated sole."""
+    def _beyond_sole(self) -> float:
+        """How far beyond the stated sole a contact of a foot ever lay [m]."""
+        if not self._pressed:
+            return 0.0
         foot = self.robot.foot
-        least = points.min(axis=0)
-        most = points.max(axis=0)
-        side = max(most[1] - foot.center[1], foot.center[1] - least[1]) - foot.half_width
-        beyond = max(foot.heel - least[0], most[0] - foot.toe, side)
-        self.beyond_sole_m = max(self.beyond_sole_m, float(beyond))
+        x, y, _ = self._sole_points().T
+        side = np.abs(y - foot.center[1]) - foot.half_width
+        return float(np.max([foot.heel - x, x - foot.toe, side], initial=0.0))
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products (k, 3) of rows (k, 3); np.cross takes five times as long."""
-    return a.take(YZX, 1) * b.take(ZXY, 1) - a.take(ZXY, 1) * b.take(YZX, 1)
+def moment(arms: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Sum (3,) of the moments of ``forces`` (k, 3) at ``arms`` (k, 3); np.cross takes five times as
+    long.
+    """
+    spread = arms.T @ forces
+    return (spread - spread.T)[[1, 2, 0], [2, 0, 1]]
 
 
 def inertial(

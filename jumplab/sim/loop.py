@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from jumplab.arguments import checked
 from jumplab.control import STAND_S
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
+from jumplab.control.kinematics import Gauge, State, about_vertical, rotation, turned
 from jumplab.control.servo import Drive
-from jumplab.errors import InputError, quoted, require_type
+from jumplab.errors import InputError
 from jumplab.io.progress import tell
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -168,20 +169,21 @@ class Disturbance:
             now = gauge.motion(tape.q[row], tape.v[row])
             if now.velocity[2] <= 0:
                 break
-        q = tape.q[row].copy()
         v = tape.v[row].copy()
         speed = now.velocity
         seen = about_vertical(gauge.heading(tape.q[-1]) + self.direction_rad)
         turn = seen @ pin.rpy.rpyToMatrix(0.0, self.pitch_rad, 0.0) @ seen.T
-        attitude = turn @ rotation(q[3:7])
+        q = turned(tape.q[row], turn)
         q[:3] = now.com + turn @ (q[:3] - now.com) + [0.0, 0.0, self.height_m]
-        q[3:7] = pin.Quaternion(attitude).coeffs()
         # the base twist is written in base axes and so has turned with the robot; the flight of its
         # CoM must not
-        v[:3] += attitude.T @ (speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed)
+        v[:3] += rotation(q[3:7]).T @ (
+            speed * [self.speed_factor, self.speed_factor, 1.0] - turn @ speed
+        )
         return round(float(tape.t[row]) / STEP_S), q, v
 
 
+@checked
 def simulate_jump(
     tape: Tape,
     robot: Robot,
@@ -191,7 +193,7 @@ def simulate_jump(
     stand_s: float = STAND_S,
     disturbance: Disturbance | None = None,
     engine: str = DEFAULT_ENGINE,
-    contact: str = CONTACTS[0],
+    contact: Any = CONTACTS[0],
     **control: Any,
 ) -> SimulationResult:
     """Play ``tape`` on a simulated robot, catch it, and watch it stand.
@@ -214,7 +216,7 @@ def simulate_jump(
     :class:`InputError` if the tape is not this robot's, an option makes no sense, the engine is not
     there, or the robot cannot stand on the ground at the start.
     """
-    _check(tape, robot, perturbation, scene, stand_s)
+    _check(tape, stand_s)
     if control.get("feedback") and disturbance is not None:
         raise InputError(
             "feedback acts in launch, and a run from the apex has none; leave one of them away"
@@ -243,23 +245,14 @@ def simulate_jump(
     return replace(result, metrics=replace(result.metrics, recovery_step_s=controller.stepped_s))
 
 
-def _check(tape, robot, perturbation, scene, stand_s) -> None:
-    require_type(tape, Tape, "the tape to play")
-    require_type(robot, Robot, "the robot to simulate")
+def _check(tape: Tape, stand_s: float) -> None:
     tape.require_jump()
-    for value, kind, what in (
-        (perturbation, Perturbation, "the perturbation"),
-        (scene, Scene, "the scene"),
-    ):
-        if value is not None:
-            require_type(value, kind, what)
-    number = isinstance(stand_s, int | float) and not isinstance(stand_s, bool)
-    if not (number and 0 < stand_s <= 60):
-        raise InputError(f"stand_s = {quoted(stand_s)} s is outside 0 ... 60 s")
+    if not 0 < stand_s <= 60:
+        raise InputError(f"stand_s = {stand_s:g} s is outside 0 ... 60 s")
     for name in ("t", "q", "v", "tau"):
         if not np.all(np.isfinite(getattr(tape, name))):
             raise InputError(
                 f"the tape's {name} has entries that are no number; plan the jump again"
             )
-    if not np.any(tape.phase == "flight") or not np.any(tape.phase == "launch"):
+    if not {"launch", "flight"} <= set(tape.phase.tolist()):
         raise InputError("the tape must have a launch and a flight; plan the jump again")

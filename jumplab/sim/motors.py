@@ -26,6 +26,7 @@ class Motors:
     def deliver(self, tau: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """What becomes of ``tau`` (nv - 6,) [N m] at true joint rates ``rate``."""
         left = max(1 - self._sag_per_w * self._drawn_w, LEAST_VOLTAGE)
-        given = np.clip(self._gain * tau, *self._limits.range(rate / left))
+        low, high = self._limits.range(rate / left)
+        given = np.minimum(np.maximum(self._gain * tau, low), high)
         self._drawn_w = float(np.maximum(given * rate, 0.0).sum())
         return given

@@ -12,7 +12,7 @@ import numpy as np
 from jumplab.control.kinematics import rotation
 from jumplab.errors import RobotError
 from jumplab.sim import STEP_S
-from jumplab.sim.engine import Engine, Kept, Presses, inertial
+from jumplab.sim.engine import Engine, Kept, inertial, moment
 from jumplab.sim.scene import REACH_M, Contacts
 
 # MuJoCo would write its warnings into a file of the working folder
@@ -51,9 +51,10 @@ SOFT_CONE_RATIO = 1000.0  # on soft ground, whose pressure gives way by far more
 # of the constraint solver; it takes five, and the check of forces sees the rest
 ITERATIONS = 100
 TOLERANCE = 1e-12
-THREE = np.arange(3)  # a contact's forces: pressure, then friction along two axes
-FOUR = np.arange(4)  # edges of a friction pyramid: pressure +- coefficient times friction
-PYRAMID = np.array([[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1]], float)
+# of a contact sensor (mjtConDataField, reduction): net force and moment, and where they act; the
+# strongest contact's force
+NET = (1 << 1 | 1 << 2 | 1 << 4, 3, 1)
+STRONGEST = (1 << 1, 2, 1)
 # of a motor, as the engine has them
 MOTOR = {"damping": "dof_damping", "armature": "dof_armature", "friction": "dof_frictionloss"}
 # geoms of the robot have it, the ground's have 0: the robot's friction coefficient is the effective
@@ -96,11 +97,25 @@ class MujocoEngine(Engine):
             geom.margin = 0.0
             geom.solref = [contact.time_s, contact.damping_ratio]
             geom.solimp = [*contact.impedance, contact.depth_m, 0.5, 2.0]
+        base, *links = [body.name for body in spec.bodies[1:]]
+        body, tree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY
+        self._sense(spec, tree, base, tree, base, STRONGEST)
+        for link in (base, *links):
+            self._sense(spec, body, link, body, "world", NET)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._model.jnt_solref[:] = [contact.time_s, contact.damping_ratio]
         self._index_links()
         self._soften(friction)
+
+    def _sense(self, spec: mujoco.MjSpec, kind, link: str, other, what: str, says) -> None:
+        """A sensor of what links and others do to each other, read in every one of the engine's
+        steps.
+        """
+        sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
+        sensor.objtype, sensor.objname = kind, link
+        sensor.reftype, sensor.refname = other, what
+        sensor.intprm[:3] = says
 
     def _soften(self, friction: float) -> None:
         """Make springs of soft blocks, which then decide their contacts, friction included.
@@ -152,9 +167,9 @@ class MujocoEngine(Engine):
         self._motors = self.robot.limits
         for key, there in MOTOR.items():
             getattr(model, there)[self._v[6:]] = getattr(self._motors, key)
-        self._feet = [model.body(name).id for name in self.robot.foot.frames]
+        self._feet = np.array([model.body(name).id for name in self.robot.foot.frames])
         self._torque = np.zeros(len(joints))
-        self._felt: list[tuple[np.ndarray, ...]] = []
+        self._felt = np.zeros((1, self._model.nsensordata))
         self._origins = np.zeros((2, 3))
 
     def close(self) -> None:
@@ -226,51 +241,45 @@ class MujocoEngine(Engine):
 
     def step(self) -> None:
         """Advance by :data:`jumplab.sim.STEP_S`."""
-        mujoco.mj_kinematics(self._model, self._data)
-        self._origins = self._data.xpos[self._feet]
-        self._felt = []
-        for _ in range(self.contact.substeps):
+        felt = []
+        for substep in range(self.contact.substeps):
             mujoco.mj_step(self._model, self._data)
-            if self._data.ncon and self._data.nefc:
-                self._felt.append(self._touches())
+            if substep == 0:
+                self._origins = self._data.xpos[self._feet]
+            felt.append(self._data.sensordata.copy())
+        self._felt = np.array(felt)
         self._torque = self._data.qfrc_applied[self._v[6:]]
         self._data.xfrc_applied[1] = 0.0
 
     def contacts(self) -> Contacts:
         """Mean forces of the ground on the feet, and all that touched, in the last step; moments
         are about where the feet were before it."""
-        if not self._felt:
-            return Contacts(np.zeros((2, 6)), frozenset(), frozenset())
-        felt = [np.concatenate(column) for column in zip(*self._felt, strict=True)]
-        acting = np.flatnonzero(felt[0][:, 0] > 0)
-        force, pairs, body, place, frame, depth, origin, turn = (x[acting] for x in felt)
-        frame = frame.reshape(-1, 3, 3)
-        way = np.where(pairs[:, 1] == body, 1.0, -1.0)[:, None]
-        arm = place + way * depth[:, None] / 2 * frame[:, 0] - origin
-        presses = Presses(
-            body - 1,
-            pairs.min(axis=1) - 1,
-            place,
-            way * (force[:, None, :] @ frame)[:, 0],
-            (arm[:, None, :] @ turn.reshape(-1, 3, 3))[:, 0],
-        )
-        return self._contacts(presses, self._origins, self.contact.substeps)
-
-    def _touches(self) -> tuple[np.ndarray, ...]:
-        """The contacts of one substep: force (k, 3) along the axes of the contact, bodies (k, 2),
-        which of both is the robot's (k,), place (k, 3), axes (k, 9) and distance (k,), place (k, 3)
-        and attitude (k, 9) of that body.
-        """
+        wrench = np.zeros((2, 6))
+        if not self._felt.any():
+            return Contacts(wrench, frozenset(), False)
+        # by the engine's step and link: force and moment of the link on the ground, and where
+        ground = self._felt[:, 3:].reshape(-1, len(self.links), 3, 3)
+        for foot, origin, on_foot in zip(self._feet, self._origins, wrench, strict=True):
+            force, turning, place = ground[:, foot - 1].swapaxes(0, 1)
+            on_foot[:3] = -force.sum(axis=0) / len(ground)
+            on_foot[3:] = -(turning.sum(axis=0) + moment(place - origin, force)) / len(ground)
         data = self._data
-        contact = data.contact
-        if self.contact.elliptic:
-            force = data.efc_force.take(contact.efc_address[:, None] + THREE, mode="clip")
-        else:  # along the edges of a pyramid
-            edges = data.efc_force.take(contact.efc_address[:, None] + FOUR, mode="clip")
-            force = edges @ PYRAMID
-            force[:, 1:] *= contact.friction[:, :2]
-        force[contact.efc_address < 0] = 0.0  # of contacts that the solver left out
-        pairs = self._model.geom_bodyid[contact.geom]
+        has = data.contact
+        noted = has.geom, has.pos, has.frame, has.dist, data.xpos, data.xmat
+        self._pressed.append(tuple(x.copy() for x in noted))
+        touching = np.flatnonzero(ground[:, :, 0].any(axis=(0, 2)))
+        colliding = bool(self._felt[:, :3].any())
+        return Contacts(wrench, frozenset(self.links[k] for k in touching), colliding)
+
+    def _sole_points(self) -> np.ndarray:
+        *contacts, xpos, xmat = zip(*self._pressed, strict=True)
+        geoms, place, frame, depth = map(np.concatenate, contacts)
+        step = np.repeat(np.arange(len(xpos)), [len(x) for x in contacts[0]])
+        pairs = self._model.geom_bodyid[geoms]
         body = pairs.max(axis=1)
-        where = contact.pos.copy(), contact.frame.copy(), contact.dist.copy()
-        return force, pairs, body, *where, data.xpos[body], data.xmat[body]
+        # a contact's place is in the middle of its depth, its axis leads to the second body
+        half = np.where(pairs[:, 1] == body, 0.5, -0.5) * depth
+        arm = place + half[:, None] * frame[:, :3] - np.array(xpos)[step, body]
+        turn = np.array(xmat)[step, body].reshape(-1, 3, 3)
+        on_foot = np.isin(body, self._feet) & (pairs.min(axis=1) == 0)
+        return (arm[:, None, :] @ turn)[on_foot, 0]

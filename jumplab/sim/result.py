@@ -8,6 +8,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -285,7 +286,7 @@ def record(
         L=np.array([motion.momentum[1] for motion in motions]),
         rho=np.array([motion.inertia[1, 1] for motion in motions]),
         touching=np.array([[name in c.touching for name in links] for c in contacts]),
-        colliding=np.array([bool(c.colliding) for c in contacts]),
+        colliding=np.array([c.colliding for c in contacts]),
     )
     for array in log.values():
         array.setflags(write=False)
@@ -307,26 +308,27 @@ def record(
     return replace(run, metrics=metrics)
 
 
+@dataclass
 class _Jump:
     """What is measured of a run: names and values of :class:`Metrics`. Lift-off and touchdown are
     rows of its log, or None.
     """
 
-    def __init__(
-        self,
-        run: SimulationResult,
-        gauge: Gauge,
-        goal: np.ndarray,
-        liftoff: int | None,
-        touchdown: int | None,
-    ):
-        self.run = run
-        self.gauge = gauge
-        self.goal = goal
-        self.liftoff = liftoff
-        self.touchdown = touchdown
-        self.force = run.foot_wrench[:, :, :3].sum(axis=1)  # (N, 3) of the ground on both feet [N]
-        self.stray = stray(run, run.robot)
+    run: SimulationResult
+    gauge: Gauge
+    goal: np.ndarray
+    liftoff: int | None
+    touchdown: int | None
+
+    @cached_property
+    def force(self) -> np.ndarray:
+        """(N, 3) of the ground on both feet [N]."""
+        return self.run.foot_wrench[:, :, :3].sum(axis=1)
+
+    @cached_property
+    def stray(self) -> np.ndarray:
+        """(N, links), see :func:`stray`."""
+        return stray(self.run, self.run.robot)
 
     def launch(self) -> dict[str, Any]:
         """Up to the touchdown."""

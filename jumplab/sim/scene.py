@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.arguments import checked
-from jumplab.control.kinematics import Gauge, about_vertical, rotation
+from jumplab.control.kinematics import Gauge, about_vertical, turned
 from jumplab.errors import InputError
 from jumplab.robot import Robot
 from jumplab.task import JumpTask
@@ -32,7 +32,7 @@ class Contacts:
     # (2, 6) force and moment on each foot, world axes, at the origin of the foot link [N, N m]
     wrench: np.ndarray
     touching: frozenset[str]  # the robot's links that press on the ground
-    colliding: frozenset[tuple[str, str]]  # pairs of the robot's links that press on each other
+    colliding: bool  # whether links of the robot press on each other
 
 
 @dataclass(frozen=True)
@@ -266,8 +266,8 @@ class Scene:
         if not under.even:
             along = about_vertical(self.along_rad)
             turn = along @ under.turn @ along.T
+            q = turned(q, turn)
             q[:3] = middle + turn @ (q[:3] - middle)
-            q[3:7] = pin.Quaternion(turn @ rotation(q[3:7])).coeffs()
         corners = gauge.corners(q)
         refused = f"scene {self.name}: the robot cannot stand on it at the start"
         gap = max((corner[2] - self.below(corner)[1] for corner in corners), key=abs)

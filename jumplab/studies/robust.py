@@ -6,7 +6,7 @@ ground. Where it then comes to rest is its capture point; the further that is fr
 soles, the sooner it falls.
 
 A flip ends as the tuck lets it, which opens sooner or later in flight, see
-:class:`jumplab.control.tuck.Tuck`. Its plan allows for other robots by an opening that may come
+:class:`jumplab.control.flight.Flight`. Its plan allows for other robots by an opening that may come
 later still.
 """
 

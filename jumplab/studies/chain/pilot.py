@@ -11,7 +11,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 from jumplab.control import STAND_S, STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.controller import Controller, Hardware
-from jumplab.control.kinematics import Gauge, State, headed, pitch_of
+from jumplab.control.kinematics import Gauge, State, headed, yaw_of
 from jumplab.control.landing import LandingController
 from jumplab.control.servo import Drive
 from jumplab.io.tape import Tape
@@ -176,23 +176,18 @@ class ChainPilot:
 
     def _at_touchdown(self, step: int, q: np.ndarray, v: np.ndarray, left: float) -> np.ndarray:
         """Pose (3,) at the touchdown to come: the posture of the tape, turned as far as the trunk
-        is off its pitch and its heading now, on the ballistic CoM.
+        will be off it, on the ballistic CoM.
         """
         jump = self.jumps[-1]
-        tape = jump.plan.tape
-        now = self._now(step)
-        row = min(np.searchsorted(tape.t, now * STEP_S), len(tape.t) - 1)
-        pitch = float(pitch_of(q) - pitch_of(tape.q[row]))
-        q = headed(q, jump.controller.looks_rad)
-        turn = pin.rpy.rpyToMatrix(0.0, pitch, 0.0)
-        flight = self._gauge.motion(q, v)
-        end, _ = jump.controller.forecast.state(flight, turn)
+        flight = self._gauge.motion(headed(q, jump.controller.looks_rad), v)
+        turn = jump.controller.forecast.turn_ahead(self._now(step), flight, left)
+        end, _ = jump.controller.forecast.state(flight, turn, left)
         fall = self._gauge.model.gravity.linear * left**2 / 2
         end[:3] += flight.com + flight.velocity * left + fall - self._gauge.com(end)
         if self._course.in_plane:
             return self._pose(end)
         pose = self._pose(headed(end, -jump.controller.looks_rad))
-        pose[2] += jump.controller.playback.attitude_error(now, q)[2]
+        pose[2] += yaw_of(turn)
         return pose
 
     def _still(self, ahead: Ahead, q: np.ndarray, v: np.ndarray) -> bool:

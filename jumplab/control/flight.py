@@ -1,4 +1,5 @@
-"""A flip's tuck opens in time.
+"""A flight to its end: when, where and how turned the robot will touch down. And the tuck of a
+flip, which opens in time.
 
 In the air L is constant and the trunk turns at (L - h) / I, where I is the pitch inertia about the
 CoM and h what the joints' own rates carry. A robot that took off with a few per cent too much L
@@ -8,16 +9,27 @@ it turn a flip of 0.5 m by about 0.03 rad.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 
 from jumplab.control import STEP_S
-from jumplab.control.kinematics import LEVEL, Gauge, Motion, pitch_of, rotation
+from jumplab.control.kinematics import (
+    LEVEL,
+    Gauge,
+    Motion,
+    about_vertical,
+    pitch_of,
+    rotation,
+    turned,
+    yaw_of,
+)
 from jumplab.control.playback import between
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
-# of the flight; before, legs and arms are still folding
+# of the flight; before, legs and arms are still folding, and a graze of the ground is no landing
 FROM_SHARE = 0.4
 LATE = 1.36  # power that puts the largest shift at 60 % of the way, where a tuck opens
 SOONER_S = 0.09  # the tuck opens at most
@@ -28,6 +40,7 @@ FORWARD = 0.95
 SHIFT_RATE = 0.5  # [1] seconds of shift per second, five 10 ms corrections per 100 ms
 NOTHING = 1e-9  # [rad/s] of a joint at rest
 SAMPLES = 32  # of the forecast; 64 change it by less than 1 mrad
+TURNS = 12  # of that about all axes
 BISECTIONS = 9  # of 0.35 s of shifts: to less than a millisecond, 5 mrad
 WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight is a flip's
 
@@ -38,38 +51,82 @@ def is_flip(tape: Tape) -> bool:
     return bool(abs(pitch[-1] - pitch[0]) > WHOLE_TURN)
 
 
-class Tuck:
-    """Shifts the tape in time during the second part of a flip's flight; the joints' path stays as
-    planned.
+class Flight:
+    """The rest of a measured flight, by the planned robot's inertia along the rest of the tape.
 
-    A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at :data:`FROM_SHARE` of
-    the flight and at touchdown. One that opens later waits where it is tightest, and has less time
-    to open: how long it may wait is a matter of the tape's speeds. The turn that is left is
-    forecast with the planned robot's inertia along the tape, from the measured pitch and angular
-    momentum.
+    The tape's last row is the posture to land in; ``ground`` is the height [m] at a place [m] along
+    the heading in which all this is seen. ``from_s`` is the time from which on anything is
+    foreseen.
+
+    A flip's tape can be shifted in time during the second part of the flight; the joints' path
+    stays as planned. A tuck that opens sooner is shifted by a sin^2 of a power of time, zero at
+    :data:`FROM_SHARE` of the flight and at touchdown. One that opens later waits where it is
+    tightest, and has less time to open: how long it may wait is a matter of the tape's speeds.
     """
 
-    def __init__(self, robot: Robot, tape: Tape):
-        gauge = Gauge(robot)
+    def __init__(self, robot: Robot, tape: Tape, ground: Callable[[float], float]):
+        self._gauge = gauge = Gauge(robot)
+        self._gravity = robot.gravity
+        self._ground = ground
+        self._q = tape.q[-1].copy()
+        self._v = tape.v[-1].copy()
+        self._ahead, _, self._below = gauge.soles(self._q) - gauge.com(self._q)
         flight = slice(tape.takeoff_index, None)
         q = tape.q[flight]
         self._t = tape.t[flight]
         self._end = float(tape.t[-1])
-        self._from = tape.takeoff_time + FROM_SHARE * (self._end - tape.takeoff_time)
+        self.from_s = tape.takeoff_time + FROM_SHARE * (self._end - tape.takeoff_time)
         self._pitch = np.unwrap(pitch_of(q))
-        self._landed = rotation(tape.q[-1, 3:7])
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])
         rates = tape.v[flight] * (np.arange(robot.model.nv) >= 6)
         rows = [gauge.motion(*row) for row in zip(level, rates, strict=True)]
         self._inertias = np.array([row.inertia for row in rows])
         self._momenta = np.array([row.momentum for row in rows])
-        late = self._t >= self._from
+        late = self._t >= self.from_s
         self._tight = float(self._t[late][np.argmin(self._inertias[late, 1, 1])])
         self._later = self._longest_wait(robot, rates[self._t >= self._tight, 6:])
-        self._sooner = min(SOONER_S, FORWARD * (self._end - self._from) / STEEP)
+        self._sooner = min(SOONER_S, FORWARD * (self._end - self.from_s) / STEEP)
         self._size = 0.0
         self._shift = 0.0
+
+    def time_left(self, now: Motion) -> float:
+        """Time until the soles meet the ground [s] in a flight that is measured ``now``; inf if
+        they never do.
+        """
+        x, _, z = now.com
+        vx, _, vz = now.velocity
+        left = 0.0
+        for _ in range(2):  # the ground's height depends on where, and so on when
+            drop = z + self._below - self._ground(x + vx * left + self._ahead)
+            root = vz**2 + 2 * self._gravity * drop
+            if root < 0:
+                return np.inf
+            left = (vz + np.sqrt(root)) / self._gravity
+        return float(left)
+
+    def state(
+        self, now: Motion, turn: np.ndarray, left_s: float, correction: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Configuration (nq,) and velocity (nv,) at touchdown, in ``left_s``.
+
+        The trunk will be off its planned attitude by ``turn`` (3, 3), and ``correction`` (nv - 6,)
+        will have been added to the tape by then. All is seen along the heading that the robot will
+        have.
+        """
+        back = about_vertical(-yaw_of(turn))
+        end = turned(self._q, back @ turn)
+        end[7:] += correction
+        rates = self._v.copy()
+        # the body turns as fast as its momentum says at the joint rates of the tape, and its CoM
+        # flies on
+        attitude = rotation(end[3:7])
+        tape = self._gauge.motion(end, rates)
+        missing = (back @ now.momentum - tape.momentum)[1] / tape.inertia[1, 1]
+        rates[3:6] += missing * attitude[1]
+        speed = back @ now.velocity - [0.0, 0.0, self._gravity * left_s]
+        rates[:3] += attitude.T @ (speed - self._gauge.motion(end, rates).velocity)
+        return end, rates
 
     def _longest_wait(self, robot: Robot, rates: np.ndarray) -> float:
         """How long [s] the tuck may wait, and still open within the speed limits of the joints,
@@ -106,16 +163,15 @@ class Tuck:
 
     def turn_ahead(self, step: int, now: Motion, left_s: float) -> np.ndarray:
         """How far (3, 3) the trunk will be turned off its planned attitude at touchdown, about all
-        axes, in ``left_s``.
+        axes, in ``left_s``; of a shifted tape, :meth:`shift` comes first.
 
-        As :meth:`shift`, which comes first, but of the whole attitude: it turns by I^-1 (L - h) in
-        its own axes, with the L that is measured, and I and h of the planned robot along the
-        shifted tape.
+        It turns by I^-1 (L - h) in its own axes, with the L that is measured, and I and h along the
+        tape.
         """
         attitude = rotation(now.q[3:7])
         t, left_s = self._clock(step, left_s)
         if left_s > STEP_S:
-            middle, pace, dt = self._pieces(self._size, t, left_s)
+            middle, pace, dt = self._pieces(self._size, t, left_s, TURNS)
             rows = np.interp(middle, self._t, np.arange(len(self._t)))
             for row, faster in zip(rows, pace, strict=True):
                 inertia = between(self._inertias, row)
@@ -125,7 +181,7 @@ class Tuck:
                     spin = np.linalg.solve(inertia, halfway.T @ now.momentum - carried)
                     halfway = attitude @ pin.exp3(spin * part)
                 attitude = halfway
-        return attitude @ self._landed.T
+        return attitude @ rotation(self._q[3:7]).T
 
     def _best(self, t: float, left_s: float, momentum: float, need: float) -> float:
         """The shift with which the trunk turns by ``need`` [rad], or the nearest one."""
@@ -145,7 +201,7 @@ class Tuck:
         held up.
         """
         due = now + left_s
-        share = np.clip((t - self._from) / max(due - self._from, STEP_S), 0.0, 1.0)
+        share = np.clip((t - self.from_s) / max(due - self.from_s, STEP_S), 0.0, 1.0)
         at = t + share * (self._end - due)
         if size >= 0:
             return np.minimum(at + size * np.sin(np.pi * share**LATE) ** 2, self._end)
@@ -155,15 +211,17 @@ class Tuck:
 
     def _left(self, size: float, t: float, left_s: float, momentum: float) -> float:
         """Turn of the trunk [rad] until touchdown, if the shift is ``size`` from now on."""
-        middle, pace, dt = self._pieces(size, t, left_s)
+        middle, pace, dt = self._pieces(size, t, left_s, SAMPLES)
         inertia = np.interp(middle, self._t, self._inertias[:, 1, 1])
         carried = np.interp(middle, self._t, self._momenta[:, 1]) * pace
         return float(np.sum((momentum - carried) / inertia) * dt)
 
-    def _pieces(self, size: float, t: float, left_s: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Places on the tape (:data:`SAMPLES`,) until touchdown [s], the pace there [1], and their
+    def _pieces(
+        self, size: float, t: float, left_s: float, count: int
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Places on the tape (``count``,) until touchdown [s], the pace there [1], and their
         distance [s].
         """
-        place = self._place(size, t + left_s * np.linspace(0, 1, SAMPLES + 1), t, left_s)
-        dt = left_s / SAMPLES
+        place = self._place(size, t + left_s * np.linspace(0, 1, count + 1), t, left_s)
+        dt = left_s / count
         return (place[1:] + place[:-1]) / 2, np.diff(place) / dt, dt
