@@ -11,6 +11,7 @@ import io
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -63,9 +64,22 @@ class Picture(Figure):
 
     @styled
     def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
-        return buffer.getvalue()
+        return _png_of(self)
+
+
+def _png_of(fig: Figure) -> bytes:
+    """A figure as PNG, drawn again only after a change."""
+    if fig.stale or not hasattr(fig, "_png"):
+        fig._png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
+        fig.stale = False
+    return fig._png
+
+
+def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
+    """A figure as a file of that kind; ``how`` are options of ``Figure.savefig``."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format=kind, **how)
+    return buffer.getvalue()
 
 
 @styled
@@ -180,13 +194,12 @@ def save_figure(
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
         raise InputError(f"figure name {name!r}: {must}")
-    png = io.BytesIO()
-    pdf = io.BytesIO()
-    fig.savefig(png, format="png", dpi=DPI, metadata=PNG_METADATA)
+    png = _png_of(fig)
     fig.set_layout_engine("none")
-    fig.savefig(pdf, format="pdf", metadata=PDF_METADATA)
+    pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
+    fig.stale = False
     text = caption_text(caption, task, robot).encode()
-    for ending, content in (("png", png.getvalue()), ("pdf", pdf.getvalue()), ("txt", text)):
+    for ending, content in (("png", png), ("pdf", pdf), ("txt", text)):
         write_file(Path(folder, f"{name}.{ending}"), content)
     return fig
 

@@ -112,7 +112,9 @@ TARGETS = 6
 TO_THE_END = {"acceptable_iter": 0, "tol": 1e-6}  # of ipopt, where the usual plan stops sooner
 
 
-def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
+def density(
+    robot: Robot, task: JumpTask, spacings: Sequence[int] = SPACINGS, targets: int = TARGETS
+) -> list[dict[str, Any]]:
     """Plans from atlases of the same area and ever more nodes: what they take, and how much dearer than the best.
 
     The best is what ipopt finds from there, to the end. ``iterations`` and ``cpu_ms`` are medians, the latter of a plan
@@ -121,9 +123,9 @@ def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
     rng, body = np.random.default_rng(0), Body(robot)
     settled = WholeBodyPlanner(robot, body=body, free=even(body), options=TO_THE_END)
     low = max(task.distance_m - AREA_M[0] / 2, 0.0), max(task.height_m - AREA_M[1] / 2, 0.1)
-    places = np.array(low) + rng.uniform(0.0, 1.0, (TARGETS, 2)) * AREA_M
+    places = np.array(low) + rng.uniform(0.0, 1.0, (targets, 2)) * AREA_M
     rows = []
-    for count in SPACINGS:
+    for count in spacings:
         axes = [np.linspace(x, x + size, count + 1) for x, size in zip(low, AREA_M, strict=True)]
         atlas = Atlas.build(robot, *axes)
         planner, clean, took, steps, dearer = Planner(robot, atlas=atlas), 0, [], [], []
@@ -139,7 +141,7 @@ def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
         step = [round(size / count, 3) for size in AREA_M]
         row = {"nodes": len(atlas.nodes), "apart": f"{step[0]:g} x {step[1]:g}", "iterations": float(np.median(steps))}
         row |= {"cpu_ms": 1e3 * float(np.median(took))}
-        row |= {"dearer": 100 * float(np.median(dearer)), "most": 100 * max(dearer), "clean": clean, "of": TARGETS}
+        row |= {"dearer": 100 * float(np.median(dearer)), "most": 100 * max(dearer), "clean": clean, "of": targets}
         rows.append(row)
     return rows
 
