@@ -62,17 +62,13 @@ styled = plt.style.context(STYLE_FILE)
 class Picture(Figure):
     """A figure that shows itself in a notebook, whatever backend is chosen there."""
 
+    _saved = b""  # its PNG, see save_figure
+
     @styled
     def _repr_png_(self) -> bytes:
-        return _png_of(self)
-
-
-def _png_of(fig: Figure) -> bytes:
-    """A figure as PNG, drawn again only after a change."""
-    if fig.stale or not hasattr(fig, "_png"):
-        fig._png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
-        fig.stale = False
-    return fig._png
+        if self._saved and not self.stale:
+            return self._saved
+        return _file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
 
 
 def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
@@ -194,10 +190,11 @@ def save_figure(
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
         raise InputError(f"figure name {name!r}: {must}")
-    png = _png_of(fig)
+    png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
     pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
-    fig.stale = False
+    fig._saved = png  # a notebook shows it without drawing it again ...
+    fig.stale = False  # ... until it is changed
     text = caption_text(caption, task, robot).encode()
     for ending, content in (("png", png), ("pdf", pdf), ("txt", text)):
         write_file(Path(folder, f"{name}.{ending}"), content)
