@@ -284,7 +284,7 @@ def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
     places = STRIP_M * np.arange(len(rows))
     colors = [PHASE_COLORS[str(phase)] for phase in record.phase[rows]]
     body = Silhouette(robot, "front" if travel[1] > travel[0] else "side")
-    film_strip(ax, body, record.q[rows], record.t[rows], colors, places, below=0.07)
+    film_strip(ax, body, record.q[rows], record.t[rows], colors, places)
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(shade(color, 0.8))
     air = (record.phase == "flight") & (record.t <= record.t[rows[-1]])
