@@ -36,14 +36,16 @@ NODES = (20, 40, 80)  # intervals of the three phases together
 NODE_REPEATS = 3  # the growth is a fit over many meshes
 
 
-def growth(robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES) -> list[dict[str, Any]]:
+def growth(
+    robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES, repeats: int = NODE_REPEATS
+) -> list[dict[str, Any]]:
     """Cost of an iteration of the direct program on ever finer meshes: intervals, iterations, iteration_s."""
     body, rows = Body(robot), []
     for n in nodes:
         flat, toe = round(n / 3), round(4 * n / 15)
         mesh = Mesh(flat, toe, n - flat - toe)
         planner = WholeBodyPlanner(robot, mesh, body=body, free=even(body))
-        plans = [planner.plan(task) for _ in range(NODE_REPEATS + 1)][1:]  # the first call of anything is not timed
+        plans = [planner.plan(task) for _ in range(repeats + 1)][1:]  # the first call of anything is not timed
         solves = [plan.attempts[0] for plan in plans]
         each = float(np.median([x.cpu_s / x.iterations for x in solves]))
         rows.append({"intervals": n, "iterations": solves[0].iterations, "iteration_s": each})
