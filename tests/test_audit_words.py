@@ -56,11 +56,8 @@ def test_the_worst_is_the_first_of_equals_and_never_minus_zero():
 
 
 def test_what_is_found_stays():
-    for thing in (LIMITS["mass"], Check("g", "n", 1, 2, "m", None, ""), AuditReport(())):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(thing, dataclasses.fields(thing)[0].name, None)
     r = replay(random_tape(0), ROBOT, None)
-    for thing in (r, r.soles[0]):
+    for thing in (LIMITS["mass"], Check("g", "n", 1, 2, "m", None, ""), AuditReport(()), r):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(thing, dataclasses.fields(thing)[0].name, None)
 
@@ -183,9 +180,9 @@ def test_what_is_no_tape_no_robot_and_no_target():
         ((3, ROBOT), {}, "the tape to audit must be a Tape, got 3"),
         ((tape, "bhr"), {}, "its robot must be a Robot, got 'bhr'"),
         ((tape, ROBOT, 1.0), {}, "the target must be a JumpTask, got 1.0"),
-        ((tape, ROBOT), {"edge_m": "far"}, "edge_m must be a finite number of metres, got 'far'"),
-        ((tape, ROBOT), {"edge_m": True}, "edge_m must be a finite number of metres, got True"),
-        ((tape, ROBOT), {"edge_m": math.nan}, "edge_m must be a finite number of metres, got nan"),
+        ((tape, ROBOT), {"edge_m": "far"}, "edge_m must be a number in m, got 'far'"),
+        ((tape, ROBOT), {"edge_m": True}, "edge_m must be a number in m, got True"),
+        ((tape, ROBOT), {"edge_m": math.nan}, "edge_m must be finite, got nan"),
     ):
         with pytest.raises(InputError) as e:
             audit(*arguments, **options)

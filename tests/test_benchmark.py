@@ -41,11 +41,9 @@ def test_rows_are_medians_over_targets_of_medians_over_repeats():
 
 
 @pytest.mark.slow
-def test_every_sort_is_timed_and_audited(monkeypatch):
+def test_every_sort_is_timed_and_audited():
     task, said = JumpTask(0.4, 0.3), []
-    for sort in SORTS:
-        monkeypatch.setitem(SORTS, sort, SORTS[sort][:2])
-    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], say=said.append)
+    found = benchmark.bench("bhr", task, 1, sorts=tuple(SORTS)[:4], most=2, say=said.append)
     again = json.loads(json.dumps(found))
     assert [x["sort"] for x in again["rows"]] == [*SORTS][:4] == [x.partition(":")[0] for x in said]
     assert all(x["targets"] == x["planned"] == x["clean"] == 2 for x in again["rows"]), again["rows"]
@@ -82,7 +80,7 @@ def test_the_command_prints_a_table_and_writes_the_numbers(monkeypatch, capsys, 
 
 
 def test_the_growth_has_a_row_for_each_mesh():
-    found = growth(Robot.load(), JumpTask(0.4, 0.3), (16, 24))
+    found = growth(Robot.load(), JumpTask(0.4, 0.3), (16, 24), 1)
     assert [x["intervals"] for x in found] == [16, 24] and all(x["iteration_s"] > 0 for x in found)
 
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from fixtures_core import jump, planner
 from paper import claims, hard_cases
 from paper.claims import Start, against_crouch, compare_starts, judge, readings, readings_markdown
 from paper.tracking import launch_followed
@@ -16,7 +17,7 @@ from jumplab.cli import notebooks
 from jumplab.errors import InputError
 from jumplab.models.full import FullBody
 from jumplab.sim import STEP_S
-from jumplab.stages.planner import METHODS, Planner
+from jumplab.stages.planner import METHODS
 from jumplab.task import GRAVITY, JumpTask
 
 # ------------------------------------------------------------------------------------------ verdicts
@@ -101,7 +102,7 @@ def test_three_starts_end_in_a_jump(bhr):
     assert all(r.iterations > 0 and 0 < r.alone_s <= r.total_s for r in rows), rows
     crouch, guess, loose = rows
     assert loose.total_s > loose.alone_s and guess.total_s > guess.alone_s
-    planned = Planner(bhr).plan(JumpTask(0.5, 0.3), "three-step").whole_body.solution.statistics
+    planned = jump(0.5, 0.3).whole_body.solution.statistics
     assert guess.cost == pytest.approx(planned.objective, rel=1e-6)
     assert loose.cost == pytest.approx(crouch.cost, rel=0.05)
 
@@ -240,26 +241,22 @@ def test_a_stopped_study_goes_on(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_case_is_solved_in_both_ways():
-    case = hard_cases.Case(0, "bad guesses", JumpTask(0.5, 0.3), 3)
+    """The direct one from a guess with much noise: the feet are put in place, or neither Hessian leads anywhere."""
+    noisy = hard_cases.cases()[95]
+    assert noisy.kind == "bad guesses" and hard_cases.NOISE_RAD[noisy.variant // 5 % 4] == 0.8
+    cases = {"three-step": hard_cases.Case(0, "bad guesses", JumpTask(0.5, 0.3), 3), "direct": noisy}
     for method in METHODS:
-        row = hard_cases.solve(case, method)
+        row = hard_cases.solve(cases[method], method)
         assert row["planned"] and row["clean"] and row["effort"] > 0 and row["cpu_s"] > 0, row
 
 
 @pytest.mark.slow
-def test_a_guess_with_much_noise_is_planned_with_its_feet_in_place():
-    case = hard_cases.cases()[95]
-    assert case.kind == "bad guesses" and hard_cases.NOISE_RAD[case.variant // 5 % 4] == 0.8
-    assert hard_cases.solve(case, "direct")["clean"]  # neither Hessian leads anywhere from the motion as it is
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("target", [(0.0, 0.2), (0.4, 0.5), (1.0, 0.5)])
-def test_the_jump_follows_stage_one(bhr, target):
-    """In the launch, rms over the time, at the same share of each phase, as README says."""
-    followed = launch_followed(Planner(bhr).plan(JumpTask(*target), "three-step"))
-    assert followed["L"] < 0.08 and followed["velocity"] < 0.05 and followed["rho"] < 0.02
-    loose = Planner(bhr, weights={"track momentum": 0.02}).plan(JumpTask(*target), "three-step")
+def test_the_jump_follows_stage_one():
+    """In the launch, rms over the time, at the same share of each phase, as the page on validity says."""
+    for target in ((0.0, 0.2), (0.4, 0.5), (1.0, 0.5)):
+        followed = launch_followed(jump(*target))
+        assert followed["L"] < 0.08 and followed["velocity"] < 0.05 and followed["rho"] < 0.02
+    loose = planner().plan(JumpTask(*target), "three-step", weights={"track momentum": 0.02})
     assert launch_followed(loose)["L"] > 4 * followed["L"]
 
 

@@ -26,7 +26,7 @@ EXPECTED = {"00_overview", "01_models", "02_srmp", "03_joint_space_mapping", "04
             "06_experiments", "07_your_robot", "08_flips", "09_chained_jumps", "10_benchmark", "11_claims",
             "12_your_own_terms", "13_three_dimensions"}  # fmt: skip
 # of the whole chain in the tests: every cell runs, on fewer targets and robots
-SMALL = dict(fast=True, samples=50, grid=3, targets=2, trials=1, runs=1, again=1, robots=2)
+SMALL = dict(fast=True, samples=50, grid=2, targets=1, trials=1, runs=1, again=1, robots=1)
 STEMS = sorted(EXPECTED | {p.stem for p in SOURCES})
 PARAMETERS = """distance_m: float = 1.0  # [m]
 height_m: float = 0.5

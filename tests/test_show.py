@@ -196,7 +196,7 @@ def test_saving_writes_three_files_without_dates(tmp_path, bhr):
     assert pixels == pytest.approx(style.DPI * fig.get_size_inches(), abs=1)
 
 
-@pytest.mark.parametrize("name", ["joint_trajectories", "jump_strobe", "reach_envelope"])
+@pytest.mark.parametrize("name", ["jump_strobe", "reach_envelope"])
 def test_drawn_twice_means_the_same_bytes(name, material, bhr, tmp_path):
     """The layout of a figure that is saved again is that of the first time."""
     made, one, other = [], *(FIGURES[name](material, bhr) for _ in range(2))

@@ -3,19 +3,19 @@
 import math
 
 import pytest
+from fixtures_core import planner
 
 from jumplab.auditing import audit
 from jumplab.errors import SolverError
-from jumplab.stages.planner import Planner
 from jumplab.task import JumpTask
 
 
 @pytest.mark.slow
 def test_the_whole_body_jumps_higher_than_the_pendulum(bhr):
-    planner, high = Planner(bhr), JumpTask(0.0, 0.8)
-    assert audit(planner.plan(high).tape, bhr, high).passed
+    high = JumpTask(0.0, 0.8)
+    assert audit(planner().plan(high).tape, bhr, high).passed
     with pytest.raises(SolverError, match=r"take-off speed by \d") as e:
-        planner.plan(high, "three-step")
+        planner().plan(high, "three-step")
     assert e.value.stage == "SRMP"
 
 
@@ -23,7 +23,7 @@ def test_the_whole_body_jumps_higher_than_the_pendulum(bhr):
 @pytest.mark.parametrize(
     "task", [JumpTask(0.0, 1.2), JumpTask(0.5, 0.2, 0.9), JumpTask(0.0, 0.2, rotation_rad=4 * math.pi)]
 )
-def test_the_absurd_is_refused_in_words(bhr, task):
+def test_the_absurd_is_refused_in_words(task):
     with pytest.raises(SolverError) as e:
-        Planner(bhr).plan(task)
+        planner().plan(task)
     assert "\n" not in str(e.value) and " by " in str(e.value) and e.value.exit_code == 3

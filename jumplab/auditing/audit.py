@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterable
 from pathlib import Path
 
+from jumplab.arguments import real
 from jumplab.auditing import contact, dynamics, motion
 from jumplab.auditing.replay import open_tape, replay
 from jumplab.auditing.report import LIMITS, AuditReport, Check, Measure
-from jumplab.errors import InputError, as_path, quoted, require_type
+from jumplab.errors import InputError, as_path, require_type
 from jumplab.io.files import write_file
 from jumplab.io.folder import CONFIG, PLAN, SUMMARY, URDF, read_json, sha256, versions
 from jumplab.io.progress import tell
@@ -20,9 +20,15 @@ from jumplab.task import JumpTask
 
 REPORT = "passport.json"
 GROUPS = (
-    motion.record,
-    dynamics.balance,
-    contact.contact,
+    motion.rates,
+    motion.switch,
+    motion.symmetry,
+    dynamics.forces,
+    dynamics.flight,
+    dynamics.takeoff,
+    dynamics.energy,
+    contact.places,
+    contact.pressure,
     dynamics.joints,
     motion.target,
     contact.collisions,
@@ -51,9 +57,8 @@ def audit(
     require_type(robot, Robot, "its robot")
     if task is not None:
         require_type(task, JumpTask, "the target")
-    number = isinstance(edge_m, int | float) and not isinstance(edge_m, bool)
-    if edge_m is not None and not (number and math.isfinite(edge_m)):
-        raise InputError(f"edge_m must be a finite number of metres, got {quoted(edge_m)}")
+    if edge_m is not None:
+        edge_m = real(edge_m, "edge_m", "m")
     open_tape(tape, robot, task)
     checks = _checks(motion.form(tape))
     if all(c.passed for c in checks):

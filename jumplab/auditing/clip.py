@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import compress, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pinocchio as pin
 from jumplab.auditing.audit import _checks
 from jumplab.auditing.contact import collisions
 from jumplab.auditing.dynamics import joints
-from jumplab.auditing.replay import Replay, norm, replay
+from jumplab.auditing.replay import Replay, norm, replay, runs
 from jumplab.auditing.report import METHOD, AuditReport, Measure
 from jumplab.errors import InputError
 from jumplab.io.clip import ENDINGS, Clip, read_clips
@@ -26,6 +26,7 @@ from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
 SIDES = "LR"
+Fall = tuple[np.ndarray, np.ndarray, float]  # see _free_falls
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,16 +65,17 @@ class ClipReport(AuditReport):
     def row(self) -> dict[str, Any]:
         """What a table of many clips says of this one."""
         flown = ", ".join(f"{a:.2f} to {b:.2f}" for a, b in self.flights)
-        values = {c.name: c.value for c in self.checks}
         row = {"clip": self.clip.name, "physical": self.passed, "flights [s]": flown or "none"}
-        return row | {f"{c.name} [{c.unit}]": values[c.name] for c in self.checks}
+        return row | {f"{c.name} [{c.unit}]": c.value for c in self.checks}
 
 
 def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
     """Feet that carry ("LR", "L", "R", "-"), from and to [s], of contacts (n, 2)."""
-    words = ["".join(s for s, on in zip(SIDES, x, strict=True) if on) for x in ground]
-    edges = [0, *(k for k in range(1, len(words)) if words[k] != words[k - 1]), len(words) - 1]
-    return [(words[a] or "-", a / fps, b / fps) for a, b in pairwise(edges)]
+    phases = []
+    for rows in runs(ground):
+        feet = "".join(compress(SIDES, ground[rows.start])) or "-"
+        phases.append((feet, rows.start / fps, min(rows.stop, len(ground) - 1) / fps))
+    return phases
 
 
 def judge(
@@ -121,9 +123,9 @@ def _judged(clip: Clip) -> ClipReport:
     r = replay(tape, clip.robot, None)
     tape = dataclasses.replace(tape, tau=r.tau)
     r = dataclasses.replace(r, tape=tape)
-    checks = _checks([*_measures(r, ground), *joints(r), *collisions(r)])
+    falls = _free_falls(r, ground)
+    checks = _checks([*_measures(r, ground, falls), *joints(r), *collisions(r)])
     checks = tuple(c for c in checks if c.name != "body clearance")
-    flights = _free_falls(r, ground)
     manifest = {
         "clip": clip.name,
         "format": clip.origin,
@@ -135,7 +137,7 @@ def _judged(clip: Clip) -> ClipReport:
         "standing_m": level.tolist(),
         "flights": [
             {"from_s": t[0], "to_s": t[-1], "acceleration_m_s2": a.tolist(), "rise_m": float(up)}
-            for t, a, up in flights
+            for t, a, up in falls
         ],
         "versions": versions(),
     }
@@ -203,10 +205,9 @@ def contacts(r: Replay, fps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _drop(flags: np.ndarray, value: bool, least: int) -> None:
     """Turn runs of a ``value`` over that are shorter than ``least``, but at both ends."""
-    edges = np.flatnonzero(np.diff(flags.astype(int))) + 1
-    for a, b in pairwise(edges.tolist()):
-        if flags[a] == value and b - a < least:
-            flags[a:b] = not value
+    for rows in runs(flags)[1:-1]:
+        if flags[rows.start] == value and rows.stop - rows.start < least:
+            flags[rows] = not value
 
 
 def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
@@ -245,7 +246,7 @@ def _pushed(r: Replay, ground: np.ndarray) -> np.ndarray:
 
 # measures
 # ----------------------------------------------------------------------------------------------
-def _measures(r: Replay, ground: np.ndarray) -> Iterator[Measure]:
+def _measures(r: Replay, ground: np.ndarray, falls: list[Fall]) -> Iterator[Measure]:
     """Measures of the group "clip"."""
     t = r.tape.t
     feet = r.tape.contact_frames
@@ -255,7 +256,6 @@ def _measures(r: Replay, ground: np.ndarray) -> Iterator[Measure]:
     yield "standing feet float", *_most(floating, t, METHOD.float_percent), feet
     yield "feet in the ground", -height, t, feet
     yield "feet on the ground slide", *_most(_sliding(r, standing), t, METHOD.slide_percent), feet
-    falls = _free_falls(r, ground)
     off = [norm(a - r.model.gravity.linear) / r.gravity for _, a, _ in falls]
     yield "flights fall freely", off, [times[0] for times, _, _ in falls]
     missing = norm(r.base_residual[:, :3]) / r.weight
@@ -297,14 +297,14 @@ def _sliding(r: Replay, ground: np.ndarray) -> np.ndarray:
     return np.where(ground, np.where(low, speed, np.inf).min(axis=2), -np.inf)
 
 
-def _free_falls(r: Replay, ground: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def _free_falls(r: Replay, ground: np.ndarray) -> list[Fall]:
     """Of each flight its times [s], the CoM's mean acceleration (3,) [m/s^2], and its rise [m]."""
-    flying = ~ground.any(axis=1)
-    edges = np.flatnonzero(np.diff(flying.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    out = []
-    for a, b in edges.tolist():
-        t, com = r.tape.t[a:b], r.com[a:b]
-        if b - a > METHOD.least_flight:
-            bent = 2 * np.polyfit(t - t[0], com, 2)[0]
-            out.append((t, bent, com[:, 2].max() - com[0, 2]))
-    return out
+    falls = []
+    for rows in runs(ground.any(axis=1)):
+        if ground[rows.start].any() or rows.stop - rows.start <= METHOD.least_flight:
+            continue
+        t = r.tape.t[rows]
+        com = r.com[rows]
+        bent = 2 * np.polyfit(t - t[0], com, 2)[0]
+        falls.append((t, bent, com[:, 2].max() - com[0, 2]))
+    return falls

@@ -13,13 +13,8 @@ from jumplab.auditing.replay import Replay, norm
 from jumplab.auditing.report import LIMITS, METHOD, Measure
 
 
-def contact(r: Replay) -> Iterator[Measure]:
-    """Measures of the group "contact"."""
-    yield from _geometry(r)
-    yield from _pressure(r)
-
-
-def _geometry(r: Replay) -> Iterator[Measure]:
+def places(r: Replay) -> Iterator[Measure]:
+    """Where the soles are: slip, turn, heights over ground and platform."""
     t = r.tape.t
     feet = r.tape.contact_frames
     points = r.sole_points
@@ -56,7 +51,8 @@ def pressure_points(r: Replay) -> tuple[np.ndarray, np.ndarray]:
     return r.foot[..., :2] + np.stack([dx, dy], axis=-1), mz - (dx * fy - dy * fx)
 
 
-def _pressure(r: Replay) -> Iterator[Measure]:
+def pressure(r: Replay) -> Iterator[Measure]:
+    """How the soles press: CoP, friction, and that the ground never pulls."""
     t = r.tape.t
     feet = r.tape.contact_frames
     friction = LIMITS["friction used"].limit

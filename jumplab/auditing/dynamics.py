@@ -7,17 +7,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from jumplab.auditing.replay import Replay, motors, norm
+from jumplab.auditing.replay import Replay, configured_sole, norm
 from jumplab.auditing.report import METHOD, Measure
-
-
-def balance(r: Replay) -> Iterator[Measure]:
-    """Measures of the group "dynamics"."""
-    yield from _forces(r)
-    yield from _flight(r)
-    if r.flights:
-        yield from _takeoff(r)
-    yield from _energy(r)
 
 
 def _contact_moment(r: Replay) -> np.ndarray:
@@ -26,7 +17,8 @@ def _contact_moment(r: Replay) -> np.ndarray:
     return (np.cross(arm, r.tape.f[..., :3]) + r.tape.f[..., 3:]).sum(axis=1)
 
 
-def _forces(r: Replay) -> Iterator[Measure]:
+def forces(r: Replay) -> Iterator[Measure]:
+    """Newton and Euler in every sample, and integrated until the last foot leaves."""
     t = r.tape.t
     # a moment is taken as a share of m g * 1 m
     yield "base force residual", norm(r.base_residual[:, :3]) / r.weight, t
@@ -44,7 +36,8 @@ def _forces(r: Replay) -> Iterator[Measure]:
     yield "angular impulse", norm(turned)[s], t[s]
 
 
-def _flight(r: Replay) -> Iterator[Measure]:
+def flight(r: Replay) -> Iterator[Measure]:
+    """The parabola of the CoM, and momentum and forces of feet in the air."""
     fall = np.array([0.0, 0.0, -r.gravity / 2])
     apart, spun = np.zeros((2, len(r.tape.t)))
     curvatures = []
@@ -68,7 +61,10 @@ def _flight(r: Replay) -> Iterator[Measure]:
     yield "no force in flight", lifted, r.tape.t, r.tape.contact_frames
 
 
-def _takeoff(r: Replay) -> Iterator[Measure]:
+def takeoff(r: Replay) -> Iterator[Measure]:
+    """Both samples of each take-off."""
+    if not r.flights:
+        return
     last = np.array([rows.start - 1 for rows in r.flights])
     t = r.tape.t
     both = np.sort(np.concatenate([last, last + 1]))
@@ -79,7 +75,8 @@ def _takeoff(r: Replay) -> Iterator[Measure]:
     yield "free fall at take-off", falling / r.gravity, t[both]
 
 
-def _energy(r: Replay) -> Iterator[Measure]:
+def energy(r: Replay) -> Iterator[Measure]:
+    """Energy against the work of the joints; mass by the ground's force."""
     power = ((r.tape.tau - r.lost) * r.tape.v[:, 6:]).sum(axis=1)
     missing = r.energy - r.energy[0] - r.integral(power)
     span = max(float(np.ptp(r.energy)), 1e-9)
@@ -98,8 +95,9 @@ def available_torque(r: Replay) -> np.ndarray:
     speed have the same sign (motoring); full torque where the joint brakes.
     """
     speed = r.tape.v[:, 6:]
-    corner, free = motors(r.robot, r.joints, "corner_speed", "no_load_speed")
-    fall = (free - np.abs(speed)) / np.maximum(free - corner, 1e-9)
+    motors = r.robot.limits
+    free = motors.no_load_speed
+    fall = (free - np.abs(speed)) / np.maximum(free - motors.corner_speed, 1e-9)
     left = np.where(r.tape.tau * speed > 0, np.clip(fall, METHOD.torque_floor, 1.0), 1.0)
     return r.model.upperEffortLimit[6:] * left
 
@@ -119,9 +117,6 @@ def joints(r: Replay) -> Iterator[Measure]:
 
 def description(r: Replay) -> Iterator[Measure]:
     """Measures of the group "robot": disagreements by which engines simulate another robot."""
-    f = r.robot.foot
-    configured = np.array([f.heel, f.toe, -f.half_width, f.half_width, f.sole_z])
-    soles = np.array([[s.heel, s.toe, s.right, s.left, s.z] for s in r.soles])
     masses = {
         link.attrib["name"]: link.find("inertial/mass")
         for link in ET.fromstring(r.robot.urdf).iter("link")
@@ -131,5 +126,5 @@ def description(r: Replay) -> Iterator[Measure]:
         for name, mass in masses.items()
         if mass is None or not float(mass.get("value", "0")) > 0
     ]
-    yield "sole as in the URDF", np.abs(soles - configured)
+    yield "sole as in the URDF", np.abs(np.subtract(r.soles, configured_sole(r.robot)))
     yield "links have mass", len(bare), None, None, {"bare": ", ".join(bare) or "none"}

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from jumplab.auditing.replay import Replay, carrying, norm
+from jumplab.auditing.replay import Replay, carrying, norm, runs
 from jumplab.auditing.report import METHOD, Measure
 from jumplab.io.tape import Tape
 from jumplab.task import JumpTask
@@ -27,25 +27,17 @@ def form(tape: Tape) -> Iterator[Measure]:
         doubled |= (np.diff(carrying(tape).astype(int), axis=0) > 0).any(axis=1)
     else:
         faults.append(abs(doubled.sum() - 1))
-    ends = [0, *(np.flatnonzero(doubled) + 1), len(tape.t)]
-    short = [b - a < METHOD.min_samples for a, b in pairwise(ends)]
+    pieces = runs(np.cumsum([False, *doubled]))
+    short = [piece.stop - piece.start < METHOD.min_samples for piece in pieces]
     faults += [step[doubled] != 0, ~(step[~doubled] > 0), short]
     yield "order of phases", sum(np.sum(x) for x in faults)
 
 
-def record(r: Replay) -> Iterator[Measure]:
-    """Measures of the group "tape" beyond :func:`form`."""
-    yield "time step", r.step, r.tape.t[1:]
-    yield "unit quaternion", np.abs(norm(r.tape.q[:, 3:7]) - 1), r.tape.t
-    yield from _rates(r)
-    yield from _switch(r)
-    if r.robot.planar and r.is_jump and (r.task is None or r.task.in_plane):
-        yield from _symmetry(r)
-
-
-def _rates(r: Replay) -> Iterator[Measure]:
+def rates(r: Replay) -> Iterator[Measure]:
     """Positions, rates and accelerations against each other, over a step and over a phase."""
     tape = r.tape
+    yield "time step", r.step, tape.t[1:]
+    yield "unit quaternion", np.abs(norm(tape.q[:, 3:7]) - 1), tape.t
     v = tape.v
     a = tape.a
     inside = r.step > 0
@@ -71,7 +63,8 @@ def _rates(r: Replay) -> Iterator[Measure]:
     yield "re-integrated rates", np.abs(rate), tape.t, r.coordinates
 
 
-def _switch(r: Replay) -> Iterator[Measure]:
+def switch(r: Replay) -> Iterator[Measure]:
+    """Jumps at take-off and where a foot lands."""
     tape = r.tape
     rows = np.array([p.start for p in r.pieces[1:]], int)
     # forces and accelerations may jump where a foot lands
@@ -106,7 +99,10 @@ def mirror(model: pin.Model) -> tuple[np.ndarray, np.ndarray] | None:
     return other, np.sign(along[np.arange(len(other)), other])
 
 
-def _symmetry(r: Replay) -> Iterator[Measure]:
+def symmetry(r: Replay) -> Iterator[Measure]:
+    """Left against right, of a jump in the plane."""
+    if not (r.robot.planar and r.is_jump and (r.task is None or r.task.in_plane)):
+        return
     tape = r.tape
     other, sign = mirror(r.model)
     angles = tape.q[:, 7:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -24,8 +25,14 @@ def norm(x: np.ndarray) -> np.ndarray:
     return np.linalg.norm(x, axis=-1)
 
 
-@dataclass(frozen=True)
-class Sole:
+def runs(values: np.ndarray) -> list[slice]:
+    """Rows of each run of equal rows in values (N,) or (N, M)."""
+    differ = (values[1:] != values[:-1]).reshape(len(values) - 1, -1).any(axis=1)
+    edges = [0, *(np.flatnonzero(differ) + 1).tolist(), len(values)]
+    return [slice(a, b) for a, b in pairwise(edges)]
+
+
+class Sole(NamedTuple):
     """Sole rectangle in the frame of a foot link [m]."""
 
     heel: float
@@ -33,11 +40,6 @@ class Sole:
     right: float
     left: float
     z: float
-
-    def points(self) -> np.ndarray:
-        """(2 n, 3) points: from heel to toe on the right edge, then on the left one."""
-        x = np.linspace(self.heel, self.toe, METHOD.sole_points)
-        return np.array([[xi, y, self.z] for y in (self.right, self.left) for xi in x])
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,7 @@ class Replay:
     @cached_property
     def pieces(self) -> list[slice]:
         """Rows without a jump of accelerations: from one doubled instant to the next."""
-        ends = [0, *(np.flatnonzero(self.step == 0) + 1).tolist(), len(self.tape.t)]
-        return [slice(a, b) for a, b in pairwise(ends)]
+        return runs(np.cumsum(np.diff(self.tape.t, prepend=-1) == 0))
 
     @cached_property
     def flights(self) -> list[slice]:
@@ -117,11 +118,8 @@ class Replay:
     @cached_property
     def stands(self) -> list[tuple[int, slice]]:
         """(foot, rows) of each contact."""
-        stands = []
-        for k, column in enumerate(self.carrying.T):
-            edges = np.flatnonzero(np.diff(column.astype(int), prepend=0, append=0))
-            stands += [(k, slice(a, b)) for a, b in edges.reshape(-1, 2).tolist()]
-        return stands
+        columns = enumerate(self.carrying.T)
+        return [(k, rows) for k, down in columns for rows in runs(down) if down[rows.start]]
 
     @property
     def is_jump(self) -> bool:
@@ -130,8 +128,13 @@ class Replay:
 
     @cached_property
     def sole_points(self) -> np.ndarray:
-        """(N, K, 2 n, 3) points of the soles in the world [m], ordered as :meth:`Sole.points`."""
-        local = np.array([s.points() for s in self.soles])  # (K, P, 3)
+        """(N, K, 2 n, 3) points of the soles in the world [m]: from heel to toe on the right edge,
+        then on the left one.
+        """
+        heel, toe, right, left, z = np.transpose(self.soles)[..., None]  # (K, 1)
+        ahead = np.linspace(heel, toe, METHOD.sole_points, axis=-1)[:, 0]  # (K, n)
+        edges = [np.stack(np.broadcast_arrays(ahead, y, z), axis=-1) for y in (right, left)]
+        local = np.concatenate(edges, axis=1)
         return self.foot[:, :, None] + np.einsum("nkij,kpj->nkpi", self.foot_rotation, local)
 
     @property
@@ -195,11 +198,6 @@ class Replay:
         return np.concatenate([np.zeros_like(values[:1]), np.cumsum(areas, axis=0)])
 
 
-def motors(robot: Robot, joints: tuple[str, ...], *keys: str) -> np.ndarray:
-    """(keys, joints) numbers of the motors, which no URDF knows."""
-    return np.array([[robot.actuators[name][key] for name in joints] for key in keys])
-
-
 def carrying(tape: Tape) -> np.ndarray:
     """(N, K) whether a foot is down: by the tape's ``contacts``, else all feet until take-off."""
     contacts = tape.extra.get("contacts")
@@ -252,13 +250,18 @@ def replay(tape: Tape, robot: Robot, task: JumpTask | None, edge_m: float | None
         ) from e
     motion = _motion(tape, model, frames)
     rates = tape.v[:, 6:]
-    numbers = "armature", "friction", "damping"
-    armature, dry, viscous = motors(robot, tuple(map(str, tape.joint_names)), *numbers)
-    lost = dry * np.tanh(rates / SLIDING_RATE) + viscous * rates
-    motion["tau"] = motion["tau"] + armature * tape.a[:, 6:] + lost
-    motion["energy"] = motion["energy"] + (armature * rates**2).sum(axis=1) / 2
+    motors = robot.limits  # of the tape's joints, in their order
+    lost = motors.friction * np.tanh(rates / SLIDING_RATE) + motors.damping * rates
+    motion["tau"] += motors.armature * tape.a[:, 6:] + lost
+    motion["energy"] += (motors.armature * rates**2).sum(axis=1) / 2
     soles = tuple(_sole(geometry, model, robot, frame) for frame in frames)
     return Replay(tape, robot, task, edge_m, model, geometry, soles, lost=lost, **motion)
+
+
+def configured_sole(robot: Robot) -> Sole:
+    """A sole as the robot's configuration has it."""
+    f = robot.foot
+    return Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
 
 
 def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: int) -> Sole:
@@ -270,8 +273,7 @@ def _sole(geometry: pin.GeometryModel, model: pin.Model, robot: Robot, frame: in
             place = model.frames[frame].placement.actInv(shape.placement)
             corners += [place.act(half * signs) for signs in product((-1, 1), repeat=3)]
     if not corners:
-        f = robot.foot
-        return Sole(f.heel, f.toe, -f.half_width, f.half_width, f.sole_z)
+        return configured_sole(robot)
     corners = np.array(corners)
     low = corners[corners[:, 2] < corners[:, 2].min() + METHOD.same_level_m]
     (heel, right, z), (toe, left, _) = low.min(axis=0), low.max(axis=0)
@@ -294,8 +296,7 @@ def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.nda
             joint = model.frames[frame].parentJoint
             external[joint] = external[joint] + data.oMi[joint].actInv(contact)
         need = pin.rnea(model, inverse, q, v, a, external)
-        force, moment = data.oMi[1].rotation @ need[:6].reshape(2, 3, 1)
-        arm = data.com[0] - data.oMi[1].translation
+        about_com = pin.SE3(np.eye(3), data.com[0])
         row = {
             "com": data.com[0].copy(),
             "com_velocity": data.hg.linear / mass,
@@ -304,7 +305,7 @@ def _motion(tape: Tape, model: pin.Model, frames: list[int]) -> dict[str, np.nda
             "energy": pin.computeMechanicalEnergy(model, data, q, v),
             "foot": [data.oMf[frame].translation.copy() for frame in frames],
             "foot_rotation": [data.oMf[frame].rotation.copy() for frame in frames],
-            "base_residual": [*force[:, 0], *(moment[:, 0] - np.cross(arm, force[:, 0]))],
+            "base_residual": about_com.actInv(data.oMi[1].act(pin.Force(need[:6]))).vector,
             "tau": need[6:].copy(),
         }
         rows.append(row)

@@ -40,6 +40,7 @@ from jumplab.show.style import (
 )
 
 VIEWS = {"side": [0, 2], "front": [1, 2]}
+BELOW_M = 0.07  # of the ground: where times are written
 ABOVE_M = 0.36  # seen above the highest base: a head is 0.3 m above the shoulders
 SHADES = {"trunk": 1.0, "limb": 0.78, "rest": 0.78, "far": 0.45}  # strengths of the colour
 BODY = "#5B6B7F"  # a robot outside of any phase
@@ -146,12 +147,11 @@ def film_strip(
     times: np.ndarray,
     colors: list[str],
     places: np.ndarray,
-    below: float,
 ) -> None:
-    """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] ``below`` [m] the ground."""
+    """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
-        ax.text(place, -below, f"{t:.2f} s", ha="center", va="top", fontsize=7)
+        ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)
 
 
 def draw_five_link(
@@ -159,11 +159,10 @@ def draw_five_link(
     model: SagittalModel,
     angles: np.ndarray,
     toe: ArrayLike = (0.0, 0.0),
-    color: str = BODY,
 ) -> dict[str, np.ndarray]:
     """Sticks: link angles (5,) [rad], toe at (2,) [m]; returns their :func:`five_link_points`."""
     points = five_link_points(model, angles, toe)
-    look = dict(color=color, zorder=2.0)
+    look = dict(color=BODY, zorder=2.0)
     ends = dict(solid_capstyle="round", solid_joinstyle="round")
     dots = dict(marker="o", markersize=4.8, markerfacecolor="white", markeredgewidth=1.8)
     parts = ("heel toe ankle", "ankle knee hip shoulder", "shoulder hand")

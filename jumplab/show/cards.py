@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -100,10 +100,9 @@ def _of_robot(robot: Robot) -> Card:
 
 def _of_audit(report: AuditReport) -> Card:
     rows = []
-    for group, some in itertools.groupby(report.checks, lambda check: check.group):
-        checks = list(some)
-        failed = [check.name for check in checks if not check.passed]
-        passed = f"{len(checks) - len(failed)} of {len(checks)}"
+    for group, count in Counter(check.group for check in report.checks).items():
+        failed = [check.name for check in report.failed if check.group == group]
+        passed = f"{count - len(failed)} of {count}"
         rows.append({"group": group, "passed": passed, "failed": ", ".join(failed)})
     return table(rows), _shares(report)
 
@@ -128,18 +127,9 @@ def _shares(report: AuditReport) -> Figure | None:
 
 
 def _of_clip(report: ClipReport) -> Card:
-    rows = [
-        {
-            "": c.name,
-            "found": c.value,
-            "limit": c.limit,
-            "unit": c.unit,
-            "at [s]": c.time,
-            "passed": c.passed,
-        }
-        for c in report.checks
-    ]
-    return table(rows), clip_sheet(report)
+    columns = {"name": "", "value": "found", "limit": "limit", "unit": "unit", "time": "at [s]"}
+    rows = [vars(check) | {"passed": check.passed} for check in report.checks]
+    return table(rows, columns | {"passed": "passed"}), clip_sheet(report)
 
 
 @styled
@@ -159,8 +149,8 @@ def clip_sheet(report: ClipReport) -> Figure:
 
 
 def _of_mended(mended: Mended) -> Card:
-    rows = [{"what": "", "clip": None, "mended": None, "change": None} | x for x in mended.changes]
-    return table(rows), jump_strobe(mended.plan.tape, mended.plan.robot)
+    rows = table(mended.changes, ("what", "clip", "mended", "change"))
+    return rows, jump_strobe(mended.plan.tape, mended.plan.robot)
 
 
 def _of_trials(report: TrialReport) -> Card:

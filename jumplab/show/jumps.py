@@ -51,7 +51,7 @@ FLIGHT_SHARES = (0.25, 0.5, 0.75)  # when frames of the flight are shown
 STRIP_M = 0.72  # from frame to frame, just more than a robot with its arms stretched out
 LEAST_SHARE = 0.02  # of the weight on a foot: below, CoP and friction are 0/0 and not drawn
 MOMENTUM, INERTIA = "$L$ [kg m$^2$/s]", "$\\rho$ [kg m$^2$]"
-# name on the tape and component of each curve in the plane, and out of it
+# name on the tape and component of each curve in the plane, and out of it: of the plan alone ...
 PLANAR_CURVES = {
     INERTIA: ("rho", ...),
     MOMENTUM: ("L", ...),
@@ -59,12 +59,21 @@ PLANAR_CURVES = {
     "$v_z$ of the CoM [m/s]": ("com_velocity", (..., 1)),
 }
 SPATIAL_CURVES = {
-    f"${sign}_{x}$ {unit}": (name, (..., k))
-    for sign, unit, name in (
-        ("v", "of the CoM [m/s]", "com_velocity"),
-        ("L", "[kg m$^2$/s]", "angular_momentum"),
-    )
-    for k, x in enumerate("xyz")
+    **{f"$v_{x}$ of the CoM [m/s]": ("com_velocity", (..., k)) for k, x in enumerate("xyz")},
+    **{f"$L_{x}$ [kg m$^2$/s]": ("angular_momentum", (..., k)) for k, x in enumerate("xyz")},
+}
+# ... and of what is simulated too
+SPATIAL_MOTION = {
+    **{f"CoM ${x}$ [m]": ("com", (..., k)) for k, x in enumerate("xyz")},
+    **{f"CoM $v_{x}$ [m/s]": ("com_velocity", (..., k)) for k, x in enumerate("xyz")},
+}
+PLANAR_MOTION = {
+    "CoM $x$ [m]": ("com", (..., 0)),
+    "CoM $z$ [m]": ("com", (..., 2)),
+    f"{MOMENTUM}, launch": ("planar_L", ...),
+    "CoM $v_x$ [m/s]": ("com_velocity", (..., 0)),
+    "CoM $v_z$ [m/s]": ("com_velocity", (..., 2)),
+    INERTIA: ("planar_rho", ...),
 }
 
 
@@ -275,7 +284,7 @@ def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
     places = STRIP_M * np.arange(len(rows))
     colors = [PHASE_COLORS[str(phase)] for phase in record.phase[rows]]
     body = Silhouette(robot, "front" if travel[1] > travel[0] else "side")
-    film_strip(ax, body, record.q[rows], record.t[rows], colors, places, below=0.07)
+    film_strip(ax, body, record.q[rows], record.t[rows], colors, places)
     for text, color in zip(ax.texts, colors, strict=True):
         text.set_color(shade(color, 0.8))
     air = (record.phase == "flight") & (record.t <= record.t[rows[-1]])
@@ -310,19 +319,10 @@ def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
 
     Out of the plane CoM position and velocity alone, in all three directions.
     """
-    flat = _in_plane(tape)
-    values = {}  # simulated and planned
-    for sign, unit, name in (("", "[m]", "com"), ("v_", "[m/s]", "com_velocity")):
-        for k, x in enumerate("xyz"):
-            if x != "y" or not flat:
-                both = getattr(result, name)[:, k], tape.extra[name][:, k]
-                values[f"CoM ${sign}{x}$ {unit}"] = both
-        if flat and not sign:
-            values[f"{MOMENTUM}, launch"] = result.L, tape.extra["planar_L"]
-    if flat:
-        values[INERTIA] = result.rho, tape.extra["planar_rho"]
     curves = {}
-    for label, (actual, planned) in values.items():
+    for label, (name, part) in (PLANAR_MOTION if _in_plane(tape) else SPATIAL_MOTION).items():
+        actual = getattr(result, name.removeprefix("planar_"))[part]
+        planned = tape.extra[name][part]
         seen = result.t <= tape.t[-1] + AFTER_TOUCHDOWN_S
         kept = slice(None)
         marks = [tape.takeoff_time]

@@ -11,6 +11,7 @@ import io
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -61,11 +62,20 @@ styled = plt.style.context(STYLE_FILE)
 class Picture(Figure):
     """A figure that shows itself in a notebook, whatever backend is chosen there."""
 
+    _saved = b""  # its PNG, see save_figure
+
     @styled
     def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=self.get_dpi(), metadata=PNG_METADATA)
-        return buffer.getvalue()
+        if self._saved and not self.stale:
+            return self._saved
+        return _file_of(self, "png", dpi=self.get_dpi(), metadata=PNG_METADATA)
+
+
+def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
+    """A figure as a file of that kind; ``how`` are options of ``Figure.savefig``."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format=kind, **how)
+    return buffer.getvalue()
 
 
 @styled
@@ -180,13 +190,13 @@ def save_figure(
     if not name or Path(name).name != name or name.startswith("."):
         must = "must be a plain file name without ending, such as 'f08_joints'"
         raise InputError(f"figure name {name!r}: {must}")
-    png = io.BytesIO()
-    pdf = io.BytesIO()
-    fig.savefig(png, format="png", dpi=DPI, metadata=PNG_METADATA)
+    png = _file_of(fig, "png", dpi=DPI, metadata=PNG_METADATA)
     fig.set_layout_engine("none")
-    fig.savefig(pdf, format="pdf", metadata=PDF_METADATA)
+    pdf = _file_of(fig, "pdf", metadata=PDF_METADATA)
+    fig._saved = png  # a notebook shows it without drawing it again ...
+    fig.stale = False  # ... until it is changed
     text = caption_text(caption, task, robot).encode()
-    for ending, content in (("png", png.getvalue()), ("pdf", pdf.getvalue()), ("txt", text)):
+    for ending, content in (("png", png), ("pdf", pdf), ("txt", text)):
         write_file(Path(folder, f"{name}.{ending}"), content)
     return fig
 

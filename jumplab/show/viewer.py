@@ -71,15 +71,13 @@ def page(
     scene: Scene | None = None,
     marks_m: Sequence[float] = (),
     title: str | None = None,
-    fps: float = FPS,
 ) -> Page:
     """The page of one jump: to play, to scrub, to look at from all sides.
 
     It shows ``plan``, ``simulation``, or each alone and both together; the title is that of the
     ``task``, whose toes' goal is marked, unless ``title`` says otherwise. ``marks_m`` are further
     places where the toes should land, from where they start [m]; the ``scene`` is flat if None.
-    Raises :class:`InputError` if there is nothing to show, or ``fps``, frames a second, cannot be
-    meant.
+    Raises :class:`InputError` if there is nothing to show.
     """
     motions = {
         name: Motion.of(record)
@@ -92,7 +90,7 @@ def page(
     parts, notes = parts_of(robot)
     toe = robot.foot.toe - float(robot.foot.center[0])
     marks = [toe + goal for goal in (0.0, *([task.distance_m] if task else []), *marks_m)]
-    ways = {name: trace(robot, motion.every(fps).q) for name, motion in motions.items()}
+    ways = {name: trace(robot, motion.every(FPS).q) for name, motion in motions.items()}
     places = np.concatenate([marks, *(way.com[:, 0] for way in ways.values())])
     span = float(places.min() - AHEAD_M), float(places.max() + AHEAD_M)
     top = float(max(motion.q[:, 2].max() for motion in motions.values()) + ABOVE_M)
@@ -102,12 +100,12 @@ def page(
     size = f"robot {robot.name}, {robot.total_mass:.0f} kg"
     facts = {  # what player.js reads
         "title": title or (describe_task(task) if task else "A jump"),
-        "note": " · ".join([size, f"{fps:g} frames per second", *notes]),
-        "fps": fps,
+        "note": " · ".join([size, f"{FPS:g} frames per second", *notes]),
+        "fps": FPS,
         "weight": robot.total_mass * GRAVITY,
         "parts": list(map(_part, parts)),
         "clips": [
-            {"name": name, **_clip(motion, robot, scene, fps, ways[name])}
+            {"name": name, **_clip(motion, robot, scene, ways[name])}
             for name, motion in motions.items()
         ],
         "ground": ground,
@@ -150,15 +148,15 @@ def _ground(scene: Scene, span: tuple[float, float]) -> tuple[list[dict[str, Any
 
 # the motion
 # ----------------------------------------------------------------------------------------------
-def _clip(whole: Motion, robot: Robot, scene: Scene, fps: float, way: Trace) -> dict[str, Any]:
+def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, Any]:
     """What the page plays of a motion that goes this way."""
-    motion = whole.every(fps)
+    motion = whole.every(FPS)
     forces = None
     if whole.wrench is not None:
         # the mean from frame to frame, as the force of an impact depends on the engine's step
-        rows = max(1, round(len(whole.t) / (whole.duration * fps)))
+        rows = max(1, round(len(whole.t) / (whole.duration * FPS)))
         mean = replace(whole, wrench=uniform_filter1d(whole.wrench, rows, axis=0, mode="nearest"))
-        wrench = mean.every(fps).wrench
+        wrench = mean.every(FPS).wrench
         feet = way.feet[..., :3, 3]
         top = np.vectorize(scene.top_at, otypes=[float])(feet[..., 0])
         places = pressure_points(wrench, feet, top, CONTACT_FORCE_N)

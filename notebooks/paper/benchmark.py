@@ -36,14 +36,16 @@ NODES = (20, 40, 80)  # intervals of the three phases together
 NODE_REPEATS = 3  # the growth is a fit over many meshes
 
 
-def growth(robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES) -> list[dict[str, Any]]:
+def growth(
+    robot: Robot, task: JumpTask, nodes: Sequence[int] = NODES, repeats: int = NODE_REPEATS
+) -> list[dict[str, Any]]:
     """Cost of an iteration of the direct program on ever finer meshes: intervals, iterations, iteration_s."""
     body, rows = Body(robot), []
     for n in nodes:
         flat, toe = round(n / 3), round(4 * n / 15)
         mesh = Mesh(flat, toe, n - flat - toe)
         planner = WholeBodyPlanner(robot, mesh, body=body, free=even(body))
-        plans = [planner.plan(task) for _ in range(NODE_REPEATS + 1)][1:]  # the first call of anything is not timed
+        plans = [planner.plan(task) for _ in range(repeats + 1)][1:]  # the first call of anything is not timed
         solves = [plan.attempts[0] for plan in plans]
         each = float(np.median([x.cpu_s / x.iterations for x in solves]))
         rows.append({"intervals": n, "iterations": solves[0].iterations, "iteration_s": each})
@@ -112,7 +114,9 @@ TARGETS = 6
 TO_THE_END = {"acceptable_iter": 0, "tol": 1e-6}  # of ipopt, where the usual plan stops sooner
 
 
-def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
+def density(
+    robot: Robot, task: JumpTask, spacings: Sequence[int] = SPACINGS, targets: int = TARGETS
+) -> list[dict[str, Any]]:
     """Plans from atlases of the same area and ever more nodes: what they take, and how much dearer than the best.
 
     The best is what ipopt finds from there, to the end. ``iterations`` and ``cpu_ms`` are medians, the latter of a plan
@@ -121,9 +125,9 @@ def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
     rng, body = np.random.default_rng(0), Body(robot)
     settled = WholeBodyPlanner(robot, body=body, free=even(body), options=TO_THE_END)
     low = max(task.distance_m - AREA_M[0] / 2, 0.0), max(task.height_m - AREA_M[1] / 2, 0.1)
-    places = np.array(low) + rng.uniform(0.0, 1.0, (TARGETS, 2)) * AREA_M
+    places = np.array(low) + rng.uniform(0.0, 1.0, (targets, 2)) * AREA_M
     rows = []
-    for count in SPACINGS:
+    for count in spacings:
         axes = [np.linspace(x, x + size, count + 1) for x, size in zip(low, AREA_M, strict=True)]
         atlas = Atlas.build(robot, *axes)
         planner, clean, took, steps, dearer = Planner(robot, atlas=atlas), 0, [], [], []
@@ -139,7 +143,7 @@ def density(robot: Robot, task: JumpTask) -> list[dict[str, Any]]:
         step = [round(size / count, 3) for size in AREA_M]
         row = {"nodes": len(atlas.nodes), "apart": f"{step[0]:g} x {step[1]:g}", "iterations": float(np.median(steps))}
         row |= {"cpu_ms": 1e3 * float(np.median(took))}
-        row |= {"dearer": 100 * float(np.median(dearer)), "most": 100 * max(dearer), "clean": clean, "of": TARGETS}
+        row |= {"dearer": 100 * float(np.median(dearer)), "most": 100 * max(dearer), "clean": clean, "of": targets}
         rows.append(row)
     return rows
 

@@ -330,7 +330,7 @@ def mapped_snapshots(plan: JointPlan, robot: Robot, platform_m: float = 0.0) -> 
         chosen = np.linspace(rows.start, rows.stop - 1, count + again).astype(int)[again:]  # the launch shows take-off
         places, frames = place + PITCH_M * np.arange(count), plan.q[chosen]
         com = np.array([body.com(q) for q in frames])
-        film_strip(ax, body, frames, plan.t[chosen], [color] * count, places, below=0.06)
+        film_strip(ax, body, frames, plan.t[chosen], [color] * count, places)
         ax.plot(places, com[:, 1], "o", markersize=3, color=INK, markerfacecolor="white", zorder=4)
         left, right = place - PITCH_M / 2, places[-1] + PITCH_M / 2
         edge = right - PITCH_M if phase == "flight" and abs(platform_m) > LEVEL_M else None

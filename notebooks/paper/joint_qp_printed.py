@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,15 +150,18 @@ READ = {  # one reading at a time, everything else as the library's; then all of
 }
 
 
-def readings_tried(srmp: SrmpPlan, robot: Robot) -> tuple[dict[str, JointPlan], dict[str, str], list[dict]]:
-    """Roll-outs of all of :data:`READ`; one that stops is tried again without torque limits.
+def readings_tried(
+    srmp: SrmpPlan, robot: Robot, names: Iterable[str] = READ
+) -> tuple[dict[str, JointPlan], dict[str, str], list[dict]]:
+    """Roll-outs of ``names`` of :data:`READ`; one that stops is tried again without torque limits.
 
     Returns
     -------
     By name, the roll-outs that come through, and the first refusal of those that stop; the table of both.
     """
     tried, said, rows = {}, {}, []
-    for name, form in READ.items():
+    for name in names:
+        form = READ[name]
         row = {"form": name, "torque limits": "fails with and without"}
         for off in ((), ("torque",)):
             try:

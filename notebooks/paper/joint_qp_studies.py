@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -217,17 +217,19 @@ def weights_tried(srmp: SrmpPlan, robot: Robot, phase: str, name: str, values: S
     return rows
 
 
-def choices_tried(task: JumpTask, srmp: SrmpPlan, robot: Robot) -> list[dict]:
-    """Stage 2 as the planner runs it and with one choice changed: tracking, and where stage 3 ends from there."""
+CHOICES: dict[str, dict[str, Any]] = {
+    "as planned": {},
+    "steps of 10 ms, as in this notebook": {"step_s": 0.01},
+    "arms towards the stance": {"options": Options(arm_rad=0.0)},
+    "gentle weights": {"options": GENTLE},
+}
+
+
+def choices_tried(task: JumpTask, srmp: SrmpPlan, robot: Robot, names: Iterable[str] = CHOICES) -> list[dict]:
+    """Stage 2 with ``names`` of :data:`CHOICES`, one changed at a time: tracking, and where stage 3 ends from there."""
     whole, rows = WholeBodyPlanner(robot, tracking=True), []
-    choices: dict[str, dict[str, Any]] = {
-        "as planned": {},
-        "steps of 10 ms, as in this notebook": {"step_s": 0.01},
-        "arms towards the stance": {"options": Options(arm_rad=0.0)},
-        "gentle weights": {"options": GENTLE},
-    }
-    for name, how in choices.items():
-        plan = map_to_joints(srmp, robot, **{"step_s": STEPS_S, **how})
+    for name in names:
+        plan = map_to_joints(srmp, robot, **{"step_s": STEPS_S, **CHOICES[name]})
         led = whole.plan(task, srmp, begin=motion_of_joints(plan, whole, srmp.toe_s))
         e, row = tracking(plan, srmp, robot), {"choice": name, "steps": plan.statistics.steps}
         row |= {"take-off speed [%]": 100 * e["takeoff_velocity"], "L at take-off [%]": 100 * e["takeoff_momentum"]}

@@ -102,9 +102,10 @@ def bench(
     repeats: int = 3,
     *,
     sorts: Sequence[str] = tuple(SORTS),
+    most: int | None = None,
     say: Callable[[str], None] = print,
 ) -> Plain:
-    """Time all ``sorts`` of :data:`SORTS`, each target ``repeats`` times; plain types.
+    """Time all ``sorts`` of :data:`SORTS`, each target (or the first ``most``) ``repeats`` times; plain types.
 
     Returns
     -------
@@ -126,7 +127,7 @@ def bench(
     for name in sorts:
         if name == STEPS and not jumper.planar:
             continue
-        tasks = targets(task, name)
+        tasks = targets(task, name)[:most]
         say(f"{name}: {len(tasks)} targets, {repeats} times each")
         planner = Planner(jumper)
         if name == FROM_ATLAS:

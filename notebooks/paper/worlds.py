@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -42,12 +43,14 @@ FALLS = {
 }
 
 
-def falls(tape: Tape, robot: Robot, scene: Scene, **how: Any) -> dict[str, SimulationResult]:
-    """The falls of :data:`FALLS`, without re-aim; ``how`` are options of :func:`jumplab.sim.simulate_jump`."""
-    draws = {cause: Perturbation.draw(robot, seed, ranges_at(names, 1.0)) for cause, (seed, names) in FALLS.items()}
-    return {
-        cause: simulate_jump(tape, robot, scene=scene, perturbation=p, reaim=False, **how) for cause, p in draws.items()
-    }
+def falls(tape: Tape, robot: Robot, scene: Scene, causes: Iterable[str] = FALLS) -> dict[str, SimulationResult]:
+    """The falls that :data:`FALLS` has for the ``causes``, without re-aim."""
+    found = {}
+    for cause in causes:
+        seed, names = FALLS[cause]
+        drawn = Perturbation.draw(robot, seed, ranges_at(names, 1.0))
+        found[cause] = simulate_jump(tape, robot, scene=scene, perturbation=drawn, reaim=False)
+    return found
 
 
 def study(folder: str | Path, path: Path = LOG, *, jobs: int | None = None) -> None:
