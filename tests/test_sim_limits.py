@@ -1,7 +1,8 @@
 """No joint of a nominal jump leaves its limits, from stand to stand, whatever planned, played and simulated it.
 
-Of the three-step plan one sample at touchdown is left out for ankles: played open loop its soles come down 5 mrad off
-the level, the ground turns them flat within a millisecond at 21 rad/s, and no motor has a part in it.
+Where soles come down 5 mrad off the level (of the three-step plan; of drives on PyBullet's ground) one sample at
+touchdown is left out for ankles: the ground turns them flat within a millisecond at 19 to 21 rad/s, and no motor has a
+part in it.
 """
 
 import numpy as np
@@ -26,20 +27,21 @@ def within_limits(robot, run, slaps=0):
     return run.landed and torque.max() <= 1 and speed.max() <= 1
 
 
-# each mode and method, and each engine
+# each mode and method, and each engine, with samples in which an ankle is turned flat
 PLAYED = [
-    ("position", "direct", INSTALLED[-1]),
-    ("position", "three-step", INSTALLED[-1]),
-    ("pd", "direct", INSTALLED[0]),
-    ("whole-body", "three-step", INSTALLED[-1]),
+    ("position", "direct", INSTALLED[-1], 0),
+    ("position", "direct", INSTALLED[0], 1),
+    ("position", "three-step", INSTALLED[-1], 1),
+    ("pd", "direct", INSTALLED[0], 0),
+    ("whole-body", "three-step", INSTALLED[-1], 1),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "method", "engine"), PLAYED)
-def test_the_default_jump_stays_within_all_limits(bhr, method, mode, engine):
+@pytest.mark.parametrize(("mode", "method", "engine", "slaps"), PLAYED)
+def test_the_default_jump_stays_within_all_limits(bhr, method, mode, engine, slaps):
     run = simulate_jump(jump(1.0, 0.5, method=method).tape, bhr, mode=mode, engine=engine)
-    assert within_limits(bhr, run, slaps=int(method == "three-step")), run.metrics
+    assert within_limits(bhr, run, slaps), run.metrics
 
 
 @pytest.mark.slow
