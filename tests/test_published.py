@@ -20,6 +20,7 @@ from jumplab.robot_import.roles import draft
 from jumplab.robot_import.urdf import PACKAGE, have_published, locate
 from jumplab.sim import INSTALLED, Scene, simulate_jump
 from jumplab.stages.planner import Planner
+from jumplab.stages.whole_body import Contacts
 from jumplab.task import JumpTask
 
 DOWNLOADED = [name for name, path in SHIPPED.items() if "robot_descriptions:" in path.read_text()]
@@ -83,6 +84,16 @@ def test_planned_clean_and_landed(name, target):
         assert result["landed"], result["reason"]
         assert result["foot_distance_m"] == pytest.approx(target[0], abs=place_m)
         assert result["com_rise_m"] == pytest.approx(target[1], abs=0.01)
+
+
+@here
+@pytest.mark.slow
+def test_the_g1_runs_up_and_leaves_from_one_foot():
+    robot = Robot.load("g1_arms")
+    plan = Planner(robot).follow(Contacts.run_up(robot))
+    report = audit(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
+    assert report.passed, report.table()
+    assert plan.tape.extra["contacts"][plan.tape.takeoff_index - 1].tolist() == [0, 1]  # the right one, on its toes
 
 
 @here
