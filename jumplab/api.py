@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError, require_type
+from jumplab.errors import InputError
 from jumplab.io import folder as folders
 from jumplab.robot import Robot
 from jumplab.stages.plan import JumpPlan
@@ -31,6 +31,7 @@ class Saved(NamedTuple):
     run: SimulationResult | None  # its simulation, if there is one
 
 
+@checked
 def plan(
     task: JumpTask | None = None,
     robot: Robot | str | Path = "bhr",
@@ -88,16 +89,17 @@ def plan(
     return plan_or_advise(Planner(robot, keep=True, **changes), task, method, patience_s)
 
 
+@checked
 def audit(plan: JumpPlan) -> AuditReport:
     """Check a plan by a second code path that sees its tape, its robot and its target, and nothing
     of the planner.
     """
     from jumplab.auditing import audit as check
 
-    require_type(plan, JumpPlan, "the plan to audit")
     return check(plan.tape, plan.robot, plan.task, edge_m=plan.summary["platform_edge_m"])
 
 
+@checked
 def judge(
     motion: Any, robot: Robot | str | Path = "bhr", **reading: Any
 ) -> ClipReport | list[ClipReport]:
@@ -122,6 +124,7 @@ def judge(
     return judged(motion, robot, **reading)
 
 
+@checked
 def mend(motion: Any, robot: Robot | str | Path = "bhr", **options: Any) -> Mended:
     """The nearest motion to a clip that the robot can do: the clip's contacts, all limits hard.
 
@@ -145,6 +148,7 @@ def mend(motion: Any, robot: Robot | str | Path = "bhr", **options: Any) -> Mend
     return mended(motion, robot, **options)
 
 
+@checked
 def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     """Play a plan on a simulated robot, catch it, and watch it stand.
 
@@ -162,7 +166,6 @@ def simulate(plan: JumpPlan, **options: Any) -> SimulationResult:
     """
     from jumplab.sim import Scene, simulate_jump
 
-    require_type(plan, JumpPlan, "the plan to simulate")
     options.setdefault("scene", Scene.of_plan(plan.summary, plan.robot))
     return simulate_jump(plan.tape, plan.robot, **options)
 
@@ -174,9 +177,6 @@ def save(folder: str | Path, plan: JumpPlan, run: SimulationResult | None = None
     """
     from jumplab.auditing import write_audit
 
-    require_type(plan, JumpPlan, "the plan to save")
-    if run is not None:
-        _require_run(run)
     report = folders.write_plan(folder, plan.tape, plan.robot, plan.summary, complete=write_audit)
     if run is not None:
         folders.write_simulation(folder, run, folders.read_plan(folder)[2])
@@ -195,12 +195,6 @@ def load(folder: str | Path) -> Saved:
     return Saved(plan, SimulationResult.load(folder, robot))
 
 
-def _require_run(run: Any) -> None:
-    from jumplab.sim import SimulationResult
-
-    require_type(run, SimulationResult, "the simulation")
-
-
 @checked
 def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     """The jump in 3-D, plan and simulation: a notebook shows the page,
@@ -209,8 +203,5 @@ def view(plan: JumpPlan, run: SimulationResult | None = None) -> Page:
     from jumplab.show.viewer import page
     from jumplab.sim import Scene
 
-    require_type(plan, JumpPlan, "the plan to view")
-    if run is not None:
-        _require_run(run)
     scene = Scene.of_plan(plan.summary, plan.robot)
     return page(plan.robot, plan=plan.tape, simulation=run, task=plan.task, scene=scene)

@@ -7,8 +7,10 @@ one sentence, before anything is done with it.
 
 from __future__ import annotations
 
+import ast
 import inspect
 import math
+import sys
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
@@ -24,6 +26,7 @@ if TYPE_CHECKING:  # help of a command is there before NumPy is
 
 F = TypeVar("F", bound=Callable)
 FLAGS = "bool", "bool_"
+RECEIVERS = "self", "cls"
 UNKNOWN = inspect.Parameter.empty  # an annotation that cannot be checked
 
 
@@ -44,22 +47,56 @@ def real(value: Any, what: str, unit: str = "") -> float:
     return number
 
 
-def checked(function: F) -> F:
-    """The same function, whose arguments are converted by their annotations.
+def shaped(value: Any, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """An array of this ``shape``, None for any length; raises :class:`InputError`, which calls it
+    ``what``.
+    """
+    array = _array(value, what)
+    fits = array.ndim == len(shape) and all(
+        wanted in (None, n) for wanted, n in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind == "U":
+        wanted = ", ".join("n" if n is None else str(n) for n in shape)
+        raise InputError(f"{what} must have the shape ({wanted}), got {quoted(value)}")
+    return array.astype(float)
+
+
+def checked(of: F) -> F:
+    """The same function, or class with its constructor and public methods, whose arguments are
+    converted by their annotations.
 
     Sequences and mappings are looked into. Parameters without an annotation, or with one of which
-    nothing is known (``Any``), are left alone.
+    nothing is known (``Any``), are left alone. Arguments that are missing, or that nobody takes,
+    are refused as well (:class:`InputError`).
     """
+    if not isinstance(of, type):
+        return _checking(of)
+    for name, member in list(vars(of).items()):
+        inner = getattr(member, "__func__", member)  # of a class's or a static method
+        if not inspect.isfunction(inner) or (name.startswith("_") and name != "__init__"):
+            continue
+        method = _checking(inner)
+        setattr(of, name, method if member is inner else type(member)(method))
+    return of
+
+
+def _checking(function: F) -> F:
     signature = inspect.signature(function)
+    called = function.__qualname__.removesuffix(".__init__")
 
     @wraps(function)
     def checking(*args: Any, **options: Any) -> Any:
-        given = signature.bind(*args, **options)
+        try:
+            given = signature.bind(*args, **options)
+        except TypeError as e:
+            names = ", ".join(name for name in signature.parameters if name not in RECEIVERS)
+            raise InputError(f"{called}: {e}; it takes {names or 'nothing'}") from None
         for name, value in given.arguments.items():
             parameter = signature.parameters[name]
             if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 continue
-            if value is not parameter.default:
+            default = parameter.default
+            if value is not default and not (isinstance(value, float) and value == default):
                 hint = _hint(parameter.annotation, function)
                 given.arguments[name] = fitting(value, hint, name)
         return function(*given.args, **given.kwargs)
@@ -76,10 +113,24 @@ def _hint(annotation: Any, function: Callable) -> Any:
 
 @lru_cache(1000)
 def _evaluated(annotation: str, function: Callable) -> Any:
+    names = function.__globals__
     try:
-        return eval(annotation, function.__globals__)  # of this package's own sources
+        return eval(annotation, names)  # of this package's own sources
     except NameError:
+        pass
+    try:
+        return eval(annotation, _with_types(names))
+    except (NameError, ImportError):
         return UNKNOWN
+
+
+def _with_types(names: Mapping[str, Any]) -> dict[str, Any]:
+    """A module's ``names``, and those that it imports for type checkers alone."""
+    out = dict(names)
+    for block in ast.parse(inspect.getsource(sys.modules[names["__name__"]])).body:
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            exec(compile(ast.Module(block.body, []), names["__name__"], "exec"), out)
+    return out
 
 
 def fitting(value: Any, hint: Any, what: str) -> Any:
@@ -90,6 +141,8 @@ def fitting(value: Any, hint: Any, what: str) -> Any:
         return SIMPLE[hint](value, what)
     if getattr(hint, "__name__", "") == "ndarray":
         return _array(value, what)
+    if hint is getattr(sys.modules.get("numpy.typing"), "ArrayLike", UNKNOWN):
+        return value if isinstance(value, Real) else _array(value, what)
     if hint is None or hint is types.NoneType:
         return _of(value, types.NoneType, what, "None")
     origin = typing.get_origin(hint)
@@ -122,6 +175,10 @@ def fitting(value: Any, hint: Any, what: str) -> Any:
 
 
 def _one_of(value: Any, hints: tuple, what: str) -> Any:
+    if Any in hints:
+        return value
+    if Path in hints and isinstance(value, str):
+        return str(as_path(value, what)) if value else value
     for hint in hints:
         if isinstance(hint, type) and hint not in SIMPLE and isinstance(value, hint):
             return value

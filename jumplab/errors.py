@@ -8,11 +8,14 @@ the message alone and exits with ``exit_code``.
 import os
 import re
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, ClassVar
 
+LISTED = 8  # names that a message lists
+NAME_BYTES = 256  # of a name that is too long for usual file systems
 _ENDLESS = re.compile(r"\S{240,}")
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60  # enough to recognise what one has typed
@@ -84,6 +87,17 @@ def quoted(value: Any) -> str:
     return " ".join(_SHORT.repr(value).split())
 
 
+def nearest(names: Iterable[str], to: Any) -> str:
+    """The names that there are, of many those nearest to what was asked for, as a message may list
+    them.
+    """
+    names = sorted(names)
+    if len(names) <= LISTED:
+        return ", ".join(names)
+    near = get_close_matches(str(to).rpartition("/")[2], names, LISTED, 0)
+    return f"{', '.join(near)} and {len(names) - LISTED} more"
+
+
 def require_type(value: Any, kind: type, what: str) -> None:
     """Refuse (:class:`InputError`) a value of another type, before it fails somewhere inside."""
     if not isinstance(value, kind):
@@ -93,7 +107,10 @@ def require_type(value: Any, kind: type, what: str) -> None:
 def as_path(value: Any, what: str) -> Path:
     """A path from what the caller gave; refuses (:class:`InputError`) what names no file."""
     if isinstance(value, str | os.PathLike) and value != "" and isinstance(os.fspath(value), str):
-        return Path(value)
+        path = Path(value)
+        if "\0" in str(path) or any(len(os.fsencode(x)) >= NAME_BYTES for x in path.parts):
+            raise InputError(f"{what} = {quoted(value)} cannot be the name of a file or folder")
+        return path
     raise InputError(f"{what} must be a path, got {quoted(value)}")
 
 

@@ -197,7 +197,7 @@ def long(low: float, high: float) -> tuple[ContactPhase, ...]:
     ("make", "sentence"),
     [
         (lambda: Contacts(()), "a contact schedule needs at least one phase"),
-        (lambda: Contacts(("LR",)), "a phase of the schedule must be a ContactPhase, got 'LR'"),
+        (lambda: Contacts(("LR",)), "an entry of phases must be a ContactPhase, got 'LR'"),
         (lambda: schedule("LR RL"), f"phase '2 RL': feet = 'RL'; {WRITE}"),
         (lambda: schedule("LR both"), f"phase '2 both': feet = 'both'; {WRITE}"),
         (lambda: Contacts((ContactPhase(3, (0.2, 0.5), 0.3),)), f"phase '1 3': feet = 3; {WRITE}"),

@@ -193,8 +193,8 @@ def test_second_writer_gives_up_in_one_sentence(bhr, tmp_path, monkeypatch):
     [
         ("/dev/null/x", "cannot be written (Not a directory); choose another one"),
         ("/proc/x", "cannot be written"),
-        ("x" * 300, "cannot be written (File name too long); choose another one"),
-        ("a\0b", "cannot be the name of a folder"),
+        ("x" * 300, "cannot be the name of a file or folder"),
+        ("a\0b", "cannot be the name of a file or folder"),
         (__file__, "is a file; choose a folder"),
     ],
 )

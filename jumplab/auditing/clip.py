@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from jumplab.arguments import checked
 from jumplab.auditing.audit import _checks
 from jumplab.auditing.contact import collisions
 from jumplab.auditing.dynamics import joints
@@ -78,6 +79,7 @@ def phases_of(ground: np.ndarray, fps: float) -> list[tuple[str, float, float]]:
     return phases
 
 
+@checked
 def judge(
     motion: Any, robot: Robot | str = "bhr", *, fps: float | None = None, order: str = "depth-first"
 ) -> ClipReport | list[ClipReport]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
@@ -85,6 +86,7 @@ class Controller:
     ``feedback`` is asked in mode "pd".
     """
 
+    @checked
     def __init__(
         self,
         tape: Tape,

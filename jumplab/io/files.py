@@ -38,11 +38,6 @@ def _refusals(folder: Path) -> Iterator[None]:
     """Say in a sentence (:class:`InputError`) that ``folder`` is a file, or is refused by the
     system.
     """
-    if "\0" in str(folder):
-        raise InputError(
-            f"{str(folder)!r} cannot be the name of a folder (embedded null byte); choose another "
-            "one"
-        )
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InputError(f"{str(folder)!r} is a file; choose a folder")
     try:
@@ -89,7 +84,7 @@ def ensure_writable(folder: str | Path) -> Path:
 
 def write_file(path: str | Path, content: bytes, mode: int = 0o644) -> Path:
     """Write one file whole or not at all, and make its folder; raises :class:`InputError`."""
-    path = Path(path)
+    path = as_path(path, "a file")
     if path.is_dir():
         raise InputError(f"{str(path)!r} is a folder; name a file")
     with made(path.parent):

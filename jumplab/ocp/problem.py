@@ -34,7 +34,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from jumplab.errors import InputError
+from jumplab.errors import InputError, nearest, quoted
 
 PLACES = ("node", "mid", "interval", "start", "end", "problem")
 
@@ -133,6 +133,8 @@ class Term:
         if isinstance(self.expression, str):
             quantity = attrgetter(self.expression)
             object.__setattr__(self, "expression", lambda p: quantity(p))
+        if not isinstance(self.skip, tuple):
+            raise InputError(f"term {self.name!r}: skip must be a tuple, got {quoted(self.skip)}")
         if self.skip != (0, 0) and (self.is_cost or self.at != "node"):
             raise InputError(
                 f"term {self.name!r}: skip is for constraints at 'node'; a cost at {self.at!r} has "
@@ -284,9 +286,9 @@ class Problem:
         """Raise :class:`InputError` if a name, "name" or "phase/name", is no term or bound here."""
         for name in names:
             if not any(is_named(owner, x, (name,)) for owner, x in self.items()):
-                listed = ", ".join(sorted({x.name for _, x in self.items()}))
                 raise InputError(
-                    f"{what} {name!r}: the problem {self.name!r} has no such term; it has {listed}"
+                    f"{what} {quoted(name)}: the problem {self.name!r} has no such term; it has "
+                    f"{nearest({x.name for _, x in self.items()}, name)}"
                 )
 
     def table(self) -> list[dict]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
 from jumplab.arguments import real
-from jumplab.errors import InputError, quoted
+from jumplab.errors import InputError, nearest, quoted
 from jumplab.robot.files import LEG, ROLES
 from jumplab.robot.sagittal import SAGITTAL_JOINTS
 
@@ -97,7 +97,8 @@ def masses(
     for link in names:
         if not isinstance(link, str) or link not in bodies:
             raise robot.error(
-                f"there is no link {quoted(link)} to weigh otherwise; it has {', '.join(bodies)}"
+                f"there is no link {quoted(link)} to weigh otherwise; it has "
+                f"{nearest(bodies, link)}"
             )
     for link in dict.fromkeys(names):
         old = weights[link]

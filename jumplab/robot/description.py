@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.arguments import checked, real
-from jumplab.errors import RobotError, Shown, quoted
+from jumplab.errors import RobotError, Shown, quoted, require_type
 from jumplab.robot import changes, foreign
 from jumplab.robot.files import (
     ROLES,
@@ -137,6 +137,9 @@ class Robot(Shown):
         return cls(urdf, config_text)
 
     def __post_init__(self) -> None:
+        require_type(self.urdf, str, "the URDF's text")
+        require_type(self.config_text, str, "the configuration's text")
+        real(self.gravity, "gravity", "m/s^2")
         config = read_toml(self.config_text, "robot configuration")
         check_entries(config, TABLES)
         get = partial(entry, config)
@@ -219,7 +222,11 @@ class Robot(Shown):
 
     def _check_limits(self) -> None:
         """Refuse what the URDF parser would complain of on stderr, in lines of its own."""
-        for joint in ET.fromstring(self.urdf).iterfind("joint/limit/.."):
+        try:
+            urdf = ET.fromstring(self.urdf)
+        except ET.ParseError as e:
+            raise self.error(f"the URDF is no XML: {e}") from None
+        for joint in urdf.iterfind("joint/limit/.."):
             for key, text in joint.find("limit").items():
                 try:
                     float(text)

@@ -18,6 +18,8 @@ from matplotlib.patches import Circle, Polygon
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from jumplab.arguments import checked, shaped
+from jumplab.errors import InputError, quoted
 from jumplab.robot import SAGITTAL_LINKS, Robot, SagittalModel
 from jumplab.robot.sagittal import rotated
 from jumplab.robot.stance import stance_angles, stance_configuration
@@ -32,6 +34,7 @@ from jumplab.show.style import (
     PAGE_IN,
     PURPLE,
     VERMILION,
+    Color,
     bare,
     new_figure,
     shade,
@@ -52,6 +55,7 @@ ROLE_COLORS = {
 }
 
 
+@checked
 class Silhouette:
     """Outlines of the boxes around the shapes in a robot's URDF.
 
@@ -59,6 +63,8 @@ class Silhouette:
     """
 
     def __init__(self, robot: Robot, view: str = "side"):
+        if view not in VIEWS:
+            raise InputError(f"view {quoted(view)}: must be one of {', '.join(VIEWS)}")
         self.robot = robot
         self.view = view
         self._model = robot.model
@@ -95,11 +101,12 @@ class Silhouette:
         return pin.centerOfMass(self._model, self._data, q)[self._axes].copy()
 
 
+@checked
 def draw_robot(
     ax: Axes,
     body: Silhouette,
     q: np.ndarray,
-    color: str,
+    color: Color,
     *,
     strength: float = 1,
     shift: float = 0,
@@ -110,6 +117,7 @@ def draw_robot(
     ``strength`` 0 ... 1 is how much of the colour is used, less is nearer to white; ``shift`` moves
     it forward [m].
     """
+    q = shaped(q, (body.robot.model.nq,), "q")
     edge = tint(shade(color, 0.55), 0.25 + 0.75 * strength)
     look = dict(edgecolor=edge, linewidth=0.5, zorder=zorder)
     for kind, outline in body.outlines(q):
@@ -123,37 +131,49 @@ def draw_robot(
             ax.add_patch(Circle(np.add(places[name], (shift, 0.0)), radius, facecolor=face, **look))
 
 
+@checked
 def strobe(
     ax: Axes,
     body: Silhouette,
     frames: ArrayLike,
-    colors: list[str],
+    colors: list[Color],
     *,
     strengths: ArrayLike = 1,
     shifts: ArrayLike = 0,
 ) -> None:
     """Frames (n, nq), later ones in front; strengths and shifts [m] as in :func:`draw_robot`."""
+    frames = shaped(frames, (None, body.robot.model.nq), "frames")
     n = len(frames)
-    looks = np.broadcast_to(strengths, n), np.broadcast_to(shifts, n)
+    if len(colors) != n:
+        raise InputError(f"{len(colors)} colors given for {n} frames")
+    looks = (
+        np.full(n, x) if np.ndim(x) == 0 else shaped(x, (n,), name)
+        for x, name in ((strengths, "strengths"), (shifts, "shifts"))
+    )
     for k, (q, color, strength, shift) in enumerate(zip(frames, colors, *looks, strict=True)):
         draw_robot(ax, body, q, color, strength=strength, shift=shift, zorder=2 + k / n)
     equal_scales(ax)
 
 
+@checked
 def film_strip(
     ax: Axes,
     body: Silhouette,
     frames: np.ndarray,
     times: np.ndarray,
-    colors: list[str],
+    colors: list[Color],
     places: np.ndarray,
 ) -> None:
     """Frames (n, nq), CoM at ``places`` (n,) [m], times (n,) [s] below the ground."""
+    frames = shaped(frames, (None, body.robot.model.nq), "frames")
+    times = shaped(times, (len(frames),), "times")
+    places = shaped(places, (len(frames),), "places")
     strobe(ax, body, frames, colors, shifts=places - [body.com(q)[0] for q in frames])
     for place, t in zip(places, times, strict=True):
         ax.text(place, -BELOW_M, f"{t:.2f} s", ha="center", va="top", fontsize=7)
 
 
+@checked
 def draw_five_link(
     ax: Axes,
     model: SagittalModel,
@@ -174,11 +194,13 @@ def draw_five_link(
     return points
 
 
+@checked
 def five_link_points(
     model: SagittalModel, angles: np.ndarray, toe: ArrayLike = (0.0, 0.0)
 ) -> dict[str, np.ndarray]:
     """Places (2,) [m] of toe, heel, joints, hand and com for link angles (5,) [rad]."""
-    toe = np.asarray(toe, float)
+    toe = shaped(toe, (2,), "toe")
+    angles = shaped(angles, (len(model.span),), "angles")
     spans = [rotated(angle, span) for angle, span in zip(angles, model.span, strict=True)]
     tips = toe + np.cumsum(spans, axis=0)
     places = dict(zip(("ankle", "knee", "hip", "shoulder", "hand"), tips, strict=True))
@@ -186,6 +208,7 @@ def five_link_points(
     return places | {"toe": toe, "heel": toe + rotated(angles[0], model.heel), "com": com}
 
 
+@checked
 def draw_ground(
     ax: Axes, left: float, right: float, *, edge: float | None = None, height: float = 0.0
 ) -> None:
@@ -198,11 +221,14 @@ def draw_ground(
     ax.plot(x, z, color=GROUND, linewidth=0.8, zorder=1.5)
 
 
+@checked
 def draw_path(ax: Axes, x: np.ndarray, z: np.ndarray, zorder: float = 5.0) -> None:
     """The dotted path (n,) [m] of the CoM."""
+    z = shaped(z, (len(x),), "z")
     ax.plot(x, z, color=INK, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=zorder)
 
 
+@checked
 def draw_com(ax: Axes, place: np.ndarray) -> None:
     """The mark of the CoM at ``place`` (2,) [m]."""
     look = dict(markersize=6, color=VERMILION)
@@ -210,6 +236,7 @@ def draw_com(ax: Axes, place: np.ndarray) -> None:
     ax.plot(*place, marker="+", zorder=7, **look)
 
 
+@checked
 def equal_scales(ax: Axes) -> None:
     """Equal scales on both axes, everything in view."""
     ax.set_aspect("equal", adjustable="box")
@@ -218,6 +245,7 @@ def equal_scales(ax: Axes) -> None:
 
 # the sheet of a robot
 # ----------------------------------------------------------------------------------------------
+@checked
 @styled
 def robot_sheet(robot: Robot) -> Figure:
     """A robot standing, its moving joints with their roles from the front, and its five links."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from jumplab.arguments import checked
 from jumplab.auditing import audit
 from jumplab.errors import InputError, Shown
 from jumplab.show.bodies import robot_sheet
@@ -42,6 +43,7 @@ if TYPE_CHECKING:  # pictures need no simulator
 Card = tuple[Table, Picture | None]
 
 
+@checked
 def card(x: Shown) -> str | None:
     """HTML of a result's card; None for what has none."""
     make = next((CARDS[kind.__name__] for kind in type(x).__mro__ if kind.__name__ in CARDS), None)
@@ -132,6 +134,7 @@ def _of_clip(report: ClipReport) -> Card:
     return table(rows, columns | {"passed": "passed"}), clip_sheet(report)
 
 
+@checked
 @styled
 def clip_sheet(report: ClipReport) -> Figure:
     """What a judged clip does over time; shaded where no foot carries."""
@@ -186,6 +189,7 @@ CARDS: Mapping[str, Callable[[Any], Card]] = {
 }
 
 
+@checked
 class Plots:
     """Pictures of a plan or of a simulation: ``plan.plots.torques()``; each returns a matplotlib
     figure. Joints, torques and momentum are of plans.

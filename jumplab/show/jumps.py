@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jumplab.arguments import checked
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.motors import MotorLimits
@@ -113,9 +114,10 @@ def _panels(curves: dict[str, tuple], handles: list, height: float) -> tuple[Fig
     return fig, axes
 
 
+@checked
 @styled
 def joint_trajectories(
-    tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, ...] | None = None
+    tape: Tape, robot: Robot, *, guess: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 ) -> Figure:
     """F-8: one column per pair of joints, angle above and velocity below, limits thin.
 
@@ -155,6 +157,7 @@ def joint_trajectories(
     return fig
 
 
+@checked
 @styled
 def inertia_and_momentum(tape: Tape) -> Figure:
     """F-9: inertia, CoM velocity and angular momentum of the plan; dashed what stage 1 asked for.
@@ -178,6 +181,7 @@ def inertia_and_momentum(tape: Tape) -> Figure:
 
 # limits
 # ----------------------------------------------------------------------------------------------
+@checked
 @styled
 def margins(tape: Tape, robot: Robot, limits: Limits | None = None) -> Figure:
     """Torque against speed of each joint in its envelope; CoP in the sole and friction used through
@@ -243,6 +247,7 @@ def _draw_contact(cop: Axes, friction: Axes, tape: Tape, robot: Robot, limits: L
         ax.set(xlabel="time [s]", ylabel=label)
 
 
+@checked
 def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
     """Launch's ground reaction over ``t`` (n,) [s], left foot first.
 
@@ -268,6 +273,7 @@ def ground_reaction(tape: Tape, robot: Robot) -> dict[str, np.ndarray]:
 
 # simulations
 # ----------------------------------------------------------------------------------------------
+@checked
 @styled
 def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
     """F-1: a simulated or planned jump in one picture, each phase in its colour, with the CoM's
@@ -312,6 +318,7 @@ def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarr
     return np.array(rows)
 
 
+@checked
 @styled
 def momentum(result: SimulationResult, tape: Tape, robot: Robot) -> Figure:
     """F-12: CoM position [m] and velocity [m/s], inertia, and L during the launch; dashed the plan,

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, quoted
 from jumplab.show.style import (
     COLUMN_IN,
@@ -45,6 +46,7 @@ RADAR_COLORS = LAUNCH, FLIGHT, INK, LANDING
 RADAR_WIDTHS = 4.0, 2.6, 0.8, 1.6  # equal lines show below each other
 
 
+@checked
 @styled
 def envelope_map(envelope: Envelope, *others: Envelope) -> Figure:
     """The map of an envelope; a cell's colour is the limit that it uses most, its strength how much
@@ -105,6 +107,7 @@ def _draw_cells(ax: Axes, envelope: Envelope, colors: Mapping[str, Any], tick: s
     ax.grid(False)
 
 
+@checked
 @styled
 def margin_radar(reports: MarginReport | Mapping[str, MarginReport]) -> Figure:
     """How much of each disturbance plans bear, as a share of the largest that is tried: plain, and

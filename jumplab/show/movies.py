@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter1d
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, require_type
 from jumplab.io.files import settle, write_file
 from jumplab.io.motion import Motion, Record
@@ -46,6 +47,7 @@ SHOWN_M = -6.0, 8.0  # of the ground
 COLORS = 64  # of a GIF: more is larger, and looks the same
 
 
+@checked
 @dataclass(frozen=True)
 class Movie:
     """A finished moving picture; a notebook shows it, :meth:`save` writes it."""
@@ -68,6 +70,7 @@ class Movie:
         return f"<video {look} controls loop autoplay muted playsinline></video>"
 
 
+@checked
 def movie(
     robot: Robot, record: Record | Motion, scene: Scene | None = None, kind: str = "gif"
 ) -> Movie:

@@ -15,17 +15,20 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import is_color_like, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jumplab.errors import InputError
+from jumplab.arguments import checked, shaped
+from jumplab.errors import InputError, quoted
 from jumplab.io.folder import versions, write_file
 from jumplab.robot import Robot
 from jumplab.show.waiting import show_waiting
 from jumplab.task import JumpTask
 
+Color = str | tuple[float, float, float]  # as Matplotlib has them
 Tasks = JumpTask | Sequence[JumpTask] | None
 # Okabe and Ito's palette, which stays apart for every kind of colour vision
 LAUNCH, FLIGHT, LANDING = "#0072B2", "#E69F00", "#009E73"
@@ -37,6 +40,7 @@ LIMIT, GROUND = "#999999", "#8C8C8C"
 # width of one column of an IEEE page, and of both [in]
 COLUMN_IN = 3.5
 PAGE_IN = 7.16
+PAGE_MOST_IN = 100  # more is a typo
 DPI = 200  # of the PNG
 PNG_METADATA = {"Software": None}  # no versions and no dates: the same figure gives the same bytes
 PDF_METADATA = {"Creator": None, "Producer": None, "CreationDate": None}
@@ -78,29 +82,49 @@ def _file_of(fig: Figure, kind: str, **how: Any) -> bytes:
     return buffer.getvalue()
 
 
+@checked
 @styled
 def new_figure(width: float = COLUMN_IN, height: float = 2.4) -> Picture:
     """An empty figure of the style, ``width`` and ``height`` [in]."""
+    if not (0 < width < PAGE_MOST_IN and 0 < height < PAGE_MOST_IN):
+        raise InputError(
+            f"a figure of {width:g} x {height:g} in: each must be above 0 and below {PAGE_MOST_IN}"
+        )
     return Picture(figsize=(width, height))
 
 
-def tint(color: str, share: float) -> tuple[float, float, float]:
+@checked
+def tint(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of ``color`` mixed with white: share 1 is the colour itself, 0 is white."""
-    return tuple(1 - share * (1 - x) for x in to_rgb(color))
+    return tuple(1 - share * (1 - x) for x in _mixed(color, share))
 
 
-def shade(color: str, share: float) -> tuple[float, float, float]:
+@checked
+def shade(color: Color, share: float) -> tuple[float, float, float]:
     """(r, g, b) of ``color`` mixed with black: share 1 is the colour itself, 0 is black."""
-    return tuple(share * x for x in to_rgb(color))
+    return tuple(share * x for x in _mixed(color, share))
+
+
+def _mixed(color: Color, share: float) -> tuple[float, float, float]:
+    """(r, g, b) of a color of which there is to be a ``share``."""
+    if not is_color_like(color):
+        raise InputError(f"color {quoted(color)}: Matplotlib knows none such")
+    if not 0 <= share <= 1:
+        raise InputError(f"a share of {share:g} of a color is outside 0 ... 1")
+    return to_rgb(color)
 
 
 # curves of a jump
 # -----------------------------------------------------------------------------------------------
+@checked
 def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs) -> list[Line2D]:
     """Plot ``y`` (N,) over ``t`` (N,), each run of one ``phase`` (N,) in that phase's colour.
 
     ``phase`` holds names of :data:`PHASE_COLORS`; further keywords go to ``Axes.plot``.
     """
+    t, y = (shaped(x, (len(phase),), name) for x, name in ((t, "t"), (y, "y")))
+    if unknown := sorted({*map(str, phase)} - {*PHASE_COLORS}):
+        raise InputError(f"phase {unknown[0]!r}: must be one of {', '.join(PHASE_COLORS)}")
     cuts = np.flatnonzero(phase[1:] != phase[:-1]) + 1
     lines = []
     for rows in np.split(np.arange(len(phase)), cuts):
@@ -109,6 +133,7 @@ def by_phase(ax: Axes, t: np.ndarray, y: np.ndarray, phase: np.ndarray, **kwargs
     return lines
 
 
+@checked
 def compare(
     ax: Axes,
     curve: tuple,
@@ -125,18 +150,21 @@ def compare(
     ax.set_ylabel(label)
 
 
+@checked
 def mark_time(ax: Axes, times: Iterable[float]) -> None:
     """Thin dotted vertical lines at the ``times`` [s] where phases change."""
     for t in times:
         ax.axvline(t, color=LIMIT, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
 
 
+@checked
 def limits(ax: Axes, *bounds: float) -> None:
     """Thin horizontal lines at bounds."""
     for bound in bounds:
         ax.axhline(bound, **LIMIT_STYLE)
 
 
+@checked
 def phase_handles(
     *phases: str, reference: str | None = None, limit: str | None = None
 ) -> list[Line2D]:
@@ -147,11 +175,13 @@ def phase_handles(
     return handles
 
 
-def legend_above(fig: Figure, handles: list) -> None:
+@checked
+def legend_above(fig: Figure, handles: list[Artist]) -> None:
     """One legend over all panels, outside of them."""
     fig.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.4)
 
 
+@checked
 def panel_letters(axes: Iterable[Axes]) -> None:
     """(a), (b), ... before the panels' titles."""
     for letter, ax in zip("abcdefghijklmnop", axes, strict=False):
@@ -159,6 +189,7 @@ def panel_letters(axes: Iterable[Axes]) -> None:
         ax.set_title(title.rstrip())
 
 
+@checked
 def bare(ax: Axes) -> None:
     """No frame, ticks or grid: for pictures rather than plots."""
     # hidden ticks would still be laid out, which takes longer than the picture
@@ -169,6 +200,7 @@ def bare(ax: Axes) -> None:
 
 # saving
 # ----------------------------------------------------------------------------------------------
+@checked
 @styled
 def save_figure(
     fig: Figure,
@@ -219,6 +251,7 @@ def caption_text(caption: str, task: Tasks = None, robot: Robot | None = None) -
     return "\n".join([*lines, f"Made with {made_with()}.", ""])
 
 
+@checked
 def describe_task(task: JumpTask) -> str:
     """The target in words, such as "1.00 m forward, CoM rise 0.50 m"."""
     words = [f"{abs(task.distance_m):.2f} m {'forward' if task.distance_m >= 0 else 'backward'}"]

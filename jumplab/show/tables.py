@@ -11,9 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.arguments import checked
+from jumplab.errors import InputError
 from jumplab.io import folder
 
+DIGITS_MOST = 17  # a float has no more
 
+
+@checked
 @dataclass(frozen=True, repr=False)
 class Table:
     """A finished table of texts; make one with :func:`table`."""
@@ -38,6 +43,7 @@ class Table:
         return f"<table><thead>{head}</thead><tbody>{body}</tbody></table>"
 
 
+@checked
 def table(
     rows: Iterable[Mapping],
     columns: Iterable[str] | Mapping[str, str] | None = None,
@@ -51,6 +57,9 @@ def table(
     them. Numbers have ``digits`` significant digits, or ``decimals`` places after the point if they
     are not whole by type.
     """
+    for name, places in (("digits", digits), ("decimals", decimals)):
+        if places is not None and not 0 <= places <= DIGITS_MOST:
+            raise InputError(f"{name} = {places} is outside 0 ... {DIGITS_MOST}")
     rows = list(rows)
     if columns is None:
         columns = list(rows[0]) if rows else []

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError
 from jumplab.io.folder import write_file
 from jumplab.io.motion import CONTACT_FORCE_N, Motion, Record
@@ -40,6 +41,7 @@ TRACK_DEPTH_M = 0.06
 FILES = {"PAGE": "page.html", "STYLE": "page.css", "PLAYER": "player.js"}
 
 
+@checked
 @dataclass(frozen=True)
 class Page:
     """A finished page that needs nothing else; a notebook shows it, :meth:`save` writes it."""
@@ -62,6 +64,7 @@ class Page:
         )
 
 
+@checked
 def page(
     robot: Robot,
     *,

@@ -185,6 +185,7 @@ class Push:
         return self.step <= step < self.step + self.steps
 
 
+@checked
 @dataclass(frozen=True)
 class Perturbation:
     """One robot of the population: factors and shifts by link or joint name; what is not named is
@@ -231,7 +232,6 @@ class Perturbation:
                 raise InputError(f"{name} = {delay_s:g} s is outside 0 ... 0.02 s")
 
     @classmethod
-    @checked
     def draw(
         cls, robot: Robot, seed: int, ranges: Ranges = Ranges(), noise: SensorNoise = SensorNoise()
     ) -> Perturbation:

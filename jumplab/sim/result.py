@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.control import STAND_S
 from jumplab.control.kinematics import Gauge, about_vertical, pitch_of
 from jumplab.errors import InputError, Shown, SolverError
@@ -185,6 +186,7 @@ class SimulationResult(Shown, Named):
         settings = {"settings": self.settings}
         return {"schema": SIMULATION_SCHEMA, **asdict(self.metrics), **settings, **checked}
 
+    @checked
     def save(self, folder: str | Path, extra: dict | None = None) -> None:
         """Write ``simulation.npz``, then ``simulation.json`` (with ``extra`` entries), each whole
         or not at all.
@@ -197,6 +199,7 @@ class SimulationResult(Shown, Named):
         write_file(Path(folder) / REPORT_NAME, text.encode())
 
     @classmethod
+    @checked
     def load(cls, folder: str | Path, robot: Robot) -> SimulationResult | None:
         """What :meth:`save` wrote into ``folder``; None if it holds no simulation. Raises
         :class:`InputError` if a file is damaged, or the simulation is not one of ``robot``.

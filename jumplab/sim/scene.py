@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from jumplab.arguments import checked
+from jumplab.arguments import checked, shaped
 from jumplab.control.kinematics import Gauge, about_vertical, turned
 from jumplab.errors import InputError
 from jumplab.robot import Robot
@@ -35,6 +35,7 @@ class Contacts:
     colliding: bool  # whether links of the robot press on each other
 
 
+@checked
 @dataclass(frozen=True)
 class Block:
     """One box: from ``x_from`` to ``x_to`` along the jump, as wide as the world unless told, with
@@ -74,6 +75,7 @@ class Block:
 NOTHING = Block(-REACH_M, REACH_M, -REACH_M)  # where there is no ground
 
 
+@checked
 @dataclass(frozen=True)
 class Scene:
     """A named list of blocks. The robot starts with the middle of its soles at x = 0 on a top at z
@@ -93,7 +95,6 @@ class Scene:
         return cls.level("flat", {})
 
     @classmethod
-    @checked
     def level(cls, name: str, tops: Mapping[float, float], along_rad: float = 0.0) -> Scene:
         """Level ground at z = 0 that from each place [m] on has another height [m], such as the
         ditch {0.3: -1.0, 0.8: 0.0}, the platform {0.5: 0.4} or the stairs {0.3: 0.1, 0.6: 0.2}.
@@ -116,12 +117,15 @@ class Scene:
         """The ground that a plan was made for, from its ``summary``: flat, or two levels that meet
         at the edge.
         """
-        top = summary["target"]["platform_m"]
-        if top == 0:
-            return cls.flat()
-        # soles' middle at x = 0
-        edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
-        return cls.level("platform", {edge: top}, JumpTask(**summary["target"]).along_rad)
+        try:
+            task = JumpTask(**summary["target"])
+            if task.platform_m == 0:
+                return cls.flat()
+            # soles' middle at x = 0
+            edge = summary["platform_edge_m"] + robot.foot.toe - float(robot.foot.center[0])
+        except (KeyError, TypeError) as e:
+            raise InputError(f"the summary is none of a plan ({e})") from None
+        return cls.level("platform", {edge: task.platform_m}, task.along_rad)
 
     @classmethod
     def of_run(cls, report: Mapping[str, Any], summary: Mapping[str, Any], robot: Robot) -> Scene:
@@ -134,9 +138,11 @@ class Scene:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Scene:
         """The scene of plain data, those of :func:`dataclasses.asdict`."""
-        return cls(
-            data["name"], tuple(Block(**block) for block in data["blocks"]), data["along_rad"]
-        )
+        try:
+            blocks = tuple(Block(**block) for block in data["blocks"])
+            return cls(data["name"], blocks, data["along_rad"])
+        except (KeyError, TypeError) as e:
+            raise InputError(f"the scene is damaged ({e})") from None
 
     @property
     def plain(self) -> bool:
@@ -149,7 +155,7 @@ class Scene:
         """
         if max(abs(heading_rad), abs(self.along_rad)) < STRAIGHT_RAD:
             return self
-        x, _ = self.along(Gauge(robot).soles(q))
+        x, _ = self.along(Gauge(robot).soles(shaped(q, (robot.model.nq,), "q")))
         return Scene(self.name, (Block(-REACH_M, REACH_M, self.top_at(x)),))
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -205,7 +211,7 @@ class Scene:
 
     def along(self, point: np.ndarray) -> tuple[float, float]:
         """Place of a ``point`` (3,) along the heading of the landing, and to its left [m]."""
-        x, y, _ = about_vertical(-self.along_rad) @ point
+        x, y, _ = about_vertical(-self.along_rad) @ shaped(point, (3,), "the point")
         return float(x), float(y)
 
     def landing_moved(
@@ -222,7 +228,7 @@ class Scene:
         ``ends`` are the configurations (nq,) in which the robot starts and lands. Raises
         :class:`InputError` if the soles stand at both on the same ground.
         """
-        start, end = map(Gauge(robot).corners, ends)
+        start, end = (Gauge(robot).corners(shaped(q, (robot.model.nq,), "q")) for q in ends)
         way = (end.mean(axis=0) - start.mean(axis=0))[:2]
         scene = self
         if len(self.blocks) == 1 and self.blocks[0] == Block(-REACH_M, REACH_M):
@@ -248,7 +254,7 @@ class Scene:
         """How much higher the ground is than the blocks of the ``planned`` scene, under the soles
         of ``q`` [m].
         """
-        soles = Gauge(robot).soles(q)
+        soles = Gauge(robot).soles(shaped(q, (robot.model.nq,), "q"))
         real, height = self.below(soles)
         return height - real.soft_m - planned.below(soles)[0].top
 
@@ -259,10 +265,10 @@ class Scene:
         Raises :class:`InputError` if a corner of a sole is not on the ground then, or the CoM not
         above the soles.
         """
+        q = shaped(q, (robot.model.nq,), "q")
         gauge = Gauge(robot)
         middle = gauge.soles(q)
         under, _ = self.below(middle)
-        q = q.copy()
         if not under.even:
             along = about_vertical(self.along_rad)
             turn = along @ under.turn @ along.T

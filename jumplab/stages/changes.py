@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
-from jumplab.errors import InputError, quoted, require_type
+from jumplab.errors import InputError, nearest, quoted, require_type
 from jumplab.ocp import Problem, Term, changed
 
 LAUNCH = ("flat", "toe")  # phases of "launch" in stages 1 and 3
@@ -115,8 +115,9 @@ def sorted_out(
         extra_terms[stage][phase] = (*extra_terms[stage].get(phase, ()), *extra)
         for term in extra_terms[stage][phase]:
             require_type(term, Term, f"an own term of {name!r}")
-    for names, by_stage in ((weights, scales), (dict.fromkeys(off), gone)):
-        for name, value in names.items():
+    switches = [(name, None) for name in off]
+    for names, by_stage in ((weights.items(), scales), (switches, gone)):
+        for name, value in names:
             stage, rest = _stage_of(name)
             by_stage[stage][rest] = value
     return {
@@ -172,7 +173,9 @@ def named(kind: type[Settings], given: Settings | Mapping[str, Any] | None) -> d
         )
     for name, value in given.items():
         if name not in names:
-            raise InputError(f"{kind.__name__} has no {quoted(name)}; it has {', '.join(names)}")
+            raise InputError(
+                f"{kind.__name__} has no {quoted(name)}; it has {nearest(names, name)}"
+            )
         if _sort(value) not in [_sort(getattr(x, name)) for x in (usual, usual.of_flip())]:
             raise InputError(
                 f"{kind.__name__}: {name} = {quoted(value)} must be like {getattr(usual, name)!r}"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jumplab.arguments import checked
 from jumplab.errors import InputError, Shown
 from jumplab.io.columns import Named
 from jumplab.io.tape import Tape
@@ -34,6 +35,7 @@ class StageRow:
     solve_s: float
 
 
+@checked
 @dataclass(frozen=True, repr=False)
 class JumpPlan(Shown, Named):
     """A finished plan.

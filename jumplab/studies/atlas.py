@@ -52,6 +52,7 @@ class Node:
     x: np.ndarray  # (n,) the motion, as the problem's scaled variables
 
 
+@checked
 class Atlas:
     """Plans over a grid; give it to :class:`jumplab.Planner`, whose direct plans then begin with
     it.
@@ -84,7 +85,6 @@ class Atlas:
 
     # building ----------------------------------------------------------------------------------
     @classmethod
-    @checked
     def build(
         cls,
         robot: Robot,
@@ -214,7 +214,6 @@ class Atlas:
         return short_hash([self.key, self.distances, self.heights, costs])
 
     # file --------------------------------------------------------------------------------------
-    @checked
     def save(self, folder: str | Path) -> Path:
         """Write ``atlas.npz`` (its head as JSON, motions (nodes, n)) into ``folder``; returns its
         path.
@@ -238,7 +237,6 @@ class Atlas:
             return write_file(folder / FILE, buffer.getvalue())
 
     @classmethod
-    @checked
     def load(cls, folder: str | Path) -> Atlas:
         """The atlas of a ``folder`` (that of :meth:`save`); raises :class:`InputError` if there is
         none, or it is damaged or unfinished.

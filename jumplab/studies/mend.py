@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from jumplab.arguments import checked
 from jumplab.auditing.clip import ClipReport, judge, phases_of
 from jumplab.errors import InfeasibleError, InputError, Shown, SolverError, require_type
 from jumplab.io.clip import Clip
@@ -114,6 +115,7 @@ class Mended(Shown):
         }
 
 
+@checked
 def mend(
     motion: Any,
     robot: Robot | str = "bhr",

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from jumplab.arguments import checked
-from jumplab.errors import InputError, quoted, require_type
+from jumplab.errors import InputError, quoted
 from jumplab.robot import Robot
 from jumplab.robot.stance import leg_length
 from jumplab.stages.whole_body.settings import Limits, Mesh
@@ -71,6 +71,7 @@ class ContactPhase:
         return self.feet == FLIGHT
 
     @classmethod
+    @checked
     def usual(cls, feet: str, robot: Robot) -> ContactPhase:
         """A phase with times [s] and intervals that suit the robot's legs; ``feet`` as above."""
         kind = "toes"
@@ -81,6 +82,7 @@ class ContactPhase:
         return cls(feet, (low, high), guess, INTERVALS[kind])
 
 
+@checked
 @dataclass(frozen=True)
 class Place:
     """Where a foot comes down, against where it stood first; and how far the optimiser may move it.
@@ -101,6 +103,7 @@ class Place:
     free_rad: float = 0.0
 
 
+@checked
 @dataclass(frozen=True)
 class Contacts:
     """A contact schedule.
@@ -130,8 +133,6 @@ class Contacts:
     landings: tuple[tuple[int, int], ...] = field(init=False)
 
     def __post_init__(self):
-        for p in self.phases:
-            require_type(p, ContactPhase, "a phase of the schedule")
         named = [replace(p, name=p.name or f"{k} {p.feet}") for k, p in enumerate(self.phases, 1)]
         object.__setattr__(self, "phases", tuple(named))
         object.__setattr__(self, "places", tuple(self.places))
@@ -224,7 +225,6 @@ class Contacts:
     # the usual ones, with steps of usual length where none is given [m]
     # ------------------------------------------------------------------------------------------
     @classmethod
-    @checked
     def of(
         cls, feet: str, robot: Robot, places: Iterable[Place] = (), *, ends: str = "rest"
     ) -> Contacts:
@@ -235,7 +235,6 @@ class Contacts:
         return cls(tuple(ContactPhase.usual(f, robot) for f in feet.split()), tuple(places), ends)
 
     @classmethod
-    @checked
     def hop(
         cls, robot: Robot, ahead_m: float | None = None, *, foot: str = "left", same: bool = False
     ) -> Contacts:
@@ -249,7 +248,6 @@ class Contacts:
         return cls.of(f"LR {up} {up.lower()} - {f'{up} ' * same}LR", robot, [place, place])
 
     @classmethod
-    @checked
     def run_up(cls, robot: Robot, steps: int = 1, step_m: float | None = None) -> Contacts:
         """One or more steps of ``step_m`` [m], then off one foot, and down on both."""
         d = _step(robot, step_m)
@@ -262,7 +260,6 @@ class Contacts:
         return cls.of(" ".join(words), robot, [Place(x) for x in (*ahead, jump, jump)])
 
     @classmethod
-    @checked
     def leap(cls, robot: Robot, step_m: float | None = None, *, share: float = 2.4) -> Contacts:
         """A step of ``step_m`` [m], then off the right foot, and down on the left one, the other
         following; ``share`` is how many steps ahead they land.
@@ -271,13 +268,11 @@ class Contacts:
         return cls.of("LR L lR R r - L LR", robot, [Place(d), Place(share * d), Place(share * d)])
 
     @classmethod
-    @checked
     def hurdle(cls, robot: Robot, step_m: float | None = None) -> Contacts:
         """A leap that goes farther, ``step_m`` [m] as there."""
         return cls.leap(robot, step_m, share=2.8)
 
     @classmethod
-    @checked
     def bound(cls, robot: Robot, jumps: int = 2, jump_m: float | None = None) -> Contacts:
         """Jumps of ``jump_m`` [m] off both feet and down on both, in a row."""
         d = _step(robot, jump_m)
@@ -285,14 +280,12 @@ class Contacts:
         return cls.of("LR" + " lr - LR" * jumps, robot, places)
 
     @classmethod
-    @checked
     def step_off(cls, robot: Robot, drop_m: float, ahead_m: float | None = None) -> Contacts:
         """Off an edge with one foot first, in flight, and down on both, ``drop_m`` [m] lower."""
         low = Place(_off(robot, ahead_m), up_m=-drop_m)
         return cls.of("LR L l - LR", robot, [low, low])
 
     @classmethod
-    @checked
     def drop_jump(
         cls, robot: Robot, drop_m: float, ahead_m: float | None = None, jump_m: float | None = None
     ) -> Contacts:
