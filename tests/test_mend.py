@@ -39,8 +39,8 @@ def test_short_events_are_one_and_a_motion_begins_and_ends_on_both_feet(words, f
     phases = planned_phases(seen(words))
     assert " ".join(x for x, *_ in phases) == feet
     assert [begin for _, begin, _ in phases[1:]] == [end for *_, end in phases[:-1]]
-    if feet == "LR lr - LR":  # a foot's last two frames go to the phases beside them, half each
-        assert phases[2][1:] == pytest.approx((31 / 30, 45 / 30))
+    if feet == "LR lr - LR":  # a foot's last two frames are no flight
+        assert phases[2][1:] == pytest.approx((32 / 30, 44 / 30))
     if feet == "LR":
         assert phases[0][1:] == pytest.approx((0.0, 63 / 30))
 

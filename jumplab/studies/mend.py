@@ -34,16 +34,15 @@ from jumplab.stages.whole_body.tape import feet_of
 AROUND_S = 0.6  # of standing, before the first and after the last event
 MERGED_S = 0.12  # phases that are shorter are events of one ...
 SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
-TOES_S = 0.1  # on the toes before a flight, ...
-ROLLING_S = 0.22  # ... if the phase before it is this long
-# steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
+TOES_S = 0.1  # on the toes before a flight, but at most half of the phase
+# steps [s] of phases on flat feet, where a foot lands, on the toes, in flight; least number of them
+STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.014, FLIGHT: 0.024}
 LEAST_STEPS = 6
 MOST_STEPS = 60
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
 # makes flights too long for their rise
 STRETCH = (0.6, 1.5)
-FLIGHT_STRETCH = (0.4, 1.2)
+FLIGHT_STRETCH = (0.86, 1.15)
 FREE_M = (0.15, 0.15)  # by which footholds may move
 FREE_RAD = 0.4
 BENT_RAD = 0.35  # of knees, down to which the base is lowered
@@ -204,29 +203,31 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
         rows[-1][2] = min(rows[-1][2], rows[-1][1] + AROUND_S)
     for k in range(len(rows) - 1, 0, -1):
         feet, a, b = rows[k - 1]
-        if rows[k][0] == FLIGHT and b - a > ROLLING_S:
-            rows[k - 1][2] = b - TOES_S
-            rows.insert(k, [feet.lower(), b - TOES_S, b])
+        if rows[k][0] == FLIGHT:
+            rises = b - min(TOES_S, (b - a) / 2)
+            rows[k - 1][2] = rises
+            rows.insert(k, [feet.lower(), rises, b])
     return [(feet, a, b) for feet, a, b in rows]
 
 
 def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:
-    """Phases without those too short to count, whose time goes to those beside them."""
+    """Phases without those too short to count, those on one foot first; their time goes to those
+    beside them, but to flights only what is between two of them.
+    """
     rows = [list(row) for row in phases]
-    k = 0
-    while k < len(rows):
-        feet, a, b = rows[k]
-        again = k > 0 and rows[k - 1][0] == feet
-        if not again and (len(rows) == 1 or b - a >= _shortest(rows, k)):
-            k += 1
-            continue
-        del rows[k]
-        if again:
-            rows[k - 1][2] = b
-        elif 0 < k < len(rows):
-            rows[k - 1][2] = rows[k][1] = (a + b) / 2
-        k = 0
-    return rows
+    while True:
+        for k in range(len(rows) - 1, 0, -1):
+            if rows[k][0] == rows[k - 1][0]:
+                rows[k - 1][2] = rows.pop(k)[2]
+        short = [k for k, (_, a, b) in enumerate(rows) if b - a < _shortest(rows, k)]
+        if not short or len(rows) == 1:
+            return rows
+        k = min(short, key=lambda k: (rows[k][0] == "LR", rows[k][2] - rows[k][1]))
+        _, a, b = rows.pop(k)
+        if 0 < k < len(rows):
+            flies = [rows[k - 1][0] == FLIGHT, rows[k][0] == FLIGHT]
+            at = (a + b) / 2 if flies[0] == flies[1] else a if flies[0] else b
+            rows[k - 1][2] = rows[k][1] = at
 
 
 def _shortest(rows: list[list], k: int) -> float:
@@ -301,7 +302,7 @@ class Draft:
             lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
             low, high = FLIGHT_STRETCH if feet == FLIGHT else STRETCH
             kind = feet if feet == FLIGHT else "toe" if feet.islower() else "flat"
-            if k and self.phases[k - 1][0] == FLIGHT:
+            if k and kind == "flat" and self.holds[k].keys() - self.holds[k - 1].keys():
                 kind = "landing"
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
             phases.append(ContactPhase(feet, (low * lasts, high * lasts), lasts, steps))

@@ -143,7 +143,7 @@ class Weights:
     track_duration: float = 50.0  # [1] / [s]^2
 
     # where a given motion is followed
-    follow_joints: float = 20.0  # [1] / [rad]^2 / [s]
+    follow_joints: float = 30.0  # [1] / [rad]^2 / [s]
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter

@@ -200,8 +200,9 @@ def _ground(
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
         leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
-        if len(instants) > 1 and (_on_a_line(holds, pitch) or leaves or schedule.follows):
-            given = pitch, holds, instants, robot, wrench.sum(axis=1)
+        line = _on_a_line(holds, pitch) and not (schedule.follows and len(holds) == 1)
+        if len(instants) > 1 and (line or leaves or schedule.follows):
+            given = pitch, holds, instants, robot, wrench.sum(axis=1), line
             motion = _balanced(legs, motion, *given, stays=not leaves)
         motion = legs.held(motion, holds, pitch)
         parts.append((motion, wrench, contacts))
@@ -243,12 +244,13 @@ def _balanced(
     t: np.ndarray,
     robot: Robot,
     wrench: np.ndarray,
+    line: bool,
     stays: bool,
 ) -> Motion:
     """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
-    Where all feet that carry are on their toes, in one line, no ground force has a moment about
-    that line: what the motion between nodes needs of it goes. Elsewhere all that it needs besides
+    Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
+    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides
     the planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. What
     a phase moves the base by goes within the phase if it ``stays`` on the ground.
     """
@@ -257,7 +259,6 @@ def _balanced(
     q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
     ahead, across, _ = pin.rpy.rpyToMatrix(0.0, 0.0, edge[3]).T
-    line = _on_a_line(holds, pitch)
     every = np.arange(len(t))
     ways = np.array([[*ahead, 0.0, 0.0, 0.0]]) if line else np.eye(BASE)
     seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)

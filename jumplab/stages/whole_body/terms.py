@@ -577,8 +577,9 @@ def phase_terms(
         terms += tracking(m)
     if follows:
         terms += following(m, landed)
-    if m.feet == "LR":
+    if m.feet == "LR" or (follows and m.feet.isupper()):
         terms += reserve(m)
+    if m.feet == "LR":
         if both_carry and (m.limits.least_push or not m.free.even):
             terms.append(loads(m))
     if len(m.modes) == 1 or follows:
