@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,17 @@ from jumplab.stages.whole_body.motions import HEEL_UP, Motion, Reach, configurat
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
 
-AROUND_S = 0.6  # of standing, before the first and after the last event
+# of standing, before the first and after the last event: there it begins and ends where the joints
+# move least, [rad/s] rms, a second more of it counted as one more of those
+AROUND_S = (0.6, 1.2)
+LONG_S = 1.5  # of standing between two motions, of which one is mended
 MERGED_S = 0.12  # phases that are shorter are events of one ...
 SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
 TOES_S = 0.1  # on the toes before a flight, but at most half of the phase
 # steps [s] of phases on flat feet, where a foot lands, on the toes, in flight; least number of them
 STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.014, FLIGHT: 0.024}
 LEAST_STEPS = 6
-MOST_STEPS = 60
+MOST_STEPS = 90
 # shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
 # makes flights too long for their rise
 STRETCH = (0.6, 1.5)
@@ -181,7 +185,7 @@ def spans(flags: np.ndarray) -> list[tuple[int, int]]:
 # ----------------------------------------------------------------------------------------------
 def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     """Feet that carry, from and to [s]: those of the clip without events of less than
-    :data:`MERGED_S`, cut to what is :data:`AROUND_S` around the others.
+    :data:`MERGED_S`, cut to what stands around the others (:data:`AROUND_S`).
 
     Where both feet are fast for long but low, the clip skips, and flies here.
     """
@@ -197,10 +201,14 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             f"clip {before.clip.name!r}: it never stands on both feet, and a motion has to begin "
             f"so; give more of it"
         )
-    rows = rows[standing[0] : standing[-1] + 1]
+    # between long standing the motion that flies longest, else that of most phases
+    long = [k for k in standing[1:-1] if rows[k][2] - rows[k][1] > LONG_S]
+    ends = pairwise([standing[0], *long, standing[-1]])
+    parts = [[list(row) for row in rows[a : b + 1]] for a, b in ends] or [rows[standing[0] :]]
+    rows = max(parts, key=lambda x: (sum(b - a for f, a, b in x if f == FLIGHT), len(x)))
     if len(rows) > 1:
-        rows[0][1] = max(rows[0][1], rows[0][2] - AROUND_S)
-        rows[-1][2] = min(rows[-1][2], rows[-1][1] + AROUND_S)
+        rows[0][1] = max(rows[0][1], rows[0][2] - _standing_s(before, rows[0][2], -1))
+        rows[-1][2] = min(rows[-1][2], rows[-1][1] + _standing_s(before, rows[-1][1], 1))
     for k in range(len(rows) - 1, 0, -1):
         feet, a, b = rows[k - 1]
         if rows[k][0] == FLIGHT:
@@ -208,6 +216,13 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             rows[k - 1][2] = rises
             rows.insert(k, [feet.lower(), rises, b])
     return [(feet, a, b) for feet, a, b in rows]
+
+
+def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
+    """How much of the standing before (``way`` -1) or after an event to keep [s]."""
+    rates = np.sqrt((before.tape.v[:, 6:] ** 2).mean(axis=1))
+    kept = np.arange(AROUND_S[0], AROUND_S[1] + 1e-9, 1 / before.clip.fps)
+    return float(kept[np.argmin(np.interp(event_s + way * kept, before.clip.t, rates) + kept)])
 
 
 def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:

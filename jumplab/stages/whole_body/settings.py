@@ -97,6 +97,7 @@ class Limits:
             straight_knee_rad=0.25,
             sides_share=0.3,
             hands_inward_m=1.0,
+            link_distance_m=0.008,  # its arms are near its legs for long, also between nodes
         )
 
     def of_flip(self) -> Limits:
@@ -143,7 +144,7 @@ class Weights:
     track_duration: float = 50.0  # [1] / [s]^2
 
     # where a given motion is followed
-    follow_joints: float = 30.0  # [1] / [rad]^2 / [s]
+    follow_joints: float = 40.0  # [1] / [rad]^2 / [s]
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
