@@ -43,10 +43,11 @@ TOES_S = 0.1  # on the toes before a flight, but at most half of the phase
 STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.014, FLIGHT: 0.024}
 LEAST_STEPS = 6
 MOST_STEPS = 90
-# shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
-# makes flights too long for their rise
+# shares of a phase's time within which it may be changed, on the ground and in flight; feet that
+# kinematics moves in no time need some of it
 STRETCH = (0.6, 1.5)
 FLIGHT_STRETCH = (0.86, 1.15)
+SHORT_FLIGHT_S = 0.3
 FREE_M = (0.15, 0.15)  # by which footholds may move
 FREE_RAD = 0.4
 BENT_RAD = 0.35  # of knees, down to which the base is lowered
@@ -315,12 +316,14 @@ class Draft:
         phases = []
         for k, (feet, a, b) in enumerate(self.phases):
             lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
-            low, high = FLIGHT_STRETCH if feet == FLIGHT else STRETCH
+            low, high = (lasts * x for x in (FLIGHT_STRETCH if feet == FLIGHT else STRETCH))
+            if feet == FLIGHT:
+                high = max(high, SHORT_FLIGHT_S)
             kind = feet if feet == FLIGHT else "toe" if feet.islower() else "flat"
             if k and kind == "flat" and self.holds[k].keys() - self.holds[k - 1].keys():
                 kind = "landing"
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
-            phases.append(ContactPhase(feet, (low * lasts, high * lasts), lasts, steps))
+            phases.append(ContactPhase(feet, (low, high), lasts, steps))
             for side, hold in self.holds[k].items():
                 if k and side in self.holds[k - 1]:
                     continue

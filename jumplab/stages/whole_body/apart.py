@@ -98,13 +98,14 @@ def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
     """Both; rows of one pair, face and phase are one row for the nodes from the first to the last
     of them.
 
-    Links that met in spite of their row met between its nodes: it asks for :data:`MORE_M` [m] more.
+    Links that met where their row is met between its nodes: it asks for :data:`MORE_M` [m] more.
     """
     out = {(x.phase, x.pair.key): x for x in old}
     for x in new:
         key = x.phase, x.pair.key
         if y := out.get(key):
-            more = y.more_m + MORE_M
+            inside = x.first + NODES >= y.first and x.last - NODES <= y.last
+            more = y.more_m + MORE_M * inside
             x = replace(x, first=min(x.first, y.first), last=max(x.last, y.last), more_m=more)
         out[key] = x
     return tuple(out.values())

@@ -141,12 +141,16 @@ def _travel(robot: Robot, origin: np.ndarray, turn: np.ndarray) -> dict[str, np.
     return {"soles_travel": middle[1] - middle[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
-def _joining(before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray) -> Motion:
+def _joining(
+    before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray, most_s: float
+) -> Motion:
     """What to add to a motion (n, k) on three levels that begins at ``after`` (k,) each, so that it
-    begins at ``before`` and is itself again after :data:`JOINING_S`; ``t`` (n,) since then [s].
+    begins at ``before`` and is itself again after :data:`JOINING_S`, ``most_s`` at the latest;
+    ``t`` (n,) since then [s].
     """
     ends = [(x - y, np.zeros(len(x))) for x, y in zip(before, after, strict=True)]
-    return quintic(ends, JOINING_S, np.minimum(t, JOINING_S)[:, None])
+    lasts = min(JOINING_S, most_s)
+    return quintic(ends, lasts, np.minimum(t, lasts)[:, None])
 
 
 # on the ground
@@ -193,7 +197,8 @@ def _ground(
             places, rates, gains = (x[-1] for x in before.motion)
             first = solved[numbers[0]]
             after = (first.q[0, : b.nv], first.v[0, : b.nv], gains)
-            more = _joining((places, rates, gains), after, instants - t[0])
+            since = instants - t[0]
+            more = _joining((places, rates, gains), after, since, t[-1] - t[0])
             motion = [x + y for x, y in zip(motion, more, strict=True)]
         pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
         holds = holds_of(phase, b)
@@ -324,7 +329,7 @@ def _flight(
     since = t - t[0]
     planned = flight.sample(since)
     last = [x[-1, BASE:] for x in before.motion]
-    more = _joining(last, [x[0, BASE:] for x in planned], since)
+    more = _joining(last, [x[0, BASE:] for x in planned], since, since[-1])
     joints = [x[:, BASE:] + y for x, y in zip(planned, more, strict=True)]
     fall = Fall(robot, model, before.motion)
     missed = _arriving(body, [x[-1:, : len(model.names)] for x in planned], sides)
