@@ -55,6 +55,7 @@ LOWER_M = 0.005  # steps of that
 MOST_LOWER_M = 0.12
 OFF_M = 0.002
 START_ROUNDS = 30
+BEGUN_OFF = 0.05  # [m, rad] by which a sole may miss its place as it begins
 START_ROOM_RAD = 0.01  # of the first posture to the stops
 SMOOTH_FRAMES = 3.0
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
@@ -188,13 +189,16 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     """Feet that carry, from and to [s]: those of the clip without events of less than
     :data:`MERGED_S`, cut to what stands around the others (:data:`AROUND_S`).
 
-    Where both feet are fast for long but low, the clip skips, and flies here.
+    Where both feet are fast for long but low, the clip skips: here it flies, but between two steps
+    on one foot the other one carries.
     """
     fps = before.clip.fps
     ground = before.ground.copy()
     for a, b in spans(~before.still.any(axis=1)):
         if b - a > MERGED_S * fps and ground[a:b].any(axis=1).all():
-            ground[a:b] = False
+            one = ground[max(a - 1, 0)]
+            steps = one.sum() == 1 and np.array_equal(one, ground[min(b, len(ground) - 1)])
+            ground[a:b] = ~one if steps else False
     rows = _merged(phases_of(ground, fps))
     standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
     if not standing or rows[standing[-1]][0] == FLIGHT:
@@ -395,6 +399,12 @@ class Draft:
             chart, left = self._placed(chart, 0, 0)
             if min(self._bends(chart)) < BENT_RAD or left > OFF_M:
                 chart[2] -= LOWER_M
+        if left > BEGUN_OFF:
+            raise InfeasibleError(
+                f"clip {self.clip.name!r} cannot be mended: where it begins, both legs at the ends "
+                f"of their ranges leave a sole {left:.2f} rad or m off flat on its place; the feet "
+                f"are {np.linalg.norm(self.holds[0][0][:2] - self.holds[0][1][:2]):.2f} m apart"
+            )
         return chart
 
     def _placed(self, chart: np.ndarray, k: int, i: int) -> tuple[np.ndarray, float]:

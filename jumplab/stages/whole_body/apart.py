@@ -42,7 +42,8 @@ def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> lis
         if np.linalg.norm(one[1] - other[1], axis=1).min() > reach + least_m:
             continue
         gaps = np.concatenate([face_gaps(one, other), face_gaps(other, one)])  # (12, n)
-        near = np.flatnonzero(gaps.max(axis=0) < least_m)
+        # the first node is given, so that before the second one no row keeps them apart
+        near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
         met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
         for rows in _runs(np.array(met, int)):
             # one face, or neighbouring phases ask for two

@@ -31,6 +31,7 @@ from jumplab.stages.whole_body.problem import Schedule
 SHORTEST_S = 0.05 / RATE_HZ  # a shorter last step is joined to the one before
 # over which a phase passes from where the one before ended on the tape to its own plan
 JOINING_S = 0.25
+BALANCED_S = 0.4  # after about so much the base is back where it is planned
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 LANDED_RAD = 1e-6  # [rad, rad/s] by which legs may miss their plan at the end of a flight
 LANDINGS = 60  # corrections of that end at most; a jump takes two or three
@@ -207,8 +208,15 @@ def _ground(
         leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
         line = _on_a_line(holds, pitch) and not (schedule.follows and len(holds) == 1)
         if len(instants) > 1 and (line or leaves or schedule.follows):
-            given = pitch, holds, instants, robot, wrench.sum(axis=1), line
-            motion = _balanced(legs, motion, *given, stays=not leaves)
+            count = 1 if line else max(1, round((instants[-1] - instants[0]) / BALANCED_S))
+            rows = np.array_split(np.arange(len(instants)), count)
+            balanced = []
+            for part in rows:
+                tipped = {side: [x[part] for x in levels] for side, levels in pitch.items()}
+                given = tipped, holds, instants[part], robot, wrench[part].sum(axis=1), line
+                stays = not leaves or part is not rows[-1]
+                balanced.append(_balanced(legs, [x[part] for x in motion], *given, stays=stays))
+            motion = [np.concatenate(x) for x in zip(*balanced, strict=True)]
         motion = legs.held(motion, holds, pitch)
         parts.append((motion, wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
