@@ -209,9 +209,15 @@ def test_the_folder_for_mujoco(name, tmp_path):
     spec.worldbody.first_body().add_freejoint()
     there = spec.compile()
     assert (model.nq, model.nv, model.nu) == (there.nq, there.nv, there.nv - 6) and model.nbody == there.nbody
-    assert x["qpos"].shape[1:] == (model.nq,) and x["qvel"].shape[1:] == (model.nv,) and x["fps"] == 50
+    assert x["qpos"].shape[1:] == (model.nq,) and x["qvel"].shape[1:] == (model.nv,) and x["fps"] == 1000
     assert [model.actuator(i).name for i in range(model.nu)] == list(x["joint_names"])
     assert [model.joint(i).name for i in range(1, model.njnt)] == list(x["joint_names"])
+    effort = [Robot.load(name).actuators.get(joint, {}).get("effort") for joint in x["joint_names"]]
+    for limits, most in zip(model.actuator_ctrlrange, effort, strict=True):
+        assert (limits == [-most, most]).all() if most else limits[1] > 0  # as it was planned with
+    assert (
+        model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and (model.geom_solref[:, 0] == export.MUJOCO_CONTACT_S).all()
+    )
     for mine, other in ((model.body_mass, there.body_mass), (model.body_inertia, there.body_inertia),
                         (model.body_ipos, there.body_ipos), (model.body_pos, there.body_pos)):  # fmt: skip
         assert np.abs(mine - other)[1:].max() < 1e-6

@@ -224,7 +224,7 @@ def test_files_and_their_names(tmp_path):
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
     assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
                      "beyondmimic-npz": 50, "holosoma-npz": 50, "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
-                     "bones-csv": 120, "mujoco": 50}  # fmt: skip
+                     "bones-csv": 120, "mujoco": 1000}  # fmt: skip
 
 
 def test_the_folder_of_a_replay(tmp_path):

@@ -22,6 +22,11 @@ from jumplab.io.motion import Motion, checked_rate
 from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
 from jumplab.robot import Robot
 
+# of MuJoCo's folder: the step, the time in which a penetration fades, impedance of friction over
+# that of pressure
+MUJOCO_STEP_S = 0.001
+MUJOCO_CONTACT_S = 0.005
+MUJOCO_CONE_RATIO = 10.0
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
 
@@ -280,10 +285,11 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """The robot on level ground as MuJoCo's XML, a motor on every joint, and ``qpos``, ``qvel``,
-    ``ctrl`` (torques).
+    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with, and
+    ``qpos``, ``qvel``, ``ctrl`` (torques).
 
-    Armature, friction and damping of the motors are the joints'.
+    Limits of torque are the plan's, as are armature, friction and damping of the joints. Steps are
+    short and contacts hard, or feet that land sink and slide.
     """
     import mujoco
 
@@ -293,10 +299,22 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint()
-    spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    option = spec.option
+    option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    option.timestep = MUJOCO_STEP_S
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = MUJOCO_CONE_RATIO
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    for geom in spec.geoms:
+        geom.solref = [MUJOCO_CONTACT_S, 1.0]
     for name in whole.joints:
-        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        joint = spec.joint(name)
+        if name in whole.robot.actuators:
+            effort = whole.robot.actuators[name]["effort"]
+            joint.actfrcrange = [-effort, effort]
+        motor.ctrlrange = joint.actfrcrange
     motors = whole.robot.motors
     for name, value in motors["armature"].items():
         spec.joint(name).armature = value

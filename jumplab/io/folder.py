@@ -63,7 +63,7 @@ FORMATS = {
     "asap-pkl": ("asap.pkl", 30.0),
     "sonic-pkl": ("sonic.pkl", 50.0),
     "bones-csv": ("bones.csv", 120.0),
-    "mujoco": ("mujoco", 50.0),
+    "mujoco": ("mujoco", 1000.0),
 }
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 # what a new simulation makes untrue and therefore removes, and what a new plan does

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jumplab as jl
 from jumplab.auditing.clip import ClipReport
+from jumplab.auditing.report import LIMITS
 from jumplab.errors import JumplabError
 from jumplab.io.clip import ENDINGS
 from jumplab.io.files import write_file
@@ -58,6 +60,20 @@ def _played(mended: Mended) -> dict[str, bool | None]:
     """By engine, whether the simulated robot lands the jump; None where the schedule is no jump from two feet."""
     jump = mended.jump
     return {engine: None if jump is None else jl.simulate(jump, engine=engine).landed for engine in ENGINES}
+
+
+def failing(measures: Mapping[str, float]) -> list[str]:
+    """Names of the measures that are beyond what judging allows."""
+    return [name for name, value in measures.items() if value > LIMITS[name.rpartition(" [")[0]].limit]
+
+
+def causes(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A line per measure: how many clips are beyond what judging allows, before and after mending."""
+    mended = [row for row in rows if row["mended"]]
+    clips = {"all before": [r["before"] for r in rows], "mended, before": [r["before"] for r in mended]}
+    clips["mended, after"] = [r["after"] for r in mended]
+    counts = {title: Counter(name for x in some for name in failing(x)) for title, some in clips.items()}
+    return [{"beyond": name} | {title: count[name] for title, count in counts.items()} for name in rows[0]["before"]]
 
 
 def stored(path: Path = LOG) -> list[dict[str, Any]]:
