@@ -64,7 +64,9 @@ def _played(mended: Mended) -> dict[str, bool | None]:
 
 def failing(measures: Mapping[str, float]) -> list[str]:
     """Names of the measures that are beyond what judging allows."""
-    return [name for name, value in measures.items() if value > LIMITS[name.rpartition(" [")[0]].limit]
+    limits = {name: LIMITS[name.rpartition(" [")[0]] for name in measures}
+    signs = {name: -1 if limit.at_least else 1 for name, limit in limits.items()}
+    return [name for name, x in measures.items() if signs[name] * (x - limits[name].limit) > 0]
 
 
 def causes(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
