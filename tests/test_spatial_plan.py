@@ -626,6 +626,8 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     later = [replace(x, first=x.first + 1, last=x.last + 2) for x in found]
     # they met in spite of their rows, so between the nodes: each asks for more
     assert merged(found, later) == tuple(replace(x, last=x.last + 2, more_m=MORE_M) for x in found)
+    beside = [replace(x, first=x.last + 1, last=x.last + 6) for x in found]
+    assert merged(found, beside) == tuple(replace(x, last=x.last + 6) for x in found)
     assert merged(apart, ()) == apart
 
 
