@@ -85,8 +85,11 @@ class Mended(Shown):
     span_s: tuple[float, float] = (0.0, 0.0)
 
     def line(self) -> str:
-        """The clip and the plan."""
-        return f"{self.before.clip.name} as {self.plan.line()}"
+        """The clip, what of it is kept, and the plan."""
+        begin, end = self.span_s
+        all_s = self.before.clip.t[-1]
+        kept = f"{self.before.clip.name}, {begin:.2f} to {end:.2f} s of {all_s:.2f} s"
+        return f"{kept}, as {self.plan.line()}"
 
     @cached_property
     def jump(self) -> JumpPlan | None:
