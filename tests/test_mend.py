@@ -9,7 +9,7 @@ from test_judge import CLIPS, NO_ROBOTS, standing
 
 import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError
-from jumplab.studies.mend import AROUND_S, TOES_S, planned_phases
+from jumplab.studies.mend import AROUND_S, TOES_S, Draft, planned_phases
 
 
 def seen(words):
@@ -82,6 +82,45 @@ def test_a_stance_too_wide_for_flat_soles_is_refused():
 def test_a_clip_that_never_stands_is_refused():
     with pytest.raises(InputError, match="it never stands on both feet, and a motion has to begin so"):
         planned_phases(seen([("L", 30), ("R", 30)]))
+
+
+# in the manner of a clip
+GOAL = jl.JumpTask(0.6, 0.15, side_m=0.1, yaw_rad=0.3)
+
+
+@NO_ROBOTS
+def test_a_clip_that_is_followed_to_a_target_lands_there():
+    report = jl.judge(CLIPS / "jump_forward_level2.pkl", "g1")
+    usual, moved = Draft(report), Draft(report, goal=GOAL)
+    first, last = (np.mean([moved._middle(hold)], axis=0) for hold in (moved.holds[0], moved.holds[-1]))
+    assert last - first == pytest.approx([GOAL.distance_m, GOAL.side_m, GOAL.yaw_rad])
+    assert all(place.free_m == (0.0, 0.0) for place in moved.contacts.places)
+    flight = next(phase for phase in moved.contacts.phases if phase.flying)
+    assert flight.guess_s == pytest.approx(2 * np.sqrt(2 * GOAL.height_m / GOAL.gravity))
+    np.testing.assert_allclose(moved.motion.charts[0], usual.motion.charts[0], atol=1e-9)  # the launch is the clip's
+
+
+@NO_ROBOTS
+def test_what_no_clip_shows_is_refused():
+    with pytest.raises(InputError, match="like a clip is one on level ground that does not turn over"):
+        jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
+    with pytest.raises(
+        InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"
+    ):
+        jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
+    with pytest.raises(InputError, match="leave method and robust out, and give one of both"):
+        jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
+
+
+@NO_ROBOTS
+@pytest.mark.slow
+def test_a_jump_to_a_target_in_the_manner_of_a_clip():
+    plan = jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl")
+    assert plan.planned_distance_m == pytest.approx(0.6, abs=1e-4) and plan.planned_rise_m == pytest.approx(
+        0.15, abs=2e-3
+    )
+    assert plan.task.side_m == pytest.approx(0.1, abs=1e-4) and plan.task.yaw_rad == pytest.approx(0.3, abs=1e-4)
+    assert jl.audit(plan).passed
 
 
 @NO_ROBOTS

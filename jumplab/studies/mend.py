@@ -31,6 +31,7 @@ from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.motions import HEEL_UP, Motion, Reach, configurations
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
+from jumplab.task import JumpTask
 
 # of standing, before the first and after the last event: there it begins and ends where the joints
 # move least, [rad/s] rms, a second more of it counted as one more of those
@@ -58,6 +59,8 @@ START_ROUNDS = 30
 BEGUN_OFF = 0.05  # [m, rad] by which a sole may miss its place as it begins
 START_ROOM_RAD = 0.01  # of the first posture to the stops
 SMOOTH_FRAMES = 3.0
+LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
+RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
 NEAR = 1e-3  # of a limit's size: it binds
 
@@ -173,6 +176,45 @@ def mend(
     ) from refusal
 
 
+def like(
+    task: JumpTask,
+    motion: Any,
+    robot: Robot | str = "bhr",
+    *,
+    fps: float | None = None,
+    order: str = "depth-first",
+    **changes: Any,
+) -> JumpPlan:
+    """A jump to a target in the manner of a clip: its joints, its feet, its times on the ground.
+
+    Parameters
+    ----------
+    task : travel, rise and turn on level ground.
+    motion, robot, fps, order, changes : as of :func:`mend`; the clip jumps once, off both feet and
+        down on both.
+
+    Raises
+    ------
+    InputError, InfeasibleError, SolverError
+        If the clip or the target is not of that sort, or there is no such motion.
+    """
+    if task.platform_m or task.rotation_rad:
+        raise InputError("a jump like a clip is one on level ground that does not turn over")
+    before = (
+        motion if isinstance(motion, ClipReport) else judge(motion, robot, fps=fps, order=order)
+    )
+    require_type(before, ClipReport, "one clip to jump like")
+    draft = Draft(before, goal=task)
+    return Planner(before.clip.robot, keep=True, **changes).follow(
+        draft.contacts,
+        gravity=task.gravity,
+        rise_m=task.height_m,
+        weights={"follow take-off speed": RISE_WEIGHT},
+        motion=draft.motion,
+        stance=draft.start,
+    )
+
+
 def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended:
     draft = Draft(before, factor)
     plan = planner.follow(draft.contacts, motion=draft.motion, stance=draft.start)
@@ -260,7 +302,8 @@ def _shortest(rows: list[list], k: int) -> float:
 
 
 class Draft:
-    """A clip made ready to be followed, ``factor`` of its way, turn and height.
+    """A clip made ready to be followed, ``factor`` of its way, turn and height; with a ``goal`` its
+    only flight goes there.
 
     Attributes
     ----------
@@ -270,7 +313,7 @@ class Draft:
     start : configuration (nq,) in which it begins.
     """
 
-    def __init__(self, before: ClipReport, factor: float = 1.0):
+    def __init__(self, before: ClipReport, factor: float = 1.0, goal: JumpTask | None = None):
         self.clip: Clip = before.clip
         self.body = Body(self.clip.robot)
         self.reach = Reach(self.body, Limits().range_margin_rad)
@@ -284,8 +327,50 @@ class Draft:
         tips = origin + turn @ self.clip.robot.foot.tip
         self.feet = np.concatenate([tips, yaw[..., None]], axis=2)  # (n, 2, 4) x y z yaw
         self.holds = self._holds()
+        self.goal = goal
+        if goal is not None:
+            self._go(goal, before)
         self.contacts = self._contacts(factor)
         self.motion = self._along()
+
+    def _go(self, goal: JumpTask, before: ClipReport) -> None:
+        """Move what follows the flight to the ``goal``, and the flight on the way there, as high as
+        that asks for.
+        """
+        feet = [x for x, *_ in self.phases]
+        k = feet.index(FLIGHT) if FLIGHT in feet else 0
+        if feet.count(FLIGHT) != 1 or feet[k - 1] != "lr" or feet[k + 1] != "LR":
+            raise InputError(
+                f"clip {self.clip.name!r}: its feet carry as {' '.join(feet)}; a jump to a target "
+                f"is like one that flies once, off both feet and down on both"
+            )
+        stood, middle = (self._middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
+        turn = goal.yaw_rad - (middle[2] - stood[2])
+        way = np.add(stood[:2], [goal.distance_m, goal.side_m])
+        back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
+
+        def there(x: np.ndarray) -> np.ndarray:
+            return (x - middle[:2]) @ back + way
+
+        _, begin, end = self.phases[k]
+        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)[:, None]
+        x = self.charts
+        x[:, :2] += share * (there(x[:, :2]) - x[:, :2])
+        x[:, 3] += share[:, 0] * turn
+        rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
+        line = np.interp(self.clip.t, [begin, end], np.interp([begin, end], self.clip.t, x[:, 2]))
+        flown = (share > 0) & (share < 1)
+        more = goal.height_m / max([*rises_m, LEAST_RISE_M]) - 1
+        x[:, 2] += flown[:, 0] * more * (x[:, 2] - line)
+        for hold in self.holds[k + 1 :]:
+            for side, place in hold.items():
+                hold[side] = np.array([*there(place[:2]), 0.0, place[3] + turn])
+
+    def _middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
+        """x, y of the middle between the soles in their places [m], and their mean yaw [rad]."""
+        half = self.body.half_m
+        soles = [[x - half * np.cos(a), y - half * np.sin(a), a] for x, y, _, a in hold.values()]
+        return np.mean(soles, axis=0)
 
     def _rows(self, k: int) -> slice:
         """Frames of a phase."""
@@ -323,6 +408,8 @@ class Draft:
         phases = []
         for k, (feet, a, b) in enumerate(self.phases):
             lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
+            if self.goal and feet == FLIGHT:
+                lasts = 2 * self.goal.takeoff_speed / self.goal.gravity
             low, high = (lasts * x for x in (FLIGHT_STRETCH if feet == FLIGHT else STRETCH))
             if feet == FLIGHT:
                 high = max(high, SHORT_FLIGHT_S)
@@ -335,7 +422,7 @@ class Draft:
                 if k and side in self.holds[k - 1]:
                     continue
                 ahead, left = hold[:2] - self.body.places[side][:2]
-                free = (FREE_M, FREE_RAD) if k else ((0.0, 0.0), 0.0)
+                free = ((0.0, 0.0), 0.0) if self.goal or not k else (FREE_M, FREE_RAD)
                 place = Place(float(ahead), float(left), float(hold[3]), 0.0, *free)
                 (places if k else first).append(place)
         return Contacts(tuple(phases), tuple(places), first=tuple(first))
