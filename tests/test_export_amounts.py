@@ -216,9 +216,11 @@ def test_files_and_their_names(tmp_path):
     ((name, entry),) = pickle.loads(
         export.write("sonic-pkl", short(), ROBOT, tmp_path / "hop.pkl").read_bytes()
     ).items()
-    assert (
-        name == "hop" and entry["fps"] == 50 and isinstance(entry["fps"], int)
-    )  # the file's name
+    assert name == "hop" and entry["fps"] == 50 and isinstance(entry["fps"], int)  # the file's name
+    with pytest.raises(
+        InputError, match="the format has no joints called 'knee', and '.*' moves by .* choose sonic-pkl"
+    ):
+        export.library_entry(WHOLE, frames(50.0), 50.0, without="knee")
     odd = export.tracked(WHOLE, frames(29.97), 29.97)["fps"]
     assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}

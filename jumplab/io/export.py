@@ -27,6 +27,7 @@ from jumplab.robot import Robot
 MUJOCO_STEP_S = 0.001
 MUJOCO_CONTACT_S = 0.005
 MUJOCO_CONE_RATIO = 10.0
+HELD_RAD = 0.02  # by which joints that a format leaves out may move
 LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
 
@@ -225,9 +226,17 @@ def library_entry(
     names are free of ``without``, depth-first, and ``pose_aa`` (F, 1 + J + ``more``, 3), the same
     as rotation vectors of the root and about the joints' axes; of bodies fixed to others zero.
 
-    ``smpl_joints`` (F, 24, 3) are zeros, for a robot has none.
+    ``smpl_joints`` (F, 24, 3) are zeros, for a robot has none. Raises :class:`InputError` if a
+    joint that is left out moves.
     """
     kept = [k for k, name in enumerate(whole.joints) if not without or without not in name]
+    moved = np.ptp(x.q[:, 7:], axis=0)
+    moved[kept] = 0.0
+    if moved.max(initial=0.0) > HELD_RAD:
+        raise InputError(
+            f"the format has no joints called {without!r}, and {whole.joints[moved.argmax()]!r} "
+            f"moves by {moved.max():.2f} rad; choose sonic-pkl"
+        )
     dof = x.q[:, 7:][:, kept]
     root = Rotation.from_quat(x.q[:, 3:7]).as_rotvec()
     turned = dof[..., None] * axes_of(whole.urdf, [whole.joints[k] for k in kept])
