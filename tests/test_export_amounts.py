@@ -217,9 +217,7 @@ def test_files_and_their_names(tmp_path):
         export.write("sonic-pkl", short(), ROBOT, tmp_path / "hop.pkl").read_bytes()
     ).items()
     assert name == "hop" and entry["fps"] == 50 and isinstance(entry["fps"], int)  # the file's name
-    with pytest.raises(
-        InputError, match="the format has no joints called 'knee', and '.*' moves by .* choose sonic-pkl"
-    ):
+    with pytest.raises(InputError, match="the format has no joints called 'knee'"):
         export.library_entry(WHOLE, frames(50.0), 50.0, without="knee")
     odd = export.tracked(WHOLE, frames(29.97), 29.97)["fps"]
     assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
