@@ -3,12 +3,15 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from test_judge import CLIPS, NO_ROBOTS, standing
 
 import jumplab as jl
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.io import export
+from jumplab.io.motion import Motion
 from jumplab.studies.mend import AROUND_S, TOES_S, Draft, planned_phases
 
 
@@ -104,9 +107,7 @@ def test_a_clip_that_is_followed_to_a_target_lands_there():
 def test_what_no_clip_shows_is_refused():
     with pytest.raises(InputError, match="like a clip is one on level ground that does not turn over"):
         jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
-    with pytest.raises(
-        InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"
-    ):
+    with pytest.raises(InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"):
         jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
     with pytest.raises(InputError, match="leave method and robust out, and give one of both"):
         jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
@@ -125,7 +126,7 @@ def test_a_jump_to_a_target_in_the_manner_of_a_clip():
 
 @NO_ROBOTS
 @pytest.mark.slow
-def test_a_public_clip_is_mended_audited_and_stands():
+def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
     mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
     rows = {row["what"]: row for row in mended.changes}
     assert jl.audit(mended.plan).passed and not mended.before.passed
@@ -135,3 +136,20 @@ def test_a_public_clip_is_mended_audited_and_stands():
     assert abs(rows["flight 1 [s]"]["change"]) < 0.15 * rows["flight 1 [s]"]["clip"]
     assert mended.binding and mended.factor == 1 and mended.jump.tape.t[-1] < mended.plan.tape.t[-1]
     assert jl.simulate(mended.jump).landed
+    folder = export.write("mujoco", Motion.of(mended.plan.tape), mended.plan.robot, tmp_path / "mujoco")
+    off_m, height_m = played(folder)
+    assert off_m < 0.1 and height_m > 0.7  # the plain player below stands a second after the end
+
+
+def played(folder, gain=8.0, damping=0.2):
+    """How far the base of a robot in MuJoCo is from its plan's end a second later, and its height [m]; joints have
+    their torques, and are pulled to their angles and rates."""
+    model, x = mujoco.MjModel.from_xml_path(str(folder / "robot.xml")), np.load(folder / "motion.npz")
+    x, data = {key: x[key] for key in ("qpos", "qvel", "ctrl")}, mujoco.MjData(model)
+    effort = model.actuator_ctrlrange[:, 1]
+    data.qpos[:], data.qvel[:] = x["qpos"][0], x["qvel"][0]
+    for k in np.minimum(np.arange(len(x["ctrl"]) + 1000), len(x["ctrl"]) - 1):
+        pull = gain * (x["qpos"][k, 7:] - data.qpos[7:]) + damping * (x["qvel"][k, 6:] - data.qvel[6:])
+        data.ctrl[:] = x["ctrl"][k] + effort * pull
+        mujoco.mj_step(model, data)
+    return np.linalg.norm(data.qpos[:3] - x["qpos"][-1, :3]), data.qpos[2]
