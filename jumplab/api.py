@@ -37,6 +37,7 @@ def plan(
     robot: Robot | str | Path = "bhr",
     *,
     contacts: Contacts | None = None,
+    like: Any = None,
     method: str = USUAL,
     robust: Ranges | None = None,
     patience_s: float = math.inf,
@@ -51,6 +52,8 @@ def plan(
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
         your own. It is planned by the whole-body program, audited foot by foot, and not yet played
         on a simulated robot.
+    like : a clip, what :func:`judge` takes or returned of it, in whose manner the target is to be
+        reached: one flight off both feet and down on both, on level ground.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
         joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step"
@@ -75,12 +78,17 @@ def plan(
         raise InputError(
             "give either a target, JumpTask(...), or a contact schedule, contacts=Contacts.hop(...)"
         )
-    if contacts is not None:
-        if robust is not None or method != USUAL:
+    if contacts is not None or like is not None:
+        if robust is not None or method != USUAL or not (contacts is None or like is None):
             raise InputError(
-                "a contact schedule is planned by the whole-body program; leave method and robust "
-                "out"
+                "a contact schedule, or a jump like a clip, is planned by the whole-body program; "
+                "leave method and robust out, and give one of both"
             )
+    if like is not None:
+        from jumplab.studies.mend import like as alike
+
+        return alike(task, like, robot, **changes)
+    if contacts is not None:
         return Planner(robot, keep=True, **changes).follow(contacts)
     if robust is not None:
         from jumplab.studies.robust import robust_changes

@@ -11,13 +11,14 @@ import pinocchio as pin
 import pytest
 from fixtures_core import jump
 from fixtures_robots import arm_base, held_arms, sideways, waist, write
+from scipy.spatial.transform import Rotation
 from test_cli import one_sentence, run
 from test_store import names
 
 from jumplab.errors import InputError, RobotError
 from jumplab.io import export
 from jumplab.io import folder as store
-from jumplab.io.motion import Motion
+from jumplab.io.motion import Motion, steady
 from jumplab.io.whole import ORDERS, Whole, ordered
 from jumplab.robot import Robot
 from jumplab.robot.files import SHIPPED
@@ -82,6 +83,26 @@ def states(format_name: str, path) -> dict:
             own: np.column_stack([x[f"{name}_{kind}"] for name in names])
             for own, kind in (("angles", "position_rad"), ("rates", "velocity_rad_s"), ("torque", "torque_N_m"))
         } | {"contact": np.column_stack([x["contact_left"], x["contact_right"]])}  # fmt: skip
+    if format_name in ("asap-pkl", "sonic-pkl"):  # as their loaders do: the root and the joints from rotation vectors
+        (entry,) = pickle.loads(path.read_bytes()).values()
+        aa, count = entry["pose_aa"].astype(float), len(entry["joint_names"])
+        turn = np.roll(Rotation.from_rotvec(aa[:, 0]).as_quat(), 1, axis=1)
+        turn *= np.sign(np.sum(turn * np.roll(entry["root_rot"], 1, axis=1), axis=1, keepdims=True))
+        angles = aa[:, 1 : 1 + count].sum(axis=2)  # axes are those of the frame
+        qpos = np.column_stack([entry["root_trans_offset"], turn, angles])
+        assert np.abs(angles - entry["dof"]).max() < 1e-6 and not aa[:, 1 + count :].any()
+        assert aa.shape[1] == 1 + count + 3 * (format_name == "asap-pkl") and len(entry["smpl_joints"]) == len(aa)
+        whole = not any("wrist" in name for name in entry["joint_names"]) and format_name == "asap-pkl"
+        return {} if whole and count == 23 else {"qpos": qpos, "joint_names": entry["joint_names"]}
+    if format_name == "bones-csv":
+        x = np.genfromtxt(path, delimiter=",", names=True)
+        place, turn = (np.column_stack([x[f"root_{w}{a}"] for a in "XYZ"]) for w in ("translate", "rotate"))
+        quaternions = steady(np.roll(Rotation.from_euler("xyz", turn, degrees=True).as_quat(), 1, axis=1))
+        names = [n for n in x.dtype.names if n.endswith("_dof")]
+        angles = np.radians(np.column_stack([x[n] for n in names]))
+        assert x.dtype.names[0] == "Frame" and (np.diff(x["Frame"]) == 1).all()
+        return {"qpos": np.column_stack([place / 100, quaternions, angles]),
+                "joint_names": [n.removesuffix("_dof") for n in names]}  # fmt: skip
     folder = {"mujoco": "motion.npz", "urdf-replay": "trajectory.npz"}.get(format_name)
     x = npz(path / folder if folder else path)
     if format_name in ("npz", "urdf-replay"):
@@ -90,6 +111,8 @@ def states(format_name: str, path) -> dict:
                          zip(turn, x["base_angular_velocity_world_rad_s"], strict=True)])  # fmt: skip
         x["qpos"] = np.column_stack([x["base_position_m"], turn, x["joint_position_rad"]])
         x["qvel"] = np.column_stack([x["base_velocity_world_m_s"], spin, x["joint_velocity_rad_s"]])
+    if format_name == "isaaclab-npz":
+        x["order"] = x.pop("joint_names")
     if format_name == "holosoma-npz":
         x |= {"qpos": x["joint_pos"], "qvel": x["joint_vel"]}
     return x
@@ -139,6 +162,17 @@ def check_states(format_name, x, joints, qpos, qvel):
         assert list(x["joint_names"]) == joints
     if format_name == "csv":
         assert np.abs(x["angles"] - qpos[:, 7:]).max() < 1e-5 and np.abs(x["rates"] - qvel[:, 6:]).max() < 1e-5
+    if format_name == "isaaclab-npz":
+        assert (
+            np.abs(x["base_pos_w"] - qpos[:, :3]).max() < 1e-5
+            and np.abs(x["base_lin_vel_w"] - qvel[:, :3]).max() < 1e-5
+        )
+        assert np.abs(np.sum(x["base_quat_w"] * qpos[:, 3:7], axis=1)) == pytest.approx(1.0, abs=1e-6)
+        spin = Rotation.from_quat(np.roll(qpos[:, 3:7], -1, axis=1)).apply(qvel[:, 3:6])
+        assert np.abs(x["base_ang_vel_w"] - spin).max() < 1e-5 and x["framerate"] == x["fps"]
+        columns = [joints.index(name) for name in x["order"]]
+        assert np.abs(x["joint_pos"] - qpos[:, 7:][:, columns]).max() < 1e-5
+        assert np.abs(x["joint_vel"] - qvel[:, 6:][:, columns]).max() < 1e-5
     if format_name in ("mjlab-npz", "beyondmimic-npz"):
         columns = [joints.index(name) for name in x["joint_names"]]
         assert np.abs(x["joint_pos"] - qpos[:, 7:][:, columns]).max() < 1e-5
@@ -175,9 +209,15 @@ def test_the_folder_for_mujoco(name, tmp_path):
     spec.worldbody.first_body().add_freejoint()
     there = spec.compile()
     assert (model.nq, model.nv, model.nu) == (there.nq, there.nv, there.nv - 6) and model.nbody == there.nbody
-    assert x["qpos"].shape[1:] == (model.nq,) and x["qvel"].shape[1:] == (model.nv,) and x["fps"] == 50
+    assert x["qpos"].shape[1:] == (model.nq,) and x["qvel"].shape[1:] == (model.nv,) and x["fps"] == 1000
     assert [model.actuator(i).name for i in range(model.nu)] == list(x["joint_names"])
     assert [model.joint(i).name for i in range(1, model.njnt)] == list(x["joint_names"])
+    effort = [Robot.load(name).actuators.get(joint, {}).get("effort") for joint in x["joint_names"]]
+    for limits, most in zip(model.actuator_ctrlrange, effort, strict=True):
+        assert (limits == [-most, most]).all() if most else limits[1] > 0  # as it was planned with
+    assert (
+        model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and (model.geom_solref[:, 0] == export.MUJOCO_CONTACT_S).all()
+    )
     for mine, other in ((model.body_mass, there.body_mass), (model.body_inertia, there.body_inertia),
                         (model.body_ipos, there.body_ipos), (model.body_pos, there.body_pos)):  # fmt: skip
         assert np.abs(mine - other)[1:].max() < 1e-6

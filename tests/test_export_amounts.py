@@ -175,7 +175,8 @@ def test_links_in_both_orders():
 # files ----------------------------------------------------------------------------------------------------------
 NAMES = {"csv": "joints.csv", "npz": "motion.npz", "urdf-replay": "replay", "unitree-csv": "unitree.csv",
          "gmr-pkl": "gmr.pkl", "mjlab-npz": "mjlab.npz", "beyondmimic-npz": "beyondmimic.npz",
-         "holosoma-npz": "holosoma.npz", "mujoco": "mujoco"}  # fmt: skip
+         "holosoma-npz": "holosoma.npz", "isaaclab-npz": "isaaclab.npz", "asap-pkl": "asap.pkl",
+         "sonic-pkl": "sonic.pkl", "bones-csv": "bones.csv", "mujoco": "mujoco"}  # fmt: skip
 
 
 def test_files_and_their_names(tmp_path):
@@ -212,11 +213,18 @@ def test_files_and_their_names(tmp_path):
     assert raw[:2] == b"\x80\x04"  # the protocol that every Python 3 in use reads
     for key, values in export.retargeted(WHOLE, x, 30.0).items():
         np.testing.assert_array_equal(pickle.loads(raw)[key], values)
+    ((name, entry),) = pickle.loads(
+        export.write("sonic-pkl", short(), ROBOT, tmp_path / "hop.pkl").read_bytes()
+    ).items()
+    assert name == "hop" and entry["fps"] == 50 and isinstance(entry["fps"], int)  # the file's name
+    with pytest.raises(InputError, match="the format has no joints called 'knee'"):
+        export.library_entry(WHOLE, frames(50.0), 50.0, without="knee")
     odd = export.tracked(WHOLE, frames(29.97), 29.97)["fps"]
     assert odd.tolist() == [29.97] and export.tracked(WHOLE, frames(50.0), 50.0)["fps"].dtype == np.int64
     rates = {name: rate for name, (_, rate) in export.FORMATS.items()}
     assert rates == {"csv": 1000, "npz": 1000, "urdf-replay": 100, "unitree-csv": 30, "gmr-pkl": 30, "mjlab-npz": 50,
-                     "beyondmimic-npz": 50, "holosoma-npz": 50, "mujoco": 50}  # fmt: skip
+                     "beyondmimic-npz": 50, "holosoma-npz": 50, "isaaclab-npz": 50, "asap-pkl": 30, "sonic-pkl": 50,
+                     "bones-csv": 120, "mujoco": 1000}  # fmt: skip
 
 
 def test_the_folder_of_a_replay(tmp_path):

@@ -1,28 +1,34 @@
 """Clips mended: the schedule that is read from them, and one public clip from file to a robot that stands."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from test_judge import CLIPS, NO_ROBOTS, standing
 
 import jumplab as jl
-from jumplab.errors import InputError
-from jumplab.studies.mend import AROUND_S, TOES_S, planned_phases
+from jumplab.errors import InfeasibleError, InputError
+from jumplab.io import export
+from jumplab.io.motion import Motion
+from jumplab.studies.mend import AROUND_S, TOES_S, Draft, planned_phases
 
 
 def seen(words):
-    """A report of a clip whose feet carry as ``words`` say: (feet, frames at 30 per second)."""
-    ground = np.concatenate([np.tile(["L" in feet, "R" in feet], (n, 1)) for feet, n in words])
+    """A report of a clip whose feet carry as ``words`` say: (feet, frames at 30 per second); small letters slide."""
+    ground = np.concatenate([np.tile(["L" in feet.upper(), "R" in feet.upper()], (n, 1)) for feet, n in words])
+    still = np.concatenate([np.tile(["L" in feet, "R" in feet], (n, 1)) for feet, n in words])
     report = jl.judge(standing())
     clip = replace(report.clip, q=np.tile(report.clip.q[:1], (len(ground), 1)))
-    return replace(report, clip=clip, ground=ground, still=ground)
+    tape = SimpleNamespace(v=np.zeros((len(ground), clip.robot.model.nv)))
+    return replace(report, clip=clip, tape=tape, ground=ground, still=still)
 
 
 def test_events_are_kept_around_a_jump_and_toes_put_before_it():
     feet, begin, end = zip(*planned_phases(seen([("LR", 40), ("-", 12), ("LR", 40)])), strict=True)
     assert feet == ("LR", "lr", "-", "LR")
-    assert np.subtract(end, begin) == pytest.approx([AROUND_S - TOES_S, TOES_S, 12 / 30, AROUND_S], abs=0.05)
+    assert np.subtract(end, begin) == pytest.approx([AROUND_S[0] - TOES_S, TOES_S, 12 / 30, AROUND_S[0]], abs=0.05)
     assert begin[1:] == pytest.approx(end[:-1])
 
 
@@ -39,10 +45,41 @@ def test_short_events_are_one_and_a_motion_begins_and_ends_on_both_feet(words, f
     phases = planned_phases(seen(words))
     assert " ".join(x for x, *_ in phases) == feet
     assert [begin for _, begin, _ in phases[1:]] == [end for *_, end in phases[:-1]]
-    if feet == "LR lr - LR":  # a foot's last two frames go to the phases beside them, half each
-        assert phases[2][1:] == pytest.approx((31 / 30, 45 / 30))
+    if feet == "LR lr - LR":  # a foot's last two frames are no flight
+        assert phases[2][1:] == pytest.approx((32 / 30, 44 / 30))
     if feet == "LR":
         assert phases[0][1:] == pytest.approx((0.0, 63 / 30))
+
+
+@pytest.mark.parametrize(
+    "words, feet",
+    [  # both feet fast: a skip from foot to foot flies, between two steps on one foot the other one carries
+        ([("LR", 30), ("R", 10), ("lr", 6), ("L", 10), ("LR", 30)], "LR R r - L LR"),
+        ([("LR", 30), ("R", 10), ("lr", 6), ("R", 10), ("LR", 30)], "LR R L R LR"),
+        # of two motions with long standing between them the one that flies, else that of more phases
+        ([("LR", 30), ("-", 12), ("LR", 60), ("L", 10), ("R", 10), ("LR", 30)], "LR lr - LR"),
+        ([("LR", 30), ("L", 10), ("LR", 60), ("L", 10), ("R", 10), ("LR", 30)], "LR L R LR"),
+    ],
+)
+def test_skips_are_steps_or_flights_and_one_motion_is_kept(words, feet):
+    assert " ".join(x for x, *_ in planned_phases(seen(words))) == feet
+
+
+def test_the_cut_is_where_the_joints_are_quiet():
+    report = seen([("LR", 60), ("-", 12), ("LR", 60)])
+    report.tape.v[60 - 27 :, 6:] = 2.0  # it crouches for 0.9 s, and goes on moving
+    (_, begin, _), *_, (_, lands, end) = planned_phases(report)
+    assert 2.0 - begin == pytest.approx(0.93, abs=0.02) and end - lands == pytest.approx(AROUND_S[0], abs=0.02)
+
+
+@NO_ROBOTS
+def test_a_stance_too_wide_for_flat_soles_is_refused():
+    clip = jl.judge(CLIPS / "side_jump_level2.pkl", "g1").clip
+    q = clip.q.copy()
+    joints = [7 + clip.robot.joint_names.index(f"{side}_hip_roll_joint") for side in ("left", "right")]
+    q[:, joints] += [0.5, -0.5]
+    with pytest.raises(InfeasibleError, match="where it begins, both legs at the ends of their ranges leave a sole"):
+        jl.mend(replace(clip, q=q))
 
 
 def test_a_clip_that_never_stands_is_refused():
@@ -50,15 +87,69 @@ def test_a_clip_that_never_stands_is_refused():
         planned_phases(seen([("L", 30), ("R", 30)]))
 
 
+# in the manner of a clip
+GOAL = jl.JumpTask(0.6, 0.15, side_m=0.1, yaw_rad=0.3)
+
+
+@NO_ROBOTS
+def test_a_clip_that_is_followed_to_a_target_lands_there():
+    report = jl.judge(CLIPS / "jump_forward_level2.pkl", "g1")
+    usual, moved = Draft(report), Draft(report, goal=GOAL)
+    first, last = (np.mean([moved._middle(hold)], axis=0) for hold in (moved.holds[0], moved.holds[-1]))
+    assert last - first == pytest.approx([GOAL.distance_m, GOAL.side_m, GOAL.yaw_rad])
+    assert all(place.free_m == (0.0, 0.0) for place in moved.contacts.places)
+    flight = next(phase for phase in moved.contacts.phases if phase.flying)
+    assert flight.guess_s == pytest.approx(2 * np.sqrt(2 * GOAL.height_m / GOAL.gravity))
+    np.testing.assert_allclose(moved.motion.charts[0], usual.motion.charts[0], atol=1e-9)  # the launch is the clip's
+
+
+@NO_ROBOTS
+def test_what_no_clip_shows_is_refused():
+    with pytest.raises(InputError, match="like a clip is one on level ground that does not turn over"):
+        jl.plan(jl.JumpTask(0.5, 0.3, platform_m=0.1), "g1", like=CLIPS / "jump_forward_level2.pkl")
+    with pytest.raises(InputError, match="its feet carry as LR R r - L LR; a jump to a target is like one"):
+        jl.plan(GOAL, "g1", like=CLIPS / "side_jump_level2.pkl")
+    with pytest.raises(InputError, match="leave method and robust out, and give one of both"):
+        jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl", method="three-step")
+
+
 @NO_ROBOTS
 @pytest.mark.slow
-def test_a_public_clip_is_mended_audited_and_stands():
+def test_a_jump_to_a_target_in_the_manner_of_a_clip():
+    plan = jl.plan(GOAL, "g1", like=CLIPS / "jump_forward_level2.pkl")
+    assert plan.planned_distance_m == pytest.approx(0.6, abs=1e-4) and plan.planned_rise_m == pytest.approx(
+        0.15, abs=2e-3
+    )
+    assert plan.task.side_m == pytest.approx(0.1, abs=1e-4) and plan.task.yaw_rad == pytest.approx(0.3, abs=1e-4)
+    assert jl.audit(plan).passed
+
+
+@NO_ROBOTS
+@pytest.mark.slow
+def test_a_public_clip_is_mended_audited_and_stands(tmp_path):
     mended = jl.mend(CLIPS / "jump_forward_level2.pkl", "g1")
     rows = {row["what"]: row for row in mended.changes}
     assert jl.audit(mended.plan).passed and not mended.before.passed
     # differences of frames blur the landing's torques, and nothing else
     assert {c.name for c in jl.judge(mended.plan).failed} <= {"joint torque", "torque at speed"}
     assert rows["joints, rms [rad]"]["change"] < 0.25 and rows["footholds, largest [m]"]["change"] < 0.07
-    assert abs(rows["rise 1 [m]"]["change"]) < 0.05
+    assert abs(rows["flight 1 [s]"]["change"]) < 0.15 * rows["flight 1 [s]"]["clip"]
     assert mended.binding and mended.factor == 1 and mended.jump.tape.t[-1] < mended.plan.tape.t[-1]
     assert jl.simulate(mended.jump).landed
+    folder = export.write("mujoco", Motion.of(mended.plan.tape), mended.plan.robot, tmp_path / "mujoco")
+    off_m, height_m = played(folder)
+    assert off_m < 0.1 and height_m > 0.7  # the plain player below stands a second after the end
+
+
+def played(folder, gain=8.0, damping=0.2):
+    """How far the base of a robot in MuJoCo is from its plan's end a second later, and its height [m]; joints have
+    their torques, and are pulled to their angles and rates."""
+    model, x = mujoco.MjModel.from_xml_path(str(folder / "robot.xml")), np.load(folder / "motion.npz")
+    x, data = {key: x[key] for key in ("qpos", "qvel", "ctrl")}, mujoco.MjData(model)
+    effort = model.actuator_ctrlrange[:, 1]
+    data.qpos[:], data.qvel[:] = x["qpos"][0], x["qvel"][0]
+    for k in np.minimum(np.arange(len(x["ctrl"]) + 1000), len(x["ctrl"]) - 1):
+        pull = gain * (x["qpos"][k, 7:] - data.qpos[7:]) + damping * (x["qvel"][k, 6:] - data.qvel[6:])
+        data.ctrl[:] = x["ctrl"][k] + effort * pull
+        mujoco.mj_step(model, data)
+    return np.linalg.norm(data.qpos[:3] - x["qpos"][-1, :3]), data.qpos[2]

@@ -608,7 +608,7 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     plan, last = jump(SIDE), planner().stage("direct")
     phases = list(plan.whole_body.solution.phases.values())
     intervals, names = [len(p.j) for p in phases], list(plan.whole_body.solution.phases)
-    assert too_close(last.body, phases) == []
+    assert too_close(last.body, phases, 0.003) == []
     apart = plan.whole_body.schedule.apart
     problem = plan.whole_body.solution.problem
     rows = {(owner, t.name): t.skip for owner, t in problem.terms() if " apart, face " in t.name}
@@ -619,13 +619,15 @@ def test_links_that_meet_on_a_tape_get_rows_where_they_do(bhr):
     assert apart and plan.statistics[-1].stage == "direct, links apart, held Gauss-Newton"
     q, rolls = phases[2].q.copy(), ("left_hip_roll", "right_hip_roll")
     q[5:8, [BASE + bhr.joint_names.index(name) for name in rolls]] += [-0.3, 0.3]  # legs that cross
-    found = too_close(last.body, [*phases[:2], replace(phases[2], q=q)])
+    found = too_close(last.body, [*phases[:2], replace(phases[2], q=q)], 0.003)
     assert {x.phase for x in found} == {2}
     assert all(1 <= x.first <= 5 and 7 <= x.last <= intervals[2] for x in found)
     assert any({x.pair.first.name[:5], x.pair.second.name[:5]} == {"left_", "right"} for x in found)
     later = [replace(x, first=x.first + 1, last=x.last + 2) for x in found]
     # they met in spite of their rows, so between the nodes: each asks for more
     assert merged(found, later) == tuple(replace(x, last=x.last + 2, more_m=MORE_M) for x in found)
+    beside = [replace(x, first=x.last + 1, last=x.last + 6) for x in found]
+    assert merged(found, beside) == tuple(replace(x, last=x.last + 6) for x in found)
     assert merged(apart, ()) == apart
 
 

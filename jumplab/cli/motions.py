@@ -70,6 +70,7 @@ def mend(args: Namespace) -> None:
     report = store.write_plan(args.out, plan.tape, plan.robot, plan.summary, complete=complete)
     args.found |= {"out": args.out, "plan": plan.summary, **mended.to_json()}
     print_summary(plan.summary)
+    print(mended.line())
     print(tables.table(mended.changes, ["what", "clip", "mended", "change"], digits=3))
     if mended.jump is not None:
         folder = Path(args.out, JUMP)

@@ -90,6 +90,7 @@ class _Raw:
     origin: str
     fps: float | None = None
     names: tuple[str, ...] | None = None
+    usual_fps: float = USUAL_FPS  # where nobody says
 
 
 # files
@@ -152,7 +153,7 @@ def _columns(text: str) -> Mapping[str, Any]:
 
 def _rate(x: Mapping[str, Any]) -> float | None:
     """Frames a second that a file states, or that its times have [1/s]."""
-    for name in ("fps", "hz"):
+    for name in ("fps", "hz", "framerate"):
         if name in x:
             return float(np.ravel(x[name])[0])
     for name in ("time_s", "time", "t"):
@@ -184,6 +185,27 @@ def _of_table(x: Mapping[str, Any]) -> _Raw:
     return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], "a table of joints by name", names=names)
 
 
+def _of_animation(x: Mapping[str, Any]) -> _Raw:
+    place, turn = (
+        np.column_stack([x[f"root_{word}{axis}"] for axis in "XYZ"])
+        for word in ("translate", "rotate")
+    )
+    joints = [name for name in x if name.endswith("_dof")]
+    return _Raw(
+        place / 100,
+        Rotation.from_euler("xyz", turn, degrees=True).as_quat(),
+        np.radians(np.column_stack([x[name] for name in joints])),
+        "an animator's table, cm and degrees",
+        names=tuple(name.removesuffix("_dof") for name in joints),
+        usual_fps=120.0,
+    )
+
+
+def _of_base(x: Mapping[str, Any]) -> _Raw:
+    words = "base and joints, quaternion w x y z"
+    return _Raw(x["base_pos_w"], _first_wxyz(x["base_quat_w"]), x["joint_pos"], words)
+
+
 def _of_rows(q: np.ndarray, words: str) -> _Raw:
     return _Raw(q[:, :3], q[:, 3:7], q[:, 7:], f"{words}, quaternion x y z w")
 
@@ -205,6 +227,8 @@ FORMS: tuple[tuple[tuple[str, ...], Callable[[Mapping[str, Any]], _Raw]], ...] =
         (("root_pos", "root_rot", "dof_pos"), "pickle of a retargeter"),
         (("base_position_m", "base_quaternion_xyzw", "joint_position_rad"), "arrays with units"),
         (("body_pos_w", "body_quat_w", "joint_pos"), _of_tracker),
+        (("base_pos_w", "base_quat_w", "joint_pos"), _of_base),
+        (("root_translateX", "root_rotateX"), _of_animation),
         (("qpos",), _of_mujoco),
         (("q", "t", "joint_names"), lambda x: _of_rows(x["q"], "a plan or simulation")),
         (("rows",), lambda x: _of_rows(x["rows"], "rows of numbers")),
@@ -236,7 +260,8 @@ def read_clips(
     ----------
     robot : whose clips they are; where a clip has other joints than it, the shipped robot of the
         same URDF that has those.
-    fps : frames a second [1/s], if the file does not say (then :data:`USUAL_FPS`).
+    fps : frames a second [1/s], if the file does not say (then :data:`USUAL_FPS`,
+        120 of tables in cm and degrees).
     order : "depth-first" or "breadth-first", of joints without names.
 
     Raises
@@ -271,7 +296,7 @@ def read_clips(
 def _clip(where: str, name: str, raw: _Raw, robot: Robot, fps: float | None, order: str) -> Clip:
     """A clip of what a file holds, or a sentence."""
     notes = []
-    rate = raw.fps or fps or USUAL_FPS
+    rate = raw.fps or fps or raw.usual_fps
     if raw.fps is None:
         notes.append(f"{rate:g} frames per second {'as told' if fps else 'taken for granted'}")
     elif fps is not None and abs(fps - raw.fps) > 0.01 * raw.fps:

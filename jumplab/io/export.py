@@ -19,9 +19,16 @@ from jumplab.errors import InputError
 from jumplab.io.columns import table_of
 from jumplab.io.folder import FORMATS, transaction, write_file
 from jumplab.io.motion import Motion, checked_rate
-from jumplab.io.whole import ORDERS, Whole, ordered
+from jumplab.io.whole import ORDERS, Whole, axes_of, ordered
 from jumplab.robot import Robot
 
+# of MuJoCo's folder: the step, the time in which a penetration fades, impedance of friction over
+# that of pressure
+MUJOCO_STEP_S = 0.001
+MUJOCO_CONTACT_S = 0.005
+MUJOCO_CONE_RATIO = 10.0
+HELD_RAD = 0.02  # by which joints that a format leaves out may move
+LIBRARIES = ("asap-pkl", "sonic-pkl")  # files that may hold many motions by name
 PHASE_CODES = {"launch": 0, "flight": 1, "landing": 2}
 
 
@@ -56,6 +63,8 @@ def write(
         raise InputError(f"--out must name a file that ends in {ending}, got {str(path)!r}")
     whole = Whole(robot)
     content = CONTENTS[format_name](whole, whole.frames(motion, rate), rate)
+    if format_name in LIBRARIES:
+        content = {path.stem: content}  # readers of folders look there
     if ending:
         return write_file(path, _encoded(ending, content))
     known = (*content, ".staging", ".commit")  # the last two are left by a writer that was killed
@@ -193,6 +202,70 @@ def retargeted(whole: Whole, x: Motion, fps: float) -> dict[str, object]:
     }
 
 
+def with_base(whole: Whole, x: Motion, fps: float) -> dict[str, np.ndarray]:
+    """What trainers in Isaac Lab keep of a motion: joints breadth-first, by name, and the base,
+    quaternion w x y z, velocities in world axes at its origin; 32-bit floats.
+    """
+    base, turn, speed, spin = whole.bodies(x, whole.links[:1], at_com=False).values()
+    arrays = tracked(whole, x, fps, order=ORDERS[1])
+    kept = {k: arrays[k] for k in ("fps", "joint_pos", "joint_vel", "joint_torque")}
+    places = {"base_pos_w": base, "base_quat_w": turn}
+    places |= {"base_lin_vel_w": speed, "base_ang_vel_w": spin}
+    return {
+        "framerate": np.array(float(fps)),
+        **kept,
+        **{name: array[:, 0].astype(np.float32) for name, array in places.items()},
+        **{k: arrays[k] for k in ("contact", "phase", "joint_names")},
+    }
+
+
+def library_entry(
+    whole: Whole, x: Motion, fps: float, *, without: str = "", more: int = 0
+) -> dict[str, object]:
+    """A motion library's entry: the root (quaternion x y z w), angles ``dof`` of the joints whose
+    names are free of ``without``, depth-first, and ``pose_aa`` (F, 1 + J + ``more``, 3), the same
+    as rotation vectors of the root and about the joints' axes; of bodies fixed to others zero.
+
+    ``smpl_joints`` (F, 24, 3) are zeros, for a robot has none. Raises :class:`InputError` if a
+    joint that is left out moves.
+    """
+    kept = [k for k, name in enumerate(whole.joints) if not without or without not in name]
+    moved = np.ptp(x.q[:, 7:], axis=0)
+    moved[kept] = 0.0
+    if moved.max(initial=0.0) > HELD_RAD:
+        raise InputError(
+            f"the format has no joints called {without!r}, and {whole.joints[moved.argmax()]!r} "
+            f"moves by {moved.max():.2f} rad; choose sonic-pkl"
+        )
+    dof = x.q[:, 7:][:, kept]
+    root = Rotation.from_quat(x.q[:, 3:7]).as_rotvec()
+    turned = dof[..., None] * axes_of(whole.urdf, [whole.joints[k] for k in kept])
+    poses = np.concatenate([root[:, None], turned, np.zeros((len(dof), more, 3))], axis=1)
+    return {
+        "root_trans_offset": x.q[:, :3].astype(np.float32),
+        "pose_aa": poses.astype(np.float32),
+        "dof": dof.astype(np.float32),
+        "root_rot": x.q[:, 3:7],
+        "smpl_joints": np.zeros((len(dof), 24, 3), np.float32),
+        "contact": x.contact,
+        "joint_names": [whole.joints[k] for k in kept],
+        "fps": int(fps) if fps == int(fps) else fps,
+    }
+
+
+def animated(whole: Whole, x: Motion, fps: float) -> str:
+    """A table as animators keep it: number of the frame, the root in cm and degrees (about the
+    world's x, then y, then z), then joints in degrees.
+    """
+    angles = Rotation.from_quat(x.q[:, 3:7]).as_euler("xyz", degrees=True)
+    angles = np.unwrap(angles, axis=0, period=360.0)
+    head = [f"root_{word}{axis}" for word in ("translate", "rotate") for axis in "XYZ"]
+    head = ["Frame", *head, *(f"{name}_dof" for name in whole.joints)]
+    rest = np.hstack([100 * x.q[:, :3], angles, np.degrees(x.q[:, 7:])])
+    table = np.column_stack([np.arange(len(rest)), rest])
+    return _rows(table, ",".join(head), ["%d"] + ["%.9g"] * rest.shape[1])
+
+
 def pybullet_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     """The URDF, the trajectory, and a script of ten lines that shows it."""
     texts = resources.files("jumplab.io")
@@ -221,10 +294,11 @@ def _qpos_qvel(x: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
-    """The robot on level ground as MuJoCo's XML, a motor on every joint, and ``qpos``, ``qvel``,
-    ``ctrl`` (torques).
+    """The robot on level ground as MuJoCo's XML, with the motors that it is planned with, and
+    ``qpos``, ``qvel``, ``ctrl`` (torques).
 
-    Armature, friction and damping of the motors are the joints'.
+    Limits of torque are the plan's, as are armature, friction and damping of the joints. Steps are
+    short and contacts hard, or feet that land sink and slide.
     """
     import mujoco
 
@@ -234,10 +308,22 @@ def mujoco_folder(whole: Whole, x: Motion, fps: float) -> dict[str, Any]:
     spec.compiler.discardvisual = False
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint()
-    spec.option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    option = spec.option
+    option.gravity = [0.0, 0.0, -whole.robot.gravity]
+    option.timestep = MUJOCO_STEP_S
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = MUJOCO_CONE_RATIO
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    for geom in spec.geoms:
+        geom.solref = [MUJOCO_CONTACT_S, 1.0]
     for name in whole.joints:
-        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        joint = spec.joint(name)
+        if name in whole.robot.actuators:
+            effort = whole.robot.actuators[name]["effort"]
+            joint.actfrcrange = [-effort, effort]
+        motor.ctrlrange = joint.actfrcrange
     motors = whole.robot.motors
     for name, value in motors["armature"].items():
         spec.joint(name).armature = value
@@ -269,5 +355,9 @@ CONTENTS: Mapping[str, Callable[[Whole, Motion, float], Any]] = {
     "mjlab-npz": tracked,
     "beyondmimic-npz": partial(tracked, order=ORDERS[1], at_com=True),
     "holosoma-npz": with_world,
+    "isaaclab-npz": with_base,
+    "asap-pkl": partial(library_entry, without="wrist", more=3),  # head and hands
+    "sonic-pkl": library_entry,
+    "bones-csv": animated,
     "mujoco": mujoco_folder,
 }

@@ -59,7 +59,11 @@ FORMATS = {
     "mjlab-npz": ("mjlab.npz", 50.0),
     "beyondmimic-npz": ("beyondmimic.npz", 50.0),
     "holosoma-npz": ("holosoma.npz", 50.0),
-    "mujoco": ("mujoco", 50.0),
+    "isaaclab-npz": ("isaaclab.npz", 50.0),
+    "asap-pkl": ("asap.pkl", 30.0),
+    "sonic-pkl": ("sonic.pkl", 50.0),
+    "bones-csv": ("bones.csv", 120.0),
+    "mujoco": ("mujoco", 1000.0),
 }
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 # what a new simulation makes untrue and therefore removes, and what a new plan does

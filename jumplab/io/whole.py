@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -195,3 +195,13 @@ def ordered(urdf: str, order: str = ORDERS[0]) -> tuple[tuple[str, ...], tuple[s
         waiting = below[link] + waiting if order == ORDERS[0] else waiting + below[link]
     joints, links = zip(*moving, strict=True)
     return joints[1:], links
+
+
+def axes_of(urdf: str, names: Sequence[str]) -> np.ndarray:
+    """Axes (J, 3) of the joints with these names, in their own frames."""
+    axes = {
+        joint.get("name"): getattr(joint.find("axis"), "attrib", {}).get("xyz", "1 0 0")
+        for joint in ElementTree.fromstring(urdf).iterfind("joint")
+    }
+    ways = np.array([axes[name].split() for name in names], float)
+    return ways / np.linalg.norm(ways, axis=1, keepdims=True)

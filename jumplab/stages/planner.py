@@ -396,6 +396,7 @@ class Planner:
         contacts: Contacts,
         *,
         gravity: float = GRAVITY,
+        rise_m: float = 0.1,
         weights: Mapping[str, float] | None = None,
         motion: Motion | None = None,
         stance: np.ndarray | None = None,
@@ -406,6 +407,8 @@ class Planner:
         ----------
         contacts : the schedule; it ends at rest.
         gravity : [m/s^2].
+        rise_m : of the CoM, whose take-off speed the term "follow take-off speed" asks for if it
+            has a weight [m].
         weights : of cost terms of stage "whole body" in this plan, instead of their own.
         motion : along the schedule, that the plan shall be near to, and begins with.
         stance : configuration (nq,) in which it begins, soles flat in the first places.
@@ -421,8 +424,8 @@ class Planner:
                 "a schedule that ends at touchdown is a standing jump; ask for it by its target"
             )
         asked = sorted_out(weights=weights)[LAST]
-        # a schedule has its own places; of a target only gravity is taken
-        level = JumpTask(0.0, 0.1, gravity=gravity)
+        # a schedule has its own places; of a target only gravity and rise are taken
+        level = JumpTask(0.0, rise_m, gravity=gravity)
         settings = {"limits": self.limits}
         options = {}
         if motion is not None:

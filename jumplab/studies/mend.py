@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,20 +32,24 @@ from jumplab.stages.whole_body.coordinates import BASE
 from jumplab.stages.whole_body.motions import HEEL_UP, Motion, Reach, configurations
 from jumplab.stages.whole_body.settings import Limits
 from jumplab.stages.whole_body.tape import feet_of
+from jumplab.task import JumpTask
 
-AROUND_S = 0.6  # of standing, before the first and after the last event
+# of standing, before the first and after the last event: there it begins and ends where the joints
+# move least, [rad/s] rms, a second more of it counted as one more of those
+AROUND_S = (0.6, 1.2)
+LONG_S = 1.5  # of standing between two motions, of which one is mended
 MERGED_S = 0.12  # phases that are shorter are events of one ...
 SHUFFLED_S = 0.2  # as are those on one foot between two on both feet
-TOES_S = 0.1  # on the toes before a flight, ...
-ROLLING_S = 0.22  # ... if the phase before it is this long
-# steps [s] of phases on flat feet, after a flight, on the toes, in flight; the least number of them
-STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.018, FLIGHT: 0.03}
+TOES_S = 0.1  # on the toes before a flight, but at most half of the phase
+# steps [s] of phases on flat feet, where a foot lands, on the toes, in flight; least number of them
+STEPS_S = {"flat": 0.035, "landing": 0.024, "toe": 0.014, FLIGHT: 0.024}
 LEAST_STEPS = 6
-MOST_STEPS = 60
-# shares of a phase's time within which it may be changed, on the ground and in flight: kinematics
-# makes flights too long for their rise
+MOST_STEPS = 90
+# shares of a phase's time within which it may be changed, on the ground and in flight; feet that
+# kinematics moves in no time need some of it
 STRETCH = (0.6, 1.5)
-FLIGHT_STRETCH = (0.4, 1.2)
+FLIGHT_STRETCH = (0.86, 1.15)
+SHORT_FLIGHT_S = 0.3
 FREE_M = (0.15, 0.15)  # by which footholds may move
 FREE_RAD = 0.4
 BENT_RAD = 0.35  # of knees, down to which the base is lowered
@@ -52,8 +57,11 @@ LOWER_M = 0.005  # steps of that
 MOST_LOWER_M = 0.12
 OFF_M = 0.002
 START_ROUNDS = 30
+BEGUN_OFF = 0.05  # [m, rad] by which a sole may miss its place as it begins
 START_ROOM_RAD = 0.01  # of the first posture to the stops
 SMOOTH_FRAMES = 3.0
+LEAST_RISE_M = 0.02  # of a clip's flight, to be scaled
+RISE_WEIGHT = 1e5  # [1] / [m/s]^2, of the take-off speed that a target asks for
 FACTORS = (0.8, 0.6, 0.4)  # of what cannot be mended
 NEAR = 1e-3  # of a limit's size: it binds
 
@@ -81,8 +89,11 @@ class Mended(Shown):
     span_s: tuple[float, float] = (0.0, 0.0)
 
     def line(self) -> str:
-        """The clip and the plan."""
-        return f"{self.before.clip.name} as {self.plan.line()}"
+        """The clip, what of it is kept, and the plan."""
+        begin, end = self.span_s
+        all_s = self.before.clip.t[-1]
+        kept = f"{self.before.clip.name}, {begin:.2f} to {end:.2f} s of {all_s:.2f} s"
+        return f"{kept}, as {self.plan.line()}"
 
     @cached_property
     def jump(self) -> JumpPlan | None:
@@ -167,6 +178,45 @@ def mend(
     ) from refusal
 
 
+def like(
+    task: JumpTask,
+    motion: Any,
+    robot: Robot | str = "bhr",
+    *,
+    fps: float | None = None,
+    order: str = "depth-first",
+    **changes: Any,
+) -> JumpPlan:
+    """A jump to a target in the manner of a clip: its joints, its feet, its times on the ground.
+
+    Parameters
+    ----------
+    task : travel, rise and turn on level ground.
+    motion, robot, fps, order, changes : as of :func:`mend`; the clip jumps once, off both feet and
+        down on both.
+
+    Raises
+    ------
+    InputError, InfeasibleError, SolverError
+        If the clip or the target is not of that sort, or there is no such motion.
+    """
+    if task.platform_m or task.rotation_rad:
+        raise InputError("a jump like a clip is one on level ground that does not turn over")
+    before = (
+        motion if isinstance(motion, ClipReport) else judge(motion, robot, fps=fps, order=order)
+    )
+    require_type(before, ClipReport, "one clip to jump like")
+    draft = Draft(before, goal=task)
+    return Planner(before.clip.robot, keep=True, **changes).follow(
+        draft.contacts,
+        gravity=task.gravity,
+        rise_m=task.height_m,
+        weights={"follow take-off speed": RISE_WEIGHT},
+        motion=draft.motion,
+        stance=draft.start,
+    )
+
+
 def _mended(planner: Planner, before: ClipReport, factor: float = 1.0) -> Mended:
     draft = Draft(before, factor)
     plan = planner.follow(draft.contacts, motion=draft.motion, stance=draft.start)
@@ -184,15 +234,18 @@ def spans(flags: np.ndarray) -> list[tuple[int, int]]:
 # ----------------------------------------------------------------------------------------------
 def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
     """Feet that carry, from and to [s]: those of the clip without events of less than
-    :data:`MERGED_S`, cut to what is :data:`AROUND_S` around the others.
+    :data:`MERGED_S`, cut to what stands around the others (:data:`AROUND_S`).
 
-    Where both feet are fast for long but low, the clip skips, and flies here.
+    Where both feet are fast for long but low, the clip skips: here it flies, but between two steps
+    on one foot the other one carries.
     """
     fps = before.clip.fps
     ground = before.ground.copy()
     for a, b in spans(~before.still.any(axis=1)):
         if b - a > MERGED_S * fps and ground[a:b].any(axis=1).all():
-            ground[a:b] = False
+            one = ground[max(a - 1, 0)]
+            steps = one.sum() == 1 and np.array_equal(one, ground[min(b, len(ground) - 1)])
+            ground[a:b] = ~one if steps else False
     rows = _merged(phases_of(ground, fps))
     standing = [k for k, row in enumerate(rows) if row[0] == "LR"]
     if not standing or rows[standing[-1]][0] == FLIGHT:
@@ -200,35 +253,48 @@ def planned_phases(before: ClipReport) -> list[tuple[str, float, float]]:
             f"clip {before.clip.name!r}: it never stands on both feet, and a motion has to begin "
             f"so; give more of it"
         )
-    rows = rows[standing[0] : standing[-1] + 1]
+    # between long standing the motion that flies longest, else that of most phases
+    long = [k for k in standing[1:-1] if rows[k][2] - rows[k][1] > LONG_S]
+    ends = pairwise([standing[0], *long, standing[-1]])
+    parts = [[list(row) for row in rows[a : b + 1]] for a, b in ends] or [rows[standing[0] :]]
+    rows = max(parts, key=lambda x: (sum(b - a for f, a, b in x if f == FLIGHT), len(x)))
     if len(rows) > 1:
-        rows[0][1] = max(rows[0][1], rows[0][2] - AROUND_S)
-        rows[-1][2] = min(rows[-1][2], rows[-1][1] + AROUND_S)
+        rows[0][1] = max(rows[0][1], rows[0][2] - _standing_s(before, rows[0][2], -1))
+        rows[-1][2] = min(rows[-1][2], rows[-1][1] + _standing_s(before, rows[-1][1], 1))
     for k in range(len(rows) - 1, 0, -1):
         feet, a, b = rows[k - 1]
-        if rows[k][0] == FLIGHT and b - a > ROLLING_S:
-            rows[k - 1][2] = b - TOES_S
-            rows.insert(k, [feet.lower(), b - TOES_S, b])
+        if rows[k][0] == FLIGHT:
+            rises = b - min(TOES_S, (b - a) / 2)
+            rows[k - 1][2] = rises
+            rows.insert(k, [feet.lower(), rises, b])
     return [(feet, a, b) for feet, a, b in rows]
 
 
+def _standing_s(before: ClipReport, event_s: float, way: int) -> float:
+    """How much of the standing before (``way`` -1) or after an event to keep [s]."""
+    rates = np.sqrt((before.tape.v[:, 6:] ** 2).mean(axis=1))
+    kept = np.arange(AROUND_S[0], AROUND_S[1] + 1e-9, 1 / before.clip.fps)
+    return float(kept[np.argmin(np.interp(event_s + way * kept, before.clip.t, rates) + kept)])
+
+
 def _merged(phases: Sequence[tuple[str, float, float]]) -> list[list]:
-    """Phases without those too short to count, whose time goes to those beside them."""
+    """Phases without those too short to count, those on one foot first; their time goes to those
+    beside them, but to flights only what is between two of them.
+    """
     rows = [list(row) for row in phases]
-    k = 0
-    while k < len(rows):
-        feet, a, b = rows[k]
-        again = k > 0 and rows[k - 1][0] == feet
-        if not again and (len(rows) == 1 or b - a >= _shortest(rows, k)):
-            k += 1
-            continue
-        del rows[k]
-        if again:
-            rows[k - 1][2] = b
-        elif 0 < k < len(rows):
-            rows[k - 1][2] = rows[k][1] = (a + b) / 2
-        k = 0
-    return rows
+    while True:
+        for k in range(len(rows) - 1, 0, -1):
+            if rows[k][0] == rows[k - 1][0]:
+                rows[k - 1][2] = rows.pop(k)[2]
+        short = [k for k, (_, a, b) in enumerate(rows) if b - a < _shortest(rows, k)]
+        if not short or len(rows) == 1:
+            return rows
+        k = min(short, key=lambda k: (rows[k][0] == "LR", rows[k][2] - rows[k][1]))
+        _, a, b = rows.pop(k)
+        if 0 < k < len(rows):
+            flies = [rows[k - 1][0] == FLIGHT, rows[k][0] == FLIGHT]
+            at = (a + b) / 2 if flies[0] == flies[1] else a if flies[0] else b
+            rows[k - 1][2] = rows[k][1] = at
 
 
 def _shortest(rows: list[list], k: int) -> float:
@@ -238,7 +304,8 @@ def _shortest(rows: list[list], k: int) -> float:
 
 
 class Draft:
-    """A clip made ready to be followed, ``factor`` of its way, turn and height.
+    """A clip made ready to be followed, ``factor`` of its way, turn and height; with a ``goal`` its
+    only flight goes there.
 
     Attributes
     ----------
@@ -248,7 +315,7 @@ class Draft:
     start : configuration (nq,) in which it begins.
     """
 
-    def __init__(self, before: ClipReport, factor: float = 1.0):
+    def __init__(self, before: ClipReport, factor: float = 1.0, goal: JumpTask | None = None):
         self.clip: Clip = before.clip
         self.body = Body(self.clip.robot)
         self.reach = Reach(self.body, Limits().range_margin_rad)
@@ -262,8 +329,50 @@ class Draft:
         tips = origin + turn @ self.clip.robot.foot.tip
         self.feet = np.concatenate([tips, yaw[..., None]], axis=2)  # (n, 2, 4) x y z yaw
         self.holds = self._holds()
+        self.goal = goal
+        if goal is not None:
+            self._go(goal, before)
         self.contacts = self._contacts(factor)
         self.motion = self._along()
+
+    def _go(self, goal: JumpTask, before: ClipReport) -> None:
+        """Move what follows the flight to the ``goal``, and the flight on the way there, as high as
+        that asks for.
+        """
+        feet = [x for x, *_ in self.phases]
+        k = feet.index(FLIGHT) if FLIGHT in feet else 0
+        if feet.count(FLIGHT) != 1 or feet[k - 1] != "lr" or feet[k + 1] != "LR":
+            raise InputError(
+                f"clip {self.clip.name!r}: its feet carry as {' '.join(feet)}; a jump to a target "
+                f"is like one that flies once, off both feet and down on both"
+            )
+        stood, middle = (self._middle(hold) for hold in (self.holds[0], self.holds[k + 1]))
+        turn = goal.yaw_rad - (middle[2] - stood[2])
+        way = np.add(stood[:2], [goal.distance_m, goal.side_m])
+        back = pin.rpy.rpyToMatrix(0.0, 0.0, turn)[:2, :2].T
+
+        def there(x: np.ndarray) -> np.ndarray:
+            return (x - middle[:2]) @ back + way
+
+        _, begin, end = self.phases[k]
+        share = np.clip((self.clip.t - begin) / (end - begin), 0.0, 1.0)[:, None]
+        x = self.charts
+        x[:, :2] += share * (there(x[:, :2]) - x[:, :2])
+        x[:, 3] += share[:, 0] * turn
+        rises_m = [flight["rise_m"] for flight in before.manifest["flights"]]
+        line = np.interp(self.clip.t, [begin, end], np.interp([begin, end], self.clip.t, x[:, 2]))
+        flown = (share > 0) & (share < 1)
+        more = goal.height_m / max([*rises_m, LEAST_RISE_M]) - 1
+        x[:, 2] += flown[:, 0] * more * (x[:, 2] - line)
+        for hold in self.holds[k + 1 :]:
+            for side, place in hold.items():
+                hold[side] = np.array([*there(place[:2]), 0.0, place[3] + turn])
+
+    def _middle(self, hold: dict[int, np.ndarray]) -> np.ndarray:
+        """x, y of the middle between the soles in their places [m], and their mean yaw [rad]."""
+        half = self.body.half_m
+        soles = [[x - half * np.cos(a), y - half * np.sin(a), a] for x, y, _, a in hold.values()]
+        return np.mean(soles, axis=0)
 
     def _rows(self, k: int) -> slice:
         """Frames of a phase."""
@@ -301,17 +410,21 @@ class Draft:
         phases = []
         for k, (feet, a, b) in enumerate(self.phases):
             lasts = (b - a) * (math.sqrt(factor) if feet == FLIGHT else 1.0)
-            low, high = FLIGHT_STRETCH if feet == FLIGHT else STRETCH
+            if self.goal and feet == FLIGHT:
+                lasts = 2 * self.goal.takeoff_speed / self.goal.gravity
+            low, high = (lasts * x for x in (FLIGHT_STRETCH if feet == FLIGHT else STRETCH))
+            if feet == FLIGHT:
+                high = max(high, SHORT_FLIGHT_S)
             kind = feet if feet == FLIGHT else "toe" if feet.islower() else "flat"
-            if k and self.phases[k - 1][0] == FLIGHT:
+            if k and kind == "flat" and self.holds[k].keys() - self.holds[k - 1].keys():
                 kind = "landing"
             steps = min(MOST_STEPS, max(LEAST_STEPS, math.ceil(lasts / STEPS_S[kind])))
-            phases.append(ContactPhase(feet, (low * lasts, high * lasts), lasts, steps))
+            phases.append(ContactPhase(feet, (low, high), lasts, steps))
             for side, hold in self.holds[k].items():
                 if k and side in self.holds[k - 1]:
                     continue
                 ahead, left = hold[:2] - self.body.places[side][:2]
-                free = (FREE_M, FREE_RAD) if k else ((0.0, 0.0), 0.0)
+                free = ((0.0, 0.0), 0.0) if self.goal or not k else (FREE_M, FREE_RAD)
                 place = Place(float(ahead), float(left), float(hold[3]), 0.0, *free)
                 (places if k else first).append(place)
         return Contacts(tuple(phases), tuple(places), first=tuple(first))
@@ -378,6 +491,12 @@ class Draft:
             chart, left = self._placed(chart, 0, 0)
             if min(self._bends(chart)) < BENT_RAD or left > OFF_M:
                 chart[2] -= LOWER_M
+        if left > BEGUN_OFF:
+            raise InfeasibleError(
+                f"clip {self.clip.name!r} cannot be mended: where it begins, both legs at the ends "
+                f"of their ranges leave a sole {left:.2f} rad or m off flat on its place; the feet "
+                f"are {np.linalg.norm(self.holds[0][0][:2] - self.holds[0][1][:2]):.2f} m apart"
+            )
         return chart
 
     def _placed(self, chart: np.ndarray, k: int, i: int) -> tuple[np.ndarray, float]:

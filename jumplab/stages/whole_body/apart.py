@@ -15,15 +15,16 @@ from jumplab.stages.whole_body.shapes import Apart, Box, Pair
 SAMPLES = 3  # in every interval, that are looked at
 NODES = 2  # before and after such an instant that a row is for
 MORE_M = 0.006  # that links which met between the nodes of their row keep besides
-LEAST_M = 0.002  # distance that links must keep; the audit asks for half of it
+MET_M = 1e-3  # nearer than what a row asks for by this, links are said to meet
 
 Placed = tuple[Box, np.ndarray, np.ndarray]  # middles (n, 3) and axes (n, 3, 3) of a box
 
 
-def too_close(body: Body, phases: Sequence[PhaseSolution]) -> list[Apart]:
-    """Rows for the links that are nearer than :data:`LEAST_M` [m] in the motion of some phases, one
-    after the other; none if all is well.
+def too_close(body: Body, phases: Sequence[PhaseSolution], kept_m: float) -> list[Apart]:
+    """Rows for the links that are nearer than ``kept_m``, less :data:`MET_M` [m], in the motion of
+    some phases, one after the other; none if all is well.
     """
+    least_m = kept_m - MET_M
     at = [np.linspace(0.0, p.duration, SAMPLES * (len(p.t) - 1) + 1) for p in phases]
     phase = np.repeat(np.arange(len(phases)), [len(t) for t in at])
     node = np.concatenate([np.arange(len(t)) / SAMPLES for t in at])
@@ -38,11 +39,12 @@ def too_close(body: Body, phases: Sequence[PhaseSolution]) -> list[Apart]:
         one = boxes[i]
         other = boxes[k]
         reach = np.linalg.norm(one[0].half) + np.linalg.norm(other[0].half)
-        if np.linalg.norm(one[1] - other[1], axis=1).min() > reach + LEAST_M:
+        if np.linalg.norm(one[1] - other[1], axis=1).min() > reach + least_m:
             continue
         gaps = np.concatenate([face_gaps(one, other), face_gaps(other, one)])  # (12, n)
-        near = np.flatnonzero(gaps.max(axis=0) < LEAST_M)
-        met = [row for row in near if _distance(body, number, configurations[row]) < LEAST_M]
+        # the first node is given, so that before the second one no row keeps them apart
+        near = np.flatnonzero((gaps.max(axis=0) < least_m) & ((phase > 0) | (node >= 1)))
+        met = [row for row in near if _distance(body, number, configurations[row]) < least_m]
         for rows in _runs(np.array(met, int)):
             # one face, or neighbouring phases ask for two
             face = int(np.argmax(gaps[:, rows].min(axis=1)))
@@ -97,13 +99,14 @@ def merged(old: Sequence[Apart], new: Sequence[Apart]) -> tuple[Apart, ...]:
     """Both; rows of one pair, face and phase are one row for the nodes from the first to the last
     of them.
 
-    Links that met in spite of their row met between its nodes: it asks for :data:`MORE_M` [m] more.
+    Links that met where their row is met between its nodes: it asks for :data:`MORE_M` [m] more.
     """
     out = {(x.phase, x.pair.key): x for x in old}
     for x in new:
         key = x.phase, x.pair.key
         if y := out.get(key):
-            more = y.more_m + MORE_M
+            inside = x.first + NODES >= y.first and x.last - NODES <= y.last
+            more = y.more_m + MORE_M * inside
             x = replace(x, first=min(x.first, y.first), last=max(x.last, y.last), more_m=more)
         out[key] = x
     return tuple(out.values())

@@ -228,7 +228,8 @@ class WholeBodyPlanner:
         """
         solved = program.solve_apart(asked, start)
         best = WholeBodyPlan.of(program, asked.task, solved, start.name)
-        for further in REFINED:
+        # what is followed is settled
+        for further in REFINED[program.follows :]:
             if best.used <= 1 or program.spent(asked):
                 break
             program = program if further is SETTLED else program.finer

@@ -54,6 +54,7 @@ USUAL_SIZE = 4500  # variables, up to which that holds; larger programs have mor
 # [s] an iteration in a program of that size may take on average, three times as long as on a quiet
 # core
 ITERATION_S = 0.12
+RISING_S = 0.06  # in which a foot that follows a motion rises or comes down by its clearance
 ROUNDS = 4  # of rows for links that met
 BUILT = 8  # programs with such rows that are kept
 
@@ -194,7 +195,7 @@ class Program(Shown):
 
     def _met(self, solved: Solved) -> list[Apart]:
         """Rows for links that meet; in an even motion without those of mirror images."""
-        met = too_close(self.body, list(solved.phases.values()))
+        met = too_close(self.body, list(solved.phases.values()), self.limits.link_distance_m)
         if not self.free.even:
             return met
         model = self.body.model
@@ -251,9 +252,13 @@ class Program(Shown):
         values = {p.name: {} for p in phases}
         for side in self.free.sides:
             for run in _runs([side not in p.modes for p in phases]):
-                ends = np.cumsum([0, *(phases[k].intervals for k in run)])
+                lasts = [phases[k].guess_s if self.follows else phases[k].intervals for k in run]
+                ends = np.cumsum([0.0, *lasts])
                 for k, first, last in zip(run, ends, ends[1:], strict=False):
-                    bump = _bump(np.arange(first, last + 1) / ends[-1])
+                    at = np.linspace(first, last, phases[k].intervals + 1)
+                    bump = _bump(at / ends[-1])
+                    if self.follows:  # a foot does not leave, or come down, at once
+                        bump = np.minimum(bump, (np.minimum(at, ends[-1] - at) / RISING_S) ** 3)
                     # in a jump the soles come down steeply, in a step they hardly leave the ground
                     height = bump**3 if run[-1] == len(phases) - 1 else bump
                     if phases[k].flying:

@@ -97,6 +97,7 @@ class Limits:
             straight_knee_rad=0.25,
             sides_share=0.3,
             hands_inward_m=1.0,
+            link_distance_m=0.008,  # its arms are near its legs for long, also between nodes
         )
 
     def of_flip(self) -> Limits:
@@ -143,12 +144,13 @@ class Weights:
     track_duration: float = 50.0  # [1] / [s]^2
 
     # where a given motion is followed
-    follow_joints: float = 20.0  # [1] / [rad]^2 / [s]
+    follow_joints: float = 50.0  # [1] / [rad]^2 / [s]
     follow_base: float = 100.0  # [1] / [m]^2 / [s]
     follow_attitude: float = 60.0  # [1] / [rad]^2 / [s]
+    follow_takeoff: float = 0.0  # [1] / [m/s]^2, of the vertical speed that a target's rise needs
     follow_duration: float = 100.0  # [1], of the share by which a phase is longer or shorter
-    # [1] / [m, rad]^2; with a twentieth of it feet are shuffled instead of jumped
-    follow_foothold: float = 600.0
+    # [1] / [m, rad]^2; with a fortieth of it feet are shuffled instead of jumped
+    follow_foothold: float = 1200.0
 
     def of_clip(self) -> Weights:
         """The same for a motion that follows another one: what it costs counts less."""

@@ -192,8 +192,11 @@ GIVEN = (
     Start(MENDED, from_mended, True, 60),
     Start(MENDED, from_mended, False, 150),
 )
-# of a motion that is followed: near it the exact Hessian settles, the held one wanders
-FOLLOWED = (Start("given motion", from_motion, False, 120),)
+# of a motion that is followed: near it the exact Hessian settles, the held one wanders; links that
+# meet move it further, so it need not be exact before
+FOLLOWED = (
+    Start("given motion", from_motion, False, 120, QUICK | {"acceptable_obj_change_tol": 5e-3}),
+)
 FROM_NEIGHBOUR = (
     Start(NEIGHBOUR, from_neighbour, True, 100, NEAR),
     Start(NEIGHBOUR, from_neighbour, False, 150, WARM | {"acceptable_iter": 1}),

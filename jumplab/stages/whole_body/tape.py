@@ -31,6 +31,7 @@ from jumplab.stages.whole_body.problem import Schedule
 SHORTEST_S = 0.05 / RATE_HZ  # a shorter last step is joined to the one before
 # over which a phase passes from where the one before ended on the tape to its own plan
 JOINING_S = 0.25
+BALANCED_S = 0.4  # after about so much the base is back where it is planned
 BALANCING = 2  # corrections, each a hundred times smaller than the one before
 LANDED_RAD = 1e-6  # [rad, rad/s] by which legs may miss their plan at the end of a flight
 LANDINGS = 60  # corrections of that end at most; a jump takes two or three
@@ -141,12 +142,16 @@ def _travel(robot: Robot, origin: np.ndarray, turn: np.ndarray) -> dict[str, np.
     return {"soles_travel": middle[1] - middle[0], "feet_turn": np.array(turned[-1] - turned[0])}
 
 
-def _joining(before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray) -> Motion:
+def _joining(
+    before: Sequence[np.ndarray], after: Sequence[np.ndarray], t: np.ndarray, most_s: float
+) -> Motion:
     """What to add to a motion (n, k) on three levels that begins at ``after`` (k,) each, so that it
-    begins at ``before`` and is itself again after :data:`JOINING_S`; ``t`` (n,) since then [s].
+    begins at ``before`` and is itself again after :data:`JOINING_S`, ``most_s`` at the latest;
+    ``t`` (n,) since then [s].
     """
     ends = [(x - y, np.zeros(len(x))) for x, y in zip(before, after, strict=True)]
-    return quintic(ends, JOINING_S, np.minimum(t, JOINING_S)[:, None])
+    lasts = min(JOINING_S, most_s)
+    return quintic(ends, lasts, np.minimum(t, lasts)[:, None])
 
 
 # on the ground
@@ -193,16 +198,25 @@ def _ground(
             places, rates, gains = (x[-1] for x in before.motion)
             first = solved[numbers[0]]
             after = (first.q[0, : b.nv], first.v[0, : b.nv], gains)
-            more = _joining((places, rates, gains), after, instants - t[0])
+            since = instants - t[0]
+            more = _joining((places, rates, gains), after, since, t[-1] - t[0])
             motion = [x + y for x, y in zip(motion, more, strict=True)]
         pitch = {side: [x[:, b.nv + i] for x in sampled] for i, side in enumerate(b.raised)}
         holds = holds_of(phase, b)
         legs = Legs.of(schedule.body, list(holds))
         wrench, contacts = _planned(b, phase, holds, at)
         leaves = k + 1 < len(solved) and schedule.modes[k + 1].flying
-        if len(instants) > 1 and (_on_a_line(holds, pitch) or leaves or schedule.follows):
-            given = pitch, holds, instants, robot, wrench.sum(axis=1)
-            motion = _balanced(legs, motion, *given, stays=not leaves)
+        line = _on_a_line(holds, pitch) and not (schedule.follows and len(holds) == 1)
+        if len(instants) > 1 and (line or leaves or schedule.follows):
+            count = 1 if line else max(1, round((instants[-1] - instants[0]) / BALANCED_S))
+            rows = np.array_split(np.arange(len(instants)), count)
+            balanced = []
+            for part in rows:
+                tipped = {side: [x[part] for x in levels] for side, levels in pitch.items()}
+                given = tipped, holds, instants[part], robot, wrench[part].sum(axis=1), line
+                stays = not leaves or part is not rows[-1]
+                balanced.append(_balanced(legs, [x[part] for x in motion], *given, stays=stays))
+            motion = [np.concatenate(x) for x in zip(*balanced, strict=True)]
         motion = legs.held(motion, holds, pitch)
         parts.append((motion, wrench, contacts))
     motions, wrenches, codes = zip(*parts, strict=True)
@@ -243,12 +257,13 @@ def _balanced(
     t: np.ndarray,
     robot: Robot,
     wrench: np.ndarray,
+    line: bool,
     stays: bool,
 ) -> Motion:
     """The motion, its base moved by some micrometres so that the ground's force is what is planned.
 
-    Where all feet that carry are on their toes, in one line, no ground force has a moment about
-    that line: what the motion between nodes needs of it goes. Elsewhere all that it needs besides
+    Where all feet that carry are on their toes, in one ``line``, no ground force has a moment about
+    it: what the motion between nodes needs of that goes. Elsewhere all that it needs besides
     the planned ``wrench`` (n, 6) goes: where the load is low, little of it would tip the feet. What
     a phase moves the base by goes within the phase if it ``stays`` on the ground.
     """
@@ -257,7 +272,6 @@ def _balanced(
     q, v, a = (x.copy() for x in motion)
     edge = np.mean(list(holds.values()), axis=0)
     ahead, across, _ = pin.rpy.rpyToMatrix(0.0, 0.0, edge[3]).T
-    line = _on_a_line(holds, pitch)
     every = np.arange(len(t))
     ways = np.array([[*ahead, 0.0, 0.0, 0.0]]) if line else np.eye(BASE)
     seen = np.array([[0.0, 0.0, 0.0, *across]]) if line else np.eye(BASE)
@@ -323,7 +337,7 @@ def _flight(
     since = t - t[0]
     planned = flight.sample(since)
     last = [x[-1, BASE:] for x in before.motion]
-    more = _joining(last, [x[0, BASE:] for x in planned], since)
+    more = _joining(last, [x[0, BASE:] for x in planned], since, since[-1])
     joints = [x[:, BASE:] + y for x, y in zip(planned, more, strict=True)]
     fall = Fall(robot, model, before.motion)
     missed = _arriving(body, [x[-1:, : len(model.names)] for x in planned], sides)

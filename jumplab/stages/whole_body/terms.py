@@ -301,15 +301,16 @@ def reserve(m: Mode) -> list[Term]:
 
 # feet in the air
 # ---------------------------------------------------------------------------------------------
-def swing_rows(m: Mode, side: int) -> Term:
+def swing_rows(m: Mode, side: int, follows: bool) -> Term:
     """A foot in the air keeps its sole's corners off the ground [m], in the plane points along its
     middle line, by as much as the references ask for.
 
-    Its ankle stays as high as it stands, or the shank would graze.
+    Its ankle stays as high as it stands, or the shank would graze, and a margin, which in a motion
+    that ``follows`` another comes and goes with the clearance.
     """
     body = m.body
     foot = body.feet[side]
-    least = body.ankle_m + m.limits.ankle_margin_m
+    margin = m.limits.ankle_margin_m
     places = body.corners[side]
     if m.free.plane:
         toe, heel = places.reshape(2, 2, 3).mean(axis=1)
@@ -317,7 +318,8 @@ def swing_rows(m: Mode, side: int) -> Term:
 
     def heights(p):
         asked = getattr(p.ref, f"{SIDES[side]}_clearance")
-        lows = [(place, asked) for place in places] + [(np.zeros(3), least)]
+        more = margin * asked / m.limits.clearance_m if follows else margin
+        lows = [(place, asked) for place in places] + [(np.zeros(3), body.ankle_m + more)]
         points = [(p.tree.point(foot, place), low) for place, low in lows]
         return ca.vertcat(*(x[2] - p.ground(x) - low for x, low in points))
 
@@ -570,15 +572,16 @@ def phase_terms(
     terms = all_phases(m, joined)
     for side in m.sides:  # the first node is given, so it needs no rows
         terms += foot_rows(m, side, joined or first, side in landed)
-    terms += [swing_rows(m, side) for side in m.free.sides if side not in m.modes]
+    terms += [swing_rows(m, side, follows) for side in m.free.sides if side not in m.modes]
     if m.flying:
         terms += opening_rows(m)
     if tracked:
         terms += tracking(m)
     if follows:
         terms += following(m, landed)
-    if m.feet == "LR":
+    if m.feet == "LR" or (follows and m.feet.isupper()):
         terms += reserve(m)
+    if m.feet == "LR":
         if both_carry and (m.limits.least_push or not m.free.even):
             terms.append(loads(m))
     if len(m.modes) == 1 or follows:

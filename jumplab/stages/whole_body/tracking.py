@@ -96,7 +96,12 @@ def following(m: Mode, landed: Iterable[int]) -> list[Term]:
     def duration(p):
         return p.duration / p.ref.lasts - 1
 
+    def takeoff(p):
+        return p.flight("vel")[2] - p.p.takeoff_speed
+
+    speed = row("take-off speed", "m/s", "start", takeoff, w.follow_takeoff)
     return [
+        *([speed] if m.flying else []),
         row("joints", "rad", "node", joints, w.follow_joints),
         row("base", "m", "node", place, w.follow_base),
         row("attitude", "rad", "node", attitude, w.follow_attitude),
