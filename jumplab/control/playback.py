@@ -72,9 +72,11 @@ class Playback:
         self._rate = self._v[:, 6:]
         last = np.searchsorted(tape.t, self._grid + STEP_S / 2, side="right") - 1
         self._stands = tape.contacts[last]
-        changes = np.diff(self._stands > tapes.AIR, axis=0).any(axis=1)
+        changes = np.diff((self._stands > tapes.AIR).astype(int), axis=0)
+        # the first step in which a foot comes down
+        self.lands = int(np.argmax([*(changes > 0).any(axis=1), True])) + 1
         self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
-        self._change[:-1][changes] = 0.0  # what the ground gives changes there at once
+        self._change[:-1][changes.any(axis=1)] = 0.0  # what the ground gives changes there at once
         first = (self._stands != self._stands[0]).any(axis=1)
         self._moves = int(np.argmax(first)) if first.any() else self.steps
 

@@ -77,10 +77,9 @@ class PlanOnFile:
     @classmethod
     def read(cls, folder: str | Path) -> PlanOnFile:
         """The plan of a ``folder`` (that of ``jumplab plan``); raises :class:`InputError` if it
-        holds no whole one of a jump.
+        holds no whole one.
         """
         tape, robot, summary = store.read_plan(folder)
-        tape.require_jump()
         return cls(Path(folder), tape, robot, Scene.of_plan(summary, robot), summary)
 
     @property
