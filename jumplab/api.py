@@ -35,7 +35,7 @@ def plan(
     task: JumpTask | None = None,
     robot: Robot | str | Path = "bhr",
     *,
-    contacts: Contacts | None = None,
+    contacts: Contacts | str | None = None,
     method: str = USUAL,
     robust: Ranges | None = None,
     patience_s: float = math.inf,
@@ -48,8 +48,8 @@ def plan(
     ----------
     task : what to reach, in a jump from a stand; or else
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
-        your own. It is planned by the whole-body program, audited foot by foot, and not yet played
-        on a simulated robot.
+        your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
+        whole-body program, and audited foot by foot.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
     method : "direct" (the whole body alone) or, for targets in the plane, "three-step" (SRMP,
         joint-space QPs, whole body: what the paper does). The default is "direct", but "three-step"
@@ -80,6 +80,8 @@ def plan(
                 "a contact schedule is planned by the whole-body program; leave method and robust "
                 "out"
             )
+        if isinstance(contacts, str):
+            contacts = Contacts.named(contacts, robot)
         return Planner(robot, keep=True, **changes).follow(contacts)
     if robust is not None:
         from jumplab.studies.robust import robust_changes

@@ -71,8 +71,9 @@ class Controller:
         :mod:`.servo`; after it, a landing in torque mode.
     reaim : put the legs in the air to where they can catch the robot, see :class:`.reaim.Reaim`.
     step : allow one recovery step after touchdown, see :class:`.step.RecoveryStep`.
-    feedback : let the joints leave the tape in launch, so that the body as a whole launches as
-        planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd".
+    feedback : let the joints leave the tape on the ground, so that the body as a whole moves as
+        planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd". If None, where the tape
+        stands on one foot: what is wrong there tips the robot.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state;
         "spring" leads to the stance by spring-dampers alone, and so does "planned" where stage 1
         finds no landing.
@@ -102,7 +103,7 @@ class Controller:
         mode: str = "position",
         reaim: bool = False,
         step: bool = False,
-        feedback: bool = False,
+        feedback: bool | None = None,
         landing: str = "planned",
         ground: Callable[[float], float] = level,
         hardware: Hardware = Hardware(),
@@ -129,6 +130,9 @@ class Controller:
         self._servo = kind(robot, hardware.delay_s, hardware.substeps)
         if feedback:
             check_mode(mode)
+        if feedback is None:
+            alone = (tape.contacts > AIR).sum(axis=1) == 1
+            feedback = bool(at_rest and mode != "pd" and alone.any())
         self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None
         self._awaited = tape.contacts[-1] == AIR  # feet, which end the tape as they come down
         flies = bool(self._awaited.all())

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from jumplab.control import STEP_S
-from jumplab.control.body import PERIOD_STEPS, WRENCH_SCALE, WholeBody, corner_rows, solver
+from jumplab.control.body import PERIOD_STEPS, WholeBody, corner_rows, solver
 from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
 from jumplab.control.playback import AIR, FLAT, Command, Playback, Stand, resampled
 from jumplab.errors import InputError
@@ -43,7 +43,7 @@ FADE_SHARE = 0.4
 FADED = 5.0
 # weights of base accelerations and of wrenches / 100 N, so that the answer is one
 LEAST = 1e-8
-LEAST_WRENCH = 1e-2
+LEAST_WRENCH = 1e-4
 TORQUE_DIGITS = 4  # [0.1 mN m]
 DIGITS = 9  # of accelerations: ProxQP's last ones depend on where its memory lies
 
@@ -113,7 +113,6 @@ class LaunchFeedback:
             stand: (on_feet(robot, point), np.split(corner_rows(robot, FRICTION, share, 1.0), 2))
             for stand, (point, share) in stands.items()
         }
-        self._points = {stand: point for stand, (point, _) in stands.items()}
         self._legs = [leg - BASE for leg in leg_columns(robot)]
 
     def _planned(self, tape: Tape) -> np.ndarray:
@@ -180,8 +179,7 @@ class LaunchFeedback:
             if self.rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
                 self.changes = -2 * POSTURE_RATE * self._rates
             else:
-                at = command.state or state[:2]
-                self.changes, tau = self._solve(due, stand, *at, command.wrench)
+                self.changes, tau = self._solve(due, stand, *(command.state or state[:2]))
                 self._torque = self._none if tau is None else tau - command.tau
         self._rates = self._rates + STEP_S * self.changes
         self.angles = self.angles + STEP_S * self._rates
@@ -218,11 +216,10 @@ class LaunchFeedback:
         self.off_m = float(np.clip(ahead, -MOST_OFF_M, MOST_OFF_M))
 
     def _solve(
-        self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray, wrench: np.ndarray
+        self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step
-        ``due``, whose ``wrench`` (2, 6) is on the feet, and the motors' torques (nv - 6,) with that
-        [N m], None without a solution.
+        ``due``, and the motors' torques (nv - 6,) with that [N m], None without a solution.
         """
         body = self._body
         carries = np.array(stand) > tapes.AIR
@@ -233,7 +230,9 @@ class LaunchFeedback:
         body.update(q, v, anchors)
         body.set_contact(carries)
         com, speed, push, momentum, spin, _, *toes = self.rows[due]
-        if due >= self.playback.lands:  # feet stand where they came down, and the plan goes on there
+        if (
+            due >= self.playback.lands
+        ):  # feet stand where they came down, and the plan goes on there
             com = com + [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
         ahead = self.off_m * self._forward
         # that the real CoM takes besides
@@ -254,10 +253,7 @@ class LaunchFeedback:
             qp.cost(f"foot {side}", body.sole_rows[side], -body.sole_drift[side], still)
         qp.cost("posture", body.unknowns[6 : body.nv], tape + back, posture)
         qp.cost("base", body.unknowns[:6], 0.0, LEAST)
-        # what feet push against each other no motion says: as planned
-        arms = [turn @ self._points[x] for turn, x in zip(body.attitudes, stand, strict=True)]
-        load = wrench - np.hstack([np.zeros((2, 3)), np.cross(arms, wrench[:, :3])])
-        qp.cost("wrenches", body.unknowns[body.nv :], load.ravel() / WRENCH_SCALE, LEAST_WRENCH)
+        qp.cost("wrenches", body.unknowns[body.nv :], 0.0, LEAST_WRENCH)
         answer = self.solver.solve(qp)
         if not answer.solved:
             self._spin = spin

@@ -259,6 +259,4 @@ def _check(tape: Tape, stand_s: float) -> None:
                 f"the tape's {name} has entries that are no number; plan the jump again"
             )
     if not tape.contacts[0].all() or not tape.flights:
-        raise InputError(
-            "the tape must begin on both feet, and have a flight; plan the jump again"
-        )
+        raise InputError("the tape must begin on both feet, and have a flight; plan the jump again")
