@@ -200,7 +200,7 @@ class Controller:
         return command if self.feedback is None else self.feedback(step, command, state)
 
     def _touches(self, step: int, state: State) -> bool:
-        """Whether the feet that are awaited come down; those that others stand for do so in time."""
+        """Whether the feet that are awaited come down; beside one that stands, in time at least."""
         late = self.forecast is None and step >= self.playback.steps
         return late or state.wrench[self._awaited, 2].sum() > self._touches_n
 

@@ -230,9 +230,7 @@ class LaunchFeedback:
         body.update(q, v, anchors)
         body.set_contact(carries)
         com, speed, push, momentum, spin, _, *toes = self.rows[due]
-        if (
-            due >= self.playback.lands
-        ):  # feet stand where they came down, and the plan goes on there
+        if due >= self.playback.lands:  # the plan goes on where the feet came down
             com = com + [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
         ahead = self.off_m * self._forward
         # that the real CoM takes besides

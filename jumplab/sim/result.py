@@ -33,6 +33,7 @@ SMOOTHING_S = 0.02
 SATURATED = 0.999  # share of the available torque that counts as "at the limit"
 # a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
 MIN_FLIGHT_S = 0.05
+LOADED = 0.05  # [1] of the weight
 FLOWN_M = 0.01  # way of the toe until the middle of a flight; feet that only carry nothing stay
 REPORT_NAME = "simulation.json"
 XZ = tuple[float, float]
@@ -70,7 +71,8 @@ class Finding:
 class Metrics:
     """Numbers of one run, all measured in the simulation; None where it did not get so far.
 
-    Take-off is that of the flight that rises highest, touchdown the end of the last one. Loads are ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the
+    Take-off is that of the flight that rises highest, touchdown the end of the last one. Loads are
+    ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the
     landing along the heading in which the robot was meant to land, those of the launch along the
     one in which it began.
     """
@@ -113,7 +115,7 @@ class Metrics:
     landing_impulse: XZ | None = None
     # largest mean over 20 ms of what presses on both feet then [N]
     landing_force_n: Maybe = None
-    # largest way of a foot's toe while it is loaded, from one coming down to the next [m]
+    # largest way of a toe along the ground while its foot is loaded, until the last touchdown [m]
     slip_m: Maybe = None
     # when, after touchdown, a foot left to catch the robot elsewhere; where the feet end counts
     # that step then
@@ -264,8 +266,8 @@ def record(
 
     ``rows`` are of each step (nq,) and (nv,) before it, the motors' torques (nv - 6,) in it [N m],
     and what touched in it; ``goal`` (nq,) is how the tape ends, where the ground is really
-    ``higher_m`` higher [m], after so many ``flights``; ``solves`` are QPs posed and failed. Raises :class:`SolverError` if the
-    engine's numbers have exploded.
+    ``higher_m`` higher [m], after so many ``flights``; ``solves`` are QPs posed and failed. Raises
+    :class:`SolverError` if the engine's numbers have exploded.
     """
     *columns, contacts = zip(*rows, strict=True)
     q, v, tau = map(np.array, columns)
@@ -359,6 +361,7 @@ class _Jump:
         out = dict(
             stray_contacts=tuple(run.link_names[i] for i in np.flatnonzero(stray)),
             launch_impulse=_xz(self.force[:off].sum(axis=0) * STEP_S),
+            slip_m=self.slip(),
         )
         if off is None:
             return out
@@ -370,6 +373,20 @@ class _Jump:
             takeoff_velocity=_xz(run.com_velocity[off]),
             takeoff_momentum=float(run.L[off]),
         )
+
+    def slip(self) -> float:
+        """The largest way of a toe along the ground, of those that a foot goes while it is loaded,
+        until the last touchdown [m].
+        """
+        robot = self.run.robot
+        rows = slice(0, self.touchdown)
+        loaded = self.run.foot_wrench[rows, :, 2] > LOADED * robot.total_mass * robot.gravity
+        tips = [[x.act(robot.foot.tip) for x in self.gauge.places(q)] for q in self.run.q[rows]]
+        ways = [0.0]
+        for down, tip in zip(loaded.T, np.swapaxes(tips, 0, 1), strict=True):
+            edges = np.flatnonzero(np.diff(down.astype(int), prepend=0, append=0)).reshape(-1, 2)
+            ways += [np.linalg.norm((tip[a:b] - tip[a])[:, :2], axis=1).max() for a, b in edges]
+        return float(max(ways))
 
     def landing(self) -> dict[str, Any]:
         """From the touchdown on; nothing if there is none."""
