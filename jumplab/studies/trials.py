@@ -155,7 +155,8 @@ class TrialSettings:
         """The jump of a ``drawn`` robot; ``options`` as of :func:`jumplab.sim.simulate_jump`."""
         for name in ("mode", "reaim", "step", "feedback", "engine", "contact"):
             options[name] = getattr(self, name)
-        options["feedback"] = self.feedback or None  # on one foot, without being asked
+        if not self.feedback:
+            del options["feedback"]  # on one foot, without being asked
         options |= {"scene": plan.scene, "perturbation": drawn}
         return simulate_jump(plan.tape, plan.robot, **options)
 
