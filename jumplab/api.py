@@ -36,7 +36,7 @@ def plan(
     task: JumpTask | None = None,
     robot: Robot | str | Path = "bhr",
     *,
-    contacts: Contacts | None = None,
+    contacts: Contacts | str | None = None,
     like: Any = None,
     method: str = USUAL,
     robust: Ranges | None = None,
@@ -50,8 +50,8 @@ def plan(
     ----------
     task : what to reach, in a jump from a stand; or else
     contacts : a schedule of what is on the ground when and where: a hop, a run-up, a leap, one of
-        your own. It is planned by the whole-body program, audited foot by foot, and not yet played
-        on a simulated robot.
+        your own; or the words of :meth:`Contacts.named`, such as "hop=0.2". It is planned by the
+        whole-body program, and audited foot by foot.
     like : a clip, what :func:`judge` takes or returned of it, in whose manner the target is to be
         reached: one flight off both feet and down on both, on level ground.
     robot : who jumps, or what :meth:`Robot.load` takes: a name, a TOML, a URDF.
@@ -89,6 +89,8 @@ def plan(
 
         return alike(task, like, robot, **changes)
     if contacts is not None:
+        if isinstance(contacts, str):
+            contacts = Contacts.named(contacts, robot)
         return Planner(robot, keep=True, **changes).follow(contacts)
     if robust is not None:
         from jumplab.studies.robust import robust_changes

@@ -12,18 +12,19 @@ from jumplab.auditing import audit
 from jumplab.auditing.replay import replay
 from jumplab.cli.main import main
 from jumplab.errors import InfeasibleError, InputError
+from jumplab.sim import INSTALLED
 
 AIR, TOE, FLAT = 0, 1, 2
-ANOTHER = (
-    "the plan follows another contact schedule than a standing jump: only standing jumps can be simulated; its tape "
-    "can be audited, viewed and saved"
-)
-
-
 @cache
 def hop() -> jl.JumpPlan:
     robot = jl.Robot.load()
     return jl.plan(robot=robot, contacts=jl.Contacts.hop(robot))
+
+
+@cache
+def two_bounds() -> jl.JumpPlan:
+    robot = jl.Robot.load()
+    return jl.plan(robot=robot, contacts="bound=2")
 
 
 def test_a_hop_follows_its_schedule():
@@ -110,14 +111,64 @@ def test_after_a_step_down_the_cop_is_judged_at_the_height_of_the_lower_ground(b
         assert cop.value == pytest.approx(1e3 * beyond_m, abs=1e-3) and cop.passed == (beyond_m < 0.002)
 
 
-def test_nobody_plays_it_yet(tmp_path, capsys):
-    with pytest.raises(InputError) as e:
-        jl.simulate(hop())
-    assert str(e.value) == ANOTHER
-    jl.save(tmp_path / "hop", hop())
-    for command in ("simulate", "trials", "certify", "margins"):
-        assert main([command, str(tmp_path / "hop")]) == 2
-        assert ANOTHER in capsys.readouterr().err
+@pytest.mark.parametrize("engine", INSTALLED)
+def test_it_is_played_and_caught_on_both_feet(tmp_path, engine):
+    plan = hop()
+    run = jl.simulate(plan, engine=engine)
+    assert run.landed and run.checks_passed, run.line()
+    assert run.metrics.foot_distance_m == pytest.approx(plan.planned_distance_m, abs=0.02)
+    assert run.metrics.com_rise_m == pytest.approx(plan.planned_rise_m, abs=0.01)
+    assert list(dict.fromkeys(run.phase.tolist())) == ["launch", "flight", "landing"]
+    assert run.settings["feedback"]["failures"] == 0  # on one foot, without being asked
+    jl.save(tmp_path / "hop", plan, run)
+    again = jl.load(tmp_path / "hop")
+    assert again.run.metrics == run.metrics and np.array_equal(again.plan.tape.contacts, plan.tape.contacts)
+
+
+def test_the_tape_says_how_each_foot_stands():
+    tape = hop().tape
+    (flight,) = tape.flights
+    assert tape.caught == flight.stop and not tape.contacts[flight].any()
+    cut = tape.until(tape.caught)
+    assert len(cut.t) == len(cut.contacts) == flight.stop and cut.caught == len(cut.t)
+    assert cut.t[-1] == tape.t[flight.stop]  # the instant of the landing is there twice
+    said = {k: x for k, x in tape.extra.items() if k not in ("contacts", "toe_phase_start")}
+    silent = replace(tape, extra=said).contacts
+    assert set(silent[tape.phase == "launch"].ravel()) == {FLAT} and not silent[flight].any()
+
+
+@pytest.mark.parametrize("mode", ["position", "pd", "whole-body"])
+def test_a_bound_is_one_tape_with_two_flights(bhr, mode):
+    plan = two_bounds()
+    assert len(plan.tape.flights) == 2 and plan.planned_rise_m > 0.1
+    run = jl.simulate(plan, mode=mode, stand_s=3.0)
+    assert run.landed and run.checks_passed, run.line()
+    flying = np.flatnonzero(np.diff((run.phase == "flight").astype(int)) == 1)
+    assert len(flying) == 2 and run.phase[-1] == "landing"
+    assert run.metrics.foot_distance_m == pytest.approx(plan.planned_distance_m, abs=0.02)
+    assert run.settings["feedback"] is None  # two feet carry it
+
+
+def test_commands_take_a_schedule_by_its_name(tmp_path, capsys):
+    out = str(tmp_path / "bound")
+    assert main(["plan", "--contacts", "bound=2", "--out", out]) == 0
+    assert jl.load(out).plan.schedule == ("LR", "lr", "-", "LR", "lr", "-", "LR")
+    assert main(["simulate", out]) == 0
+    assert main(["view", out]) == 0 and main(["export", out, "--format", "csv"]) == 0
+    for words, said in (
+        ("bond", "contacts 'bond': choose one of hop, run_up, leap, hurdle, bound, step_off, drop_jump"),
+        ("drop_jump", "contacts 'drop_jump': write drop_jump=N, N a number of metres"),
+        ("run_up=two", "contacts 'run_up=two': write run_up=N, N a number of steps"),
+    ):
+        assert main(["plan", "--contacts", words, "--out", out]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["plan", "--contacts", "hop", "--side-m", "0.2", "--out", out]) == 2
+    assert "--side-m is part of a target, and --contacts gives a schedule instead" in capsys.readouterr().err
+
+
+def test_what_a_page_says_of_one_foot():
+    page = jl.view(hop())
+    assert "launch, left foot" in page.html and "launch, right foot" not in page.html
 
 
 def test_either_a_target_or_a_schedule():

@@ -110,7 +110,7 @@ def test_poses_are_those_of_the_log(page, simulation, bhr):
                 assert poses[k, j - 1, :3] == pytest.approx(frame.translation, abs=1e-4)
                 turn = pin.Quaternion(poses[k, j - 1, 3:].astype(float)).normalized().toRotationMatrix()
                 assert turn == pytest.approx(frame.rotation, abs=1e-3)
-    starts = {name: t for t, name in facts["clips"][0]["phases"]}
+    starts = {name: t for t, _, name in facts["clips"][0]["phases"]}
     assert list(starts) == ["launch", "flight", "landing"] and starts["launch"] == 0
     assert starts["flight"] == pytest.approx(simulation.metrics.liftoff_s, abs=0.021)
     assert starts["landing"] == pytest.approx(simulation.metrics.touchdown_s, abs=0.021)

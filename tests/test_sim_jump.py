@@ -13,7 +13,7 @@ import pytest
 from jumplab.control.controller import level
 from jumplab.control.flight import Flight
 from jumplab.control.kinematics import Gauge, pitch_of
-from jumplab.control.playback import Playback
+from jumplab.control.playback import FLAT, Playback
 from jumplab.errors import InputError, SolverError
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
@@ -269,7 +269,7 @@ def test_playback_leaves_a_wrong_posture_smoothly(bhr, tape):
     assert np.allclose(gap[0], off, atol=1e-6) and np.abs(rate[0]).max() < 1e-3
     assert np.allclose(np.diff(gap, axis=0) / STEP_S, (rate[1:] + rate[:-1]) / 2, atol=1e-4)
     gone = int(np.flatnonzero((gap == 0).all(axis=1))[0])
-    assert {command.feet for command in led[:gone]} == {"flat"} and not gap[gone:].any()
+    assert {command.feet for command in led[:gone]} == {FLAT} and not gap[gone:].any()
     wrong[7:] += 0.019 - off  # so much do sensors err
     careless = Playback(tape, bhr)
     careless.approach(wrong)
@@ -302,16 +302,24 @@ def test_events_from_forces():
         (((100, 400), (300, 0), (10, 900), (200, 0), (10, 300)), (100, 400)),  # a bounce
         (((300, 0), (100, 900)), (0, 300)),  # begun in the air
         (((100, 400), (300, 0)), (100, None)),
-        (((100, 400),), (None, None)),
+        (((100, 400),), None),
     ):
         force = np.concatenate([np.full(n, f, float) for n, f in parts])
-        assert events(force, lambda row: np.array([2e-3 * row, 0, 0])) == rows
+        assert events(force, lambda row: np.array([2e-3 * row, 0, 0])) == ([rows] if rows else [])
+
+
+def test_as_many_flights_as_the_plan_has():
+    parts = (100, 400), (300, 0), (50, 900), (200, 0), (10, 300), (100, 0)
+    force = np.concatenate([np.full(n, f, float) for n, f in parts])
+    rows = [(100, 400), (450, 650), (660, None)]
+    for count in (1, 2, 3):
+        assert events(force, lambda row: np.array([2e-3 * row, 0, 0]), count) == rows[:count]
 
 
 def test_a_crouch_that_unloads_the_feet_is_no_flight():
     force = np.concatenate([np.full(n, f, float) for n, f in ((100, 9), (200, 0), (80, 90), (300, 0), (9, 90))])
-    assert events(force, lambda row: np.array([0, 0, 1e-3 * max(row - 380, 0)])) == (380, 680)
-    assert events(force, lambda row: np.zeros(3)) == (None, None)
+    assert events(force, lambda row: np.array([0, 0, 1e-3 * max(row - 380, 0)])) == [(380, 680)]
+    assert events(force, lambda row: np.zeros(3)) == []
 
 
 @pytest.mark.parametrize("engine", INSTALLED[-1:])

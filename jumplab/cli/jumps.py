@@ -4,6 +4,7 @@ import ast
 import json
 import time
 from argparse import Namespace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,11 @@ def plan(args: Namespace) -> None:
     """The optimisations and the audit alone."""
     start = time.perf_counter()
     task = JumpTask(**given(JumpTask, args))
+    if args.contacts:
+        why = "is part of a target, and --contacts gives a schedule instead"
+        without(args, why, **{f.name: f.default for f in fields(JumpTask)[2:]})
+        without(args, why, distance_m=1.0, height_m=0.5, robust=False, atlas=None)
+        task = None
     robot = robots.Robot.load(args.robot)
     store.ensure_writable(args.out)
     atlas = args.atlas and studies.atlas.Atlas.load(args.atlas)

@@ -1,5 +1,5 @@
-"""One jump's controller: the tape until touchdown, a landing planned on the way down, the landing
-controller after it.
+"""The controller of one tape: played until the last feet come down, a landing planned on the way
+down, the landing controller after it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,16 @@ from jumplab.arguments import checked
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS
 from jumplab.control.estimator import SURE
-from jumplab.control.flight import Flight, is_flip
-from jumplab.control.kinematics import Gauge, Motion, State, headed, turned_wrench, yaw_of
+from jumplab.control.flight import FROM_SHARE, Flight, is_flip
+from jumplab.control.kinematics import (
+    Gauge,
+    Motion,
+    State,
+    headed,
+    rotation,
+    turned_wrench,
+    yaw_of,
+)
 from jumplab.control.landing import LandingController
 from jumplab.control.launch import LaunchFeedback, check_mode
 from jumplab.control.playback import Command, Playback
@@ -22,7 +30,7 @@ from jumplab.control.reaim import Reaim
 from jumplab.control.reference import LEAD_S, LandingAhead
 from jumplab.control.servo import Drive, servo_of
 from jumplab.errors import InputError, quoted
-from jumplab.io.tape import Tape
+from jumplab.io.tape import AIR, Tape
 from jumplab.robot import Robot
 
 LANDINGS = ("planned", "spring")
@@ -64,8 +72,9 @@ class Controller:
         :mod:`.servo`; after it, a landing in torque mode.
     reaim : put the legs in the air to where they can catch the robot, see :class:`.reaim.Reaim`.
     step : allow one recovery step after touchdown, see :class:`.step.RecoveryStep`.
-    feedback : let the joints leave the tape in launch, so that the body as a whole launches as
-        planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd".
+    feedback : let the joints leave the tape on the ground, so that the body as a whole moves as
+        planned, see :class:`.launch.LaunchFeedback`. Not in mode "pd". If None, where the tape
+        stands on one foot: what is wrong there tips the robot.
     landing : "planned" follows stage 1's landing, planned in flight from the measured state;
         "spring" leads to the stance by spring-dampers alone, and so does "planned" where stage 1
         finds no landing.
@@ -78,7 +87,8 @@ class Controller:
     ----------
     looks_rad : heading in which the robot shall land, or has landed; all that looks ahead sees it
         along that one.
-    touchdown : step of the first contact after the flight, None until then.
+    touchdown : step in which the feet come down that end the schedule, and the landing begins;
+        None until then.
     ahead : what the landing controller follows, and why.
     last_step : at which a robot that is still in the air is given up.
 
@@ -95,7 +105,7 @@ class Controller:
         mode: str = "position",
         reaim: bool = False,
         step: bool = False,
-        feedback: bool = False,
+        feedback: bool | None = None,
         landing: str = "planned",
         ground: Callable[[float], float] = level,
         hardware: Hardware = Hardware(),
@@ -105,11 +115,13 @@ class Controller:
         if not isinstance(landing, str) or landing not in LANDINGS:
             raise InputError(f"landing {quoted(landing)}: must be one of {', '.join(LANDINGS)}")
         self.goal = tape.q[-1]
+        tape = tape.until(tape.caught)
         self._gauge = Gauge(robot)
         # without the rounding of a plan that goes straight on: states need not be turned then
-        heading = round(self._gauge.heading(tape.q[-1]), HEADING_DIGITS)
+        heading = round(self._gauge.heading(self.goal), HEADING_DIGITS)
         self.looks_rad = start_rad + heading
         tape = replace(tape, q=headed(tape.q, heading), f=turned_wrench(tape.f, heading))
+        self._last = tape.q[-1]
         self._none = np.zeros(len(robot.joint_names))
         self._tau = self._none
         self._at_rest = at_rest
@@ -120,17 +132,23 @@ class Controller:
         self._servo = kind(robot, hardware.delay_s, hardware.substeps)
         if feedback:
             check_mode(mode)
+        if feedback is None:
+            alone = (tape.contacts > AIR).sum(axis=1) == 1
+            feedback = bool(at_rest and mode != "pd" and alone.any())
         self.feedback = LaunchFeedback(robot, tape, self.playback) if feedback else None
-        self.forecast = Flight(robot, tape, ground)
+        self._awaited = tape.contacts[-1] == AIR  # feet, which end the tape as they come down
+        flies = bool(self._awaited.all())
+        self.forecast = Flight(robot, tape, ground) if flies else None
         self.landing = LandingController(robot, may_step=step, force_noise_n=hardware.force_noise_n)
         flip = is_flip(tape)
-        # other jumps land flat, within a centimetre or two of what was planned for them
-        self.ahead = LandingAhead(robot, landing, again=flip)
-        self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim else None
+        # other jumps land flat, within a centimetre or two of what was planned for them; a robot
+        # that stands on one foot does not fall onto the other
+        self.ahead = LandingAhead(robot, landing if flies else "spring", again=flip)
+        self._reaim = Reaim(robot, tape, legs_alone=flip) if reaim and flies else None
         self._shifts = reaim and flip
         self._yield_s = (FLIP_YIELD_S if flip else YIELD_S) + hardware.delay_s
         self._touches_n = max(TOUCHDOWN_FORCE_N, SURE * np.sqrt(2) * hardware.force_noise_n)
-        self._looks_from = round(self.forecast.from_s / STEP_S)
+        self._looks_from = round(_looks_from_s(tape, self._awaited) / STEP_S)
         self.last_step = self.playback.steps + round(WAIT_S / STEP_S)
 
     @property
@@ -172,17 +190,24 @@ class Controller:
         if self.touchdown is None:
             if step < self._looks_from:
                 return self._play(step, state)
-            if state.wrench[:, 2].sum() <= self._touches_n:
-                return self._fly(step, *state[:2])
+            if not self._touches(step, state):
+                fly = self._play if self.forecast is None else self._fly
+                return fly(step, state)
             state = self._touch(step, state)
         return self._land(step - self.touchdown, state)
 
     def _play(self, step: int, state: State) -> Command:
-        """In launch, and early in flight."""
+        """Before the last flight is under way."""
         command = self.playback.command(step, *state[:2], self._none)
         return command if self.feedback is None else self.feedback(step, command, state)
 
-    def _fly(self, step: int, q: np.ndarray, v: np.ndarray) -> Command:
+    def _touches(self, step: int, state: State) -> bool:
+        """Whether the feet that are awaited come down; beside one that stands, in time at least."""
+        late = self.forecast is None and step >= self.playback.steps
+        return late or state.wrench[self._awaited, 2].sum() > self._touches_n
+
+    def _fly(self, step: int, state: State) -> Command:
+        q, v, _ = state
         now = self._gauge.motion(q, v)
         left = self.forecast.time_left(now)
         shift = self.forecast.shift(step, now, left) if self._shifts else (0.0, 0.0)
@@ -224,10 +249,20 @@ class Controller:
         Soles point where the trunk does, and along that heading the robot has to be caught.
         """
         self.touchdown = step
-        now = self._gauge.motion(*state[:2])
-        yaw = round(yaw_of(self.forecast.turn_ahead(step, now, 0.0)), HEADING_DIGITS)
+        turn = rotation(state.q[3:7]) @ rotation(self._last[3:7]).T
+        yaw = round(yaw_of(turn), HEADING_DIGITS)
         self.looks_rad += yaw
         state = state.along(yaw)
         if self.ahead.source == "planned" and self.ahead.followed is None:  # ground came early
             self.landing.reference = self.ahead.plan(*state[:2], step * STEP_S, 0.0)
         return state
+
+
+def _looks_from_s(tape: Tape, awaited: np.ndarray) -> float:
+    """Time [s] from which on feet that are ``awaited`` (2,), in the air at the tape's end, may come
+    down: sooner, a graze of the ground is no landing.
+    """
+    end = float(tape.t[-1])
+    left = np.flatnonzero((tape.contacts[:, awaited] > AIR).any(axis=1))
+    begin = float(tape.t[left[-1] + 1]) if len(left) else end
+    return begin + FROM_SHARE * (end - begin)

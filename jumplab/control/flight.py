@@ -46,13 +46,16 @@ WHOLE_TURN = np.pi  # [rad] a tape that turns by more than half a turn in flight
 
 
 def is_flip(tape: Tape) -> bool:
-    """Whether the trunk turns over in the tape's flight."""
-    pitch = np.unwrap(pitch_of(tape.q))[tape.takeoff_index :]
+    """Whether the trunk turns over in the tape's last flight."""
+    if not tape.flights:
+        return False
+    pitch = np.unwrap(pitch_of(tape.q[tape.flights[-1]]))
     return bool(abs(pitch[-1] - pitch[0]) > WHOLE_TURN)
 
 
 class Flight:
-    """The rest of a measured flight, by the planned robot's inertia along the rest of the tape.
+    """The rest of a measured flight, by the planned robot's inertia along the rest of the tape,
+    which ends with that flight.
 
     The tape's last row is the posture to land in; ``ground`` is the height [m] at a place [m] along
     the heading in which all this is seen. ``from_s`` is the time from which on anything is
@@ -71,11 +74,11 @@ class Flight:
         self._q = tape.q[-1].copy()
         self._v = tape.v[-1].copy()
         self._ahead, _, self._below = gauge.soles(self._q) - gauge.com(self._q)
-        flight = slice(tape.takeoff_index, None)
+        flight = tape.flights[-1]
         q = tape.q[flight]
         self._t = tape.t[flight]
         self._end = float(tape.t[-1])
-        self.from_s = tape.takeoff_time + FROM_SHARE * (self._end - tape.takeoff_time)
+        self.from_s = float(self._t[0] + FROM_SHARE * (self._end - self._t[0]))
         self._pitch = np.unwrap(pitch_of(q))
         # about the CoM in trunk axes: inertia, and momentum of the joints' rates alone
         level = np.hstack([np.tile(LEVEL, (len(q), 1)), q[:, 7:]])

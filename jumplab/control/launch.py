@@ -23,11 +23,13 @@ import pinocchio as pin
 from jumplab.control import STEP_S
 from jumplab.control.body import PERIOD_STEPS, WholeBody, corner_rows, solver
 from jumplab.control.kinematics import Gauge, State, about_vertical, rotation
-from jumplab.control.playback import AIR, FLAT, TOE, Command, Playback, resampled
+from jumplab.control.playback import AIR, FLAT, Command, Playback, Stand, resampled
 from jumplab.errors import InputError
+from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet
+from jumplab.robot.legs import BASE, leg_columns
 
 FRICTION = 0.6  # more than plans use, less than most floors have
 LENGTH_SHARE = 0.95  # of the sole for the CoP
@@ -57,6 +59,7 @@ COM_WEIGHT = 1.0, 1.0, 3.0
 MOMENTUM_WEIGHT = 1.0  # of L-rate over a nominal inertia
 FOOT_WEIGHT = 1e4
 POSTURE_WEIGHT = 0.02
+SWING_WEIGHT = 1.0  # of a leg in the air, which is on its way to where it lands
 MOST = 40.0  # [rad/s^2] that a joint's acceleration may differ by from the tape's
 # standard deviations. Of the load on the trunk before anything is felt, in shares of the robot's
 # mass: its mass, and that times how far it is ahead of and above the base [m]
@@ -90,8 +93,8 @@ class LaunchFeedback:
         self._gauge = Gauge(robot)
         self.solver = solver()
         self.off_m = 0.0
-        fade_s = FADE_SHARE * float(tape.t[-1] - tape.takeoff_time)
-        self._fade_rate = max(FADE_RATE, FADED / fade_s)
+        air_s = [np.ptp(tape.t[rows]) for rows in tape.flights]
+        self._fade_rate = max([FADE_RATE, *(FADED / (FADE_SHARE * x) for x in air_s)])
         # of the joints, off the tape
         self.angles, self._rates, self.changes = np.zeros((3, len(robot.joint_names)))
         self._none = np.zeros(len(robot.joint_names))
@@ -104,28 +107,32 @@ class LaunchFeedback:
         self._first = tape.q[0]
         self.rows = self._planned(tape)
         self._spin = self.rows[0, 4]  # rate of L that the last command takes
-        stands = {FLAT: (robot.foot.center, LENGTH_SHARE), TOE: (robot.foot.tip, 0.0)}
+        flat = robot.foot.center, LENGTH_SHARE
+        stands = {tapes.AIR: flat, tapes.TOE: (robot.foot.tip, 0.0), tapes.FLAT: flat}
         self._stands = {
-            stand: (on_feet(robot, point), corner_rows(robot, FRICTION, share, 1.0))
+            stand: (on_feet(robot, point), np.split(corner_rows(robot, FRICTION, share, 1.0), 2))
             for stand, (point, share) in stands.items()
         }
+        self._legs = [leg - BASE for leg in leg_columns(robot)]
 
     def _planned(self, tape: Tape) -> np.ndarray:
-        """CoM, its velocity and acceleration, L, its rate, and the base's acceleration (steps, 6,
-        3) of the launch.
+        """CoM, its velocity and acceleration, L, its rate, the base's acceleration, and the places
+        of the left and the right toe (steps, 8, 3) of the tape.
         """
-        last = tape.takeoff_index
         mass = self._robot.total_mass
         gravity = self._robot.model.gravity.linear
         rows = []
-        for q, v, a, f in zip(tape.q[:last], tape.v[:last], tape.a[:last], tape.f, strict=False):
+        for q, v, a, f in zip(tape.q, tape.v, tape.a, tape.f, strict=True):
             base = rotation(q[3:7]) @ (a[:3] + np.cross(v[3:6], v[:3]))
             now = self._gauge.motion(q, v)
             push = f[:, :3].sum(axis=0) / mass + gravity
             moment = self._moment(q, now.com, f)
-            rows.append([now.com, now.velocity, push, now.momentum, moment, base])
-        grid = np.arange(self.playback.takeoff) * STEP_S
-        return resampled(grid, tape.t[:last], np.array(rows))
+            rows.append([now.com, now.velocity, push, now.momentum, moment, base, *self._toes(q)])
+        grid = np.arange(self.playback.steps + 1) * STEP_S
+        return resampled(grid, tape.t, np.array(rows))
+
+    def _toes(self, q: np.ndarray) -> list[np.ndarray]:
+        return [foot.act(self._robot.foot.tip) for foot in self._gauge.places(q)]
 
     def _moment(self, q: np.ndarray, com: np.ndarray, wrench: np.ndarray) -> np.ndarray:
         """Moment (3,) about ``com`` of wrenches (2, 6) at the origins of the foot links."""
@@ -165,7 +172,9 @@ class LaunchFeedback:
             self.changes = self._back(self._fade_rate)
             self._torque = self._none
         elif step % PERIOD_STEPS == 0:
-            if self.playback.stands(step + round(ROLLING_S / STEP_S)) == FLAT:
+            ahead = step + round(ROLLING_S / STEP_S)
+            # an impact says nothing of loads
+            if ahead < self.playback.lands and self.playback.stands(ahead) == FLAT:
                 self._feel(state, self.rows[step])
             if self.rows[due, 2, 2] + self._robot.gravity < LEAST_LOAD * self._robot.gravity:
                 self.changes = -2 * POSTURE_RATE * self._rates
@@ -182,7 +191,7 @@ class LaunchFeedback:
     def _feel(self, state: State, planned: np.ndarray) -> None:
         """Learn from the feet's wrenches where the CoM is, unless they carry little or are tilted.
 
-        ``planned`` (6, 3) is the row of what is followed now. A load of mass m at p pushes by F = m
+        ``planned`` (8, 3) is the row of what is followed now. A load of mass m at p pushes by F = m
         (a - g), with a the base's acceleration, and turns by p x F: linear in m and m p, of which a
         Kalman filter keeps the mean.
         """
@@ -207,16 +216,22 @@ class LaunchFeedback:
         self.off_m = float(np.clip(ahead, -MOST_OFF_M, MOST_OFF_M))
 
     def _solve(
-        self, due: int, stand: str, q: np.ndarray, v: np.ndarray
+        self, due: int, stand: Stand, q: np.ndarray, v: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """What the joints' accelerations (nv - 6,) shall differ by from those of the tape's step
         ``due``, and the motors' torques (nv - 6,) with that [N m], None without a solution.
         """
         body = self._body
-        anchors, corners = self._stands[stand]
+        carries = np.array(stand) > tapes.AIR
+        anchors, corners = zip(
+            *((self._stands[x][0][side], self._stands[x][1][side]) for side, x in enumerate(stand)),
+            strict=True,
+        )
         body.update(q, v, anchors)
-        body.set_contact(np.ones(2, bool))
-        com, speed, push, momentum, spin, _ = self.rows[due]
+        body.set_contact(carries)
+        com, speed, push, momentum, spin, _, *toes = self.rows[due]
+        if due >= self.playback.lands:  # the plan goes on where the feet came down
+            com = com + [1.0, 1.0, 0.0] * np.subtract(self._toes(q), toes)[carries].mean(axis=0)
         ahead = self.off_m * self._forward
         # that the real CoM takes besides
         moment = np.cross(ahead, body.mass * (push - body.gravity))
@@ -225,12 +240,16 @@ class LaunchFeedback:
         turn = spin + moment + MOMENTUM_RATE * (momentum - body.momentum)
         tape = self.playback.acceleration(due)
         back = self._back(POSTURE_RATE)
-        qp = body.program(v, corners, moment)
+        qp = body.program(v, np.vstack(corners), moment)
         body.balance(qp, push + shift, turn, (COM_WEIGHT, MOMENTUM_WEIGHT))
-        still = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(stand == FLAT), 1.0])
-        for side in (0, 1):
+        posture = np.full(len(back), POSTURE_WEIGHT)
+        for side, x in enumerate(stand):
+            if x == tapes.AIR:
+                posture[self._legs[side]] = SWING_WEIGHT
+                continue
+            still = FOOT_WEIGHT * np.array([1.0, 1.0, 1.0, 1.0, float(x == tapes.FLAT), 1.0])
             qp.cost(f"foot {side}", body.sole_rows[side], -body.sole_drift[side], still)
-        qp.cost("posture", body.unknowns[6 : body.nv], tape + back, POSTURE_WEIGHT)
+        qp.cost("posture", body.unknowns[6 : body.nv], tape + back, posture)
         qp.cost("base", body.unknowns[:6], 0.0, LEAST)
         qp.cost("wrenches", body.unknowns[body.nv :], 0.0, LEAST_WRENCH)
         answer = self.solver.solve(qp)

@@ -1,4 +1,4 @@
-"""Launch and flight: the tape, step by step, as commands that the servos of :mod:`.servo` turn into
+"""The tape, step by step, as commands that the servos of :mod:`.servo` turn into
 what joints are sent. The paper plays it in position mode (Sec. VI-B).
 """
 
@@ -14,14 +14,15 @@ from scipy.interpolate import PPoly
 from jumplab.control import STEP_S
 from jumplab.control.kinematics import Gauge
 from jumplab.errors import InputError
+from jumplab.io import tape as tapes
 from jumplab.io.tape import Tape
 from jumplab.robot import Robot
 
-# how both feet stand
-FLAT = "flat"
-TOE = "toe"
-AIR = "air"
-HEEL_RAD = 1e-6  # a foot that is tilted by more stands on its toe
+# how the left and the right foot stand
+Stand = tuple[int, int]
+FLAT: Stand = (tapes.FLAT, tapes.FLAT)
+TOE: Stand = (tapes.TOE, tapes.TOE)
+AIR: Stand = (tapes.AIR, tapes.AIR)
 # a start farther off than sensors err is led back until the heels rise; sooner, the robot tips
 WRONG_RAD = 0.02
 WAY_BACK = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])  # of time, smooth at 0 and at 1
@@ -36,7 +37,7 @@ class Command:
     acceleration: np.ndarray | None = None  # (nv - 6,) [rad/s^2]
     tau: np.ndarray | None = None  # (nv - 6,) of the plan, or that is to be given [N m]
     change: np.ndarray | float = 0.0  # of ``tau`` within the step, as planned [N m]
-    feet: str = AIR  # how they stand by the plan
+    feet: Stand = AIR  # how they stand by the plan
     # (2, 6) of the plan on them, as on a tape; None: none
     wrench: np.ndarray | None = None
     share: float = 1.0  # of the torque limit, for the servo
@@ -61,7 +62,6 @@ class Playback:
                 f"the tape's joints {', '.join(names[:3])} ... are not those of robot {robot.name}"
             )
         self.steps = round(float(tape.t[-1]) / STEP_S)
-        self.takeoff = round(tape.takeoff_time / STEP_S)
         self.lead = round(lead_s / STEP_S)
         self._gauge = Gauge(robot)
         self._grid = np.arange(self.steps + 1) * STEP_S
@@ -70,15 +70,20 @@ class Playback:
         )
         self._q = q[:, 7:]
         self._rate = self._v[:, 6:]
+        last = np.searchsorted(tape.t, self._grid + STEP_S / 2, side="right") - 1
+        self._stands = tape.contacts[last]
+        changes = np.diff((self._stands > tapes.AIR).astype(int), axis=0)
+        # the first step in which a foot comes down
+        self.lands = int(np.argmax([*(changes > 0).any(axis=1), True])) + 1
         self._change = np.diff(self.tau, axis=0, append=self.tau[-1:])
-        self._change[self.takeoff - 1] = 0.0  # what the ground held ends there at once
-        tilts = (self._gauge.places(q)[0].rotation[2, 0] for q in tape.q)
-        tilted = (t for t, x in zip(tape.t, tilts, strict=True) if abs(x) > HEEL_RAD)
-        self._heel_off = round(float(next(tilted, tape.t[-1])) / STEP_S)
+        self._change[:-1][changes.any(axis=1)] = 0.0  # what the ground gives changes there at once
+        first = (self._stands != self._stands[0]).any(axis=1)
+        self._moves = int(np.argmax(first)) if first.any() else self.steps
 
-    def stands(self, step: float) -> str:
+    def stands(self, step: float) -> Stand:
         """How the feet stand by the plan."""
-        return AIR if step >= self.takeoff else TOE if step >= self._heel_off else FLAT
+        left, right = self._stands[min(max(int(step), 0), self.steps)].tolist()
+        return left, right
 
     def command(
         self,
@@ -124,10 +129,10 @@ class Playback:
         self._rate[rows] += way(self._grid[rows], 1)
 
     def way_back(self) -> list[np.ndarray]:
-        """Share (k,) of an error at the start that is left while the feet stand flat, and its first
-        two derivatives [1, 1/s, 1/s^2].
+        """Share (k,) of an error at the start that is left while the feet stand as there, and its
+        first two derivatives [1, 1/s, 1/s^2].
         """
-        steps = min(self._heel_off, self.takeoff)
+        steps = self._moves
         share = np.arange(steps) / max(steps, 1)
         lasts_s = max(steps, 1) * STEP_S
         return [WAY_BACK.deriv(k)(share) / lasts_s**k for k in range(3)]

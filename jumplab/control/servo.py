@@ -34,10 +34,12 @@ import pinocchio as pin
 
 from jumplab.control import STEP_S
 from jumplab.control.kinematics import about_vertical
-from jumplab.control.playback import AIR, FLAT, TOE, Command
+from jumplab.control.playback import Command
 from jumplab.errors import InputError, quoted
+from jumplab.io.tape import AIR, FLAT, TOE
 from jumplab.robot import Robot
 from jumplab.robot.contact import on_feet, point_motion
+from jumplab.robot.legs import leg_columns
 from jumplab.robot.stance import stance_configuration
 
 # of "pd": kp, kd [N m/rad, N m s/rad] of pitch joints, ...
@@ -61,7 +63,7 @@ GIVE = 1e-4
 EPSILON = 1e-8  # [(m/s^2)^2/N^2] settles what each foot takes, and nothing else
 # row of a foot's twist, in axes that are turned with it, that is free while it stands on its toe
 PITCH = 4
-HELD = np.delete(np.arange(6), PITCH), np.arange(6)  # of a foot on its toe, and flat
+HELD = {TOE: np.delete(np.arange(6), PITCH), FLAT: np.arange(6)}
 UNITS = np.repeat([1.0, LEVER_M], 3)
 
 
@@ -125,9 +127,9 @@ class TorqueServo:
     where commands come from, so that a late one is late twice.
 
     On the ground tau = planned + kp * error + kd * rate error, explicit at 1 kHz: the damping is
-    bounded by the joint's reflected inertia over the age of a command. In the air the foot alone
-    hangs on the ankle, and such gains would make it swing; there the errors ask for accelerations,
-    which the inertia of the free body turns into torques.
+    bounded by the joint's reflected inertia over the age of a command. On the ankle of a leg in the
+    air the foot alone hangs, and such gains would make it swing; there, and everywhere in flight,
+    the errors ask for accelerations, which the inertia of the free body turns into torques.
     """
 
     told = "planned torques, angles and rates; it measures all joints"
@@ -139,6 +141,7 @@ class TorqueServo:
         role = {name: role for role, pair in robot.joints.items() for name in pair}
         gains = [GAINS.get(role.get(name), PITCH_GAINS) for name in robot.joint_names]
         self._kp, self._kd = np.transpose(gains)
+        self._legs = [leg - 6 for leg in leg_columns(robot)]
 
     def drive(self, command: Command, q: np.ndarray, v: np.ndarray) -> Drive:
         """What is sent for ``command`` at the measured (q, v)."""
@@ -147,13 +150,19 @@ class TorqueServo:
         tau = command.tau + self._late * command.change
         error = command.q - q[7:]
         rate_error = command.rate - v[6:]
-        if command.feet != AIR:
-            return Drive(tau + self._kp * error + self._kd * rate_error)
+        held = self._kp * error + self._kd * rate_error
+        swings = [leg for leg, x in zip(self._legs, command.feet, strict=True) if x == AIR]
+        if not swings:
+            return Drive(tau + held)
         # torques per joint acceleration of the free body
         whole = pin.crba(self._model, self._data, q)
         free = whole[6:, 6:] - whole[6:, :6] @ np.linalg.solve(whole[:6, :6], whole[:6, 6:])
         wish = FLIGHT_BANDWIDTH * (FLIGHT_CORNER * error + rate_error)
-        return Drive(tau + free @ wish)
+        if len(swings) == len(self._legs):
+            swings = [np.arange(len(tau))]
+        for leg in swings:
+            held[leg] = free[np.ix_(leg, leg)] @ wish[leg]
+        return Drive(tau + held)
 
 
 class WholeBodyServo:
@@ -259,21 +268,21 @@ class WholeBodyServo:
         """Motions that the feet cannot make: Jacobian (k, nv), drift (k,), units (k,) of the wrench
         against each, and the plan's wrench (k,), about the points on which they stand.
         """
-        held = HELD[command.feet == FLAT]
         wrenches = np.zeros((2, 6)) if command.wrench is None else command.wrench
-        rows = [np.zeros((0, self._model.nv + 2))]
-        for anchor, wrench in zip(self._anchors.get(command.feet, ()), wrenches, strict=False):
-            foot = point_motion(self._model, self._data, anchor)
-            load = wrench.copy()
-            load[3:] -= pin.skew(foot.turn @ self._pivots[command.feet]) @ wrench[:3]
+        rows = [np.zeros((0, self._model.nv + 3))]
+        for side, stand in enumerate(command.feet):
+            if stand == AIR:
+                continue
+            foot = point_motion(self._model, self._data, self._anchors[stand][side])
+            load = wrenches[side].copy()
+            load[3:] -= pin.skew(foot.turn @ self._pivots[stand]) @ load[:3]
             # in axes that are turned about the vertical as the foot is
             yaw = np.arctan2(foot.turn[1, 0], foot.turn[0, 0])
             along = np.kron(np.eye(2), about_vertical(-yaw))
-            columns = np.concatenate([foot.jacobian.T, [foot.drift, load]])
-            rows.append((along @ columns.T)[held])
+            columns = along @ np.concatenate([foot.jacobian.T, [foot.drift, load]]).T
+            rows.append(np.column_stack([columns, UNITS])[HELD[stand]])
         rows = np.concatenate(rows)
-        units = np.resize(UNITS[held], len(rows))
-        return rows[:, :-2], rows[:, -2], units, rows[:, -1]
+        return rows[:, :-3], rows[:, -3], rows[:, -1], rows[:, -2]
 
 
 # how the tape is played until touchdown, by name

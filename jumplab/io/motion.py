@@ -65,7 +65,9 @@ class Motion:
             return record
         states = record.t, record.q, record.v, record.tau, record.phase
         if hasattr(record, "a"):
-            return cls(*states, "plan", getattr(record, "f", None))
+            stands = getattr(record, "contacts", None)
+            down = None if stands is None else stands > 0
+            return cls(*states, "plan", getattr(record, "f", None), down)
         wrench = getattr(record, "foot_wrench", None)
         pressing = None if wrench is None else wrench[:, :, 2] > CONTACT_FORCE_N
         return cls(*states, "simulation", wrench, pressing)

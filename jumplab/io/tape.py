@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +13,23 @@ from jumplab.errors import InputError, Shown, as_path
 
 SCHEMA = "jumplab-plan-1"
 RATE_HZ = 1000.0  # the paper's control cycle is 1 ms (Sec. VI-A)
+# how a foot stands, in ``contacts``
+AIR = 0
+TOE = 1
+FLAT = 2
 # of the arrays, in the order of the fields
 _DIMENSIONS = dict(t=1, q=2, v=2, a=2, tau=2, phase=1, contact_frames=1, f=3, joint_names=1)
 
 
 @dataclass(frozen=True, repr=False)
 class Tape(Shown):
-    """Launch and flight of the full robot at 1 kHz.
+    """A motion of the full robot at 1 kHz: launch and flight, or any contact schedule.
 
     Configurations are in Pinocchio's free-flyer order. Torques are what motors give: they move the
     links, turn the motors' own armature, and overcome their friction, where these are known
-    (:attr:`.Robot.actuators`); otherwise they are the joints' torques of inverse dynamics. The
-    instant of take-off appears twice, once per phase. ``extra`` (SRMP and planar solutions) is for
-    study, and not needed to play the tape.
+    (:attr:`.Robot.actuators`); otherwise they are the joints' torques of inverse dynamics. Instants
+    of take-off and landing appear twice, once per phase. ``extra`` has how the feet stand
+    (``contacts``), and SRMP and planar solutions, which are for study.
     """
 
     t: np.ndarray  # (N,) time from the start of the launch [s]
@@ -34,7 +39,7 @@ class Tape(Shown):
     v: np.ndarray
     a: np.ndarray  # (N, nv) time derivative of v [m/s^2, rad/s^2]
     tau: np.ndarray  # (N, nv - 6) motor torques at the joints [N m]
-    phase: np.ndarray  # (N,) "launch" or "flight"
+    phase: np.ndarray  # (N,) "launch" (a foot carries) or "flight"
     contact_frames: np.ndarray  # (K,) names of the foot links; where wrenches act
     # (N, K, 6) force then moment on the robot, world axes, at each contact frame's origin [N, N m]
     f: np.ndarray
@@ -54,27 +59,51 @@ class Tape(Shown):
             if isinstance(x, np.ndarray):
                 x.setflags(write=False)
 
-    def require_jump(self) -> None:
-        """Refuse (:class:`InputError`) a tape along another contact schedule: nothing plays it."""
-        contacts = self.extra.get("contacts")
-        if contacts is None:
-            return
-        carried = np.asarray(contacts) > 0
-        switches = np.flatnonzero(np.any(np.diff(carried, axis=0), axis=1))
-        if len(switches) != 1 or carried[-1].any():
-            raise InputError(
-                "the plan follows another contact schedule than a standing jump: only standing "
-                "jumps can be simulated; its tape can be audited, viewed and saved"
-            )
+    @cached_property
+    def contacts(self) -> np.ndarray:
+        """(N, K) how each foot stands: :data:`AIR`, :data:`TOE` or :data:`FLAT`.
+
+        A tape that does not say stands on all feet until take-off, on the toes from
+        ``toe_phase_start`` on.
+        """
+        said = self.extra.get("contacts")
+        if np.shape(said) == self.f.shape[:2]:
+            return said
+        toes = self.t >= self.extra.get("toe_phase_start", np.inf)
+        codes = np.where(self.phase == "flight", AIR, np.where(toes, TOE, FLAT))
+        return np.repeat(codes[:, None], len(self.contact_frames), axis=1)
+
+    @property
+    def flights(self) -> list[slice]:
+        """Rows of each flight, in their order."""
+        flying = (self.contacts == AIR).all(axis=1)
+        edges = np.flatnonzero(np.diff(flying.astype(int), prepend=0, append=0))
+        return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+    @cached_property
+    def caught(self) -> int:
+        """Row in which the last foot comes down that stands at the end; the number of rows if the
+        tape ends in the air, or no foot comes down.
+        """
+        down = self.contacts > AIR
+        came = np.flatnonzero((np.diff(down.astype(int), axis=0) > 0).any(axis=1)) + 1
+        return int(came[-1]) if len(came) and down[-1].any() else len(self.t)
+
+    def until(self, row: int) -> Tape:
+        """The tape up to a ``row``, which it does not have any more."""
+        rows = self.arrays().items()
+        cut = {k: x[:row] for k, x in rows if np.shape(x)[:1] == self.t.shape}
+        own = {k: x for k, x in cut.items() if k in _DIMENSIONS}
+        return replace(self, **own, extra={k: cut.get(k, x) for k, x in self.extra.items()})
 
     @property
     def takeoff_index(self) -> int:
-        """Row of the first flight sample."""
+        """Row of the first flight sample; zero if there is none."""
         return int(np.argmax(self.phase == "flight"))
 
     @property
     def takeoff_time(self) -> float:
-        """Time of take-off [s]."""
+        """Time of the first take-off [s]."""
         return float(self.t[self.takeoff_index])
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -66,7 +66,7 @@ def _of_plan(plan: JumpPlan) -> Card:
         "travel [m]": plan.planned_distance_m,
         "rise of the CoM [m]": plan.planned_rise_m,
         "its apex above the stance [m]": plan.planned_apex_m,
-        "time in the air [s]": float(plan.tape.t[-1] - plan.tape.takeoff_time),
+        "time in the air [s]": float(sum(np.ptp(plan.tape.t[x]) for x in plan.tape.flights)),
         f"largest torque [N m], {joint}": peaks[joint],
         "solving [s]": sum(row.solve_s for row in plan.statistics),
     }

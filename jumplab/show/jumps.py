@@ -305,16 +305,22 @@ def jump_strobe(record: SimulationResult | Tape, robot: Robot) -> Figure:
 
 
 def _strip_rows(record: SimulationResult | Tape, height: np.ndarray) -> np.ndarray:
-    """Rows of the frames: start, crouch, lift-off, some of the flight, touchdown, deepest, end."""
-    flight = np.flatnonzero(record.phase == "flight")
+    """Rows of the frames: beginning, deepest and end of each time on the ground, some of each
+    flight.
+    """
     end = len(record.t) - 1
-    if not len(flight):  # it never left the ground
+    edges = np.flatnonzero(record.phase[1:] != record.phase[:-1]) + 1
+    pieces = np.split(np.arange(end + 1), edges)
+    if len(pieces) == 1:  # it never left the ground
         return np.linspace(0, end, 5).astype(int)
-    first, last = int(flight[0]), int(flight[-1])
-    rows = [0, int(np.argmin(height[:first])), first - 1] if first else []
-    rows += [first + int(share * (last - first)) for share in FLIGHT_SHARES]
-    if last < end:
-        rows += [last + 1, last + 1 + int(np.argmin(height[last + 1 :])), end]
+    shares = FLIGHT_SHARES if len(pieces) < 4 else FLIGHT_SHARES[1:2]
+    rows = []
+    for piece in pieces:
+        first, last = int(piece[0]), int(piece[-1])
+        if record.phase[first] == "flight":
+            rows += [first + int(share * (last - first)) for share in shares]
+            continue
+        rows += [first, first + int(np.argmin(height[piece])), last]
     return np.array(rows)
 
 

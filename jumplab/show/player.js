@@ -42,7 +42,7 @@ let duration = 0, now = 0, playing = false, before = 0, lead = clips[0];
 const point = (poses, k) => new Vector3().fromArray(poses, k);
 const turn = (poses, k) => new Quaternion().fromArray(poses, k + 3);
 
-const phaseAt = (clip, time) => clip.phases.filter(([start]) => start <= time + 1e-9).at(-1)[1];
+const phaseAt = (clip, time, column = 1) => clip.phases.filter(([start]) => start <= time + 1e-9).at(-1)[column];
 
 // The frames before and after an instant, and the share of the way between them.
 function frames(clip, time) {
@@ -157,7 +157,7 @@ function seek(time) {
   for (const clip of clips) if (shown(clip)) pose(clip, now);
   byId("time").value = now;
   const phase = phaseAt(lead, now);
-  byId("phase-name").textContent = phase;
+  byId("phase-name").textContent = phaseAt(lead, now, 2);
   byId("dot").style.background = facts.css[phase];
   byId("clock").textContent = `${now.toFixed(2)} s`;
   compare();

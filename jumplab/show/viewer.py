@@ -165,16 +165,26 @@ def _clip(whole: Motion, robot: Robot, scene: Scene, way: Trace) -> dict[str, An
         places = pressure_points(wrench, feet, top, CONTACT_FORCE_N)
         force = np.where(np.isnan(places), np.nan, wrench[..., :3])
         forces = np.concatenate([places, force], axis=-1)
-    cuts = [0, *(np.flatnonzero(motion.phase[1:] != motion.phase[:-1]) + 1)]
+    words = [_words(*row) for row in zip(motion.phase, motion.contact, strict=True)]
+    cuts = [k for k, word in enumerate(words) if k == 0 or word != words[k - 1]]
     return {
         "bodies": way.joints.shape[1],
         "frames": len(motion.t),
-        "phases": [[float(motion.t[k] - motion.t[0]), str(motion.phase[k])] for k in cuts],
+        "phases": [
+            [float(motion.t[k] - motion.t[0]), str(motion.phase[k]), words[k]] for k in cuts
+        ],
         "poses": _packed(way.joints),
         "path": _packed(way.com),
         "forces": None if forces is None else _packed(forces),
         "values": _packed(_values(whole, motion, robot, way, forces)),
     }
+
+
+def _words(phase: str, contact: np.ndarray) -> str:
+    """The name of a phase, with the foot that carries if it is one alone before the last flight."""
+    if phase != "launch" or contact.all() or not contact.any():
+        return str(phase)
+    return f"{phase}, {('left', 'right')[int(contact[1])]} foot"
 
 
 def _part(part: Part) -> dict[str, Any]:

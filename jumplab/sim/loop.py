@@ -117,11 +117,13 @@ class Run:
         goal: np.ndarray,
         solves: tuple[int, int],
         rows: slice = slice(None),
+        flights: int = 1,
         **settings: Any,
     ) -> SimulationResult:
         """The checked record of the run, or of some ``rows`` of it.
 
-        ``goal`` (nq,) is where the robot shall land, ``solves`` are the QPs posed and failed.
+        ``goal`` (nq,) is where the robot shall land, ``solves`` are the QPs posed and failed, and
+        it is to fly so many ``flights``.
         """
         settings |= dict(
             scene=self.scene.name,
@@ -146,6 +148,7 @@ class Run:
             self.links,
             goal,
             higher_m=higher_m,
+            flights=flights,
             solves=solves,
             settings=settings,
         )
@@ -154,7 +157,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """A wrong state at the apex of the flight."""
+    """A wrong state at the apex of the last flight."""
 
     speed_factor: float = 1.0  # on the horizontal velocity of the whole robot [1]
     pitch_rad: float = 0.0  # turn of the whole robot about its CoM, forward along ``direction_rad``
@@ -165,7 +168,8 @@ class Disturbance:
     def apex(self, tape: Tape, robot: Robot) -> tuple[int, np.ndarray, np.ndarray]:
         """Step of the apex of ``tape``, and the disturbed q (nq,), v (nv,) of ``robot`` there."""
         gauge = Gauge(robot)
-        for row in range(tape.takeoff_index, len(tape.t)):
+        rows = tape.flights[-1]
+        for row in range(rows.start, rows.stop):
             now = gauge.motion(tape.q[row], tape.v[row])
             if now.velocity[2] <= 0:
                 break
@@ -200,13 +204,13 @@ def simulate_jump(
 
     Parameters
     ----------
-    tape : planned launch and flight.
+    tape : of a standing jump, or along any other contact schedule that begins on both feet.
     robot : the robot as planned; the simulated one differs from it by ``perturbation``.
     perturbation : None simulates the robot as planned.
     scene : ground; flat if None.
-    stand_s : how long to watch after touchdown [s]; less than the default is no landing.
-    disturbance : begin at the apex of the flight, in a state that differs so; time, distance and
-        rise count from there.
+    stand_s : how long to watch after the last touchdown [s]; less than the default is no landing.
+    disturbance : begin at the apex of the last flight, in a state that differs so; time, distance
+        and rise count from there.
     engine : "bullet" or "mujoco"; the default is the first that is installed.
     contact : "hard", as plans assume, or "usual", the engine's own defaults.
     control : ``mode``, ``reaim``, ``step``, ``feedback`` and ``landing`` of
@@ -241,12 +245,12 @@ def simulate_jump(
     settings = {name: control.get(name, False) for name in ("reaim", "step")}
     settings |= dict(mode=controller.mode, stand_s=stand_s, **controller.to_json())
     settings["disturbance"] = disturbance and asdict(disturbance)
-    result = run.result(controller.goal, controller.solves, **settings)
+    flights = len(tape.flights) if disturbance is None else 1
+    result = run.result(controller.goal, controller.solves, flights=flights, **settings)
     return replace(result, metrics=replace(result.metrics, recovery_step_s=controller.stepped_s))
 
 
 def _check(tape: Tape, stand_s: float) -> None:
-    tape.require_jump()
     if not 0 < stand_s <= 60:
         raise InputError(f"stand_s = {stand_s:g} s is outside 0 ... 60 s")
     for name in ("t", "q", "v", "tau"):
@@ -254,5 +258,5 @@ def _check(tape: Tape, stand_s: float) -> None:
             raise InputError(
                 f"the tape's {name} has entries that are no number; plan the jump again"
             )
-    if not {"launch", "flight"} <= set(tape.phase.tolist()):
-        raise InputError("the tape must have a launch and a flight; plan the jump again")
+    if not tape.contacts[0].all() or not tape.flights:
+        raise InputError("the tape must begin on both feet, and have a flight; plan the jump again")

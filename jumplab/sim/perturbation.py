@@ -331,8 +331,8 @@ class Perturbation:
         """The shoves as forces, in the steps of a planned jump."""
         if not self.shoves:
             return ()
-        takeoff = _of_one_jump(tape).takeoff_time
-        end = float(tape.t[-1])
+        tape = _of_one_jump(tape)
+        takeoff, end = tape.t[[tape.flights[-1].start, tape.caught - 1]].tolist()
         spans = dict(zip(PHASES, pairwise((0.0, takeoff, end, end + AFTER_S)), strict=True))
         pushes = []
         for shove in self.shoves:

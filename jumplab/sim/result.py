@@ -34,6 +34,7 @@ SMOOTHING_S = 0.02
 SATURATED = 0.999  # share of the available torque that counts as "at the limit"
 # a shorter loss of contact is a hop of the launch; the lowest jump flies 0.13 s
 MIN_FLIGHT_S = 0.05
+LOADED = 0.05  # [1] of the weight
 FLOWN_M = 0.01  # way of the toe until the middle of a flight; feet that only carry nothing stay
 REPORT_NAME = "simulation.json"
 XZ = tuple[float, float]
@@ -69,16 +70,18 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """Numbers of one jump, all measured in the simulation; None where the jump did not get so far.
+    """Numbers of one run, all measured in the simulation; None where it did not get so far.
 
-    Loads are ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the
+    Take-off is that of the flight that rises highest, touchdown the end of the last one. Loads are
+    ratios ``|value| / limit``, largest over the run; vectors are (x, z), those of the
     landing along the heading in which the robot was meant to land, those of the launch along the
     one in which it began.
     """
 
     # travel of the toes from the start to where they stand at the end
     foot_distance_m: Maybe = None
-    foot_distance_touchdown_m: Maybe = None  # the same, to the first touchdown
+    # the same, to the touchdown, if that is on both feet
+    foot_distance_touchdown_m: Maybe = None
     side_m: Maybe = None  # travel of the soles to the left, from the start to the end
     yaw_rad: Maybe = None  # turn of the feet about the vertical, whole turns counted
     # apex minus CoM at lift-off, the last contact force above a few newtons
@@ -113,6 +116,8 @@ class Metrics:
     landing_impulse: XZ | None = None
     # largest mean over 20 ms of what presses on both feet then [N]
     landing_force_n: Maybe = None
+    # largest way of a toe along the ground while its foot is loaded, until the last touchdown [m]
+    slip_m: Maybe = None
     # when, after touchdown, a foot left to catch the robot elsewhere; where the feet end counts
     # that step then
     recovery_step_s: Maybe = None
@@ -137,7 +142,8 @@ class SimulationResult(Shown, Named):
     com_velocity: np.ndarray  # (N, 3) [m/s]
     L: np.ndarray  # (N,) angular momentum about the pitch axis through the CoM [kg m^2/s]
     rho: np.ndarray  # (N,) total pitch inertia about the CoM [kg m^2]
-    phase: np.ndarray  # (N,) "launch", "flight" or "landing", by the simulated contact forces
+    # (N,) by the simulated contact forces: "flight", "landing" after the last one, "launch" before
+    phase: np.ndarray
     touching: np.ndarray  # (N, links) whether a link pressed on the ground
     colliding: np.ndarray  # (N,) whether links of the robot pressed on each other
     link_names: tuple[str, ...]
@@ -255,6 +261,7 @@ def record(
     goal: np.ndarray,
     *,
     higher_m: float = 0.0,
+    flights: int = 1,
     solves: tuple[int, int] = (0, 0),
     settings: dict | None = None,
 ) -> SimulationResult:
@@ -262,8 +269,8 @@ def record(
 
     ``rows`` are of each step (nq,) and (nv,) before it, the motors' torques (nv - 6,) in it [N m],
     and what touched in it; ``goal`` (nq,) is how the tape ends, where the ground is really
-    ``higher_m`` higher [m]; ``solves`` are QPs posed and failed. Raises :class:`SolverError` if the
-    engine's numbers have exploded.
+    ``higher_m`` higher [m], after so many ``flights``; ``solves`` are QPs posed and failed. Raises
+    :class:`SolverError` if the engine's numbers have exploded.
     """
     *columns, contacts = zip(*rows, strict=True)
     q, v, tau = map(np.array, columns)
@@ -271,11 +278,12 @@ def record(
         raise SolverError("the engine lost the robot: its state is not finite", stage="simulation")
     wrench = np.array([c.wrench for c in contacts])
     gauge = Gauge(robot)
-    times = events(wrench[:, :, 2].sum(axis=1), lambda row: gauge.toe(q[row]))
-    liftoff, touchdown = times
+    flown = events(wrench[:, :, 2].sum(axis=1), lambda row: gauge.toe(q[row]), flights)
     phase = np.full(len(q), "launch", dtype="<U7")
-    for row, name in zip(times, ("flight", "landing"), strict=True):
-        phase[len(q) if row is None else row :] = name
+    for liftoff, touchdown in flown:
+        phase[liftoff:touchdown] = "flight"
+    if len(flown) == flights and flown[-1][1] is not None:
+        phase[flown[-1][1] :] = "landing"
     motions = [gauge.motion(*row) for row in zip(q, v, strict=True)]
     log = dict(
         t=np.arange(len(q)) * STEP_S,
@@ -295,7 +303,7 @@ def record(
         array.setflags(write=False)
     names = dict(link_names=links, joint_names=robot.joint_names)
     run = SimulationResult(**log, **names, metrics=None, settings=settings or {}, robot=robot)
-    jump = _Jump(run, gauge, goal, liftoff, touchdown)
+    jump = _Jump(run, gauge, goal, flown, flights)
     standing_s, landed, reason = jump.verdict(higher_m)
     metrics = Metrics(
         **jump.loads(),
@@ -313,15 +321,30 @@ def record(
 
 @dataclass
 class _Jump:
-    """What is measured of a run: names and values of :class:`Metrics`. Lift-off and touchdown are
-    rows of its log, or None.
+    """What is measured of a run: names and values of :class:`Metrics`. What it has ``flown`` are
+    rows of its log.
     """
 
     run: SimulationResult
     gauge: Gauge
     goal: np.ndarray
-    liftoff: int | None
-    touchdown: int | None
+    flown: list[tuple[int, int | None]]
+    flights: int
+
+    @cached_property
+    def liftoff(self) -> int | None:
+        """Row in which the highest flight begins."""
+        return max(self.flown, key=self.rise, default=(None, None))[0]
+
+    @property
+    def touchdown(self) -> int | None:
+        """Row in which the last flight ends."""
+        return self.flown[-1][1] if len(self.flown) == self.flights else None
+
+    def rise(self, rows: tuple[int, int | None]) -> float:
+        """Apex minus CoM at the beginning of a flight [m]."""
+        height = self.run.com[slice(*rows), 2]
+        return float(height.max() - height[0])
 
     @cached_property
     def force(self) -> np.ndarray:
@@ -341,17 +364,32 @@ class _Jump:
         out = dict(
             stray_contacts=tuple(run.link_names[i] for i in np.flatnonzero(stray)),
             launch_impulse=_xz(self.force[:off].sum(axis=0) * STEP_S),
+            slip_m=self.slip(),
         )
         if off is None:
             return out
-        apex = float(run.com[off : self.touchdown, 2].max())
+        rise = max(map(self.rise, self.flown))
         return out | dict(
             liftoff_s=float(run.t[off]),
-            com_rise_m=apex - float(run.com[off, 2]),
-            com_apex_m=apex - float(run.com[0, 2]),
+            com_rise_m=rise,
+            com_apex_m=rise + float(run.com[off, 2] - run.com[0, 2]),
             takeoff_velocity=_xz(run.com_velocity[off]),
             takeoff_momentum=float(run.L[off]),
         )
+
+    def slip(self) -> float:
+        """The largest way of a toe along the ground, of those that a foot goes while it is loaded,
+        until the last touchdown [m].
+        """
+        robot = self.run.robot
+        rows = slice(0, self.touchdown)
+        loaded = self.run.foot_wrench[rows, :, 2] > LOADED * robot.total_mass * robot.gravity
+        tips = [[x.act(robot.foot.tip) for x in self.gauge.places(q)] for q in self.run.q[rows]]
+        ways = [0.0]
+        for down, tip in zip(loaded.T, np.swapaxes(tips, 0, 1), strict=True):
+            edges = np.flatnonzero(np.diff(down.astype(int), prepend=0, append=0)).reshape(-1, 2)
+            ways += [np.linalg.norm((tip[a:b] - tip[a])[:, :2], axis=1).max() for a, b in edges]
+        return float(max(ways))
 
     def landing(self) -> dict[str, Any]:
         """From the touchdown on; nothing if there is none."""
@@ -364,6 +402,8 @@ class _Jump:
         # a turn moves the toes, and shall be no distance
         place = gauge.soles if heading else gauge.toe
         start, touch, end = (place(run.q[row]) for row in (0, down, -1))
+        heights = [foot.act(self.run.robot.foot.center)[2] for foot in gauge.places(run.q[down])]
+        both = abs(np.subtract(*heights)) < LEVEL_TOLERANCE_M
         seen = about_vertical(-heading)
         impact = self.force[down:][: round(IMPACT_S / STEP_S)]
         window = round(SMOOTHING_S / STEP_S)
@@ -375,7 +415,7 @@ class _Jump:
         return dict(
             touchdown_s=float(run.t[down]),
             foot_distance_m=float(end[0] - start[0]),
-            foot_distance_touchdown_m=float(touch[0] - start[0]),
+            foot_distance_touchdown_m=float(touch[0] - start[0]) if both else None,
             side_m=float(end[1] - start[1]),
             yaw_rad=float(np.unwrap([trunk[-1] - trunk[0], yaw])[1]),
             touchdown_trunk_pitch_rad=float(np.unwrap(pitch_of(run.q[: down + 1]))[-1]),
@@ -389,10 +429,8 @@ class _Jump:
     def verdict(self, higher_m: float) -> tuple[float, bool, str]:
         """Seconds on the feet alone after touchdown, whether that is a landing, and why (not)."""
         down = self.touchdown
-        if self.liftoff is None:
-            return 0.0, False, "the feet never left the ground"
         if down is None:
-            return 0.0, False, "the feet never touched down"
+            return 0.0, False, self._unfinished()
         fallen = np.flatnonzero(self.stray.any(axis=1))
         end = next((int(row) for row in fallen if row >= down), len(self.stray))
         standing = float((end - down) * STEP_S)
@@ -405,6 +443,17 @@ class _Jump:
             when = f"{abs(row - down) * STEP_S:.2f} s {side} touchdown"
             return standing, False, f"{name} touched the ground {when}"
         return standing, *self._stands(standing, higher_m)
+
+    def _unfinished(self) -> str:
+        """Why there is no last touchdown."""
+        if not self.flown:
+            return "the feet never left the ground"
+        if self.flights == 1:
+            return "the feet never touched down"
+        fallen = np.flatnonzero(self.stray.any(axis=1))
+        name = self.run.link_names[int(np.argmax(self.stray[fallen[0]]))] if len(fallen) else ""
+        fell = f", {name} touched the ground after {fallen[0] * STEP_S:.2f} s" if name else ""
+        return f"{len(self.flown)} of {self.flights} flights were begun{fell}"
 
     def _stands(self, standing: float, higher_m: float) -> tuple[bool, str]:
         run = self.run
@@ -453,18 +502,21 @@ def motors_spent(motors: MotorLimits, tau: np.ndarray, rates: np.ndarray) -> np.
     return (np.abs(tau) >= SATURATED * np.where(tau > 0, high, -low)) & (tau != 0)
 
 
-def events(force: np.ndarray, toe: Callable[[int], np.ndarray]) -> tuple[int | None, int | None]:
-    """Rows of lift-off and touchdown: the ends of the first long time without vertical ``force``
-    (N,) [N] in which the ``toe`` moves, (3,) [m] at each row. Where gravity is small, a crouch
-    leaves no force either, but the feet stay.
+def events(
+    force: np.ndarray, toe: Callable[[int], np.ndarray], flights: int = 1
+) -> list[tuple[int, int | None]]:
+    """Rows of lift-off and touchdown of the first ``flights``: long times without vertical
+    ``force`` (N,) [N] in which the ``toe`` moves, (3,) [m] at each row. Where gravity is small, a
+    crouch leaves no force either, but the feet stay.
     """
     edges = np.concatenate([[-1], np.flatnonzero(force > CONTACT_FORCE_N), [len(force)]])
+    flown: list[tuple[int, int | None]] = []
     for k in np.flatnonzero((np.diff(edges) - 1) * STEP_S >= MIN_FLIGHT_S):
         liftoff, touchdown = int(edges[k]) + 1, int(edges[k + 1])
         middle = (liftoff + touchdown) // 2
-        if np.linalg.norm(toe(middle) - toe(liftoff)) > FLOWN_M:
-            return liftoff, touchdown if touchdown < len(force) else None
-    return None, None
+        if len(flown) < flights and np.linalg.norm(toe(middle) - toe(liftoff)) > FLOWN_M:
+            flown.append((liftoff, touchdown if touchdown < len(force) else None))
+    return flown
 
 
 def _xz(vector: np.ndarray) -> XZ:

@@ -176,7 +176,7 @@ class JumpPlan(Shown, Named):
 
     @property
     def planned_rise_m(self) -> float:
-        """CoM apex minus CoM at take-off [m], on the tape."""
+        """CoM apex minus CoM at take-off [m], in the tape's highest flight."""
         return self.summary["planned_rise_m"]
 
     @property
@@ -236,18 +236,16 @@ def planned(tape: Tape) -> dict[str, float]:
     """Where the motion of a tape goes; to the side only if it is not one in the plane."""
     extra = tape.extra
     height = extra["com"][:, 2]
-    apex = float(height[tape.takeoff_index :].max())
+    flights = [height[rows] for rows in tape.flights] or [height]
+    rise, apex = max((float(x.max() - x[0]), float(x.max())) for x in flights)
     ahead, left, _ = extra["soles_travel"].tolist()
     aside = {"planned_side_m": left, "planned_yaw_rad": float(extra["feet_turn"])}
     if "planar_toe" in extra:
         toe = extra["planar_toe"]
         ahead = float(toe[-1, 0] - toe[0, 0])
         aside = {}
-    rise = {
-        "planned_rise_m": apex - float(height[tape.takeoff_index]),
-        "planned_apex_m": apex - float(height[0]),
-    }
-    return {"planned_distance_m": ahead, **rise, **aside}
+    high = {"planned_rise_m": rise, "planned_apex_m": apex - float(height[0])}
+    return {"planned_distance_m": ahead, **high, **aside}
 
 
 def _summary(

@@ -55,7 +55,10 @@ CONFIDENCE = 0.95
 # what logs of earlier versions say of runs that fail their checks, and what is said now
 OLDER = ("not honest: ", "failed checks of the run: ")
 # what is corrected: without, with
-LAUNCH = "open loop", "CoM and angular momentum are led back to the plan"
+LAUNCH = (
+    "open loop on two feet; on one, CoM and angular momentum are led back to the plan",
+    "CoM and angular momentum are led back to the plan",
+)
 REAIM = "no", "the legs turn in the air against errors of trunk, speed and momentum, about all axes"
 STEP = "none", "one, if the robot would come to rest beyond its soles"
 KNOWN = (
@@ -77,10 +80,9 @@ class PlanOnFile:
     @classmethod
     def read(cls, folder: str | Path) -> PlanOnFile:
         """The plan of a ``folder`` (that of ``jumplab plan``); raises :class:`InputError` if it
-        holds no whole one of a jump.
+        holds no whole one.
         """
         tape, robot, summary = store.read_plan(folder)
-        tape.require_jump()
         return cls(Path(folder), tape, robot, Scene.of_plan(summary, robot), summary)
 
     @property
@@ -120,7 +122,7 @@ class TrialSettings:
     ranges: Ranges = field(default_factory=Ranges)  # half-widths of the draws
     engine: str = DEFAULT_ENGINE  # or "mujoco"
     step: bool = False  # allow one recovery step where the feet alone cannot catch the robot
-    feedback: bool = False  # correct the launch; open loop otherwise
+    feedback: bool = False  # correct the launch; open loop otherwise, but on one foot
     contact: str = CONTACTS[0]  # how the ground gives way
 
     def __post_init__(self):
@@ -153,6 +155,8 @@ class TrialSettings:
         """The jump of a ``drawn`` robot; ``options`` as of :func:`jumplab.sim.simulate_jump`."""
         for name in ("mode", "reaim", "step", "feedback", "engine", "contact"):
             options[name] = getattr(self, name)
+        if not self.feedback:
+            del options["feedback"]  # on one foot, without being asked
         options |= {"scene": plan.scene, "perturbation": drawn}
         return simulate_jump(plan.tape, plan.robot, **options)
 

@@ -222,6 +222,26 @@ class Contacts:
         """Index into :attr:`landings` of the contact of a foot (0 left, 1 right) in a phase."""
         return max(i for i, (k, s) in enumerate(self.landings) if k <= phase and s == side)
 
+    @classmethod
+    @checked
+    def named(cls, words: str, robot: Robot) -> Contacts:
+        """One of the usual ones by its name in :data:`NAMED`, with its first number: "leap",
+        "hop=0.2" [m], "run_up=2" steps.
+
+        Raises :class:`InputError` for another name, or a number that it cannot have.
+        """
+        name, equals, text = words.partition("=")
+        if name not in NAMED:
+            raise InputError(f"contacts {quoted(name)}: choose one of {', '.join(NAMED)}")
+        unit, number, needed = NAMED[name]
+        try:
+            given = [number(text)] if equals or needed else []
+        except ValueError:
+            raise InputError(
+                f"contacts {quoted(words)}: write {name}=N, N a number of {unit}"
+            ) from None
+        return getattr(cls, name)(robot, *given)
+
     # the usual ones, with steps of usual length where none is given [m]
     # ------------------------------------------------------------------------------------------
     @classmethod
@@ -293,6 +313,18 @@ class Contacts:
         low = Place(_off(robot, ahead_m), up_m=-drop_m)
         far = replace(low, ahead_m=low.ahead_m + _step(robot, jump_m))
         return cls.of("LR L l - LR lr - LR", robot, [low, low, far, far])
+
+
+# usual schedules: unit and kind of their first number, and whether they need one
+NAMED = {
+    "hop": ("metres", float, False),
+    "run_up": ("steps", int, False),
+    "leap": ("metres", float, False),
+    "hurdle": ("metres", float, False),
+    "bound": ("jumps", int, False),
+    "step_off": ("metres", float, True),
+    "drop_jump": ("metres", float, True),
+}
 
 
 def jump_contacts(limits: Limits, mesh: Mesh) -> Contacts:

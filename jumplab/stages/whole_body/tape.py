@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from jumplab.io.tape import RATE_HZ, Tape
+from jumplab.io.tape import AIR, FLAT, RATE_HZ, TOE, Tape
 from jumplab.models.spatial import SpatialModel
 from jumplab.ocp.solution import PhaseSolution, quintic
 from jumplab.robot import Robot
@@ -40,9 +40,6 @@ TURNS = 100  # such rounds at most
 SLOPES = 20  # samples from one slope of those corrections to the next
 LEAST_LOAD = 1e-3  # share of the weight that each foot counts as carrying there
 # codes of a foot in the tape's ``contacts``
-AIR = 0
-TOE = 1
-FLAT = 2
 CODES = {"toe": TOE, "flat": FLAT}
 
 

@@ -1,0 +1,146 @@
+"""Hops, run-ups and the like: which are planned, pass the audit, and stand in which engine and contact."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import trapezoid
+
+import jumplab as jl
+from jumplab.errors import SolverError
+from jumplab.io.files import write_file
+from jumplab.io.tape import Tape
+from jumplab.ocp.nlp import patience
+from jumplab.robot import Robot
+from jumplab.show.style import PAGE_IN, by_phase, new_figure
+from jumplab.stages.plan import JumpPlan, planned
+
+LOG = Path(__file__).with_name("schedules.jsonl")
+ROBOTS = "bhr", "g1_arms"
+PATIENCE_S = 40.0  # processor time for one plan
+# name -> words of Contacts.named
+CASES = {
+    "hop 0.1 m": "hop=0.1",
+    "hop 0.2 m": "hop=0.2",
+    "hop 0.3 m": "hop=0.3",
+    "run-up of two steps": "run_up=2",
+    "leap": "leap",
+    "step off 0.3 m": "step_off=0.3",
+    "drop jump 0.2 m": "drop_jump=0.2",
+    "hurdle": "hurdle",
+    "five bounds": "bound=5",
+}
+WORLDS = {
+    "PyBullet": dict(engine="bullet"),
+    "MuJoCo, hard": dict(engine="mujoco"),
+    "MuJoCo, usual": dict(engine="mujoco", contact="usual"),
+}
+
+
+def study(folder: str | Path, path: Path = LOG, robots: Iterable[str] = ROBOTS) -> None:
+    """Plan each case, and play it in each world; one row each, written at once, plans kept in ``folder``.
+
+    What the log has is not done again. ``python -m paper.schedules DIR`` calls it.
+    """
+    rows = stored(path) if path.is_file() else []
+    done = {(row["robot"], row["case"]) for row in rows}
+    for robot in robots:
+        for case in CASES:
+            if (robot, case) not in done:
+                rows.append({"robot": robot, "case": case} | _row(Path(folder) / f"{robot} {case}", robot, case))
+                write_file(path, "".join(json.dumps(r, ensure_ascii=False) + "\n" for r in rows).encode())
+
+
+def _row(folder: Path, robot: str, case: str) -> dict[str, Any]:
+    try:
+        plan = _planned(folder, robot, CASES[case])
+    except SolverError as e:
+        return {"planned": False, "refusal": str(e)}
+    report = jl.audit(plan)
+    where = planned(plan.tape)
+    row = {
+        "planned": True,
+        "phases": len(plan.schedule),
+        "cpu_s": round(sum(x.cpu_s for x in plan.attempts), 2),
+        "failed_checks": [check.name for check in report.failed],
+        "travel_m": where["planned_distance_m"],
+        "rise_m": where["planned_rise_m"],
+        "runs": {},
+    }
+    for world, options in WORLDS.items():
+        run = jl.simulate(plan, **options)
+        m = run.metrics
+        row["runs"][world] = {
+            "stands": run.landed and run.checks_passed,
+            "reason": run.reason,
+            "travel_m": m.foot_distance_m,
+            "rise_m": m.com_rise_m,
+            "slip_m": m.slip_m,
+        }
+    return row
+
+
+def _planned(folder: Path, robot: str, words: str) -> JumpPlan:
+    if (folder / "plan.npz").is_file():
+        return jl.load(folder).plan
+    with patience(PATIENCE_S):
+        plan = jl.plan(robot=robot, contacts=words)
+    jl.save(folder, plan)
+    return plan
+
+
+def stored(path: Path = LOG) -> list[dict[str, Any]]:
+    """The kept rows."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def table(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line per case: what was planned, and how it ended in each world."""
+    lines = []
+    for row in rows:
+        line = {"robot": row["robot"], "case": row["case"], "planned": "yes" if row["planned"] else "no"}
+        if row["planned"]:
+            line |= {"CPU [s]": row["cpu_s"], "audit": ", ".join(row["failed_checks"]) or "passed"}
+            line |= {"travel [m]": row["travel_m"], "rise [m]": row["rise_m"]}
+        ends = row.get("runs", {}).items()
+        lines.append(line | {world: "stands" if run["stands"] else "falls" for world, run in ends})
+    return lines
+
+
+def pushes(tape: Tape, robot: Robot) -> list[dict[str, Any]]:
+    """A line per contact that begins before the last take-off: what its force along x adds to the CoM's speed."""
+    end = tape.flights[-1].start
+    lines = []
+    for side, name in enumerate(("left", "right")):
+        down = tape.contacts[:end, side] > 0
+        edges = np.flatnonzero(np.diff(down.astype(int), prepend=0, append=0)).reshape(-1, 2)
+        for a, b in edges:
+            gained = trapezoid(tape.f[a:b, side, 0], tape.t[a:b]) / robot.total_mass
+            lines.append({"from [s]": tape.t[a], "to [s]": tape.t[b - 1], "foot": name, "speed ahead [m/s]": gained})
+    return sorted(lines, key=lambda line: (line["from [s]"], line["foot"]))
+
+
+def speeds(plans: dict[str, JumpPlan]) -> Figure:
+    """Speed of the CoM ahead and up over the time until the last take-off, one column for each plan."""
+    fig = new_figure(PAGE_IN, 3.0)
+    axes = fig.subplots(2, len(plans), sharex="col", sharey="row")
+    for column, (name, plan) in zip(axes.T, plans.items(), strict=True):
+        tape = plan.tape
+        t = tape.t - tape.t[tape.flights[-1].start]
+        for ax, axis in zip(column, (0, 2), strict=True):
+            by_phase(ax, t, plan.com_velocity[:, axis], tape.phase)
+        column[0].set(title=name)
+        column[1].set(xlabel="time from the last take-off [s]")
+    axes[0, 0].set_ylabel("CoM ahead [m/s]")
+    axes[1, 0].set_ylabel("CoM up [m/s]")
+    return fig
+
+
+if __name__ == "__main__":
+    study(*sys.argv[1:2])
