@@ -86,6 +86,7 @@ class WholeBodyPlanner:
         self.free = free or (even(self.body) if tracking else whole(self.body))
         given = self.body, self.contacts, limits, weights, self.free, tracking, changes
         self.usual = Program(*given, options, keep, follows)
+        self._sought: dict[tuple, Program] = {}
 
     @cached_property
     def _even(self) -> Program | None:
@@ -144,6 +145,7 @@ class WholeBodyPlanner:
         near: WholeBodyPlan | Mapping[str, PhaseGuess] | None = None,
         stance: np.ndarray | None = None,
         starts: Sequence[Start] | None = None,
+        sought: tuple[str, ...] = (),
     ) -> WholeBodyPlan:
         """Solve for a target, from one start after the other, up to the first motion that keeps
         every limit.
@@ -157,6 +159,8 @@ class WholeBodyPlanner:
         stance : configuration (nq,) in which the robot waits at rest, soles flat in the stance's
             places; it if None.
         starts : instead of the usual list.
+        sought : parameters of the target that are unknowns, the first of which is maximised; their
+            values in ``task`` are where they begin.
 
         Where nobody reads why there is no plan, :data:`jumplab.ocp.nlp.EXPLAINED` is off, and it
         gives up sooner.
@@ -172,7 +176,7 @@ class WholeBodyPlanner:
         chart = None if stance is None else self.body.model.of_pinocchio(stance[None])[0]
         self._check_standing(task, chart)
         asked = Asked(task, chart, srmp, weights, near, begin, self._straight)
-        programs = self.programs(task, weights)
+        programs = [self.seeking(x, sought) for x in self.programs(task, weights)]
         plans = []
         failures = []
         for program in programs:
@@ -202,6 +206,13 @@ class WholeBodyPlanner:
             f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
             stage=name,
         )
+
+    def seeking(self, program: Program, sought: tuple[str, ...]) -> Program:
+        """The same ``program`` with parameters of the target as unknowns, built once."""
+        key = program.free.kind, sought
+        if sought and key not in self._sought:
+            self._sought[key] = replace(program, sought=sought)
+        return self._sought[key] if sought else program
 
     def _starts(self, program: Program, asked: Asked, patient: bool) -> list[Start]:
         """The list of starts in a program, in their order; the last one only for who is

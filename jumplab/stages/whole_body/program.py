@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from jumplab.errors import Shown, SolverError
+from jumplab.ocp.assembly import Assembled
 from jumplab.ocp.nlp import LEAST_S, Nlp, Solution, left_s
+from jumplab.ocp.posing import Posed, binding, lagrangian, pack, pose
 from jumplab.ocp.solution import PhaseSolution, resampled
 from jumplab.robot import Robot
 from jumplab.stages.changes import StageChanges
@@ -25,11 +27,11 @@ from jumplab.stages.whole_body.contacts import SIDES, Contacts
 from jumplab.stages.whole_body.coordinates import Coordinates
 from jumplab.stages.whole_body.ground import Surface, surface_of_jump, surface_of_schedule
 from jumplab.stages.whole_body.motions import Motion
-from jumplab.stages.whole_body.problem import Schedule
+from jumplab.stages.whole_body.problem import SOUGHT, Schedule
 from jumplab.stages.whole_body.settings import Limits, Weights
 from jumplab.stages.whole_body.shapes import Apart
 from jumplab.stages.whole_body.starts import APART, Asked, Beginning, Start, from_solved
-from jumplab.task import JumpTask
+from jumplab.task import RANGES, JumpTask
 
 # beyond, the cost moves by less than one in a million
 IPOPT = {"tol": 1e-3, "constr_viol_tol": 1e-5, "compl_inf_tol": 1e-4}
@@ -82,6 +84,7 @@ class Program(Shown):
     changes : own terms, weights and switches.
     options : of ipopt besides :data:`IPOPT`.
     keep : whether what was built is kept for later processes.
+    sought : parameters of the target that are unknowns, see :class:`.Schedule`.
     """
 
     body: Body
@@ -94,6 +97,7 @@ class Program(Shown):
     options: Mapping[str, Any] = field(default_factory=dict)
     keep: bool = False
     follows: bool = False
+    sought: tuple[str, ...] = ()
     _built: dict[tuple, Nlp] = field(default_factory=dict, init=False)
 
     @property
@@ -104,7 +108,7 @@ class Program(Shown):
     def schedule(self, apart: tuple[Apart, ...] = ()) -> Schedule:
         """Its schedule, with rows for links that met (none by default)."""
         given = self.body, self.contacts, self.limits, self.weights
-        return Schedule(*given, apart, self.free, self.tracking, self.follows)
+        return Schedule(*given, apart, self.free, self.tracking, self.follows, self.sought)
 
     @property
     def nlp(self) -> Nlp:
@@ -120,7 +124,7 @@ class Program(Shown):
                 self._built[()] = usual
             words = (
                 f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
-                f"{self.follows}"
+                f"{self.follows} {self.sought}"
             )
             problem = self.changes.applied(self.schedule(apart).problem())
             self._built[key] = Nlp(problem, {}, words if self.keep else None)
@@ -156,11 +160,14 @@ class Program(Shown):
         limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
         nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
+        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
+        known = {name: parameters[name] for name in self.sought}
+        guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
         began = time.process_time()
         try:
             solution = nlp.solve(
-                self.parameters(asked.task, asked.stance, asked.srmp),
-                begin.guess,
+                parameters,
+                guess,
                 references=self.references(asked.srmp, asked.motion),
                 weights=self.changes.spread(self.nlp.problem, asked.weights),
                 multipliers=begin.multipliers,
@@ -200,6 +207,37 @@ class Program(Shown):
         model = self.body.model
         left = {k for k in model.left_half if model.across[k] is None}
         return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
+
+    def limits_of(self, asked: Asked, solved: Solved) -> Iterator[tuple]:
+        """What binds in a ``solved`` motion of this program, see :func:`jumplab.ocp.posing.binding`."""
+        a, posed, _ = self._posed(asked, solved)
+        return binding(a, posed, solved.solution.multipliers)
+
+    def cost_of(self, asked: Asked, solved: Solved) -> float:
+        """What the least cost is, to first order, where ``solved`` is of a program like this one
+        with other numbers; see :func:`jumplab.ocp.posing.lagrangian`.
+        """
+        a, posed, guess = self._posed(asked, solved)
+        return lagrangian(a, posed, pack(a, guess), solved.solution.multipliers)
+
+    def _posed(self, asked: Asked, solved: Solved) -> tuple[Assembled, Posed, dict]:
+        """The problem of a solution, its numbers, and the solution as a start."""
+        a = self._nlp(solved.schedule.apart).assembled
+        guess = solved.solution.guess()
+        parameters = self.parameters(asked.task, asked.stance, asked.srmp)
+        weights = self.changes.spread(a.problem, asked.weights)
+        references = self.references(asked.srmp, asked.motion)
+        return a, pose(a, parameters, guess, references, weights), guess
+
+    def found(self, task: JumpTask, solved: Solved) -> JumpTask:
+        """The target that a solution has reached: ``task`` with what was sought."""
+        if not self.sought:
+            return task
+        found = next(iter(solved.solution.phases.values())).constants
+        new = {SOUGHT[name]: found[name] for name in self.sought}
+        if "takeoff_speed" in self.sought:
+            new["height_m"] = new["height_m"] ** 2 / (2 * task.gravity)
+        return replace(task, **{k: float(np.clip(x, *RANGES[k][1:])) for k, x in new.items()})
 
     # numbers of a target
     # ------------------------------------------------------------------------------------------

@@ -204,6 +204,10 @@ APART = (
     Start("links apart", from_neighbour, True, 80, MET),
     Start("links apart", from_neighbour, False, 120, MET),
 )
+# to a record from an easy jump: to the end, or its prices would be rounding
+EXACT = {"acceptable_iter": 0, "tol": 1e-4}
+SEEKING = Start("easy jump", from_neighbour, False, 300, WARM | EXACT | {"mu_init": 1e-2})
+RECORD = Start("record", from_neighbour, False, 150, WARM | EXACT | {"mu_init": 1e-4})
 SETTLED = Start("settled", from_neighbour, False, 150, WARM | PATIENT)
 FINER = Start("finer mesh", from_neighbour, False, 150, WARM | {"acceptable_iter": 1})
 REFINED = (SETTLED, FINER, FINER)
