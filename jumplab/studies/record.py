@@ -37,16 +37,20 @@ from jumplab.stages.whole_body.terms import FAR, TORQUE_SPEED, WORTH
 from jumplab.stages.whole_body.terms import RECORD as RECORD_TERM
 from jumplab.task import RANGES, JumpTask
 
-# easy jumps to begin with, three a record: (the number sought, rise), of the leg's length, or [rad]
+# easy jumps to begin with, two a record: (the number sought, rise), of the leg's length, or [rad]
 EASY = {
-    "height_m": ((0.12, 0.12), (0.25, 0.25), (0.4, 0.4)),
-    "distance_m": ((0.2, 0.2), (0.4, 0.15), (0.5, 0.3)),
-    "platform_m": ((0.06, 0.2), (0.12, 0.3), (0.2, 0.35)),
-    "side_m": ((0.1, 0.15), (0.2, 0.2), (0.3, 0.3)),
-    "yaw_rad": ((0.3, 0.12), (0.6, 0.2), (1.0, 0.3)),
+    "height_m": ((0.2, 0.2), (0.4, 0.4)),
+    "distance_m": ((0.2, 0.2), (0.5, 0.3)),
+    "platform_m": ((0.06, 0.2), (0.15, 0.3)),
+    "side_m": ((0.1, 0.15), (0.3, 0.3)),
+    "yaw_rad": ((0.3, 0.12), (1.0, 0.3)),
 }
+# shares of the best that they led to, whose own plans, of least effort, are the next starts
+CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
 STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9  # shares of it, of which the first clean one counts
+LESS = 0.05  # of the share of a record that is played next, where a robot falls
+TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
 PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
 BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
@@ -57,8 +61,9 @@ RANGE_RAD = math.radians(0.5)
 STOPS = {"upper stop": 1, "lower stop": -1}
 END = {1: "upper", -1: "lower"}
 MOTOR = {"torque": ("effort", "N m"), "speed": ("speed", "rad/s")}
+SEEN = 2e-5  # [m, rad] of a record, which solves find again
 WHOLE_UNITS = "deg", "0.01"
-MORE = 1.03  # times the worth of what is sought, in the second of two records that make prices
+MORE = 1.01  # times the worth of what is sought, in the second of two records that make prices
 FRICTION_STEP = 0.005
 KINDS = {"plane": in_plane, "even": even, "whole": whole}  # of coordinates
 
@@ -103,8 +108,10 @@ class Price:
 
     @property
     def gap(self) -> float:
-        """By how much the check differs from the price, as a share of it."""
-        return abs(self.checked - self.price) / max(abs(self.price), 1e-9)
+        """By how much the check differs from the price, as a share of it; of the least that is
+        seen where it is next to nothing.
+        """
+        return abs(self.checked - self.price) / max(abs(self.price), SEEN / self.moved)
 
     @property
     def step(self) -> float:
@@ -130,8 +137,8 @@ class Prices(Shown):
         """How many there are, and how well they are confirmed."""
         kept = [row.gap for row in self.rows if row.stays]
         return (
-            f"{self.robot}, {self.what}: {len(self.rows)} prices, {len(kept)} of limits that may be "
-            f"moved without others taking over; there checks differ by {max(kept, default=0):.1%} "
+            f"{self.robot}, {self.what}: {len(self.rows)} prices; of {len(kept)} limits, which may "
+            f"be moved without others taking over, the checks differ by {max(kept, default=0):.1%} "
             f"at most"
         )
 
@@ -211,7 +218,8 @@ def record(
     what : "height_m", "distance_m", "platform_m", "side_m" or "yaw_rad".
     given : the rest of the target; by default a jump on the spot (a platform as near as it can be),
         with whatever rise is best.
-    share : of the record, of the plan that is played.
+    share : of the record, of the plan that is played first; a smaller one follows where a robot
+        falls.
     engines : in which it is played; none with ().
     limits : of the plans, as of :class:`jumplab.Planner`.
 
@@ -232,12 +240,7 @@ def record(
         search = _Search(planner, what, given)
         found, best = search.from_easy()
         plan, solved, program = search.plan_at(best)
-        reserve = search.reserved(plan, share) if len(engines) else None
-    runs = {}
-    for engine in engines:
-        tell(f"playing {share:.0%} of the record in {engine}")
-        scene = Scene.of_plan(reserve.summary, reserve.robot)
-        runs[engine] = simulate_jump(reserve.tape, reserve.robot, scene=scene, engine=engine)
+        share, reserve, runs = search.played(plan, share, engines)
     ends = tuple(_binding(program, plan.task, solved))
     value = getattr(plan.task, what)
     report = _audited(plan)
@@ -258,27 +261,27 @@ class _Search:
         self.sought = tuple(names)
 
     def program(self, task: JumpTask) -> Program:
-        """The one in which the number is an unknown."""
-        return self.stage.seeking(self.stage.program(task), self.sought)
+        """The one in which the number is an unknown, on a mesh of which little is left to gain."""
+        return self.stage.seeking(self.stage.program(task), self.sought).finer
 
-    def easy(self) -> Iterator[JumpTask]:
-        """Jumps to begin with."""
+    def starts(self, best: list[tuple]) -> Iterator[JumpTask]:
+        """Jumps to begin with: easy ones, then shares of the ``best`` that was found."""
         leg = self.stage.body.leg_m
         for number, rise in EASY[self.what]:
             x = number if self.what == "yaw_rad" else number * leg
-            numbers = {self.what: x}
-            if "takeoff_speed" in self.sought:
-                numbers["height_m"] = rise * leg
-            yield replace(self.given, **numbers)
+            more = {"height_m": rise * leg} if "takeoff_speed" in self.sought else {}
+            yield replace(self.given, **(more | {self.what: x}))
+        for share in CLIMB if best else ():
+            yield self.at(max(best, key=lambda x: x[0])[1], share)
 
     def from_easy(self) -> tuple[dict[str, float], Solved]:
         """What came of each start, and the best one."""
-        found = {}
-        best = []
+        found: dict[str, float] = {}
+        best: list[tuple] = []
         refusal = None
-        for task in self.easy():
+        for task in self.starts(best):
             word = (
-                f"{getattr(task, self.what):.2f} {unit_of(self.what)}, rise {task.height_m:.2f} m"
+                f"{getattr(task, self.what):.3f} {unit_of(self.what)}, rise {task.height_m:.3f} m"
             )
             tell(f"record of {self.planner.robot.name} from {word}")
             found[word] = math.nan
@@ -289,8 +292,9 @@ class _Search:
             except (InfeasibleError, SolverError) as e:
                 refusal = e
                 continue
-            found[word] = getattr(program.found(task, solved), self.what)
-            best.append((found[word], program.found(task, solved), solved))
+            reached = program.found(task, solved)
+            found[word] = getattr(reached, self.what)
+            best.append((found[word], reached, solved))
         if not best:
             raise InfeasibleError(
                 f"robot {self.planner.robot.name}: no record of {self.what}, since none of "
@@ -322,11 +326,12 @@ class _Search:
         program = self.program(self.task)
         failed = ""
         for share in STEPS_BACK:
-            sought = self.sought if share == 1 else ()
             task = self.at(self.task, share)
-            options = {"starts": (RECORD,), "sought": sought} if sought else {}
             try:
-                body = self.stage.plan(task, near=best, **options)
+                if share == 1:
+                    body = self.stage.refined(program, Asked(task, near=best), RECORD)
+                else:
+                    body = self.stage.plan(task, near=best)
             except (InfeasibleError, SolverError) as e:
                 failed = str(e)
                 continue
@@ -339,7 +344,7 @@ class _Search:
                 f"robot {robot.name}: {self.what} reaches {getattr(self.task, self.what):.3f} at "
                 f"the nodes, but no plan down to {share:.0%} of it is clean ({failed})"
             )
-        if sought:
+        if share == 1:
             contacts = body.schedule.contacts
             finest = (
                 program if contacts == program.contacts else replace(program, contacts=contacts)
@@ -354,9 +359,27 @@ class _Search:
         """A ``share`` of what is sought; of a jump onto a platform the rise stays."""
         return replace(task, **{self.what: share * getattr(task, self.what)})
 
-    def reserved(self, plan: JumpPlan, share: float) -> JumpPlan:
-        """A plan at a ``share`` of the record."""
-        return self.planner.plan(self.at(plan.task, share), "direct", near=plan)
+    def played(
+        self, plan: JumpPlan, share: float, engines: Sequence[str]
+    ) -> tuple[float, JumpPlan | None, dict[str, SimulationResult]]:
+        """A plan at a ``share`` of the record, played in all ``engines``: of several shares, each
+        :data:`LESS` than the one before, the first that lands in all, else the last one.
+        """
+        reserve = None
+        runs: dict[str, SimulationResult] = {}
+        for less in range(TRIED if len(engines) else 0):
+            tried = share - LESS * less
+            tell(f"playing {tried:.0%} of the record")
+            near = reserve or plan
+            with suppress(InfeasibleError, SolverError):
+                reserve = self.planner.plan(self.at(plan.task, tried), "direct", near=near)
+                scene = Scene.of_plan(reserve.summary, reserve.robot)
+                given = reserve.tape, reserve.robot
+                runs = {x: simulate_jump(*given, scene=scene, engine=x) for x in engines}
+                share = tried
+                if all(run.landed for run in runs.values()):
+                    break
+        return share, reserve, runs
 
 
 def unit_of(name: str) -> str:

@@ -187,7 +187,7 @@ class WholeBodyPlanner:
                 if program.spent(asked):
                     break
                 try:
-                    plans.append(self._refined(program, asked, start))
+                    plans.append(self.refined(program, asked, start))
                 except (SolverError, InfeasibleError) as e:  # the jump straight ahead may have none
                     failures.append(e)
                     continue
@@ -232,7 +232,7 @@ class WholeBodyPlanner:
             starts.sort(key=lambda x: (x.name != NEIGHBOUR, x.name == STANCE, x.held))
         return starts
 
-    def _refined(self, program: Program, asked: Asked, start: Start) -> WholeBodyPlan:
+    def refined(self, program: Program, asked: Asked, start: Start) -> WholeBodyPlan:
         """The plan of one start, its links apart.
 
         Where it passes limits between the nodes it is solved on: to the end, then on finer meshes.

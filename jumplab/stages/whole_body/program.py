@@ -209,7 +209,7 @@ class Program(Shown):
         return [x for x in met if left & {x.pair.first.body, x.pair.second.body}]
 
     def limits_of(self, asked: Asked, solved: Solved) -> Iterator[tuple]:
-        """What binds in a ``solved`` motion of this program, see :func:`jumplab.ocp.posing.binding`."""
+        """What binds in a ``solved`` motion, see :func:`jumplab.ocp.posing.binding`."""
         a, posed, _ = self._posed(asked, solved)
         return binding(a, posed, solved.solution.multipliers)
 
