@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,10 +36,10 @@ from jumplab.stages.whole_body.terms import FAR, TORQUE_SPEED, WORTH
 from jumplab.stages.whole_body.terms import RECORD as RECORD_TERM
 from jumplab.task import RANGES, JumpTask
 
-# easy jumps to begin with, two a record: (the number sought, rise), of the leg's length, or [rad]
+# easy jumps to begin with: (the number sought, rise), of the leg's length, or [rad]
 EASY = {
-    "height_m": ((0.2, 0.2), (0.4, 0.4)),
-    "distance_m": ((0.2, 0.2), (0.5, 0.3)),
+    "height_m": ((0.06, 0.06), (0.2, 0.2), (0.4, 0.4)),
+    "distance_m": ((0.1, 0.06), (0.2, 0.2), (0.5, 0.3)),
     "platform_m": ((0.06, 0.2), (0.15, 0.3)),
     "side_m": ((0.1, 0.15), (0.3, 0.3)),
     "yaw_rad": ((0.3, 0.12), (1.0, 0.3)),
@@ -48,7 +47,7 @@ EASY = {
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
-STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9  # shares of it, of which the first clean one counts
+STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7  # shares of it, of which the first clean one counts
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
@@ -56,6 +55,7 @@ PLATFORM_ROOM_M = 0.1  # of a platform's distance, over the least that it takes
 BINDS = 1e-2  # [m, m/s, rad] that the whole of a limit is worth at least, to be named
 BINDING_SHARE = 0.05  # of its largest multiplier: from there to there it binds
 ACTIVE = 1e-3  # [m, m/s, rad] that a limit at a node is worth at least, to be one that binds
+MOST = 8  # limits of joints that are priced
 MOVED = 0.005  # share by which torques, speeds, masses and legs are moved
 RANGE_RAD = math.radians(0.5)
 STOPS = {"upper stop": 1, "lower stop": -1}
@@ -191,13 +191,11 @@ class Record(Shown):
             f"{', '.join(ends)}{played * bool(self.runs)}"
         )
 
-    @cached_property
-    def _prices(self) -> Prices:
-        return _priced(self)
-
-    def prices(self) -> Prices:
-        """What more of each limit would buy, each checked by a record with it moved."""
-        return self._prices
+    def prices(self, most: int = MOST) -> Prices:
+        """What more of the ``most`` dearest limits of joints would buy, and of friction, mass and
+        legs; each checked by a record with it moved, which takes a second or two.
+        """
+        return _priced(self, most)
 
 
 @checked
@@ -208,7 +206,7 @@ def record(
     *,
     share: float = 0.95,
     engines: Sequence[str] = INSTALLED,
-    limits: Limits | Mapping[str, Any] | None = None,
+    **changes: Any,
 ) -> Record:
     """The largest ``what`` of a target that a plan was found for, and what ends it.
 
@@ -221,7 +219,7 @@ def record(
     share : of the record, of the plan that is played first; a smaller one follows where a robot
         falls.
     engines : in which it is played; none with ().
-    limits : of the plans, as of :class:`jumplab.Planner`.
+    changes : own ``limits``, ``mesh``, ``weights`` and so on, as of :class:`jumplab.Planner`.
 
     Raises
     ------
@@ -235,7 +233,7 @@ def record(
         raise InputError(f"what = {quoted(what)}: a record is one of {', '.join(EASY)}")
     if not 0 < share <= 1:
         raise InputError(f"share = {share:g} must be above 0 and at most 1")
-    planner = Planner(robot, keep=True, limits=limits)
+    planner = Planner(robot, keep=True, **changes)
     with unexplained():
         search = _Search(planner, what, given)
         found, best = search.from_easy()
@@ -280,13 +278,12 @@ class _Search:
         best: list[tuple] = []
         refusal = None
         for task in self.starts(best):
-            word = (
-                f"{getattr(task, self.what):.3f} {unit_of(self.what)}, rise {task.height_m:.3f} m"
-            )
+            size = f"{getattr(task, self.what):.3f} {unit_of(self.what)}"
+            word = f"{size}, rise {task.height_m:.3f} m"
             tell(f"record of {self.planner.robot.name} from {word}")
             found[word] = math.nan
             try:
-                near = self.stage.plan(task)
+                near = self.stage.solved(task)
                 program = self.program(task)
                 solved = program.solve(Asked(task, near=near), SEEKING)
             except (InfeasibleError, SolverError) as e:
@@ -458,7 +455,7 @@ class _Move:
     limits: Limits
 
 
-def _moves(record: Record) -> Iterator[_Move]:
+def _moves(record: Record, most: int) -> Iterator[_Move]:
     """The limits that bind, and what each record depends on: friction, mass, legs."""
     robot = record.program.robot
     limits = record.program.limits
@@ -469,7 +466,7 @@ def _moves(record: Record) -> Iterator[_Move]:
         for kind in kinds.get(row.limit, (row.limit,)):
             if row.joint in motors:
                 pairs.setdefault((kind, row.joint))
-    for kind, joint in pairs:
+    for kind, joint in list(pairs)[:most]:
         signs = _both(record.program, joint)
         word = f"{_role(robot, joint)} {kind}"
         if kind in STOPS:
@@ -507,7 +504,7 @@ def _role(robot: Robot, joint: str) -> str:
     return word.replace("_", " ")
 
 
-def _priced(record: Record) -> Prices:
+def _priced(record: Record, most: int) -> Prices:
     """The prices of a record.
 
     Multipliers say what a limit is worth in the sum of record and effort; how that grows with the
@@ -516,7 +513,7 @@ def _priced(record: Record) -> Prices:
     """
     program = record.program
     task = record.plan.task
-    usual = next(t.weight for _, t in program.nlp.problem.terms() if t.name == RECORD_TERM)
+    usual = next(t.weight for _, t in record.solved.solution.problem.terms() if t.name == RECORD_TERM)
     first = Asked(task), record.solved
     other = Asked(task, weights={RECORD_TERM: MORE * usual})
     second = other, program.solve(other, RECORD, from_solved(program, record.solved))
@@ -527,7 +524,7 @@ def _priced(record: Record) -> Prices:
     costs = [program.cost_of(*x) for x in (first, second)]
     active = _active(program, task, record.solved)
     rows = []
-    for move in _moves(record):
+    for move in _moves(record, most):
         tell(f"price of {move.limit}")
         body = Body(move.robot)
         free = KINDS[program.free.kind](body)

@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +68,14 @@ def rows() -> list[dict[str, Any]]:
 
 def missing(done: Any) -> Iterator[tuple[str, str]]:
     """Records that the log lacks, first those of robots that are planned in the plane."""
-    robots = sorted(SHIPPED, key=lambda name: (not Robot.load(name).planar, name != "bhr", name))
-    for what in WHAT:
-        for name in robots:
-            if f"{name} {what}" not in done:
-                yield name, what
+    planar = {}
+    for name in SHIPPED:
+        with suppress(JumplabError):  # its description is not installed
+            planar[name] = Robot.load(name).planar
+    cases = [(name, what) for what in WHAT for name in planar]
+    for name, what in sorted(cases, key=lambda case: not planar[case[0]]):
+        if f"{name} {what}" not in done:
+            yield name, what
 
 
 def records_table() -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -23,7 +24,7 @@ from jumplab.stages.whole_body.contacts import Contacts, jump_contacts
 from jumplab.stages.whole_body.coordinates import Coordinates, even, in_plane, whole
 from jumplab.stages.whole_body.motions import Motion, configurations
 from jumplab.stages.whole_body.plan import WholeBodyPlan
-from jumplab.stages.whole_body.program import Program
+from jumplab.stages.whole_body.program import Program, Solved
 from jumplab.stages.whole_body.settings import Limits, Mesh, Weights
 from jumplab.stages.whole_body.starts import (
     ASIDE,
@@ -206,6 +207,19 @@ class WholeBodyPlanner:
             f"best by a factor of {best.used:.3g}; ask for less, or for a finer mesh",
             stage=name,
         )
+
+    def solved(self, task: JumpTask) -> Solved:
+        """The first motion that keeps every limit at the nodes, without a look between them; raises
+        as :meth:`plan`.
+        """
+        self._check_standing(task, None)
+        asked = Asked(task, straight=self._straight)
+        program = self.program(task)
+        *starts, last = self._starts(program, asked, patient=False)
+        for start in starts:
+            with suppress(SolverError):
+                return program.solve(asked, start)
+        return program.solve(asked, last)
 
     def seeking(self, program: Program, sought: tuple[str, ...]) -> Program:
         """The same ``program`` with parameters of the target as unknowns, built once."""

@@ -119,9 +119,9 @@ class Program(Shown):
         key = tuple((x.phase, x.first, x.last, x.pair.key, x.more_m) for x in apart)
         if key not in self._built:
             if len(self._built) > BUILT:
-                usual = self._built[()]
+                usual = {(): self._built[()]} if () in self._built else {}
                 self._built.clear()
-                self._built[()] = usual
+                self._built.update(usual)
             words = (
                 f"{self.robot.hash} {self.free.kind} {self.limits} {self.weights} {self.tracking} "
                 f"{self.follows} {self.sought}"
@@ -138,9 +138,15 @@ class Program(Shown):
         )
         return replace(self, contacts=replace(self.contacts, phases=phases))
 
+    @property
+    def size(self) -> int:
+        """Number of variables, the same whatever links met."""
+        built = next(iter(self._built.values()), None) or self.nlp
+        return built.assembled.size
+
     def left_s(self, asked: Asked) -> float:
         """Processor time [s] that further attempts of a program of this size may take."""
-        usual = PATIENCE_S * max(1.0, self.nlp.assembled.size / USUAL_SIZE)
+        usual = PATIENCE_S * max(1.0, self.size / USUAL_SIZE)
         return min(usual - asked.spent_s, left_s())
 
     def spent(self, asked: Asked) -> bool:
@@ -155,11 +161,12 @@ class Program(Shown):
         sentence names the terms in conflict where it shall ``explain``.
         """
         begin = begin or start.begin(self, asked)
-        most = start.patience * ITERATION_S * self.nlp.assembled.size / USUAL_SIZE
+        built = self._nlp(begin.apart)
+        most = start.patience * ITERATION_S * self.size / USUAL_SIZE
         left = max(LEAST_S, min(most, self.left_s(asked)))
         limit = {"max_iter": start.patience, "max_cpu_time": left}
         options = {**IPOPT, **start.options, **limit, **self.options}
-        nlp = self._nlp(begin.apart).with_options(options, HOLD if start.held else None)
+        nlp = built.with_options(options, HOLD if start.held else None)
         parameters = self.parameters(asked.task, asked.stance, asked.srmp)
         known = {name: parameters[name] for name in self.sought}
         guess = {k: replace(x, constants=known | x.constants) for k, x in begin.guess.items()}
@@ -169,7 +176,7 @@ class Program(Shown):
                 parameters,
                 guess,
                 references=self.references(asked.srmp, asked.motion),
-                weights=self.changes.spread(self.nlp.problem, asked.weights),
+                weights=self.changes.spread(nlp.problem, asked.weights),
                 multipliers=begin.multipliers,
                 explain=explain,
             )
