@@ -2,31 +2,29 @@
 
 import dataclasses
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import jumplab as jl
 from jumplab.cli.main import main
-from jumplab.errors import InfeasibleError, InputError, JumplabError
+from jumplab.errors import InfeasibleError, InputError
 from jumplab.ocp import Bound, Nlp, Phase, PhaseGuess, Problem, Term
 from jumplab.show import price_bars
-from jumplab.stages.planner import Planner
 from jumplab.studies import record as study
 
-COARSE = {"mesh": {"flat": 6, "toe": 4, "flight": 6}}
+pytestmark = pytest.mark.slow  # the record takes ten seconds, its prices as long
 
 
 @pytest.fixture(scope="module")
 def highest():
-    """The highest jump of the default robot, on a coarse mesh."""
-    return jl.record("bhr", "height_m", engines=(), **COARSE)
+    """The highest jump of the default robot."""
+    return jl.record("bhr", "height_m", engines=())
 
 
 @pytest.fixture(scope="module")
 def prices(highest):
-    return highest.prices()
+    return highest.prices(most=4)
 
 
 def test_a_constant_with_the_name_of_a_parameter_takes_its_place():
@@ -47,15 +45,10 @@ def test_a_constant_with_the_name_of_a_parameter_takes_its_place():
 def test_a_record_is_a_clean_plan_and_no_easier_start_beats_it(highest):
     assert highest.audit.passed and highest.plan.task.height_m == highest.value
     assert highest.plan.planned_rise_m == pytest.approx(highest.value, abs=5e-3)
-    assert 0.9 < highest.value < 1.1 and len(highest.found) == 5 and highest.alike >= 3
+    assert 0.94 < highest.value < 1.0 and len(highest.found) == 6 and highest.alike >= 3
     assert "at least" in highest.line() and f"{highest.value:.3f} m" in highest.line()
     with pytest.raises(dataclasses.FrozenInstanceError):
         highest.value = 2.0
-
-
-def test_beyond_a_record_there_is_no_plan(highest):
-    with pytest.raises(JumplabError):
-        Planner(highest.plan.robot, **COARSE).plan(replace(highest.plan.task, height_m=1.06 * highest.value))
 
 
 def test_what_ends_a_record_is_named_with_joint_phase_and_time(highest):
@@ -70,11 +63,11 @@ def test_what_ends_a_record_is_named_with_joint_phase_and_time(highest):
 
 def test_prices_are_those_of_records_with_the_limit_moved(prices):
     rows = {row.limit: row for row in prices.rows}
-    assert {"knee speed", "knee torque", "ankle pitch torque", "knee upper stop", "friction"} <= set(rows)
+    assert {"knee speed", "knee torque", "knee upper stop", "friction"} <= set(rows)
     assert rows["knee torque"].price > 0 > rows["mass, everywhere"].price
     assert rows["thighs and shanks"].price > 0 and rows["knee speed"].unit == "rad/s"
     kept = [row for row in prices.rows if row.stays]
-    assert len(kept) >= 6
+    assert len(kept) >= 4
     for row in kept:
         assert row.gap <= 0.05, row
 
@@ -88,14 +81,14 @@ def test_records_and_prices_have_cards_and_bars(highest, prices):
 
 
 def test_a_robot_without_an_easy_jump_has_no_record(bhr):
-    with pytest.raises(InfeasibleError, match=r"no record of height_m, since none of 2 easy jumps"):
-        jl.record(bhr.with_limits(effort=0.25), "height_m", engines=(), **COARSE)
+    with pytest.raises(InfeasibleError, match=r"no record of height_m, since none of 3 easy jumps"):
+        jl.record(bhr.with_limits(effort=0.1), "height_m", engines=())
 
 
 def test_a_record_that_the_numbers_of_a_target_end_is_refused_in_a_sentence(bhr):
     on_the_moon = jl.JumpTask(0.0, 0.2, gravity=1.62)
     with pytest.raises(InfeasibleError, match=r"height_m = 1.5 m, the largest that a target may have") as e:
-        jl.record(bhr, "height_m", on_the_moon, engines=(), **COARSE)
+        jl.record(bhr, "height_m", on_the_moon, engines=())
     assert (e.value.number, e.value.bound) == ("height_m", 1.5)
 
 

@@ -2,8 +2,7 @@
 would buy.
 
 The number is an unknown of the whole-body program and as large as can be. A local solver speaks,
-from several easy jumps: a record is what it found "at least"; :mod:`.beyond` has what no motion can
-reach.
+from several easy jumps: a record is what it found "at least".
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from jumplab.io.progress import tell
 from jumplab.ocp.nlp import unexplained
 from jumplab.ocp.problem import Phase
 from jumplab.robot import Robot
-from jumplab.sim import INSTALLED, Scene, SimulationResult, simulate_jump
+from jumplab.sim import ENGINES, INSTALLED, Scene, SimulationResult, simulate_jump
 from jumplab.stages.plan import JumpPlan
 from jumplab.stages.planner import Planner
 from jumplab.stages.whole_body import Limits
@@ -47,7 +46,17 @@ EASY = {
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
-STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7  # shares of it, of which the first clean one counts
+STEPS_BACK = (
+    1.0,
+    0.99,
+    0.98,
+    0.96,
+    0.93,
+    0.9,
+    0.85,
+    0.8,
+    0.7,
+)  # shares of it, of which the first clean one counts
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
@@ -233,6 +242,9 @@ def record(
         raise InputError(f"what = {quoted(what)}: a record is one of {', '.join(EASY)}")
     if not 0 < share <= 1:
         raise InputError(f"share = {share:g} must be above 0 and at most 1")
+    for engine in engines:
+        if engine not in ENGINES:
+            raise InputError(f"engine {quoted(engine)}: choose of {', '.join(ENGINES)}, or none")
     planner = Planner(robot, keep=True, **changes)
     with unexplained():
         search = _Search(planner, what, given)
@@ -513,7 +525,9 @@ def _priced(record: Record, most: int) -> Prices:
     """
     program = record.program
     task = record.plan.task
-    usual = next(t.weight for _, t in record.solved.solution.problem.terms() if t.name == RECORD_TERM)
+    usual = next(
+        t.weight for _, t in record.solved.solution.problem.terms() if t.name == RECORD_TERM
+    )
     first = Asked(task), record.solved
     other = Asked(task, weights={RECORD_TERM: MORE * usual})
     second = other, program.solve(other, RECORD, from_solved(program, record.solved))
