@@ -46,17 +46,8 @@ EASY = {
 # shares of the best that they led to, whose own plans, of least effort, are the next starts
 CLIMB = 0.6, 0.75, 0.9
 SAME = 0.01  # share of a record within which another start ended in it
-STEPS_BACK = (
-    1.0,
-    0.99,
-    0.98,
-    0.96,
-    0.93,
-    0.9,
-    0.85,
-    0.8,
-    0.7,
-)  # shares of it, of which the first clean one counts
+# shares of it, of which the first clean one counts
+STEPS_BACK = 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.85, 0.8, 0.7
 LESS = 0.05  # of the share of a record that is played next, where a robot falls
 TRIED = 5  # shares that are played
 NEAR_END = 1e-3  # share of the range of a target's number, at whose end nothing of the robot binds
@@ -310,19 +301,27 @@ class _Search:
                 f"{len(found)} easy jumps led to one; the last one: {refusal}"
             ) from refusal
         _, task, solved = max(best, key=lambda x: x[0])
-        self.refuse_end(task)
+        self.refuse_end(task, solved)
         self.task = task
         return found, solved
 
-    def refuse_end(self, task: JumpTask) -> None:
-        """Refuse a record that is an end of what can be asked for."""
+    def refuse_end(self, task: JumpTask, solved: Solved) -> None:
+        """Refuse a record that a number of the problem ends, not the robot."""
+        least, longest = self.stage.limits.flight_s
+        who = f"robot {self.planner.robot.name}: the record of {self.what} is ended by"
+        if solved.solution.phases["flight"].duration > (1 - NEAR_END) * longest:
+            raise InfeasibleError(
+                f"{who} the flight of {longest:g} s, the longest that plans may have, not by the "
+                f"robot; allow more by limits={{'flight_s': ({least:g}, {2 * longest:g})}}",
+                number="flight_s",
+                bound=longest,
+            )
         for name in {SOUGHT[x] for x in self.sought}:
             _, low, high = RANGES[name]
             if getattr(task, name) > high - NEAR_END * (high - low):
                 raise InfeasibleError(
-                    f"robot {self.planner.robot.name}: the record of {self.what} is ended by "
-                    f"{name} = {high:g} {unit_of(name)}, the largest that a target may have, not "
-                    f"by the robot; give it lower limits, or hold more of the target",
+                    f"{who} {name} = {high:g} {unit_of(name)}, the largest that a target may have, "
+                    f"not by the robot; give it lower limits, or hold more of the target",
                     number=name,
                     bound=high,
                 )
