@@ -293,6 +293,7 @@ class _Search:
                 refusal = e
                 continue
             reached = program.found(task, solved)
+            self.refuse_end(reached, solved)
             found[word] = getattr(reached, self.what)
             best.append((found[word], reached, solved))
         if not best:
@@ -301,7 +302,6 @@ class _Search:
                 f"{len(found)} easy jumps led to one; the last one: {refusal}"
             ) from refusal
         _, task, solved = max(best, key=lambda x: x[0])
-        self.refuse_end(task, solved)
         self.task = task
         return found, solved
 
